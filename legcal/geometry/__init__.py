@@ -1,0 +1,1 @@
+"""Lines, frames and directions: pure NumPy, knows no robot and no camera."""

@@ -1,0 +1,59 @@
+"""Frames built on points, and rigid motions as people write them.
+
+Rigid motions are ``scipy.spatial.transform.RigidTransform``. A motion named
+``T_to_from`` maps coordinates in frame *from* to coordinates in frame *to*:
+``p_base = T_base_camera.apply(p_camera)``, and neighbours cancel:
+``T_base_camera * T_camera_platform``.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.types import Array
+
+
+def frame_on_points(points: Array) -> RigidTransform:
+    """Return the frame that three points define: origin, x axis, xy plane (z completes).
+
+    With two points (a planar mechanism) the z axis is kept.
+
+    Parameters
+    ----------
+    points : (3, 3) or (2, 3) array
+        Joint centres in some frame L [m].
+
+    Returns
+    -------
+    RigidTransform
+        T_L_frame. The points have coordinates (0, 0, 0), (x > 0, 0, 0), (., y > 0, 0) in it.
+
+    Raises
+    ------
+    ValueError
+        If two points coincide or the three are collinear.
+    """
+    x = points[1] - points[0]
+    spread = float(np.linalg.norm(points - points[0], axis=1).max())
+    toward_y = points[2] - points[0] if len(points) == 3 else np.cross([0.0, 0.0, 1.0], x)
+    z = np.cross(x, toward_y)
+    if spread == 0.0 or np.linalg.norm(z) < 1e-9 * spread**2:
+        raise ValueError("the points that should define a frame coincide or are collinear")
+    x = x / np.linalg.norm(x)
+    z = z / np.linalg.norm(z)
+    rotation = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
+    return RigidTransform.from_components(points[0], rotation)
+
+
+def motion_from_xyz_quat(xyz: Sequence[float], quat_xyzw: Sequence[float]) -> RigidTransform:
+    """Return the rigid motion written as ``{xyz: [m], quat_xyzw: [-]}`` in the files."""
+    return RigidTransform.from_components(np.asarray(xyz), Rotation.from_quat(quat_xyzw))
+
+
+def motion_to_xyz_quat(T: RigidTransform) -> dict[str, list[float]]:
+    """Return a rigid motion as the files write it, with the scalar part not negative."""
+    return {
+        "xyz": [float(x) for x in T.translation],
+        "quat_xyzw": [float(x) for x in T.rotation.as_quat(canonical=True)],
+    }

@@ -1,0 +1,86 @@
+"""Oriented lines in space: a unit direction u and any point M of the line.
+
+This is the one place that fixes the sign of eq (1): the moment of a line is
+``u x M``, with M measured from the origin of the frame (the camera centre C where the
+frame is a camera). Renaud, Andreff, Gogu, Martinet (2002), eq (1).
+"""
+
+import numpy as np
+
+from legcal.geometry.types import Array
+
+
+def moment(u: Array, M: Array) -> Array:
+    """Return the moment h = u x M of oriented lines, eq (1).
+
+    Parameters
+    ----------
+    u : (..., 3) array
+        Unit directions.
+    M : (..., 3) array
+        Any point of each line [m].
+
+    Returns
+    -------
+    (..., 3) array
+        Moments about the origin [m]; their norm is the distance of the line to the origin.
+    """
+    return np.asarray(np.cross(u, M))
+
+
+def nearest_point_to_origin(u: Array, M: Array) -> Array:
+    """Return the point of each line that lies nearest to the origin of the frame.
+
+    Parameters
+    ----------
+    u : (..., 3) array
+        Unit directions.
+    M : (..., 3) array
+        Any point of each line [m].
+
+    Returns
+    -------
+    (..., 3) array
+        Feet of the perpendiculars from the origin [m].
+    """
+    return np.asarray(M - u * np.sum(u * M, axis=-1, keepdims=True))
+
+
+def distance_to_line(P: Array, u: Array, M: Array) -> Array:
+    """Return the distance of points to lines, the norm of (M - P) x u of eq (6).
+
+    Parameters
+    ----------
+    P : (..., 3) array
+        Points [m].
+    u, M : (..., 3) array
+        Unit directions, and a point of each line [m].
+
+    Returns
+    -------
+    (...) array
+        Distances [m].
+    """
+    return np.asarray(np.linalg.norm(np.cross(M - P, u), axis=-1))
+
+
+def normal_basis(u: Array) -> Array:
+    """Return two unit vectors that complete each direction to a right-handed basis.
+
+    The choice is a fixed function of u: the coordinate axis least aligned with u, made
+    orthogonal to it, comes first; u x e1 comes second.
+
+    Parameters
+    ----------
+    u : (..., 3) array
+        Unit directions.
+
+    Returns
+    -------
+    (..., 2, 3) array
+        e1 and e2, with e1 x e2 = u.
+    """
+    axis = np.eye(3)[np.argmin(np.abs(u), axis=-1)]
+    e1 = axis - u * np.sum(u * axis, axis=-1, keepdims=True)
+    e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
+    return np.stack([e1, np.cross(u, e1)], axis=-2)

@@ -1,0 +1,1 @@
+"""Section 2: the mechanism, from URDF and closures to legs, and its kinematics."""

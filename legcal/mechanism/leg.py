@@ -1,0 +1,97 @@
+"""One leg of an n-leg parallel mechanism (section 2)."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+from legcal.geometry.types import Array
+
+JointLetter = Literal["R", "U", "S"]
+
+
+class LegKind(StrEnum):
+    """What moves along a leg: a motor with an encoder, a free slider, or nothing."""
+
+    ACTUATED = "actuated"
+    PASSIVE = "passive"
+    CONSTANT = "constant"
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A visible cylinder coaxial with its leg: a tube or a rod.
+
+    Attributes
+    ----------
+    link : str
+        The URDF link that carries the visual; it names the part in observations.
+    radius : float
+        Radius [m].
+    side : {"base", "platform"}
+        The half of the leg that the cylinder moves with. Positions along the leg are
+        measured from A for ``base`` and from B for ``platform``, positive from A to B.
+    start, end : float
+        The ends along the leg axis [m], ``start < end``.
+    """
+
+    link: str
+    radius: float
+    side: Literal["base", "platform"]
+    start: float
+    end: float
+
+    def span(self, length: float) -> tuple[float, float]:
+        """Return both ends as distances from A along a leg of that length [m]."""
+        shift = 0.0 if self.side == "base" else length
+        return self.start + shift, self.end + shift
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """A leg from its base joint centre A to its platform joint centre B.
+
+    Attributes
+    ----------
+    name : str
+        The name in the mechanism file.
+    base_joint, platform_joint : {"R", "U", "S"}
+        Joint types, found from the model.
+    kind : LegKind
+        Actuated, passive or constant length.
+    prismatic : str or None
+        The URDF prismatic joint; None for a constant-length leg.
+    A_base : (3,) array
+        Base joint centre in the base link [m].
+    B_platform : (3,) array
+        Platform joint centre in the platform link [m].
+    q0 : float
+        Leg length at reading zero [m]: L = sign * q + q0. The length of a constant leg.
+    sign : int
+        +1 where the leg grows with the joint value, -1 where it shrinks.
+    travel : tuple of float
+        Lower and upper joint limit [m]; (0, 0) for a constant-length leg.
+    cylinders : tuple of Cylinder
+        What a camera can see of the leg.
+    base_axis, platform_axis : (3,) array or None
+        Unit axis in the base or platform link, only for joints whose axis is a parameter.
+    """
+
+    name: str
+    base_joint: JointLetter
+    platform_joint: JointLetter
+    kind: LegKind
+    prismatic: str | None
+    A_base: Array
+    B_platform: Array
+    q0: float
+    sign: int
+    travel: tuple[float, float]
+    cylinders: tuple[Cylinder, ...]
+    base_axis: Array | None = None
+    platform_axis: Array | None = None
+
+    @property
+    def type(self) -> str:
+        """The leg's joints from base to platform, such as ``SPU``."""
+        slider = "" if self.kind is LegKind.CONSTANT else "P"
+        return f"{self.base_joint}{slider}{self.platform_joint}"

@@ -1,0 +1,83 @@
+"""The observation table: every outline of every leg in every image, with its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from legcal.geometry.types import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Outlines of cylinders in images, one row an outline (eqs 2, 3, 5).
+
+    Attributes
+    ----------
+    row : (n,) array of int
+        Index into the rows of :class:`legcal.measurements.Measurements`.
+    leg : (n,) array of int
+        Index into the legs of the mechanism.
+    part : tuple of str, length n
+        The URDF link of the cylinder.
+    edge : (n,) array of int
+        1 where epsilon of eq (5) is +1, 2 where it is -1.
+    h : (n, 3) array
+        Unit normal (a, b, c) of the plane through the camera centre and the outline, in the
+        camera frame, signed as in eq (3): h . M = epsilon R for a leg oriented from base
+        to platform. NaN for a leg that was not found.
+    ends : (n, 2, 2) array
+        Both ends of the used piece, in pixels of the image; the first is nearer to the base
+        joint. NaN for a leg that was not found.
+    covariance : (n, 2, 2) array
+        Covariance of the offsets of the line, normal to itself, at these ends [px^2].
+    used : (n,) array of bool
+        False for rejected outlines.
+    reason : tuple of str, length n
+        Why an outline was rejected; "" for used ones.
+    source : tuple of str, length n
+        ``detected`` or ``edited``.
+    """
+
+    row: IntArray
+    leg: IntArray
+    part: tuple[str, ...]
+    edge: IntArray
+    h: Array
+    ends: Array
+    covariance: Array
+    used: BoolArray
+    reason: tuple[str, ...]
+    source: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+@dataclass(frozen=True, eq=False)
+class LegAxes:
+    """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.
+
+    Attributes
+    ----------
+    row, leg : (n,) array of int
+        Indices of the image and of the leg.
+    u : (n, 3) array
+        Unit directions in the camera frame, from base to platform.
+    M : (n, 3) array
+        A point of each axis in the camera frame [m].
+    basis : (n, 2, 3) array
+        Unit vectors e1, e2 normal to u, in which the covariance is written.
+    covariance : (n, 4, 4) array
+        Covariance of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m], where the axis is known
+        as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
+    """
+
+    row: IntArray
+    leg: IntArray
+    u: Array
+    M: Array
+    basis: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.row)

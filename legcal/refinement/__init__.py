@@ -1,0 +1,1 @@
+"""Beyond the paper: one fit of everything at once, in the image."""

@@ -1,0 +1,1 @@
+"""Section 4.3: simulated measurements. No module of the method imports this package."""

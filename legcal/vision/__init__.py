@@ -1,0 +1,1 @@
+"""Section 3.1: from pixels to the axes of cylinders."""

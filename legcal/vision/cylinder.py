@@ -1,0 +1,120 @@
+"""A cylinder and its outline, both ways (section 3.1, eqs 1-5).
+
+The two planes through the camera centre that touch a cylinder of radius R have unit normals
+h1 and h2; a point M of the axis lies at +R from the first and at -R from the second. With
+u oriented from base to platform and h signed as the moment u x P of a point P of the generating
+line, edge 1 is the one with epsilon = +1.
+"""
+
+import numpy as np
+
+from legcal.errors import NotVisible
+from legcal.geometry.lines import moment, nearest_point_to_origin
+from legcal.geometry.types import Array
+
+EPSILON = np.array([1.0, -1.0])
+
+
+def outlines_of_axis(u: Array, M: Array, radius: Array | float) -> Array:
+    """Return the outlines of cylinders seen from the origin, eqs (1) and (3).
+
+    The tangent planes contain u, and stand at the angle asin(R / d) to the plane through the
+    axis and the camera centre, d being the distance of the axis.
+
+    Parameters
+    ----------
+    u : (..., 3) array
+        Unit directions in the camera frame, from base to platform.
+    M : (..., 3) array
+        A point of each axis in the camera frame [m].
+    radius : (...) array or float
+        Radii [m].
+
+    Returns
+    -------
+    (..., 2, 3) array
+        Unit normals h1 (epsilon +1) and h2 (epsilon -1).
+
+    Raises
+    ------
+    NotVisible
+        If the camera centre lies inside a cylinder or on its surface.
+    """
+    foot = nearest_point_to_origin(u, M)
+    distance = np.linalg.norm(foot, axis=-1)
+    sine = np.asarray(radius) / distance
+    if np.any(sine >= 1.0):
+        raise NotVisible(
+            "The outline of a cylinder could not be drawn: the camera centre is "
+            f"{1e3 * float(distance.min()):.1f} mm from an axis, inside the cylinder; it must "
+            "stand outside every leg; check the camera pose of the view."
+        )
+    m = moment(u, M) / distance[..., None]
+    toward = foot / distance[..., None]
+    cosine = np.sqrt(1.0 - sine**2)
+    return np.stack(
+        [cosine[..., None] * m + e * sine[..., None] * toward for e in EPSILON], axis=-2
+    )
+
+
+def axis_of_outlines(h1: Array, h2: Array, radius: Array | float) -> tuple[Array, Array]:
+    """Return the axes of cylinders from their outlines, eqs (4) and (5).
+
+    Parameters
+    ----------
+    h1, h2 : (..., 3) array
+        Unit normals of the tangent planes with epsilon +1 and -1.
+    radius : (...) array or float
+        Radii [m].
+
+    Returns
+    -------
+    u : (..., 3) array
+        Unit directions h1 x h2 of eq (4); with these signs they point from base to platform.
+    M : (..., 3) array
+        The solution of eq (5) nearest to the camera centre [m]. It exists for every
+        cylinder, unlike the point with y = 0 of the paper.
+
+    Raises
+    ------
+    NotVisible
+        If two outlines coincide, so that no cylinder has them.
+    """
+    n = np.cross(h1, h2)
+    norm = np.linalg.norm(n, axis=-1, keepdims=True)
+    if not np.all(norm > 1e-12):
+        raise NotVisible(
+            "A leg axis could not be computed: its two outlines coincide; two different edges "
+            "are needed; reject this leg in the observations."
+        )
+    u = n / norm
+    # In the plane of h1 and h2 the point is R (h1 - h2) / (1 - h1 . h2): symmetric in both.
+    cosine = np.sum(h1 * h2, axis=-1, keepdims=True)
+    M = np.asarray(radius)[..., None] * (h1 - h2) / (1.0 - cosine)
+    return u, M
+
+
+def point_with_zero_y(u: Array, M: Array) -> Array:
+    """Return the point M_LS = (x, 0, z) of axes, the paper's choice among the points of eq (5).
+
+    Parameters
+    ----------
+    u, M : (..., 3) array
+        Directions, and a point of each axis [m], in the camera frame.
+
+    Returns
+    -------
+    (..., 3) array
+        M_LS [m].
+
+    Raises
+    ------
+    NotVisible
+        If an axis is parallel to the plane y = 0, where the point does not exist.
+    """
+    if np.any(np.abs(u[..., 1]) < 1e-9):
+        raise NotVisible(
+            "M_LS = (x, 0, z) does not exist for a leg parallel to the image x axis; "
+            "use the point nearest to the camera centre instead."
+        )
+    return np.asarray(M - u * (M[..., 1:2] / u[..., 1:2]))
