@@ -1,0 +1,226 @@
+"""From outlines to leg axes with their covariance (eqs 4 and 5): the input of the four steps.
+
+Two outlines of a cylinder are two planes through the camera centre. They fix the axis, and
+their uncertainty becomes the uncertainty of the axis: small across the image, large towards
+the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from legcal.errors import NotVisible
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, IntArray
+from legcal.measurements import Measurements
+from legcal.observations import LegAxes, Outlines
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import axis_of_outlines
+
+
+def axes_from_outlines(
+    outlines: Outlines, measurements: Measurements, radius_of_part: Mapping[str, float]
+) -> LegAxes:
+    """Return the axis of every leg of which both outlines are used, eqs (4) and (5).
+
+    The cylinders of one leg in one image (a tube and a rod) share an axis: they are joined,
+    weighted by their covariances.
+
+    Parameters
+    ----------
+    outlines : Outlines
+        Outlines in images; those that are rejected or lack their partner are passed over.
+    measurements : Measurements
+        The images and their cameras.
+    radius_of_part : mapping from str to float
+        Radius of each cylinder by its URDF link [m].
+
+    Returns
+    -------
+    LegAxes
+        One row for each leg in each image, by image and then by leg. The reference point M is
+        the point of the axis in the middle of the used piece, where it is known best.
+
+    Raises
+    ------
+    NotVisible
+        If no image shows both outlines of a leg, or two outlines coincide.
+    """
+    pairs = _pairs(outlines)
+    if len(pairs) == 0:
+        raise NotVisible(
+            "Leg axes could not be computed: no leg has both outlines in any image; at least "
+            "two images of every leg are needed; check the camera poses and the detection."
+        )
+    radius = np.array([radius_of_part[outlines.part[first]] for first in pairs[:, 0]])
+    h = outlines.h[pairs]
+    u, M = axis_of_outlines(h[:, 0], h[:, 1], radius)
+    view = measurements.view[outlines.row[pairs[:, 0]]]
+    rays, h_of_offset = _end_rays_and_derivatives(outlines, pairs, view, measurements)
+    M = _nearest_point_to_ray(u, M, rays.mean(axis=(1, 2)))
+    basis = normal_basis(u)
+    derivative = axis_derivative(h, h_of_offset, u, M, basis)
+    offsets = np.zeros((len(pairs), 4, 4))
+    offsets[:, :2, :2] = outlines.covariance[pairs[:, 0]]
+    offsets[:, 2:, 2:] = outlines.covariance[pairs[:, 1]]
+    covariance = derivative @ offsets @ np.swapaxes(derivative, -1, -2)
+    separate = LegAxes(
+        outlines.row[pairs[:, 0]], outlines.leg[pairs[:, 0]], u, M, basis, covariance
+    )
+    return join_axes(separate, separate.row)
+
+
+def axis_derivative(h: Array, h_of_offset: Array, u: Array, M: Array, basis: Array) -> Array:
+    """Return the derivative of axes with respect to the offsets of both outlines.
+
+    A change of h_i must keep h_i . u = 0 (4) and h_i . M = epsilon_i R (5), so the
+    changes of u and of M solve the same 2 x 2 system.
+
+    Parameters
+    ----------
+    h : (n, 2, 3) array
+        Unit normals of both outlines.
+    h_of_offset : (n, 2, 2, 3) array
+        Derivative of each normal with respect to the offsets of its two ends [1/px].
+    u, M : (n, 3) array
+        The axes [m].
+    basis : (n, 2, 3) array
+        e1 and e2 of each axis.
+
+    Returns
+    -------
+    (n, 4, 4) array
+        d(alpha1, alpha2, beta1, beta2) / d(offsets of edge 1, of edge 2) [rad/px, m/px].
+    """
+    system = np.einsum("nia,nja->nij", h, basis)
+    change = np.zeros((len(u), 2, 2, 4))  # (n, equation i, of u or of M, offset)
+    for i in range(2):
+        for column, point in enumerate((u, M)):
+            change[:, i, column, 2 * i : 2 * i + 2] = -np.einsum(
+                "nea,na->ne", h_of_offset[:, i], point
+            )
+    solved = np.linalg.solve(system, change.reshape(len(u), 2, 8)).reshape(len(u), 2, 2, 4)
+    return np.concatenate([solved[:, :, 0], solved[:, :, 1]], axis=1)
+
+
+def join_axes(axes: LegAxes, group: IntArray) -> LegAxes:
+    """Return one axis for each leg in each group of rows, weighted by the covariances.
+
+    Parameters
+    ----------
+    axes : LegAxes
+        Observed axes, in one camera frame within a group.
+    group : (n,) array of int
+        Axes with the same group and leg are observations of one line.
+
+    Returns
+    -------
+    LegAxes
+        Joined axes, ordered by group and then by leg; ``row`` is the first of each.
+    """
+    keys = np.stack([group, axes.leg], axis=1)
+    distinct, which = np.unique(keys, axis=0, return_inverse=True)
+    members = [np.flatnonzero(which.ravel() == k) for k in range(len(distinct))]
+    joined = [_join(axes, m) for m in members]
+    u, M, basis, covariance = (np.array(part) for part in zip(*joined, strict=True))
+    first = np.array([m[0] for m in members], dtype=np.intp)
+    return LegAxes(axes.row[first], axes.leg[first], u, M, basis, covariance)
+
+
+def _join(axes: LegAxes, members: IntArray) -> tuple[Array, Array, Array, Array]:
+    """Return u, M, basis and covariance of the weighted mean of observations of one line."""
+    i = members[0]
+    u, M, basis = axes.u[i], axes.M[i], axes.basis[i]
+    if len(members) == 1:
+        return u, M, basis, axes.covariance[i]
+    information: Array = np.zeros((4, 4))
+    weighted: Array = np.zeros(4)
+    for k in members:
+        # The other line at the height of M, written in this basis.
+        u_k = axes.u[k] / (axes.u[k] @ u)
+        shift = u @ (M - axes.M[k])
+        value = np.concatenate([basis @ u_k, basis @ (axes.M[k] + shift * u_k - M)])
+        turn = basis @ axes.basis[k].T
+        move = np.block([[turn, np.zeros((2, 2))], [shift * turn, turn]])
+        weight = np.linalg.inv(move @ axes.covariance[k] @ move.T)
+        information += weight
+        weighted += weight @ value
+    covariance = np.linalg.inv(information)
+    alpha, beta = np.split(covariance @ weighted, 2)
+    u_new = u + basis.T @ alpha
+    u_new = np.asarray(u_new / np.linalg.norm(u_new))
+    M_new = np.asarray(M + basis.T @ beta)
+    # Carry e1 along so that the covariance keeps its meaning.
+    e1 = basis[0] - u_new * (u_new @ basis[0])
+    e1 /= np.linalg.norm(e1)
+    return u_new, M_new, np.array([e1, np.cross(u_new, e1)]), np.asarray(covariance)
+
+
+def _pairs(outlines: Outlines) -> IntArray:
+    """Return the indices (edge 1, edge 2) of outlines of one cylinder in one image, (n, 2)."""
+    found: dict[tuple[int, int, str], dict[int, int]] = {}
+    for i in np.flatnonzero(outlines.used):
+        key = (int(outlines.row[i]), int(outlines.leg[i]), outlines.part[i])
+        found.setdefault(key, {})[int(outlines.edge[i])] = int(i)
+    both = [(edges[1], edges[2]) for _, edges in sorted(found.items()) if len(edges) == 2]
+    return np.array(both, dtype=np.intp).reshape(-1, 2)
+
+
+def _end_rays_and_derivatives(
+    outlines: Outlines, pairs: IntArray, view: IntArray, measurements: Measurements
+) -> tuple[Array, Array]:
+    """Return the rays (x, y, 1) of the ends (n, 2, 2, 3) and d h / d offsets (n, 2, 2, 3)."""
+    rays = np.empty((len(pairs), 2, 2, 3))
+    derivative = np.empty((len(pairs), 2, 2, 3))
+    for v in np.unique(view):
+        here = pairs[view == v]
+        camera = measurements.views[v].camera
+        rays[view == v], derivative[view == v] = outline_derivative(
+            camera, outlines.h[here], outlines.ends[here]
+        )
+    return rays, derivative
+
+
+def outline_derivative(camera: Camera, h: Array, ends: Array) -> tuple[Array, Array]:
+    """Return the rays of an outline's ends and how its normal follows offsets of these ends.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    h : (..., 3) array
+        Unit normals of outlines, in its frame.
+    ends : (..., 2, 2) array
+        Their ends [px].
+
+    Returns
+    -------
+    rays : (..., 2, 3) array
+        The ends (x, y, 1) on the sensor plane.
+    derivative : (..., 2, 3) array
+        d h / d offset of each end [1/px], an offset being that of
+        :meth:`legcal.vision.camera.Camera.line_offset`.
+    """
+    xy = camera.undistort(ends)
+    ones = np.ones((*xy.shape[:-1], 1))
+    rays = np.concatenate([xy, ones], axis=-1)
+    # The line follows an offset of an end: (h + dh) . ray = -dvalue keeps the point on it.
+    J = camera.pixels_per_unit(xy)
+    ab = np.broadcast_to(h[..., None, :2], xy.shape)
+    normal = np.linalg.solve(np.swapaxes(J, -1, -2), ab[..., None])[..., 0]
+    moved = np.linalg.norm(normal, axis=-1)  # d (h . ray) / d offset
+    # dh is normal to h, zero on the ray of the other end, and -moved on its own ray.
+    other = rays[..., ::-1, :]
+    direction = np.cross(np.broadcast_to(h[..., None, :], rays.shape), other)
+    scale = -moved / np.sum(direction * rays, axis=-1)
+    return rays, direction * scale[..., None]
+
+
+def _nearest_point_to_ray(u: Array, M: Array, ray: Array) -> Array:
+    """Return the point of each axis nearest to a ray through the camera centre."""
+    d = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    across = u - d * np.sum(u * d, axis=-1, keepdims=True)
+    t = -np.sum(across * M, axis=-1) / np.sum(across * across, axis=-1)
+    return np.asarray(M + t[:, None] * u)

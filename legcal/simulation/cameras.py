@@ -1,0 +1,108 @@
+"""Camera positions around a simulated machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.types import Array
+from legcal.simulation.machine import Machine
+from legcal.vision.camera import Camera
+
+PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A camera that stands somewhere and the legs that it sees.
+
+    Attributes
+    ----------
+    camera : Camera
+        Its intrinsics.
+    T_Rb_camera : RigidTransform
+        Its pose in R_b.
+    legs : tuple of int
+        The legs that its images show.
+    """
+
+    camera: Camera
+    T_Rb_camera: RigidTransform
+    legs: tuple[int, ...]
+
+
+def sample_camera() -> Camera:
+    """Return a camera of 1024 x 768 pixels without distortion, as of the example hexapod."""
+    K = np.array([[1290.3, 0.0, 518.3], [0.0, 1290.3, 379.6], [0.0, 0.0, 1.0]])
+    return Camera(K, 1024, 768)
+
+
+def cameras_around(
+    machine: Machine,
+    rng: np.random.Generator,
+    *,
+    legs: Sequence[Sequence[int]] = PAPER_VIEWS,
+    distance: float = 0.9,
+    camera: Camera | None = None,
+) -> tuple[Viewpoint, ...]:
+    """Return cameras that stand around a machine, each on the side of the legs it sees.
+
+    Parameters
+    ----------
+    machine : Machine
+        The machine in its home pose.
+    rng : numpy.random.Generator
+        Source of small variations of position and roll.
+    legs : sequence of sequences of int
+        The legs that each camera sees.
+    distance : float
+        Distance of the cameras from the middle of the machine [m].
+    camera : Camera, optional
+        Intrinsics of all cameras; :func:`sample_camera` without it.
+
+    Returns
+    -------
+    tuple of Viewpoint
+    """
+    A_Rb = machine.parameters.base_joints
+    B_Rb = machine.home.apply(machine.parameters.platform_joints)
+    middle = 0.5 * (A_Rb + B_Rb)
+    centre = middle.mean(axis=0)
+    viewpoints = []
+    for seen in legs:
+        outward = (middle[list(seen)] - centre).mean(axis=0)
+        outward[2] = 0.0
+        if np.linalg.norm(outward) < 1e-3 * distance:  # every leg is seen: any side will do
+            outward = np.array([*rng.normal(size=2), 0.0])
+        outward /= np.linalg.norm(outward)
+        lift = rng.uniform(0.0, 0.25)
+        toward = np.array([*(outward[:2] * np.cos(lift)), np.sin(lift)])
+        position = centre + distance * rng.uniform(0.95, 1.05) * toward
+        pose = look_at(position, centre, roll=rng.uniform(-0.1, 0.1))
+        viewpoints.append(Viewpoint(camera or sample_camera(), pose, tuple(seen)))
+    return tuple(viewpoints)
+
+
+def look_at(position: Array, target: Array, roll: float = 0.0) -> RigidTransform:
+    """Return the pose of a camera that looks at a point, with its y axis down.
+
+    Parameters
+    ----------
+    position, target : (3,) array
+        The camera centre and the point on its optical axis, in a frame L with z up [m].
+    roll : float
+        Turn about the optical axis [rad].
+
+    Returns
+    -------
+    RigidTransform
+        T_L_camera.
+    """
+    z = (target - position) / np.linalg.norm(target - position)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    upright = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
+    return RigidTransform.from_components(position, upright * Rotation.from_euler("z", roll))

@@ -1,0 +1,192 @@
+"""What simulated cameras see: outlines with noise in pixels, or axes with the noise of Table 1."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, IntArray
+from legcal.observations import LegAxes, Outlines
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import EPSILON, outlines_of_axis, point_with_zero_y
+
+
+@dataclass(frozen=True)
+class OutlineNoise:
+    """White noise of the edge points of an outline.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Standard deviation of each point [px].
+    n_points : int
+        Points of each outline, equally spaced.
+    """
+
+    sigma_px: float = 0.1
+    n_points: int = 300
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the fitted line's offsets at its ends, (2, 2) [px^2]."""
+        t = np.linspace(0.0, 1.0, self.n_points)
+        design = np.stack([1.0 - t, t], axis=-1)
+        return np.asarray(self.sigma_px**2 * np.linalg.inv(design.T @ design))
+
+
+@dataclass(frozen=True)
+class TableNoise:
+    """The noise of Table 1, on the direction of an axis and on the point M_LS = (x, 0, z).
+
+    The paper prints the angles in radians; its results fit degrees only, so the default reads
+    them as degrees. ``TableNoise(psi=0.05, theta=0.06)`` is the table to the letter. The
+    Euler angles are read as turns about the camera's x axis (psi: tilt) and z axis (theta:
+    in the image).
+
+    Attributes
+    ----------
+    psi, theta : float
+        Standard deviations of the angles [rad].
+    x, z : float
+        Standard deviations of the coordinates of M_LS [m].
+    """
+
+    psi: float = float(np.deg2rad(0.05))
+    theta: float = float(np.deg2rad(0.06))
+    x: float = 0.05e-3
+    z: float = 0.10e-3
+
+
+def exact_outlines(
+    camera: Camera, u: Array, M: Array, length: Array, radius: Array, *, margin: float = 0.15
+) -> tuple[Array, Array]:
+    """Return the outlines of legs without noise.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    u, M : (n, 3) array
+        Directions and base joint centres in the camera frame [m].
+    length : (n,) array
+        Leg lengths [m].
+    radius : (n,) array
+        Radii [m].
+    margin : float
+        The part of the leg that is not seen at each end.
+
+    Returns
+    -------
+    h : (n, 2, 3) array
+        Unit normals of edges 1 and 2.
+    ends : (n, 2, 2, 2) array
+        Ends of both edges, the first nearer to the base [px].
+    """
+    h = outlines_of_axis(u, M, radius)
+    parts = np.array([margin, 1.0 - margin])
+    axis_points = M[:, None] + (length[:, None] * parts)[..., None] * u[:, None]
+    touching = axis_points[:, None] - (radius[:, None] * EPSILON)[..., None, None] * h[:, :, None]
+    return h, camera.project(touching)
+
+
+def shifted_outlines(camera: Camera, h: Array, ends: Array, offsets: Array) -> tuple[Array, Array]:
+    """Return outlines whose ends are moved across the line by offsets in pixels.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    h : (..., 3) array
+        Unit normals.
+    ends, offsets : (..., 2, 2) and (..., 2) array
+        Ends and their offsets, positive where h . (x, y, 1) > 0 [px].
+
+    Returns
+    -------
+    h : (..., 3) array
+    ends : (..., 2, 2) array
+    """
+    xy = camera.undistort(ends)
+    J = camera.pixels_per_unit(xy)
+    ab = np.broadcast_to(h[..., None, :2], xy.shape)
+    normal = np.linalg.solve(np.swapaxes(J, -1, -2), ab[..., None])[..., 0]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    moved = ends + offsets[..., None] * normal
+    xy = camera.undistort(moved)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    n = np.cross(rays[..., 0, :], rays[..., 1, :])
+    n *= np.sign(np.sum(n * h, axis=-1, keepdims=True))
+    return n / np.linalg.norm(n, axis=-1, keepdims=True), moved
+
+
+def observe_outlines(
+    camera: Camera,
+    legs: tuple[Array, Array, Array, Array],
+    noise: OutlineNoise,
+    rng: np.random.Generator | None,
+) -> tuple[Array, Array]:
+    """Return the outlines of legs (u, A, length, radius) with noise; without it if rng is None."""
+    h, ends = exact_outlines(camera, *legs)
+    if rng is None:
+        return h, ends
+    offsets = rng.multivariate_normal(np.zeros(2), noise.covariance, size=h.shape[:2])
+    return shifted_outlines(camera, h, ends, offsets)
+
+
+def observe_axes(
+    u: Array, A: Array, noise: TableNoise, rng: np.random.Generator | None
+) -> tuple[Array, Array, Array, Array]:
+    """Return u, M_LS, basis and covariance of legs through A with the noise of Table 1."""
+    M = point_with_zero_y(u, A)
+    sigma = np.array([noise.psi, noise.theta, noise.x, noise.z])
+    if rng is not None:
+        error = rng.normal(size=(len(u), 4)) * sigma
+        turn = error[:, [0]] * np.array([1.0, 0.0, 0.0]) + error[:, [1]] * np.array([0.0, 0.0, 1.0])
+        u = u + np.cross(turn, u)
+        u = u / np.linalg.norm(u, axis=-1, keepdims=True)
+        M = M + error[:, [2, 3]] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    basis = normal_basis(u)
+    map_ = np.zeros((len(u), 4, 4))
+    for column, axis in enumerate(np.eye(3)[[0, 2]]):
+        map_[:, :2, column] = np.einsum("nia,na->ni", basis, np.cross(axis, u))
+        map_[:, 2:, 2 + column] = basis @ axis
+    return u, M, basis, map_ @ np.diag(sigma**2) @ np.swapaxes(map_, -1, -2)
+
+
+def outline_table(
+    rows: Sequence[int],
+    seen: Sequence[IntArray],
+    h: Sequence[Array],
+    ends: Sequence[Array],
+    parts: Sequence[str],
+    noise: OutlineNoise,
+) -> Outlines:
+    """Return the table of outlines of images: by row, then leg, then edge."""
+    row = np.concatenate([np.full(2 * len(s), r) for r, s in zip(rows, seen, strict=True)])
+    leg = np.concatenate([np.repeat(s, 2) for s in seen])
+    n = len(row)
+    return Outlines(
+        row=row.astype(np.intp),
+        leg=leg.astype(np.intp),
+        part=tuple(parts[j] for j in leg),
+        edge=np.tile(np.array([1, 2], dtype=np.intp), n // 2),
+        h=np.concatenate([x.reshape(-1, 3) for x in h]),
+        ends=np.concatenate([x.reshape(-1, 2, 2) for x in ends]),
+        covariance=np.broadcast_to(noise.covariance, (n, 2, 2)).copy(),
+        used=np.ones(n, dtype=np.bool_),
+        reason=("",) * n,
+        source=("detected",) * n,
+    )
+
+
+def axis_table(
+    rows: Sequence[int], seen: Sequence[IntArray], axes: Sequence[tuple[Array, ...]]
+) -> LegAxes:
+    """Return the table of axes of images: by row, then leg."""
+    row = np.concatenate([np.full(len(s), r) for r, s in zip(rows, seen, strict=True)])
+    u, M, basis, covariance = (np.concatenate(part) for part in zip(*axes, strict=True))
+    leg = np.concatenate(list(seen)).astype(np.intp)
+    return LegAxes(row.astype(np.intp), leg, u, M, basis, covariance)

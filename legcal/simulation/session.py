@@ -1,0 +1,169 @@
+"""A whole simulated measurement: readings, outlines, axes, and the truth behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.types import Array
+from legcal.leg_axes import axes_from_outlines
+from legcal.measurements import Measurements, View
+from legcal.observations import LegAxes, Outlines
+from legcal.simulation.cameras import Viewpoint
+from legcal.simulation.machine import Machine
+from legcal.simulation.observe import (
+    OutlineNoise,
+    TableNoise,
+    axis_table,
+    observe_axes,
+    observe_outlines,
+    outline_table,
+)
+from legcal.simulation.poses import extreme_poses, leg_vectors
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSession:
+    """Measurements of a simulated machine, and what is true of it.
+
+    Attributes
+    ----------
+    measurements : Measurements
+        Images, readings and rough camera poses. The base link's frame is R_b.
+    outlines : Outlines or None
+        Outlines in the images; None where Table 1 gave the noise of the axes.
+    axes : LegAxes
+        Axes of the legs.
+    machine : Machine
+        The true machine.
+    viewpoints : tuple of Viewpoint
+        The true cameras.
+    T_Rb_Re : tuple of RigidTransform
+        The true platform poses, by index of pose.
+    """
+
+    measurements: Measurements
+    outlines: Outlines | None
+    axes: LegAxes
+    machine: Machine
+    viewpoints: tuple[Viewpoint, ...]
+    T_Rb_Re: tuple[RigidTransform, ...]
+
+
+def simulate_session(
+    machine: Machine,
+    viewpoints: Sequence[Viewpoint],
+    rng: np.random.Generator,
+    *,
+    noise: OutlineNoise | TableNoise,
+    noisy: bool = True,
+    sigma_q: float = 2e-6,
+    n_poses: int = 15,
+    n_images: int = 1,
+    share_poses: bool = False,
+) -> SimulatedSession:
+    """Simulate readings and observations of a machine (section 4.3).
+
+    Parameters
+    ----------
+    machine : Machine
+        The true machine.
+    viewpoints : sequence of Viewpoint
+        The true cameras and the legs that they see.
+    rng : numpy.random.Generator
+        Source of poses and noise.
+    noise : OutlineNoise or TableNoise
+        What disturbs the observations, and the covariance that they carry.
+    noisy : bool
+        False leaves observations, readings and rough camera poses exact; the covariances stay.
+    sigma_q : float
+        Standard deviation of the readings [m].
+    n_poses : int
+        Platform poses for each view.
+    n_images : int
+        Images of each pose in each view.
+    share_poses : bool
+        Every view sees the same poses (several cameras at once) instead of its own.
+
+    Returns
+    -------
+    SimulatedSession
+    """
+    n_views = len(viewpoints)
+    T_Rb_Re = extreme_poses(machine, n_poses if share_poses else n_views * n_poses, rng)
+    view = np.repeat(np.arange(n_views), n_poses * n_images)
+    pose = np.repeat(np.arange(n_views * n_poses), n_images)
+    pose = (pose % n_poses if share_poses else pose).astype(np.intp)
+    lengths = np.stack(
+        [np.linalg.norm(leg_vectors(machine.parameters, T), axis=-1) for T in T_Rb_Re]
+    )
+    q = (lengths - machine.parameters.offsets) * machine.sign
+    if noisy:
+        q = q + rng.normal(scale=sigma_q, size=q.shape)
+    measurements = Measurements(
+        views=tuple(_view(i, v, machine, rng if noisy else None) for i, v in enumerate(viewpoints)),
+        image=("",) * len(view),
+        view=view.astype(np.intp),
+        pose=pose,
+        q=q[pose],
+        sigma_q=sigma_q,
+    )
+    outlines, axes = _observe(
+        machine, viewpoints, T_Rb_Re, measurements, noise, rng if noisy else None
+    )
+    return SimulatedSession(measurements, outlines, axes, machine, tuple(viewpoints), T_Rb_Re)
+
+
+def _observe(
+    machine: Machine,
+    viewpoints: Sequence[Viewpoint],
+    T_Rb_Re: Sequence[RigidTransform],
+    measurements: Measurements,
+    noise: OutlineNoise | TableNoise,
+    rng: np.random.Generator | None,
+) -> tuple[Outlines | None, LegAxes]:
+    """Return what all images show."""
+    rows = range(measurements.n_rows)
+    seen = [np.array(viewpoints[v].legs, dtype=np.intp) for v in measurements.view]
+    legs = [
+        _legs_in_camera(machine, viewpoints[measurements.view[r]], T_Rb_Re[measurements.pose[r]])
+        for r in rows
+    ]
+    if isinstance(noise, TableNoise):
+        observed = [observe_axes(u, A, noise, rng) for u, A, _, _ in legs]
+        return None, axis_table(rows, seen, observed)
+    images = [
+        observe_outlines(viewpoints[measurements.view[r]].camera, legs[r], noise, rng) for r in rows
+    ]
+    h, ends = zip(*images, strict=True)
+    outlines = outline_table(rows, seen, h, ends, machine.parts, noise)
+    return outlines, axes_from_outlines(outlines, measurements, machine.radius_of_part())
+
+
+def _legs_in_camera(
+    machine: Machine, viewpoint: Viewpoint, T_Rb_Re: RigidTransform
+) -> tuple[Array, Array, Array, Array]:
+    """Return u, A (camera frame), length and radius of the legs that a camera sees."""
+    seen = list(viewpoint.legs)
+    legs = leg_vectors(machine.parameters, T_Rb_Re)[seen]
+    length = np.linalg.norm(legs, axis=-1)
+    T_camera_Rb = viewpoint.T_Rb_camera.inv()
+    u = T_camera_Rb.rotation.apply(legs / length[:, None])
+    return u, T_camera_Rb.apply(machine.parameters.base_joints[seen]), length, machine.radius[seen]
+
+
+def _view(
+    index: int, viewpoint: Viewpoint, machine: Machine, rng: np.random.Generator | None
+) -> View:
+    """Return the view with a rough camera pose: about 1 cm and 1 degree off."""
+    T = viewpoint.T_Rb_camera
+    if rng is not None:
+        turn = Rotation.from_rotvec(np.deg2rad(1.0) / np.sqrt(3.0) * rng.normal(size=3))
+        shift = 0.01 / np.sqrt(3.0) * rng.normal(size=3)
+        T = RigidTransform.from_components(T.translation + shift, turn * T.rotation)
+    names = tuple(f"leg{j + 1}" for j in viewpoint.legs)
+    everything = len(names) == machine.n_legs
+    return View(f"c{index + 1}", viewpoint.camera, T, None if everything else names)
