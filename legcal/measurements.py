@@ -51,6 +51,9 @@ class Measurements:
         legs, NaN for passive ones.
     sigma_q : float
         Standard deviation of a reading [m].
+    pose_labels : tuple of str, length n_poses
+        What the optional column ``pose`` calls each pose; "" for a pose without a label.
+        Empty where there is no such column.
     """
 
     views: tuple[View, ...]
@@ -59,6 +62,7 @@ class Measurements:
     pose: IntArray
     q: Array
     sigma_q: float
+    pose_labels: tuple[str, ...] = ()
 
     @property
     def n_rows(self) -> int:

@@ -1,0 +1,262 @@
+"""A dataset: the folder of section 4.1, read and validated before any work."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from legcal.dataset_schema import DatasetEntry, ViewEntry
+from legcal.errors import DatasetError
+from legcal.geometry.types import Image
+from legcal.inside import path_problem
+from legcal.measurement_table import read_measurements
+from legcal.measurements import Measurements, View
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.observation_table import read_observations
+from legcal.observations import Outlines
+from legcal.schema import closest, describe, parse_yaml, read_text, validate
+from legcal.vision.camera import Camera
+from legcal.vision.camera_file import read_camera
+from legcal.vision.image_file import image_problem, read_image
+
+FILE_NAME = "dataset.yaml"
+OBSERVATIONS_NAME = "observations.csv"
+CACHE_NAME = ".legcal-cache.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Everything that a calibration starts from.
+
+    Attributes
+    ----------
+    folder : Path
+        The dataset folder.
+    yaml_path, table_path : Path
+        ``dataset.yaml`` and the table of measurements.
+    camera_paths : tuple of Path
+        The camera file of each view.
+    mechanism : Mechanism
+        The nominal model.
+    measurements : Measurements
+        The rows of the table, in its order.
+    observations : Outlines or None
+        The rows of ``observations.csv`` if there is one: given, cached or edited.
+    notes : tuple of str
+        What is odd but allowed.
+    """
+
+    folder: Path
+    yaml_path: Path
+    table_path: Path
+    camera_paths: tuple[Path, ...]
+    mechanism: Mechanism
+    measurements: Measurements
+    observations: Outlines | None
+    notes: tuple[str, ...] = ()
+
+    def image_path(self, row: int) -> Path | None:
+        """Return the image file of a row; None where only outlines are given."""
+        image = self.measurements.image[row]
+        return self.folder / image if image else None
+
+    def read_image(self, row: int) -> Image:
+        """Return the image of a row as (height, width) grey levels 0 to 255, float32.
+
+        Raises
+        ------
+        DatasetError
+            If the row has no image, or its file cannot be used.
+        """
+        path, where = self.image_path(row), self._where(row)
+        if path is None:
+            raise DatasetError(
+                f"{where}: its image could not be read: found an empty cell, needed an image; name "
+                f"one or give its outlines in {OBSERVATIONS_NAME}."
+            )
+        return read_image(path, self._camera(row), where)
+
+    def image_problem(self, row: int) -> str | None:
+        """Return what keeps the image of a row from being used, or None; nothing is decoded."""
+        path = self.image_path(row)
+        return image_problem(path, self._camera(row), self._where(row)) if path else None
+
+    def _camera(self, row: int) -> Camera:
+        """Return the camera that took the image of a row."""
+        return self.measurements.views[int(self.measurements.view[row])].camera
+
+    def _where(self, row: int) -> str:
+        """Return the place of a row for a message."""
+        return f"{self.table_path}, row {row + 1}"
+
+
+def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
+    """Read a dataset and check everything in it that can be checked without decoding images.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The dataset folder, or its ``dataset.yaml``.
+    check_images : bool
+        Also check that every image that must be read exists, is complete and has the size of
+        its camera file.
+
+    Returns
+    -------
+    Dataset
+        With rows, views and legs in the order of the files.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong.
+    ModelError, OutOfClass
+        If the mechanism does not load.
+    """
+    yaml_path = _dataset_file(Path(folder))
+    folder = yaml_path.parent
+    entry = _read_entry(yaml_path)
+    problems: list[str] = []
+    if found := path_problem(folder, entry.measurements):
+        problems.append(
+            f"{yaml_path}: measurements could not be used: found {found} ({entry.measurements}), "
+            "needed a relative path inside it; move the table there."
+        )
+    camera_paths = tuple(folder / view.camera for view in entry.views.values())
+    cameras = _read_cameras(camera_paths, problems)
+    mechanism = load_mechanism(_mechanism_path(folder, entry.mechanism))
+    problems += _leg_problems(yaml_path, entry.views, mechanism.leg_names)
+    if problems:
+        raise DatasetError(problems)
+    views = tuple(
+        _view(name, view, cameras[path])
+        for (name, view), path in zip(entry.views.items(), camera_paths, strict=True)
+    )
+    table_path = folder / entry.measurements
+    measurements, notes = read_measurements(
+        table_path, folder, views, mechanism.legs, entry.encoder_sigma
+    )
+    dataset = Dataset(
+        folder=folder,
+        yaml_path=yaml_path,
+        table_path=table_path,
+        camera_paths=camera_paths,
+        mechanism=mechanism,
+        measurements=measurements,
+        observations=_read_outlines(folder, mechanism, measurements),
+        notes=(*notes, *_unused_views(yaml_path, measurements)),
+    )
+    problems = _row_problems(dataset) if check_images else []
+    if problems:
+        raise DatasetError(problems)
+    return dataset
+
+
+def _dataset_file(given: Path) -> Path:
+    """Return the path of dataset.yaml."""
+    path = given if given.suffix in (".yaml", ".yml") and not given.is_dir() else given / FILE_NAME
+    if not path.parent.is_dir():
+        raise DatasetError(
+            f"{given}: the dataset could not be read: found no such folder, needed a folder with a "
+            f"{FILE_NAME}; check the path."
+        )
+    if not path.exists():
+        raise DatasetError(
+            f"{given}: the dataset could not be read: found no {path.name} in the folder, needed "
+            "one; give the folder of a dataset."
+        )
+    return path
+
+
+def _read_entry(path: Path) -> DatasetEntry:
+    """Return what dataset.yaml says."""
+    found = parse_yaml(read_text(path, "dataset file"), path, "dataset file")
+    version = found.get("legcal_dataset", 1)
+    if version != 1 or isinstance(version, bool):
+        raise DatasetError(
+            f"{path}: the dataset could not be read: found legcal_dataset {describe(version)}, "
+            "needed version 1; use the legcal that wrote it, or write the file as version 1."
+        )
+    return validate(DatasetEntry, found, path)
+
+
+def _read_cameras(paths: tuple[Path, ...], problems: list[str]) -> dict[Path, Camera]:
+    """Return the camera of each file; files that cannot be used add to the problems."""
+    cameras = {}
+    for path in dict.fromkeys(paths):
+        try:
+            cameras[path] = read_camera(path)
+        except DatasetError as error:
+            problems += error.problems
+    return cameras
+
+
+def _mechanism_path(folder: Path, named: str) -> str | Path:
+    """Return the model's path relative to the dataset if there is one, else its name."""
+    path = folder / named
+    is_name = "/" not in named and not path.suffix
+    return named if is_name and not path.exists() else path
+
+
+def _leg_problems(
+    path: Path, views: Mapping[str, ViewEntry], leg_names: Sequence[str]
+) -> list[str]:
+    """Return the legs of views that the mechanism does not have."""
+    return [
+        f"{path}: views.{name}.legs could not be used: found the unknown leg {describe(leg)}, "
+        f"needed legs of the mechanism; {closest(leg, leg_names)}"
+        for name, view in views.items()
+        for leg in view.legs or ()
+        if leg not in leg_names
+    ]
+
+
+def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
+    """Return a view of the measurements."""
+    return View(
+        name=name,
+        camera=camera,
+        T_base_camera=entry.T_base_camera.motion() if entry.T_base_camera else None,
+        legs=tuple(entry.legs) if entry.legs else None,
+    )
+
+
+def _read_outlines(
+    folder: Path, mechanism: Mechanism, measurements: Measurements
+) -> Outlines | None:
+    """Return the outlines beside the dataset, if there are any."""
+    path = folder / OBSERVATIONS_NAME
+    if not path.exists():
+        return None
+    is_own = (folder / CACHE_NAME).exists()
+    return read_observations(path, mechanism.legs, measurements, skip_stale=is_own)
+
+
+def _unused_views(path: Path, measurements: Measurements) -> list[str]:
+    """Return a note for each view without a row."""
+    return [
+        f"{path}: view {view.name} has no row in the table of measurements and is left out."
+        for v, view in enumerate(measurements.views)
+        if not np.any(measurements.view == v)
+    ]
+
+
+def _row_problems(dataset: Dataset) -> list[str]:
+    """Return the rows that neither an image nor outlines make usable."""
+    outlines = dataset.observations
+    given = set() if outlines is None else set(outlines.row.tolist())
+    problems = []
+    for row in range(dataset.measurements.n_rows):
+        path = dataset.image_path(row)
+        if path is None and row not in given:
+            problems.append(
+                f"{dataset.table_path}, row {row + 1}, column image: the row could not be used: "
+                f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
+                "them; name an image or remove the row."
+            )
+        elif path is not None and (path.exists() or row not in given):
+            found = dataset.image_problem(row)
+            problems += [found] if found else []
+    return problems

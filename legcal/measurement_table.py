@@ -1,0 +1,306 @@
+"""The table ``measurements.csv``: for every image its view, its pose and the readings.
+
+The header is ``view,image,<actuated joint>,...`` with an optional ``pose``, in any order.
+Readings are in metres. Rows with the same pose label, in any view, share one platform pose
+and one reading (their mean); a row without a label is a pose of its own.
+"""
+
+import csv
+import io
+import math
+import posixpath
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from legcal.errors import DatasetError
+from legcal.geometry.types import Array, IntArray
+from legcal.inside import path_problem
+from legcal.measurements import Measurements, View
+from legcal.mechanism.leg import Leg, LegKind
+from legcal.schema import closest, describe, read_text
+
+TRAVEL_MARGIN = 0.05  # of the travel: a reading further outside is an error
+SAME_READING = 10.0  # sigma by which rows of one pose may differ
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_FIXED_COLUMNS = ("view", "image", "pose")
+_SHOWN = 3  # rows quoted in a sentence about many
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of the table: where it is, and its cells by column."""
+
+    where: str
+    cells: Mapping[str, str]
+
+
+def read_measurements(
+    path: Path, folder: Path, views: Sequence[View], legs: Sequence[Leg], sigma_q: float
+) -> tuple[Measurements, tuple[str, ...]]:
+    """Read ``measurements.csv``.
+
+    Parameters
+    ----------
+    path, folder : Path
+        The table, and the dataset folder that images are relative to.
+    views : sequence of View
+        The views of the dataset.
+    legs : sequence of Leg
+        The legs of the mechanism; their actuated joints name the columns.
+    sigma_q : float
+        Standard deviation of a reading [m].
+
+    Returns
+    -------
+    measurements : Measurements
+        With the rows in the order of the file.
+    notes : tuple of str
+        What is odd but allowed: readings a little outside their travel.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong, naming row and column. Whether the
+        images exist is not looked at.
+    """
+    joints = [leg.prismatic or "" for leg in legs if leg.kind is LegKind.ACTUATED]
+    header, lines = _read_lines(path)
+    problems = _header_problems(path, header, joints)
+    if problems:
+        raise DatasetError(problems)
+    rows = _rows(path, header, lines, problems)
+    view_index = {view.name: i for i, view in enumerate(views)}
+    problems += _view_problems(rows, view_index) + _image_problems(rows, folder)
+    readings = np.array(
+        [[_reading(row, joint, problems) for joint in joints] for row in rows], dtype=np.float64
+    ).reshape(len(rows), len(joints))
+    pose, labels = _poses(rows)
+    notes = _travel(
+        path, rows, [leg for leg in legs if leg.prismatic in joints], readings, problems
+    )
+    readings = _shared_readings(rows, pose, joints, readings, sigma_q, problems)
+    if problems:
+        raise DatasetError(problems)
+    measurements = Measurements(
+        views=tuple(views),
+        image=tuple(row.cells["image"] for row in rows),
+        view=np.array([view_index[row.cells["view"]] for row in rows], dtype=np.intp),
+        pose=pose,
+        q=_by_leg(legs, joints, readings),
+        sigma_q=sigma_q,
+        pose_labels=labels if "pose" in header else (),
+    )
+    return measurements, tuple(notes)
+
+
+def _read_lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header and the lines with their numbers, blank lines left out."""
+    try:
+        text = read_text(path, "table of measurements").decode("utf-8-sig")
+        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DatasetError(
+            f"{path}: the table could not be read: found '{error}', needed comma-separated text in "
+            "UTF-8; save it again as CSV."
+        ) from error
+    lines = [(number, cells) for number, cells in lines if any(cells)]
+    if len(lines) < 2:
+        raise DatasetError(
+            f"{path}: the table could not be used: found {'no header' if not lines else 'a header'}"
+            " and no row, needed one row for each image; record measurements."
+        )
+    return lines[0][1], lines[1:]
+
+
+def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -> list[str]:
+    """Return what is wrong with the columns."""
+    start = f"{path}, header: the columns could not be used: found"
+    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+        return [f"{start} '{header[0]}' in one column, needed commas between columns; save as CSV."]
+    known = [*_FIXED_COLUMNS, *joints]
+    problems = [
+        f"{start} the column '{name}' {header.count(name)} times, needed it once; remove one."
+        for name in dict.fromkeys(header)
+        if header.count(name) > 1
+    ]
+    problems += [
+        f"{start} the unknown column '{name}', needed view, image, pose or an actuated joint of "
+        f"the mechanism; {closest(name, known)}"
+        for name in dict.fromkeys(header)
+        if name not in known
+    ]
+    problems += [
+        f"{start} no column '{name}', needed {'the readings of that joint [m]' * (name in joints)}"
+        f"{'one' * (name not in joints)}; add the column."
+        for name in ("view", "image", *joints)
+        if name not in header
+    ]
+    return problems
+
+
+def _rows(
+    path: Path, header: Sequence[str], lines: Sequence[tuple[int, list[str]]], problems: list[str]
+) -> list[_Row]:
+    """Return the rows that have as many cells as the header."""
+    rows = []
+    for number, (line, cells) in enumerate(lines, start=1):
+        where = f"{path}, row {number} (line {line})"
+        if len(cells) == len(header):
+            rows.append(_Row(where, dict(zip(header, cells, strict=True))))
+        else:
+            kind = "short" if len(cells) < len(header) else "long"
+            problems.append(
+                f"{where}: the row is too {kind}: found {len(cells)} cells, needed {len(header)} "
+                "as in the header; complete the row."
+            )
+    return rows
+
+
+def _view_problems(rows: Sequence[_Row], view_index: Mapping[str, int]) -> list[str]:
+    """Return the rows whose view the dataset does not have."""
+    return [
+        f"{row.where}, column view: the row could not be used: found the unknown view "
+        f"{describe(row.cells['view'])}, needed a view of the dataset file; "
+        f"{closest(row.cells['view'], view_index)}"
+        for row in rows
+        if row.cells["view"] not in view_index
+    ]
+
+
+def _image_problems(rows: Sequence[_Row], folder: Path) -> list[str]:
+    """Return images that are named twice or lie outside the dataset folder."""
+    problems = []
+    first: dict[str, str] = {}
+    for row in rows:
+        image = row.cells["image"]
+        if not image:
+            continue
+        found = path_problem(folder, image)
+        if found:
+            problems.append(
+                f"{row.where}, column image: {image} could not be used: found {found}, needed a "
+                "relative path inside it; move the image there."
+            )
+        earlier = first.setdefault(posixpath.normpath(image), row.where)
+        if earlier != row.where:
+            problems.append(
+                f"{row.where}, column image: {image} could not be used: found it also in "
+                f"{earlier.rsplit(', ', 1)[-1]}, needed one row an image; remove one of them."
+            )
+    return problems
+
+
+def _reading(row: _Row, joint: str, problems: list[str]) -> float:
+    """Return one reading, NaN if its cell holds none."""
+    text = row.cells[joint]
+    value = float(text) if _NUMBER.fullmatch(text) else math.nan
+    if math.isfinite(value):
+        return value
+    problems.append(
+        f"{row.where}, column {joint}: the reading could not be used: found "
+        f"{describe(text) if text else 'an empty cell'}, needed a finite number in metres; correct "
+        "it or remove the row."
+    )
+    return math.nan
+
+
+def _poses(rows: Sequence[_Row]) -> tuple[IntArray, tuple[str, ...]]:
+    """Return the pose of each row, numbered as they first appear, and the label of each pose."""
+    labels: list[str] = []
+    index: dict[str, int] = {}
+    pose = []
+    for row in rows:
+        label = row.cells.get("pose", "")
+        if not label or label not in index:
+            index[label] = len(labels)
+            labels.append(label)
+        pose.append(index[label])
+    return np.array(pose, dtype=np.intp), tuple(labels)
+
+
+def _travel(
+    path: Path, rows: Sequence[_Row], legs: Sequence[Leg], readings: Array, problems: list[str]
+) -> list[str]:
+    """Return notes on readings a little outside their travel; further out is a problem."""
+    notes = []
+    for leg, column in zip(legs, readings.T, strict=True):
+        lower, upper = leg.travel
+        margin = TRAVEL_MARGIN * (upper - lower)
+        if not (np.isfinite(margin) and margin > 0.0):
+            continue
+        outside = (column < lower) | (column > upper)
+        far = (column < lower - margin) | (column > upper + margin)
+        needed = f"{lower:g} to {upper:g} m (the joint limits of the model)"
+        if np.any(far):
+            in_metres = 1e-3 * column[far]
+            fits = np.all((in_metres >= lower - margin) & (in_metres <= upper + margin))
+            remedy = (
+                "these look like millimetres: divide the column by 1000"
+                if fits
+                else "correct the readings or the limits"
+            )
+            problems.append(
+                f"{path}, column {leg.prismatic}: {_many(rows, column, far)}, needed {needed} with "
+                f"a margin of {TRAVEL_MARGIN:.0%}; {remedy}."
+            )
+        elif np.any(outside):
+            notes.append(
+                f"{path}, column {leg.prismatic}: {_many(rows, column, outside)}, a little outside "
+                f"the travel of {needed}."
+            )
+    return notes
+
+
+def _many(rows: Sequence[_Row], column: Array, chosen: Array) -> str:
+    """Return the first of some readings with their rows, and how many there are."""
+    index = np.flatnonzero(chosen)
+    shown = ", ".join(
+        f"{column[i]:g} m in {rows[i].where.rsplit(', ', 1)[-1]}" for i in index[:_SHOWN]
+    )
+    more = f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else ""
+    return f"readings are outside the travel: found {shown}{more}"
+
+
+def _shared_readings(
+    rows: Sequence[_Row],
+    pose: IntArray,
+    joints: Sequence[str],
+    readings: Array,
+    sigma_q: float,
+    problems: list[str],
+) -> Array:
+    """Return the readings with those of one pose replaced by their mean."""
+    shared = readings.copy()
+    for p in np.unique(pose):
+        members = np.flatnonzero(pose == p)
+        if len(members) == 1:
+            continue
+        spread = np.ptp(readings[members], axis=0)
+        for j in np.flatnonzero(spread > SAME_READING * sigma_q).tolist():
+            problems.append(
+                f"{rows[members[0]].where}, column {joints[j]}: pose "
+                f"{rows[members[0]].cells['pose']} could not be used: found readings of its "
+                f"{len(members)} rows that differ by {spread[j]:.3g} m, needed one reading within "
+                f"{SAME_READING:g} sigma ({SAME_READING * sigma_q:.3g} m); give rows of different "
+                "poses different labels."
+            )
+        # fsum rounds once, so that the mean does not depend on the order of the rows.
+        shared[members] = [math.fsum(c) / len(members) for c in readings[members].T.tolist()]
+    return shared
+
+
+def _by_leg(legs: Sequence[Leg], joints: Sequence[str], readings: Array) -> Array:
+    """Return the readings in the order of the legs: zero for constant legs, NaN for passive."""
+    columns = [
+        readings[:, joints.index(leg.prismatic or "")]
+        if leg.kind is LegKind.ACTUATED
+        else np.full(len(readings), 0.0 if leg.kind is LegKind.CONSTANT else math.nan)
+        for leg in legs
+    ]
+    return np.column_stack(columns)

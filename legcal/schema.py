@@ -1,0 +1,246 @@
+"""Files that people write: YAML read safely, and what a schema finds wrong, in sentences."""
+
+import difflib
+import re
+import reprlib
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from legcal.errors import DatasetError
+
+MAX_BYTES = 4_000_000
+MAX_NODES = 100_000  # aliases let a small file stand for a tree without bound
+
+_NEEDED = {
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "string_type": "a text",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "dict_type": "a mapping of names to values",
+    "model_type": "a mapping of names to values",
+    "model_attributes_type": "a mapping of names to values",
+}
+
+_Schema = TypeVar("_Schema", bound=BaseModel)
+
+
+class FileSchema(BaseModel):
+    """A block of a file: no unknown keys, no NaN, and it does not change once read."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True
+    )
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML in which keys are text, repeated keys are refused and 2e-6 is a number."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise _at(key, "a key that is not a single word")
+            if key.value in seen:
+                raise _at(key, f"the key '{key.value}' twice")
+            seen.add(key.value)
+            if key.tag != "tag:yaml.org,2002:merge":
+                key.tag = "tag:yaml.org,2002:str"
+        return node
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
+
+def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
+    """Return a YAML error at the place of a node."""
+    return yaml.MarkedYAMLError(problem=found, problem_mark=node.start_mark)
+
+
+def read_text(path: Path, what: str) -> bytes:
+    """Return the bytes of a small text file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    what : str
+        What the file is, for the message: ``dataset file``, ``camera file``.
+
+    Raises
+    ------
+    DatasetError
+        If there is no such regular file, it cannot be read, or it is far too large.
+    """
+    remedy = f"check the path of the {what}"
+    if not path.exists():
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found no such file, needed one; {remedy}."
+        )
+    if not path.is_file():
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found a folder or a device, needed a file; "
+            f"{remedy}."
+        )
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise DatasetError(
+                f"{path}: the {what} could not be read: found {path.stat().st_size} bytes, needed "
+                f"at most {MAX_BYTES}; {remedy}."
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found '{error.strerror}', needed a readable "
+            "file; check its permissions."
+        ) from error
+
+
+def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
+    """Return the mapping that a YAML file holds, with its keys as text.
+
+    Raises
+    ------
+    DatasetError
+        If the text is not YAML, repeats a key, is not a mapping, or grows without bound
+        through its aliases.
+    """
+    try:
+        found = yaml.load(content, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise DatasetError(
+            f"{path}{place}: the {what} could not be read: found {error.problem}, needed YAML; "
+            "mend that line."
+        ) from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found {_first_line(error)}, needed YAML text "
+            "in UTF-8; write the file again."
+        ) from error
+    if not isinstance(found, dict):
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found {describe(found)}, needed 'key: value' "
+            "lines; write the file again."
+        )
+    if _exceeds(found, MAX_NODES):
+        raise DatasetError(
+            f"{path}: the {what} could not be read: found more than {MAX_NODES} values, some "
+            "repeated through aliases, needed far fewer; write it without aliases."
+        )
+    return typing.cast("dict[str, Any]", found)
+
+
+def _first_line(error: Exception) -> str:
+    """Return what an exception says, on one line."""
+    text = str(error).strip().splitlines()
+    return f"'{text[0]}'" if text else "text nested too deeply"
+
+
+def _exceeds(value: object, limit: int) -> bool:
+    """Say whether a tree of lists and mappings has more values than a limit."""
+    pending, count = [value], 0
+    while pending:
+        node = pending.pop()
+        children: Iterable[object] = ()
+        if isinstance(node, dict):
+            children = node.values()
+        elif isinstance(node, list):
+            children = node
+        count += 1
+        if count + len(pending) > limit:
+            return True
+        pending.extend(children)
+    return False
+
+
+def validate(
+    schema: type[_Schema], found: Mapping[str, Any], path: Path, prefix: str = ""
+) -> _Schema:
+    """Return a mapping as its schema has it; ``prefix`` is its own key in the file.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each value that does not fit, naming its place in the file.
+    """
+    try:
+        return schema.model_validate(dict(found))
+    except ValidationError as error:
+        raise DatasetError([_sentence(schema, e, path, prefix) for e in error.errors()]) from error
+
+
+def describe(value: object) -> str:
+    """Return a value as a message shows it, on one short line."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 60
+    return "nothing" if value is None else short.repr(value)
+
+
+def closest(word: str, known: Iterable[str]) -> str:
+    """Return a hint at the known word most like a given one, or the known words."""
+    names = list(known)
+    near = difflib.get_close_matches(word, names, n=1)
+    return f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(names) or 'none'}"
+
+
+def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: str) -> str:
+    """Return what pydantic found wrong as one sentence."""
+    loc = [step for step in error["loc"] if step != "[key]"]
+    place = ".".join([*[prefix] * bool(prefix), *map(str, loc)]) or "the file"
+    context = error.get("ctx", {})
+    match error["type"]:
+        case "extra_forbidden":
+            hint = closest(str(loc[-1]), _keys_at(schema, loc[:-1]))
+            return f"{path}: {place} could not be used: found an unknown key; {hint}"
+        case "missing":
+            return (
+                f"{path}: {place} could not be read: found no such key, needed it; add "
+                f"'{loc[-1]}: ...' to the file."
+            )
+        case "value_error":
+            return f"{path}: {place} could not be used: {context['error']}"
+        case "greater_than":
+            needed = f"a number greater than {context['gt']:g}"
+        case "literal_error":
+            needed = context["expected"]
+        case "too_short":
+            needed = f"at least {context['min_length']} entries"
+        case "too_long":
+            needed = f"at most {context['max_length']} entries"
+        case other:
+            needed = _NEEDED.get(other, error["msg"])
+    found = describe(error["input"])
+    return f"{path}: {place} could not be read: found {found}, needed {needed}; correct the value."
+
+
+def _keys_at(schema: type[BaseModel], loc: Iterable[int | str]) -> list[str]:
+    """Return the keys that a schema knows at a place."""
+    here: Any = schema
+    for step in loc:
+        if isinstance(here, type) and issubclass(here, BaseModel):
+            field = here.model_fields.get(str(step))
+            here = field.annotation if field else None
+        else:
+            here = typing.get_args(here)[-1] if typing.get_args(here) else None
+        options = [here, *typing.get_args(here)]
+        models = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
+        is_container = typing.get_origin(here) in (dict, list, tuple)
+        here = here if is_container or not models else models[0]
+    if isinstance(here, type) and issubclass(here, BaseModel):
+        return [f.alias or name for name, f in here.model_fields.items()]
+    return []

@@ -1,0 +1,231 @@
+"""Camera files: ROS camera_info, OpenCV FileStorage and Kalibr camchain, told by their keys."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from legcal.errors import DatasetError
+from legcal.geometry.types import Array
+from legcal.schema import parse_yaml, read_text, validate
+from legcal.vision.camera import Camera, DistortionModel
+from legcal.vision.camera_schema import KalibrEntry, MatrixEntry, OpenCVEntry, RosEntry
+from legcal.vision.quiet import quiet_opencv
+
+_COUNTS: Mapping[DistortionModel, tuple[int, ...]] = {
+    "plumb_bob": (0, 4, 5),
+    "rational_polynomial": (8,),
+    "equidistant": (4,),
+}
+_OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
+_OPENCV_KEYS = {
+    "image_width": ("image_width", "image_Width"),
+    "image_height": ("image_height", "image_Height"),
+    "camera_matrix": ("camera_matrix", "Camera_Matrix"),
+    "distortion_coefficients": ("distortion_coefficients", "Distortion_Coefficients"),
+    "fisheye_model": ("fisheye_model",),
+}
+_SINGULAR = 1e-9  # smallest focal length, as a part of the image size
+
+
+def read_camera(path: Path) -> Camera:
+    """Read a camera file of any of the three kinds.
+
+    Parameters
+    ----------
+    path : Path
+        A ROS camera_info YAML (plumb_bob, rational_polynomial or equidistant), an OpenCV
+        FileStorage (YAML, XML or JSON), or a Kalibr camchain of one pinhole camera.
+
+    Returns
+    -------
+    Camera
+        K [px], its distortion and its image size [px].
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong: no such file, a kind that is not
+        known, values of the wrong type or number, a camera matrix that is singular or not
+        finite, a principal point outside the image.
+    """
+    content = read_text(path, "camera file")
+    if _OPENCV_MARKS.search(content):
+        return _from_opencv(_read_storage(content, path), path)
+    found = parse_yaml(content, path, "camera file")
+    cameras = [key for key, value in found.items() if _is_kalibr(value)]
+    if cameras or _is_kalibr(found):
+        return _from_kalibr(found, cameras, path)
+    if "camera_matrix" in found:
+        return _from_ros(found, path)
+    raise DatasetError(
+        f"{path}: the camera file could not be read: found the keys "
+        f"{', '.join(list(found)[:8]) or 'none'}, needed those of a ROS camera_info "
+        "(camera_matrix, distortion_model, ...), of an OpenCV FileStorage or of a Kalibr camchain "
+        "(cam0: camera_model, intrinsics, ...); write the calibration in one of these forms."
+    )
+
+
+def _is_kalibr(value: object) -> bool:
+    """Say whether a block looks like one camera of a Kalibr camchain."""
+    return isinstance(value, dict) and ("intrinsics" in value or "camera_model" in value)
+
+
+def _from_ros(found: Mapping[str, Any], path: Path) -> Camera:
+    """Return the camera of a ROS camera_info file."""
+    entry = validate(RosEntry, found, path)
+    return _checked(
+        path,
+        _matrix(entry.camera_matrix),
+        (entry.image_width, entry.image_height),
+        entry.distortion_model,
+        entry.distortion_coefficients.data,
+    )
+
+
+def _from_opencv(found: Mapping[str, Any], path: Path) -> Camera:
+    """Return the camera of an OpenCV FileStorage: the number of coefficients names the model."""
+    entry = validate(OpenCVEntry, found, path)
+    coefficients = entry.distortion_coefficients.data
+    model: DistortionModel = "plumb_bob"
+    if entry.fisheye_model:
+        model = "equidistant"
+    elif len(coefficients) > 5:
+        model = "rational_polynomial"
+    K = _matrix(entry.camera_matrix)
+    return _checked(path, K, (entry.image_width, entry.image_height), model, coefficients)
+
+
+def _from_kalibr(found: Mapping[str, Any], cameras: Sequence[str], path: Path) -> Camera:
+    """Return the only camera of a Kalibr camchain."""
+    if len(cameras) > 1:
+        raise DatasetError(
+            f"{path}: the camera file could not be used: found {len(cameras)} cameras "
+            f"({', '.join(cameras)}), needed one camera a file; copy each camera into a file of "
+            "its own and name that file in its view."
+        )
+    prefix = cameras[0] if cameras else ""
+    entry = validate(KalibrEntry, found[prefix] if cameras else found, path, prefix)
+    fx, fy, cx, cy = entry.intrinsics
+    model: DistortionModel = (
+        "equidistant" if entry.distortion_model == "equidistant" else "plumb_bob"
+    )
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    coefficients = entry.distortion_coeffs
+    problems = []
+    needed = 0 if entry.distortion_model == "none" else 4
+    if len(coefficients) != needed and (needed or any(coefficients)):
+        problems.append(_wrong_count(path, entry.distortion_model, len(coefficients), str(needed)))
+        coefficients = [0.0] * needed
+    return _checked(path, K, entry.resolution, model, coefficients if needed else [], problems)
+
+
+def _read_storage(content: bytes, path: Path) -> dict[str, Any]:
+    """Return the entries of an OpenCV FileStorage that describe a camera."""
+    reason = "a storage that OpenCV cannot parse"
+    try:
+        with quiet_opencv():
+            storage = cv2.FileStorage(
+                content.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+            )
+            nodes = {
+                name: node
+                for name, names in _OPENCV_KEYS.items()
+                for node in [next((n for n in map(storage.getNode, names) if not n.empty()), None)]
+                if node is not None
+            }
+            return {name: _node_value(node) for name, node in nodes.items()}
+    except UnicodeDecodeError:
+        reason = "bytes that are not UTF-8 text"
+    except (cv2.error, SystemError):
+        pass
+    raise DatasetError(
+        f"{path}: the camera file could not be read: found {reason}, needed an OpenCV FileStorage "
+        "in YAML, XML or JSON; write it again with cv2.FileStorage."
+    )
+
+
+def _node_value(node: cv2.FileNode) -> object:
+    """Return a FileStorage node as plain numbers, texts and matrices."""
+    if node.isMap():
+        matrix = node.mat()
+        if matrix is None or matrix.ndim != 2:
+            return "an entry that is not a matrix"
+        return {"rows": matrix.shape[0], "cols": matrix.shape[1], "data": matrix.ravel().tolist()}
+    if node.isInt() or node.isReal():
+        return node.real()
+    return node.string() if node.isString() else "a list"
+
+
+def _matrix(entry: MatrixEntry) -> Array:
+    """Return a matrix entry as an array."""
+    return np.array(entry.data, dtype=np.float64).reshape(entry.rows, entry.cols)
+
+
+def _wrong_count(path: Path, model: str, found: int, needed: str) -> str:
+    """Return the problem of a wrong number of distortion coefficients."""
+    return (
+        f"{path}: the distortion could not be used: found {found} coefficients, needed {needed} "
+        f"for {model}; copy all of them from the calibration."
+    )
+
+
+def _checked(
+    path: Path,
+    K: Array,
+    size: tuple[int, int],
+    model: DistortionModel,
+    coefficients: Sequence[float],
+    problems: Sequence[str] = (),
+) -> Camera:
+    """Return a camera if its numbers make one."""
+    problems = list(problems)
+    distortion = np.array(coefficients, dtype=np.float64)
+    if model == "rational_polynomial" and len(distortion) in (12, 14) and not distortion[8:].any():
+        distortion = distortion[:8]  # OpenCV pads with the thin prism and tilt that it did not fit
+    if len(distortion) not in _COUNTS[model]:
+        needed = " or ".join(str(n) for n in _COUNTS[model])
+        problems.append(_wrong_count(path, model, len(distortion), needed))
+    problems += _matrix_problems(path, K, size)
+    if not np.all(np.isfinite(distortion)):
+        problems.append(
+            f"{path}: the distortion could not be used: found a coefficient that is not finite, "
+            "needed numbers; calibrate the camera again."
+        )
+    if problems:
+        raise DatasetError(problems)
+    return Camera(K, size[0], size[1], distortion, model)
+
+
+def _matrix_problems(path: Path, K: Array, size: tuple[int, int]) -> list[str]:
+    """Return what is wrong with a camera matrix, one sentence each."""
+    start = f"{path}: the camera matrix could not be used: found"
+    if not np.all(np.isfinite(K)):
+        return [f"{start} a value that is not finite, needed numbers; calibrate the camera again."]
+    problems = []
+    if not np.array_equal(K[2], [0.0, 0.0, 1.0]) or K[1, 0] != 0.0:
+        problems.append(
+            f"{start} {K.tolist()}, needed [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; write the matrix "
+            "row by row, divided by its last element."
+        )
+    for name, focal, extent in (("fx", K[0, 0], size[0]), ("fy", K[1, 1], size[1])):
+        if focal == 0.0 or abs(focal) < _SINGULAR * extent:
+            problems.append(
+                f"{start} {name} = {focal:g}, so that it is singular, needed a focal length above "
+                "0 px; copy it from the calibration."
+            )
+        elif focal < 0.0:
+            problems.append(
+                f"{start} {name} = {focal:g}, needed a focal length above 0 px; write the matrix "
+                "for x to the right and y down."
+            )
+    for name, centre, extent in (("cx", K[0, 2], size[0]), ("cy", K[1, 2], size[1])):
+        if not -0.5 <= centre <= extent - 0.5:
+            problems.append(
+                f"{start} {name} = {centre:g}, needed a principal point inside the image of "
+                f"{size[0]} x {size[1]} px; calibrate at the size of the images."
+            )
+    return problems

@@ -1,0 +1,210 @@
+"""Image files: complete, of the camera's size, and read as grey levels.
+
+OpenCV fills what is missing of a truncated JPEG with grey and says nothing, so completeness
+is checked on the bytes first: a JPEG must reach its end-of-image marker, a PNG its IEND
+chunk with right checksums, a TIFF must hold all the strips or tiles that its first
+directory lists. Damage inside the compressed data of a JPEG that leaves its markers in place
+is not seen.
+"""
+
+import re
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from legcal.errors import DatasetError
+from legcal.geometry.types import Image
+from legcal.vision.camera import Camera
+from legcal.vision.quiet import quiet_opencv
+
+_FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
+_TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
+
+
+class _BadImage(ValueError):
+    """What is wrong with the bytes of an image file, as the 'found' part of a sentence."""
+
+
+@dataclass(frozen=True)
+class ImageSize:
+    """Size of an image [px]."""
+
+    width: int
+    height: int
+
+
+def read_image(path: Path, camera: Camera, where: str = "") -> Image:
+    """Read an image as grey levels.
+
+    Parameters
+    ----------
+    path : Path
+        A PNG, JPEG or TIFF file, grey or colour, 8 or 16 bit. An orientation in its EXIF
+        data is ignored: pixels stay where the camera has them.
+    camera : Camera
+        The camera that took it.
+    where : str
+        Where the file is named, such as ``measurements.csv, row 3``, for the message.
+
+    Returns
+    -------
+    (height, width) array of float32
+        Grey levels on the scale 0 to 255, with fractions where the file has 16 bits or
+        colours.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, truncated, unreadable, or of another size than the camera.
+    """
+    content, problem = _complete_content(path, camera, where)
+    if problem:
+        raise DatasetError(problem)
+    try:
+        with quiet_opencv():
+            pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), _FLAGS)
+    except cv2.error:
+        pixels = None
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        found = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
+        raise DatasetError(_problem(path, where, found, "8 or 16 bit grey levels or colours"))
+    levels = pixels.astype(np.float32)
+    if pixels.dtype == np.uint16:
+        levels /= np.float32(257.0)
+    return levels if levels.ndim == 2 else np.asarray(cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY))
+
+
+def image_problem(path: Path, camera: Camera, where: str = "") -> str | None:
+    """Return what keeps an image file from being used, or None; the pixels are not decoded.
+
+    Parameters
+    ----------
+    path, camera, where
+        As in :func:`read_image`.
+    """
+    return _complete_content(path, camera, where)[1]
+
+
+def image_size(content: bytes) -> ImageSize:
+    """Return the size of an image from the bytes of its file.
+
+    Raises
+    ------
+    ValueError
+        If the bytes are not a complete PNG, JPEG or TIFF file; says what was found.
+    """
+    if not content:
+        raise _BadImage("an empty file")
+    try:
+        if content.startswith(b"\xff\xd8\xff"):
+            return _jpeg_size(content)
+        if content.startswith(_PNG_SIGNATURE):
+            return _png_size(content)
+        if content.startswith(_TIFF_SIGNATURES):
+            return _tiff_size(content)
+    except (struct.error, IndexError) as error:
+        raise _BadImage(f"a file cut off after {len(content)} bytes") from error
+    raise _BadImage("a file that is none of these")
+
+
+def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
+    """Return the bytes of an image file, and what is wrong with them if anything."""
+    needed = "a complete PNG, JPEG or TIFF file"
+    if not path.is_file():
+        found = "something that is not a file" if path.exists() else "no such file"
+        return b"", _problem(path, where, found, needed, "correct the path or remove the row")
+    try:
+        content = path.read_bytes()
+        size = image_size(content)
+    except OSError as error:
+        return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
+    except ValueError as error:
+        return b"", _problem(path, where, str(error), needed)
+    if (size.width, size.height) != (camera.width, camera.height):
+        return b"", _problem(
+            path,
+            where,
+            f"{size.width} x {size.height} px",
+            f"{camera.width} x {camera.height} px as in its camera file",
+            "use the original image, neither scaled, cropped nor rotated, or the calibration of "
+            "its size",
+        )
+    return content, None
+
+
+def _problem(
+    path: Path, where: str, found: str, needed: str, remedy: str = "copy it again or remove the row"
+) -> str:
+    """Return the sentence for an image that cannot be used."""
+    prefix = f"{where}: " if where else ""
+    return f"{prefix}image {path} could not be read: found {found}, needed {needed}; {remedy}."
+
+
+def _jpeg_size(content: bytes) -> ImageSize:
+    """Walk the segments of a JPEG to its end-of-image marker."""
+    size, at = None, 2
+    while True:
+        match = _JPEG_MARKER.search(content, at)
+        if match is None:
+            raise _BadImage(f"a JPEG cut off after {len(content)} bytes, without its end marker")
+        marker, at = content[match.start() + 1], match.end()
+        if marker == 0xD9:
+            break
+        if marker in (0x01, 0xD8):
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", content, at + 3)
+            size = ImageSize(width, height)
+        at += struct.unpack_from(">H", content, at)[0]
+    if size is None:
+        raise _BadImage("a JPEG without a picture")
+    return size
+
+
+def _png_size(content: bytes) -> ImageSize:
+    """Walk the chunks of a PNG to IEND, checking their checksums."""
+    width, height = struct.unpack_from(">II", content, 16)
+    at, kind = len(_PNG_SIGNATURE), b""
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", content, at)
+        if at + 12 + length > len(content):
+            raise _BadImage(f"a PNG cut off after {len(content)} bytes")
+        (checksum,) = struct.unpack_from(">I", content, at + 8 + length)
+        if zlib.crc32(memoryview(content)[at + 4 : at + 8 + length]) != checksum:
+            raise _BadImage(f"a PNG whose {kind.decode('latin-1')} chunk has a wrong checksum")
+        at += 12 + length
+    return ImageSize(width, height)
+
+
+def _tiff_size(content: bytes) -> ImageSize:
+    """Read the first directory of a TIFF and see that its strips or tiles are there."""
+    order = "<" if content.startswith(b"II") else ">"
+    (at,) = struct.unpack_from(order + "I", content, 4)
+    (n_tags,) = struct.unpack_from(order + "H", content, at)
+    tags: dict[int, tuple[int, ...]] = {}
+    for i in range(n_tags):
+        entry = at + 2 + 12 * i
+        tag, kind, count = struct.unpack_from(order + "HHI", content, entry)
+        letter = _TIFF_TYPES.get(kind)
+        if letter is None or count > len(content):
+            continue
+        pattern = f"{order}{count}{letter}"
+        if struct.calcsize(pattern) > 4:
+            (entry_at,) = struct.unpack_from(order + "I", content, entry + 8)
+        else:
+            entry_at = entry + 8
+        tags[tag] = struct.unpack_from(pattern, content, entry_at)
+    if not (tags.get(256) and tags.get(257)):
+        raise _BadImage("a TIFF without a picture")
+    starts, lengths = (tags.get(273, tags.get(324, ())), tags.get(279, tags.get(325, ())))
+    ends = [start + length for start, length in zip(starts, lengths, strict=False)]
+    if not ends or max(ends) > len(content):
+        raise _BadImage(f"a TIFF cut off after {len(content)} bytes")
+    return ImageSize(tags[256][0], tags[257][0])
