@@ -45,6 +45,11 @@ class Machine:
         return len(self.sign)
 
     @property
+    def leg_names(self) -> tuple[str, ...]:
+        """Names of the legs."""
+        return tuple(f"leg{j + 1}" for j in range(self.n_legs))
+
+    @property
     def parts(self) -> tuple[str, ...]:
         """The URDF link of each leg's one cylinder, named as in the shipped hexapod."""
         return tuple(f"leg{j + 1}_tube" for j in range(self.n_legs))

@@ -1,0 +1,196 @@
+"""Section 3.2: the base joint centres in the camera frames, eq (6).
+
+All axes of one leg in the images of one view meet in its base joint centre A. The centre is
+the point nearest to them: linear least squares, in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.errors import NotIdentifiable
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.measurements import Measurements
+from legcal.observations import LegAxes
+from legcal.stages.nominal import Criteria, NominalMechanism
+
+_REWEIGHTINGS = 5
+_HUBER = 3.0  # axes whose residual exceeds this multiple of the median lose weight
+_SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
+_LARGEST_SIGMA = 0.1  # of the distance to the camera
+
+
+@dataclass(frozen=True, eq=False)
+class JointsInCamera:
+    """Base joint centres in the frame of each view.
+
+    Attributes
+    ----------
+    A_camera : (n_views, n_legs, 3) array
+        Centres in the camera frame [m]; zero where not located.
+    located : (n_views, n_legs) array of bool
+        Which centres were located.
+    covariance : (n_views, n_legs, 3, 3) array
+        Covariance of the centres [m^2]; zero where not located.
+    diagnostics : tuple of str
+        Which legs were left out of which views, and why.
+    """
+
+    A_camera: Array
+    located: BoolArray
+    covariance: Array
+    diagnostics: tuple[str, ...]
+
+
+def locate_joints_in_cameras(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    measurements: Measurements,
+    *,
+    criteria: Criteria = "default",
+) -> JointsInCamera:
+    """Locate each base joint centre in each camera frame, eq (6).
+
+    Parameters
+    ----------
+    mechanism : NominalMechanism
+        Names and number of the legs.
+    axes : LegAxes
+        Leg axes in the camera frames.
+    measurements : Measurements
+        The view of each image.
+    criteria : {"default", "literal"}
+        ``literal`` solves (6) as printed, every equation with the same weight.
+
+    Returns
+    -------
+    JointsInCamera
+
+    Raises
+    ------
+    NotIdentifiable
+        If some leg is not located in any view: each needs two different directions in one.
+
+    Notes
+    -----
+    The default weights the distance of A from each axis by the covariance of the axis there:
+    an outline pair says very exactly in which plane through the camera centre A lies, and
+    little about its depth. The covariance at A depends on A, so the weights are computed
+    again a few times, and axes that miss the others by far are given less.
+    """
+    n_views, n_legs = len(measurements.views), mechanism.n_legs
+    A_camera = np.zeros((n_views, n_legs, 3))
+    covariance = np.zeros((n_views, n_legs, 3, 3))
+    located = np.zeros((n_views, n_legs), dtype=np.bool_)
+    diagnostics = []
+    view = measurements.view[axes.row]
+    for v, j in np.ndindex(n_views, n_legs):
+        here = np.flatnonzero((view == v) & (axes.leg == j))
+        if len(here) == 0:
+            continue
+        where = f"leg {mechanism.leg_names[j]} in view {measurements.views[v].name}"
+        information = plain_information(axes, here)
+        reason = _too_few_directions(information, len(here))
+        if not reason:
+            A, C = nearest_point(information)
+            if criteria == "default":
+                A, C = weighted_point(axes, here, A)
+                reason = _too_uncertain(A, C)
+        if reason:
+            diagnostics.append(f"The base joint of {where} was left out: {reason}.")
+            continue
+        A_camera[v, j], covariance[v, j], located[v, j] = A, C, True
+    _check_every_leg(mechanism, located, diagnostics)
+    return JointsInCamera(A_camera, located, covariance, tuple(diagnostics))
+
+
+def plain_information(axes: LegAxes, here: IntArray) -> tuple[Array, Array]:
+    """Return the normal equations of (6), (3, 3) and (3,): the sum of I - u u' and of its M."""
+    u, M = axes.u[here], axes.M[here]
+    normal = np.eye(3) - u[:, :, None] * u[:, None, :]
+    return normal.sum(axis=0), np.einsum("kij,kj->i", normal, M)
+
+
+def nearest_point(information: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return the least-squares point A and the inverse of its normal matrix."""
+    inverse = np.asarray(np.linalg.inv(information[0]))
+    return np.asarray(inverse @ information[1]), inverse
+
+
+def weighted_point(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Array]:
+    """Return the point nearest to axes in units of their covariances, and its covariance."""
+    for _ in range(_REWEIGHTINGS):
+        residual, spread = miss(axes, here, A)
+        weight = np.linalg.inv(spread)
+        chi = np.sqrt(np.einsum("ki,kij,kj->k", residual, weight, residual))
+        limit = _HUBER * float(np.median(chi))
+        weight = weight * np.minimum(1.0, limit / np.maximum(chi, 1e-300))[:, None, None]
+        E = axes.basis[here]
+        normal = np.einsum("kia,kij,kjb->ab", E, weight, E)
+        right = np.einsum("kia,kij,kjb,kb->a", E, weight, E, axes.M[here])
+        A, covariance = nearest_point((normal, right))
+    return A, covariance
+
+
+def miss(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Array]:
+    """Return by how much axes miss points, in e1 and e2, and the covariance of that.
+
+    Parameters
+    ----------
+    axes : LegAxes
+        Axes.
+    here : (k,) array of int
+        Which of them.
+    A : (3,) or (k, 3) array
+        Points in the same frame [m].
+
+    Returns
+    -------
+    (k, 2) array [m], (k, 2, 2) array [m^2]
+        The axis at the height s of the point is M + s u + e (beta + s alpha).
+    """
+    arm = A - axes.M[here]
+    residual = np.einsum("kia,ka->ki", axes.basis[here], arm)
+    s = np.sum(arm * axes.u[here], axis=-1)
+    at_point = np.concatenate([s[:, None, None] * np.eye(2), np.tile(np.eye(2), (len(s), 1, 1))], 2)
+    return residual, at_point @ axes.covariance[here] @ np.swapaxes(at_point, 1, 2)
+
+
+def _too_few_directions(information: tuple[Array, Array], n_images: int) -> str:
+    """Return why (6) has no single solution, or an empty string."""
+    smallest = float(np.linalg.eigvalsh(information[0])[0])
+    if smallest > _SAME_DIRECTION * n_images:
+        return ""
+    if n_images == 1:
+        return "it was found in one image, and at least two different directions are needed"
+    return f"its direction is the same in all {n_images} images, and two are needed"
+
+
+def _too_uncertain(A: Array, covariance: Array) -> str:
+    """Return why a centre says nothing, or an empty string."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    distance = float(np.linalg.norm(A))
+    if sigma <= _LARGEST_SIGMA * distance:
+        return ""
+    return (
+        f"its directions differ too little to say where they meet (sigma {1e3 * sigma:.0f} mm "
+        f"at {1e3 * distance:.0f} mm from the camera)"
+    )
+
+
+def _check_every_leg(
+    mechanism: NominalMechanism, located: BoolArray, diagnostics: list[str]
+) -> None:
+    """Refuse when a leg was located in no view."""
+    missing = [mechanism.leg_names[int(j)] for j in np.flatnonzero(~located.any(axis=0))]
+    if missing:
+        raise NotIdentifiable(
+            [
+                f"The base joint of leg {name} could not be located: found no view that shows the "
+                "leg in two different directions, needed one; add images in which it is visible."
+                for name in missing
+            ]
+            + diagnostics
+        )

@@ -1,0 +1,187 @@
+"""The legs as steps 3 and 4 see them: directions u that start at located base joints A.
+
+Legs of one platform pose that were seen in one frame form a *group*. All cameras that were
+located in step 2 share the frame R_b, so that several cameras or several images of one pose
+make one group; the other cameras keep their own frames, since distances do not depend on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.leg_axes import join_axes
+from legcal.measurements import Measurements
+from legcal.observations import LegAxes
+from legcal.stages.joints_in_base import JointsInBase
+from legcal.stages.joints_in_camera import JointsInCamera, miss
+from legcal.stages.nominal import NominalMechanism
+
+
+@dataclass(frozen=True, eq=False)
+class LegDirections:
+    """Directions of legs from their base joints, by group and then by leg.
+
+    Attributes
+    ----------
+    group : (n,) array of int
+        Legs of one group belong to one platform pose, in one frame.
+    view : (n,) array of int
+        View of the first image of each.
+    leg : (n,) array of int
+        Index of the leg.
+    A : (n, 3) array
+        Base joint centres in the frame of the group [m].
+    u : (n, 3) array
+        Unit directions from base to platform.
+    basis : (n, 2, 3) array
+        e1, e2 normal to u.
+    covariance : (n, 2, 2) array
+        Covariance of u along e1 and e2 [rad^2].
+    reading : (n,) array
+        sign * q [m]: the leg length less its offset; NaN for passive legs.
+    """
+
+    group: IntArray
+    view: IntArray
+    leg: IntArray
+    A: Array
+    u: Array
+    basis: Array
+    covariance: Array
+    reading: Array
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+    def groups(self) -> list[IntArray]:
+        """Return the indices of the legs of each group."""
+        return [np.flatnonzero(self.group == g) for g in np.unique(self.group)]
+
+
+def observed_directions(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    measurements: Measurements,
+    joints: JointsInCamera,
+) -> LegDirections:
+    """Return u as the images give it, from A of step 1 in each camera frame: the u of (13).
+
+    Images of one pose in one view are averaged.
+    """
+    here = joints.located[measurements.view[axes.row], axes.leg]
+    axes = _selected(axes, here)
+    view, pose = measurements.view[axes.row], measurements.pose[axes.row]
+    key = np.stack([view, pose, axes.leg], axis=1)
+    distinct, which = np.unique(key, axis=0, return_inverse=True)
+    which = which.ravel()
+    total = np.zeros((len(distinct), 3))
+    np.add.at(total, which, axes.u)
+    u = total / np.linalg.norm(total, axis=1, keepdims=True)
+    first = np.array([np.flatnonzero(which == k)[0] for k in range(len(distinct))], dtype=np.intp)
+    v, k, j = distinct.T
+    return LegDirections(
+        group=v * measurements.n_poses + k,
+        view=v,
+        leg=j,
+        A=joints.A_camera[v, j],
+        u=u,
+        basis=normal_basis(u),
+        covariance=axes.covariance[first, :2, :2],
+        reading=mechanism.sign[j] * measurements.q[axes.row[first], j],
+    )
+
+
+def directions_through_joints(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    measurements: Measurements,
+    joints: JointsInCamera,
+    base: JointsInBase,
+) -> LegDirections:
+    """Return u of the legs given that each axis passes through its base joint A.
+
+    Parameters
+    ----------
+    mechanism : NominalMechanism
+        Its signs.
+    axes : LegAxes
+        Leg axes in the camera frames.
+    measurements : Measurements
+        Views, poses and readings of the images.
+    joints : JointsInCamera
+        The result of step 1, for views that step 2 did not locate.
+    base : JointsInBase
+        The result of step 2.
+
+    Returns
+    -------
+    LegDirections
+
+    Notes
+    -----
+    One image says little about the tilt of a leg towards the camera, and (13) multiplies
+    that error by the leg's length. But A is known from many images, and the middle of the
+    leg from this one: an axis through both has a much better direction. This is what
+    conditioning the covariance of the axis on "it passes through A" does.
+    """
+    view = measurements.view[axes.row]
+    known = np.array([T is not None for T in base.T_Rb_camera])
+    usable = known[view] | joints.located[view, axes.leg]
+    axes, view = _selected(axes, usable), view[usable]
+    u, M, basis = axes.u.copy(), axes.M.copy(), axes.basis.copy()
+    for v, T in enumerate(base.T_Rb_camera):
+        if T is not None:
+            here = view == v
+            u[here], M[here] = T.rotation.apply(axes.u[here]), T.apply(axes.M[here])
+            basis[here] = T.rotation.apply(axes.basis[here].reshape(-1, 3)).reshape(-1, 2, 3)
+    pose = measurements.pose[axes.row]
+    frame = np.where(known[view], 0, 1 + view)
+    in_groups = replace(axes, u=u, M=M, basis=basis)
+    axes = join_axes(in_groups, frame * measurements.n_poses + pose)
+    view, pose = measurements.view[axes.row], measurements.pose[axes.row]
+    frame = np.where(known[view], 0, 1 + view)
+    A = np.where(known[view][:, None], base.A_Rb[axes.leg], joints.A_camera[view, axes.leg])
+    u, basis, covariance = condition_on_point(axes, A)
+    return LegDirections(
+        group=frame * measurements.n_poses + pose,
+        view=view,
+        leg=axes.leg,
+        A=A,
+        u=u,
+        basis=basis,
+        covariance=covariance,
+        reading=mechanism.sign[axes.leg] * measurements.q[axes.row, axes.leg],
+    )
+
+
+def condition_on_point(axes: LegAxes, A: Array) -> tuple[Array, Array, Array]:
+    """Return u, basis and covariance (n, 2, 2) of axes that are known to pass through points A."""
+    residual, spread = miss(axes, np.arange(len(axes)), A)
+    s = np.sum((A - axes.M) * axes.u, axis=-1)
+    C = axes.covariance
+    cross = C[:, :2, 2:] + s[:, None, None] * C[:, :2, :2]  # cov(alpha, beta + s alpha)
+    gain = cross @ np.linalg.inv(spread)
+    alpha = (gain @ residual[..., None])[..., 0]
+    covariance = C[:, :2, :2] - gain @ np.swapaxes(cross, 1, 2)
+    u = axes.u + np.einsum("nia,ni->na", axes.basis, alpha)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=-1, keepdims=True)
+    e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
+    symmetric = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
+    return u, np.stack([e1, np.cross(u, e1)], axis=1), symmetric
+
+
+def _selected(axes: LegAxes, keep: BoolArray) -> LegAxes:
+    """Return some of the axes."""
+    return LegAxes(
+        axes.row[keep],
+        axes.leg[keep],
+        axes.u[keep],
+        axes.M[keep],
+        axes.basis[keep],
+        axes.covariance[keep],
+    )

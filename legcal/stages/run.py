@@ -1,0 +1,95 @@
+"""Section 3 from leg axes to parameters: the four steps in a row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scipy.spatial.transform import RigidTransform
+
+from legcal.measurements import Measurements
+from legcal.mechanism.parameters import KinematicParameters
+from legcal.observations import LegAxes
+from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
+from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
+from legcal.stages.leg_directions import directions_through_joints, observed_directions
+from legcal.stages.nominal import Criteria, NominalMechanism
+from legcal.stages.offsets import Offsets, identify_offsets
+from legcal.stages.platform_joints import PlatformJoints, locate_platform_joints
+
+
+@dataclass(frozen=True, eq=False)
+class StagedResult:
+    """What the four steps give.
+
+    Attributes
+    ----------
+    parameters : KinematicParameters
+        The identified parameters.
+    T_Rb_camera : tuple of RigidTransform or None, length n_views
+        Where each camera stood; None for a view that locates fewer than three base joints.
+    joints_in_camera, joints_in_base, offsets, platform_joints
+        The results of steps 1 to 4.
+    diagnostics : tuple of str
+        What was left out, and why.
+    """
+
+    parameters: KinematicParameters
+    T_Rb_camera: tuple[RigidTransform | None, ...]
+    joints_in_camera: JointsInCamera
+    joints_in_base: JointsInBase
+    offsets: Offsets
+    platform_joints: PlatformJoints
+    diagnostics: tuple[str, ...]
+
+
+def run_steps(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    measurements: Measurements,
+    *,
+    criteria: Criteria = "default",
+) -> StagedResult:
+    """Identify all parameters from leg axes and readings by the four steps (3.2 to 3.5).
+
+    Parameters
+    ----------
+    mechanism : NominalMechanism
+        The nominal mechanism: its parameters are the start.
+    axes : LegAxes
+        Leg axes in the camera frames.
+    measurements : Measurements
+        Views, poses and readings of the images.
+    criteria : {"default", "literal"}
+        ``literal`` takes (6), (9), (14) and (16) as printed, unweighted.
+
+    Returns
+    -------
+    StagedResult
+
+    Raises
+    ------
+    NotIdentifiable
+        If the observations do not determine the parameters.
+    DidNotConverge
+        If a step does not converge.
+    """
+    joints = locate_joints_in_cameras(mechanism, axes, measurements, criteria=criteria)
+    base = locate_joints_in_base(mechanism, joints, criteria=criteria)
+    directions = (
+        observed_directions(mechanism, axes, measurements, joints)
+        if criteria == "literal"
+        else directions_through_joints(mechanism, axes, measurements, joints, base)
+    )
+    offsets = identify_offsets(mechanism, directions, measurements.sigma_q, criteria=criteria)
+    platform = locate_platform_joints(
+        mechanism, directions, offsets, measurements.sigma_q, criteria=criteria
+    )
+    return StagedResult(
+        parameters=KinematicParameters(base.A_Rb, platform.B_Re, platform.q0),
+        T_Rb_camera=base.T_Rb_camera,
+        joints_in_camera=joints,
+        joints_in_base=base,
+        offsets=offsets,
+        platform_joints=platform,
+        diagnostics=joints.diagnostics,
+    )

@@ -1,0 +1,160 @@
+"""Least-squares problems in CasADi, solved with IPOPT: the one place of steps 2, 3 and 4.
+
+A step builds its residuals and a start; this module scales the unknowns, hands IPOPT the
+Gauss-Newton Hessian J'J and refuses an answer that did not converge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array, BoolArray
+
+_RANK = 1e-7  # singular values of the scaled Jacobian below this are directions that nothing shows
+_OPTIONS: dict[str, bool | int | float | str] = {
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-10,
+    "ipopt.acceptable_tol": 1e-8,
+    "ipopt.max_iter": 300,
+    "ipopt.mu_init": 1e-9,
+    "ipopt.nlp_scaling_method": "none",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """Half the sum of squared residuals, to be minimised from a start.
+
+    Attributes
+    ----------
+    name : str
+        What is looked for, for messages: "the base joints (eq 9)".
+    x : casadi.SX
+        Unknowns, one column.
+    residuals : casadi.SX
+        Residuals, one column, in units of their standard deviations or of eqs (9), (14), (16).
+    start : (n,) array
+        Values of the unknowns to start from.
+    """
+
+    name: str
+    x: ca.SX
+    residuals: ca.SX
+    start: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A converged least-squares problem.
+
+    Attributes
+    ----------
+    x : (n,) array
+        The unknowns.
+    residuals : (m,) array
+        The residuals there.
+    jacobian : (m, n) array
+        Their derivative there.
+    n_iterations : int
+        Iterations that IPOPT took.
+    status : str
+        What IPOPT says about the end.
+    """
+
+    x: Array
+    residuals: Array
+    jacobian: Array
+    n_iterations: int
+    status: str
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squared residuals."""
+        return 0.5 * float(self.residuals @ self.residuals)
+
+    def covariance(self) -> Array:
+        """Return the covariance of the unknowns when residuals have unit variance, (n, n).
+
+        Directions that no residual shows are given none: see :meth:`unseen`.
+        """
+        scale = _column_scale(self.jacobian)
+        inverse = np.linalg.pinv(self.jacobian * scale, rcond=_RANK)
+        scaled = inverse * scale[:, None]
+        return np.asarray(scaled @ scaled.T)
+
+    def unseen(self, n_first: int) -> BoolArray:
+        """Return which of the first unknowns can move without changing any residual, (n_first,)."""
+        scale = _column_scale(self.jacobian)
+        _, singular, rows = np.linalg.svd(self.jacobian * scale, full_matrices=True)
+        filled = np.zeros(len(rows))
+        filled[: len(singular)] = singular
+        null = rows[filled < _RANK * max(float(filled.max()), 1e-300)]
+        return np.asarray(np.abs(null[:, :n_first]).max(axis=0, initial=0.0) > 1e-3)
+
+
+def solve_least_squares(problem: LeastSquares) -> Solution:
+    """Minimise half the sum of squared residuals with IPOPT and a Gauss-Newton Hessian.
+
+    The unknowns are counted from the start in units of what one residual unit shows, so that
+    tolerances do not depend on the units of length or on the noise.
+
+    Parameters
+    ----------
+    problem : LeastSquares
+        What to minimise.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    DidNotConverge
+        If IPOPT does not report success.
+    """
+    value = ca.Function("value", [problem.x], [problem.residuals])
+    slope = ca.Function("slope", [problem.x], [ca.jacobian(problem.residuals, problem.x)])
+    scale = _column_scale(np.asarray(slope(problem.start).full()))
+    z = ca.MX.sym("z", len(problem.start))
+    x = problem.start + scale * z
+    r, J = value(x), ca.mtimes(slope(x), ca.diag(ca.sparsify(ca.DM(scale))))
+    p, lam_f, lam_g = ca.MX.sym("p", 0), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
+    gauss_newton = ca.Function(
+        "nlp_hess_l",
+        [z, p, lam_f, lam_g],
+        [lam_f * ca.triu(ca.mtimes(J.T, J))],
+        ["x", "p", "lam_f", "lam_g"],
+        ["triu_hess_gamma_x_x"],
+    )
+    nlp = {"x": z, "p": p, "f": 0.5 * ca.sumsqr(r)}
+    options: dict[str, Any] = {"hess_lag": gauss_newton, **_OPTIONS}
+    solver = ca.nlpsol("solver", "ipopt", nlp, options)
+    found = problem.start + scale * np.asarray(solver(x0=0.0)["x"].full()).ravel()
+    stats = solver.stats()
+    if not stats["success"]:
+        raise DidNotConverge(
+            f"{problem.name} could not be computed: IPOPT stopped after {stats['iter_count']} "
+            f"iterations with {stats['return_status']}, needed Solve_Succeeded; check the "
+            "nominal model and the observations, or reject the ones with large residuals."
+        )
+    return Solution(
+        x=found,
+        residuals=np.asarray(value(found).full()).ravel(),
+        jacobian=np.asarray(slope(found).full()),
+        n_iterations=int(stats["iter_count"]),
+        status=str(stats["return_status"]),
+    )
+
+
+def _column_scale(jacobian: Array) -> Array:
+    """Return the change of each unknown that moves the residuals by one unit."""
+    norms = np.linalg.norm(jacobian, axis=0)
+    floor = 1e-6 * float(norms.max(initial=0.0)) or 1.0
+    return np.asarray(1.0 / np.maximum(norms, floor))
