@@ -12,6 +12,7 @@ from legcal.geometry.types import Image
 from legcal.inside import path_problem
 from legcal.measurement_table import read_measurements
 from legcal.measurements import Measurements, View
+from legcal.mechanism.files import shipped_folders, shipped_names
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.observation_table import read_observations
@@ -193,11 +194,12 @@ def _read_cameras(paths: tuple[Path, ...], problems: list[str]) -> dict[Path, Ca
     return cameras
 
 
-def _mechanism_path(folder: Path, named: str) -> str | Path:
-    """Return the model's path relative to the dataset if there is one, else its name."""
+def _mechanism_path(folder: Path, named: str) -> Path:
+    """Return the model's path relative to the dataset if there is one, else a shipped one."""
     path = folder / named
-    is_name = "/" not in named and not path.suffix
-    return named if is_name and not path.exists() else path
+    if not path.exists() and named in shipped_names():
+        return shipped_folders()[0] / f"{named}.yaml"
+    return path
 
 
 def _leg_problems(

@@ -5,8 +5,6 @@ Readings are in metres. Rows with the same pose label, in any view, share one pl
 and one reading (their mean); a row without a label is a pose of its own.
 """
 
-import csv
-import io
 import math
 import posixpath
 import re
@@ -16,19 +14,19 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.csv_file import Line, read_lines
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array, IntArray
 from legcal.inside import path_problem
 from legcal.measurements import Measurements, View
 from legcal.mechanism.leg import Leg, LegKind
-from legcal.schema import closest, describe, read_text
+from legcal.schema import closest, describe
+from legcal.travel import check_travel
 
-TRAVEL_MARGIN = 0.05  # of the travel: a reading further outside is an error
 SAME_READING = 10.0  # sigma by which rows of one pose may differ
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _FIXED_COLUMNS = ("view", "image", "pose")
-_SHOWN = 3  # rows quoted in a sentence about many
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ def read_measurements(
         images exist is not looked at.
     """
     joints = [leg.prismatic or "" for leg in legs if leg.kind is LegKind.ACTUATED]
-    header, lines = _read_lines(path)
+    header, lines = _read_table(path)
     problems = _header_problems(path, header, joints)
     if problems:
         raise DatasetError(problems)
@@ -80,9 +78,9 @@ def read_measurements(
         [[_reading(row, joint, problems) for joint in joints] for row in rows], dtype=np.float64
     ).reshape(len(rows), len(joints))
     pose, labels = _poses(rows)
-    notes = _travel(
-        path, rows, [leg for leg in legs if leg.prismatic in joints], readings, problems
-    )
+    actuated = [leg for leg in legs if leg.kind is LegKind.ACTUATED]
+    outside, notes = check_travel(path, [row.where for row in rows], actuated, readings)
+    problems += outside
     readings = _shared_readings(rows, pose, joints, readings, sigma_q, problems)
     if problems:
         raise DatasetError(problems)
@@ -95,21 +93,12 @@ def read_measurements(
         sigma_q=sigma_q,
         pose_labels=labels if "pose" in header else (),
     )
-    return measurements, tuple(notes)
+    return measurements, notes
 
 
-def _read_lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header and the lines with their numbers, blank lines left out."""
-    try:
-        text = read_text(path, "table of measurements").decode("utf-8-sig")
-        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError(
-            f"{path}: the table could not be read: found '{error}', needed comma-separated text in "
-            "UTF-8; save it again as CSV."
-        ) from error
-    lines = [(number, cells) for number, cells in lines if any(cells)]
+def _read_table(path: Path) -> tuple[list[str], list[Line]]:
+    """Return the header and the lines below it."""
+    lines = read_lines(path, "table of measurements")
     if len(lines) < 2:
         raise DatasetError(
             f"{path}: the table could not be used: found {'no header' if not lines else 'a header'}"
@@ -145,7 +134,7 @@ def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -
 
 
 def _rows(
-    path: Path, header: Sequence[str], lines: Sequence[tuple[int, list[str]]], problems: list[str]
+    path: Path, header: Sequence[str], lines: Sequence[Line], problems: list[str]
 ) -> list[_Row]:
     """Return the rows that have as many cells as the header."""
     rows = []
@@ -222,49 +211,6 @@ def _poses(rows: Sequence[_Row]) -> tuple[IntArray, tuple[str, ...]]:
             labels.append(label)
         pose.append(index[label])
     return np.array(pose, dtype=np.intp), tuple(labels)
-
-
-def _travel(
-    path: Path, rows: Sequence[_Row], legs: Sequence[Leg], readings: Array, problems: list[str]
-) -> list[str]:
-    """Return notes on readings a little outside their travel; further out is a problem."""
-    notes = []
-    for leg, column in zip(legs, readings.T, strict=True):
-        lower, upper = leg.travel
-        margin = TRAVEL_MARGIN * (upper - lower)
-        if not (np.isfinite(margin) and margin > 0.0):
-            continue
-        outside = (column < lower) | (column > upper)
-        far = (column < lower - margin) | (column > upper + margin)
-        needed = f"{lower:g} to {upper:g} m (the joint limits of the model)"
-        if np.any(far):
-            in_metres = 1e-3 * column[far]
-            fits = np.all((in_metres >= lower - margin) & (in_metres <= upper + margin))
-            remedy = (
-                "these look like millimetres: divide the column by 1000"
-                if fits
-                else "correct the readings or the limits"
-            )
-            problems.append(
-                f"{path}, column {leg.prismatic}: {_many(rows, column, far)}, needed {needed} with "
-                f"a margin of {TRAVEL_MARGIN:.0%}; {remedy}."
-            )
-        elif np.any(outside):
-            notes.append(
-                f"{path}, column {leg.prismatic}: {_many(rows, column, outside)}, a little outside "
-                f"the travel of {needed}."
-            )
-    return notes
-
-
-def _many(rows: Sequence[_Row], column: Array, chosen: Array) -> str:
-    """Return the first of some readings with their rows, and how many there are."""
-    index = np.flatnonzero(chosen)
-    shown = ", ".join(
-        f"{column[i]:g} m in {rows[i].where.rsplit(', ', 1)[-1]}" for i in index[:_SHOWN]
-    )
-    more = f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else ""
-    return f"readings are outside the travel: found {shown}{more}"
 
 
 def _shared_readings(

@@ -8,48 +8,29 @@ one has its own, otherwise by their numbers in ``measurements.csv``, counted fro
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from legcal.atomic import write_atomically
+from legcal.csv_file import read_lines
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array
 from legcal.measurements import Measurements
 from legcal.mechanism.leg import Leg
+from legcal.observation_row import (
+    COLUMNS,
+    VERDICTS,
+    OutlineRow,
+    parse_row,
+    place_of,
+    rows_to_outlines,
+)
 from legcal.observations import Outlines
-from legcal.schema import closest, describe, read_text
 
-NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
-COLUMNS = ("view", "image", "leg", "part", "edge", *NUMBERS, "verdict", "reason", "source")
-VERDICTS = ("used", "rejected")
-SOURCES = ("detected", "edited")
-
-UNIT_EXACT = 1e-12  # |h| as computed; it is kept as it stands
-UNIT_TOLERANCE = 1e-3  # |h| as written with few digits; it is normalised
 LINE_TOLERANCE_PX = 5.0  # ends further from the line contradict it
-
-
-@dataclass(frozen=True)
-class _Outline:
-    """One row of the table, parsed."""
-
-    where: str
-    row: int
-    leg: int
-    part: str
-    edge: int
-    numbers: tuple[float, ...]
-    used: bool
-    reason: str
-    source: str
-
-    @property
-    def key(self) -> tuple[int, int, str, int]:
-        """What makes an outline one and the same."""
-        return self.row, self.leg, self.part, self.edge
 
 
 def row_names(measurements: Measurements) -> tuple[str, ...]:
@@ -170,14 +151,14 @@ def read_observations(
             zip(measurements.view, row_names(measurements), strict=True)
         )
     }
-    found: list[_Outline] = []
+    found: list[OutlineRow] = []
     first: dict[tuple[int, int, str, int], str] = {}
     for where, cells in _read_rows(path, problems):
-        place, unknown = _place(where, cells, places, legs)
+        place, unknown = place_of(where, cells, places, legs)
         if unknown and skip_stale and cells["source"] == "detected":
             continue
         problems += unknown
-        outline = _outline(where, cells, place, problems)
+        outline = parse_row(where, cells, place, problems)
         if outline is None or unknown:
             continue
         earlier = first.setdefault(outline.key, where)
@@ -189,7 +170,7 @@ def read_observations(
         found.append(outline)
     if problems:
         raise DatasetError(problems)
-    outlines = _ordered_ends(_outlines(found), measurements)
+    outlines = _ordered_ends(rows_to_outlines(found), measurements)
     problems = _line_problems(outlines, [o.where for o in found], measurements)
     if problems:
         raise DatasetError(problems)
@@ -198,16 +179,7 @@ def read_observations(
 
 def _read_rows(path: Path, problems: list[str]) -> list[tuple[str, dict[str, str]]]:
     """Return the rows of the table that are complete, each with its place."""
-    try:
-        text = read_text(path, "table of observations").decode("utf-8-sig")
-        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError(
-            f"{path}: the table could not be read: found '{error}', needed comma-separated text in "
-            "UTF-8; save it again as CSV."
-        ) from error
-    lines = [(number, cells) for number, cells in lines if any(cells)]
+    lines = read_lines(path, "table of observations")
     header = lines[0][1] if lines else []
     if sorted(header) != sorted(COLUMNS):
         raise DatasetError(
@@ -225,133 +197,6 @@ def _read_rows(path: Path, problems: list[str]) -> list[tuple[str, dict[str, str
                 f"{len(header)}; complete or remove the row."
             )
     return rows
-
-
-def _place(
-    where: str,
-    cells: Mapping[str, str],
-    places: Mapping[tuple[str, str], int],
-    legs: Sequence[Leg],
-) -> tuple[tuple[int, int], list[str]]:
-    """Return image row and leg of an outline, and the names among its cells that are unknown."""
-    start = "the outline could not be used: found"
-    unknown = []
-    view, image = cells["view"], cells["image"]
-    views = dict.fromkeys(v for v, _ in places)
-    if view not in views:
-        unknown.append(
-            f"{where}, column view: {start} the unknown view {describe(view)}, needed a view with "
-            f"measurements; {closest(view, views)}"
-        )
-    elif (view, image) not in places:
-        unknown.append(
-            f"{where}, column image: {start} {describe(image)}, needed an image of view {view} in "
-            f"the measurements; {closest(image, [i for v, i in places if v == view])}"
-        )
-    leg_names = [leg.name for leg in legs]
-    leg = leg_names.index(cells["leg"]) if cells["leg"] in leg_names else -1
-    if leg < 0:
-        unknown.append(
-            f"{where}, column leg: {start} the unknown leg {describe(cells['leg'])}, needed a leg "
-            f"of the mechanism; {closest(cells['leg'], leg_names)}"
-        )
-    else:
-        parts = [cylinder.link for cylinder in legs[leg].cylinders]
-        if cells["part"] not in parts:
-            unknown.append(
-                f"{where}, column part: {start} the unknown part {describe(cells['part'])}, needed "
-                f"a link with a cylinder of {cells['leg']}; {closest(cells['part'], parts)}"
-            )
-    return (places.get((view, image), -1), leg), unknown
-
-
-def _outline(
-    where: str, cells: Mapping[str, str], place: tuple[int, int], problems: list[str]
-) -> _Outline | None:
-    """Return one parsed row; None, with its problems added, if a cell is wrong."""
-    wrong = [
-        f"{where}, column {name}: the outline could not be used: found {describe(cells[name])}, "
-        f"needed {' or '.join(allowed)}; correct it."
-        for name, allowed in (("edge", ("1", "2")), ("verdict", VERDICTS), ("source", SOURCES))
-        if cells[name] not in allowed
-    ]
-    used = cells["verdict"] == "used"
-    numbers = [_number(cells[name]) for name in NUMBERS]
-    wrong += [
-        f"{where}, column {name}: the outline could not be used: found "
-        f"{describe(cells[name]) if cells[name] else 'an empty cell'}, needed a finite number; "
-        "correct it or set the verdict to rejected with an empty cell."
-        for name, x in zip(NUMBERS, numbers, strict=True)
-        if not math.isfinite(x) and (used or cells[name])
-    ]
-    if not wrong and used:
-        wrong = _number_problems(where, numbers)
-    problems += wrong
-    if wrong:
-        return None
-    norm = math.hypot(*numbers[:3])
-    if abs(norm - 1.0) > UNIT_EXACT:  # also false for NaN and zero norms below
-        numbers[:3] = [x / norm if norm else math.nan for x in numbers[:3]]
-    return _Outline(
-        where,
-        *place,
-        cells["part"],
-        int(cells["edge"]),
-        tuple(numbers),
-        used,
-        cells["reason"],
-        cells["source"],
-    )
-
-
-def _number(text: str) -> float:
-    """Return the number in a cell, NaN if there is none."""
-    try:
-        return float(text) if "_" not in text else math.nan
-    except ValueError:
-        return math.nan
-
-
-def _number_problems(where: str, numbers: Sequence[float]) -> list[str]:
-    """Return what is wrong with the finite numbers of a used outline."""
-    start = "the outline could not be used: found"
-    a, b, c, u0, v0, u1, v1, s00, s01, s11 = numbers
-    problems = []
-    norm = math.hypot(a, b, c)
-    if abs(norm - 1.0) > UNIT_TOLERANCE:
-        problems.append(
-            f"{where}, columns a, b, c: {start} a vector of norm {norm:.6g}, needed a unit vector; "
-            "divide the three by their norm."
-        )
-    if (u0, v0) == (u1, v1):
-        problems.append(
-            f"{where}, columns u0 to v1: {start} both ends at the same pixel, needed two ends of "
-            "a piece of the edge; correct them."
-        )
-    if not (s00 > 0.0 and s11 > 0.0 and s00 * s11 > s01 * s01):
-        problems.append(
-            f"{where}, columns s00, s01, s11: {start} a covariance that is not positive definite "
-            f"({s00:g}, {s01:g}, {s11:g}), needed variances of the offsets at both ends [px^2]; "
-            "correct them."
-        )
-    return problems
-
-
-def _outlines(found: Sequence[_Outline]) -> Outlines:
-    """Return parsed rows as arrays."""
-    numbers = np.array([o.numbers for o in found], dtype=np.float64).reshape(-1, len(NUMBERS))
-    return Outlines(
-        row=np.array([o.row for o in found], dtype=np.intp),
-        leg=np.array([o.leg for o in found], dtype=np.intp),
-        part=tuple(o.part for o in found),
-        edge=np.array([o.edge for o in found], dtype=np.intp),
-        h=numbers[:, :3],
-        ends=numbers[:, 3:7].reshape(-1, 2, 2),
-        covariance=numbers[:, [7, 8, 8, 9]].reshape(-1, 2, 2),
-        used=np.array([o.used for o in found], dtype=np.bool_),
-        reason=tuple(o.reason for o in found),
-        source=tuple(o.source for o in found),
-    )
 
 
 def _rays(outlines: Outlines, measurements: Measurements) -> Array:

@@ -1,0 +1,129 @@
+"""An order of rows, views and legs that does not depend on how the files list them.
+
+Floating-point sums depend on their order. Work in this order and map the results back, and
+a dataset gives the same result however its files are arranged.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legcal.geometry.types import IntArray
+from legcal.measurements import Measurements
+from legcal.observations import Outlines
+from legcal.outline_sets import sort_outlines
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """Permutations: element k of a reordered thing is element ``index[k]`` of the original.
+
+    Attributes
+    ----------
+    rows, views, legs : (n,) array of int
+        Original indices of rows, views and legs, in the new order.
+    """
+
+    rows: IntArray
+    views: IntArray
+    legs: IntArray
+
+
+def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Order:
+    """Return legs and views by name, and rows by view, image, pose label and readings.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The rows in any order.
+    leg_names : sequence of str
+        The legs, in the order of the columns of ``measurements.q``.
+    """
+    legs = np.argsort(np.array(leg_names, dtype=object), kind="stable")
+    view_names = np.array([view.name for view in measurements.views], dtype=object)
+    views = np.argsort(view_names, kind="stable")
+    return Order(sort_rows(measurements, legs), views, legs)
+
+
+def sort_rows(measurements: Measurements, legs: IntArray | None = None) -> IntArray:
+    """Return the rows sorted by view name, image, pose label and readings.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The rows in any order.
+    legs : (n_legs,) array of int or None
+        The order in which readings are compared; None for that of the columns.
+
+    Returns
+    -------
+    (n_rows,) array of int
+        Indices of the rows, in their new order.
+    """
+    q = np.nan_to_num(measurements.q if legs is None else measurements.q[:, legs])
+    labels = measurements.pose_labels or ("",) * measurements.n_poses
+    keys = [
+        (measurements.views[v].name, image, labels[p], readings)
+        for v, image, p, readings in zip(
+            measurements.view.tolist(),
+            measurements.image,
+            measurements.pose.tolist(),
+            q.tolist(),
+            strict=True,
+        )
+    ]
+    return np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+
+
+def reorder_measurements(measurements: Measurements, order: Order) -> Measurements:
+    """Return measurements in another order; poses are numbered as they first appear.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The rows in any order.
+    order : Order
+        All of their rows, views and legs in the order wanted.
+    """
+    pose = measurements.pose[order.rows]
+    poses, first = np.unique(pose, return_index=True)
+    poses = poses[np.argsort(first)]
+    labels = measurements.pose_labels
+    return replace(
+        measurements,
+        views=tuple(measurements.views[v] for v in order.views.tolist()),
+        image=tuple(measurements.image[i] for i in order.rows.tolist()),
+        view=inverse(order.views)[measurements.view[order.rows]],
+        pose=inverse(poses)[pose],
+        q=measurements.q[np.ix_(order.rows, order.legs)],
+        pose_labels=tuple(labels[p] for p in poses.tolist()) if labels else (),
+    )
+
+
+def reorder_outlines(outlines: Outlines, order: Order) -> Outlines:
+    """Return outlines of reordered measurements, sorted by row, leg, part and edge.
+
+    Parameters
+    ----------
+    outlines : Outlines
+        Outlines of the measurements in their original order.
+    order : Order
+        The order given to :func:`reorder_measurements`.
+    """
+    renamed = replace(
+        outlines, row=inverse(order.rows)[outlines.row], leg=inverse(order.legs)[outlines.leg]
+    )
+    return sort_outlines(renamed)
+
+
+def restore_outlines(outlines: Outlines, order: Order) -> Outlines:
+    """Return outlines of reordered measurements as those of the original ones, sorted."""
+    return sort_outlines(
+        replace(outlines, row=order.rows[outlines.row], leg=order.legs[outlines.leg])
+    )
+
+
+def inverse(permutation: IntArray) -> IntArray:
+    """Return where each original element went: ``inverse(p)[p[k]] == k``."""
+    return np.argsort(permutation)
