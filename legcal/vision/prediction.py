@@ -1,0 +1,155 @@
+"""Where the model says that the legs are seen in an image."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry.types import Array, IntArray
+from legcal.mechanism.leg import Cylinder
+from legcal.vision.band import Band, band_of_leg
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
+from legcal.vision.pieces import Piece, visible_pieces
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedLeg:
+    """One leg as it should appear in one image.
+
+    Attributes
+    ----------
+    row, leg : int
+        The image and the leg.
+    A_camera, B_camera : (3,) array
+        Joint centres in the camera frame [m].
+    pieces : tuple of Piece
+        The parts that can be seen, from base to platform.
+    outlines : (n_pieces, 2, 3) array
+        Their outlines h1, h2, eq (3).
+    band : Band
+        The frame along the visible stretch of the whole leg.
+    """
+
+    row: int
+    leg: int
+    A_camera: Array
+    B_camera: Array
+    pieces: tuple[Piece, ...]
+    outlines: Array
+    band: Band
+
+    @property
+    def u(self) -> Array:
+        """Unit direction from base to platform, (3,)."""
+        AB = self.B_camera - self.A_camera
+        return np.asarray(AB / np.linalg.norm(AB))
+
+    def distance_along(self, band: Band, t: Array) -> Array:
+        """Return the distance from A [m] of the axis points seen at t [px] of a band."""
+        ray = band.along @ band.origin + t / band.scale
+        u, A = self.u, self.A_camera
+        return np.asarray((ray * A[2] - band.along @ A[:2]) / (band.along @ u[:2] - ray * u[2]))
+
+    def piece_at(self, t: Array) -> IntArray:
+        """Return the index of the piece seen at t [px] of the leg's band, -1 where none is."""
+        s = self.distance_along(self.band, t)
+        index = np.full(t.shape, -1, dtype=np.intp)
+        for i, piece in enumerate(self.pieces):
+            index[(s >= piece.start) & (s <= piece.end)] = i
+        return index
+
+    def edge_offsets(self, t: Array) -> Array:
+        """Return v [px] of both outlines at t [px] of the leg's band, (2, n_t)."""
+        index = self.piece_at(t)
+        both = np.stack([self.band.offsets(h, t[:, None]) for h in self.outlines.swapaxes(0, 1)])
+        return np.asarray(np.take_along_axis(both, index[None, :, None], axis=2)[..., 0])
+
+
+def predict_legs(
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    A_base: Array,
+    B_base: Array,
+    cylinders: Sequence[Sequence[Cylinder]],
+    row: int,
+) -> list[PredictedLeg]:
+    """Predict every leg that an image should show.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera of the image.
+    T_base_camera : RigidTransform
+        Its pose in the base link.
+    A_base, B_base : (n_legs, 3) array
+        Joint centres at the reading of the image, in the base link [m].
+    cylinders : sequence, for each leg a sequence of Cylinder
+        What can be seen of the legs.
+    row : int
+        Index of the image.
+
+    Returns
+    -------
+    list of PredictedLeg
+        In the order of the legs; legs outside the image are missing.
+    """
+    T_camera_base = T_base_camera.inv()
+    A_camera, B_camera = T_camera_base.apply(A_base), T_camera_base.apply(B_base)
+    legs = []
+    for leg, (A, B) in enumerate(zip(A_camera, B_camera, strict=True)):
+        length = float(np.linalg.norm(B - A))
+        pieces = visible_pieces(cylinders[leg], length)
+        if not pieces:
+            continue
+        start, end = pieces[0].start, max(piece.end for piece in pieces)
+        band = band_of_leg(camera, A, B, start, end)
+        radii = np.array([piece.radius for piece in pieces])
+        u = (B - A) / length
+        if band is None or np.linalg.norm(A - u * (u @ A)) <= 1.01 * radii.max():
+            continue
+        outlines = outlines_of_axis(u[None], A[None], radii)
+        legs.append(PredictedLeg(row, leg, A, B, pieces, outlines, band))
+    return legs
+
+
+def hidden_by(
+    leg: PredictedLeg, others: Sequence[PredictedLeg], P_camera: Array, margin: float
+) -> IntArray:
+    """Return which other leg stands in front of points of a leg.
+
+    Parameters
+    ----------
+    leg : PredictedLeg
+        The leg.
+    others : sequence of PredictedLeg
+        The legs of the same image.
+    P_camera : (n, 3) array
+        Points of the leg's outline [m].
+    margin : float
+        Points this near to another leg's outline count as hidden, as an angle [rad].
+
+    Returns
+    -------
+    (n,) array of int
+        Index of the leg in front, -1 where the view is free.
+    """
+    front = np.full(len(P_camera), -1, dtype=np.intp)
+    distance = np.linalg.norm(P_camera, axis=1)
+    ray = P_camera / distance[:, None]
+    for other in others:
+        if other.leg == leg.leg:
+            continue
+        u, A = other.u, other.A_camera
+        length = float(np.linalg.norm(other.B_camera - A))
+        # The point of the other leg's axis nearest to the viewing ray, and the ray's nearest point.
+        c = ray @ u
+        sine2 = np.maximum(1.0 - c**2, 1e-12)
+        along = np.clip((c * (ray @ A) - u @ A) / sine2, 0.0, length)
+        nearest = A + along[:, None] * u
+        depth = np.sum(ray * nearest, axis=1)
+        gap = np.linalg.norm(nearest - depth[:, None] * ray, axis=1)
+        radius = max(piece.radius for piece in other.pieces)
+        front[(gap < radius + margin * depth) & (depth < distance)] = other.leg
+    return front

@@ -1,0 +1,157 @@
+"""Candidate strips: where a leg may be, near its prediction but tens of pixels off (hazard 14).
+
+A patch of the image is straightened along the predicted leg and cut into short blocks. Every
+block votes for the sideways shifts at which both outlines of the leg, a known distance apart,
+fall on edges of the picture; edges count by sharpness against the noise of the patch and
+not by polarity, since a lit leg may be brighter than its background on one side and darker on the
+other. Votes are added along straight lines (shift at one end, shift at the other), and
+the best few are kept: which of them is the leg is decided by all images of the view together.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from legcal.geometry.types import Array
+from legcal.vision.camera import Camera
+from legcal.vision.picture import Grey, sample
+from legcal.vision.prediction import PredictedLeg
+
+COLUMNS = 70  # columns to each side that a search window is reduced to
+NARROWEST = 6.0  # pixels that the width of a leg keeps in the reduced image
+BLOCK = 4  # rows of a block
+ROW_STEP = 2.0  # reduced pixels between rows
+MAX_BLOCKS = 100
+NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
+TILT_STEP = 2  # columns between tilts, at the end of the leg
+KEPT = 6
+NEIGHBOURS = (3, 3)  # suppressed around a kept strip: tilts, columns
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """Candidates for one leg in one image, best first.
+
+    Attributes
+    ----------
+    shift : (n, 2) array
+        Sideways shift against the prediction at both ends of the leg's band [px].
+    score : (n,) array
+        Share of the visible length whose both outlines fall on edges, 0 to 1.
+    """
+
+    shift: Array
+    score: Array
+
+
+def reduction(half_window: float, width: float) -> int:
+    """Return the whole factor by which an image may be reduced for a search.
+
+    Parameters
+    ----------
+    half_window : float
+        Largest sideways shift [px].
+    width : float
+        Width of the narrowest leg [px].
+    """
+    return max(1, int(min(half_window / COLUMNS, width / NARROWEST)))
+
+
+def find_strips(
+    small: Grey, factor: int, camera: Camera, leg: PredictedLeg, window: float, tilt: float
+) -> Strips:
+    """Find the strips that a leg may be.
+
+    Parameters
+    ----------
+    small : Grey
+        The image, reduced by ``factor``.
+    factor : int
+        See :func:`reduction`.
+    camera : Camera
+        The camera.
+    leg : PredictedLeg
+        Where the leg should be.
+    window : float
+        Largest shift against the prediction in the middle of the leg [px].
+    tilt : float
+        Largest difference of the shifts at its ends [px].
+
+    Returns
+    -------
+    Strips
+        At most ``KEPT`` candidates.
+    """
+    votes, reach = _votes(small, factor, camera, leg, window, tilt)
+    n_tilts = int(np.ceil(tilt / factor / TILT_STEP))
+    differences = TILT_STEP * np.arange(-n_tilts, n_tilts + 1)
+    n_shifts = int(np.ceil(window / factor))
+    position = (np.arange(len(votes)) + 0.5) / len(votes) - 0.5
+    columns = np.rint(differences[:, None] * position).astype(np.intp) + reach - n_shifts
+    runs = sliding_window_view(votes, 2 * n_shifts + 1, axis=1)
+    score = runs[np.arange(len(votes)), columns].sum(axis=1)
+    return _peaks(score, differences, n_shifts, factor)
+
+
+def _votes(
+    small: Grey, factor: int, camera: Camera, leg: PredictedLeg, window: float, tilt: float
+) -> tuple[NDArray[np.float32], int]:
+    """Return the votes (n_blocks, 2 reach + 1) of blocks for shifts, and the reach [columns]."""
+    band = leg.band
+    n_rows = int(band.length / (ROW_STEP * factor))
+    n_blocks = int(np.clip(n_rows // BLOCK, 3, MAX_BLOCKS))
+    t = (np.arange(n_blocks * BLOCK) + 0.5) / (n_blocks * BLOCK) * band.length
+    t_block = t.reshape(n_blocks, BLOCK).mean(axis=1)
+    edges = leg.edge_offsets(t_block)
+    reach = int(np.ceil((window + 0.5 * tilt) / factor)) + 2
+    outer = reach + int(np.ceil(np.abs(edges).max() / factor)) + 3
+    v = factor * np.arange(-outer, outer + 1.0)
+    values, inside = sample(small, factor, camera, band.points(t[:, None], v))
+    profiles = values.reshape(n_blocks, BLOCK, -1).mean(axis=1)
+    seen = np.asarray(inside.reshape(n_blocks, BLOCK, -1).all(axis=1))
+    sharpness = edge_sharpness(profiles, seen)
+    start = np.rint(edges / factor).astype(np.intp) + outer - reach
+    runs = sliding_window_view(sharpness, 2 * reach + 1, axis=1)
+    one, two = (runs[np.arange(n_blocks), first] for first in start)
+    votes = np.float32(0.5) * one * two + np.float32(0.25) * (one + two)
+    votes *= (leg.piece_at(t_block) >= 0)[:, None] / n_blocks
+    return np.asarray(votes, dtype=np.float32), reach
+
+
+def edge_sharpness(profiles: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return how much each column of profiles (n_blocks, n) looks like an edge, 0 to 1.
+
+    The maxima of the smoothed gradient along each profile, against the median of the patch,
+    widened by one column to each side.
+    """
+    smooth = cv2.GaussianBlur(profiles, (5, 1), 0.8)
+    gradient = np.zeros_like(profiles)
+    gradient[:, 1:-1] = np.abs(smooth[:, 2:] - smooth[:, :-2])
+    gradient[:, 1:-1] *= seen[:, 2:] & seen[:, :-2]
+    wide = np.asarray(cv2.dilate(gradient, np.ones((1, 3), dtype=np.uint8)), dtype=np.float32)
+    peak = np.where(gradient >= wide, gradient, np.float32(0.0))
+    typical = float(np.median(gradient[seen])) if np.any(seen) else 0.0
+    level = np.float32((NOISE_LEVELS * typical) ** 2 + 1e-3)
+    sharpness = peak**2 / (peak**2 + level)
+    return np.asarray(cv2.dilate(sharpness, np.ones((1, 3), dtype=np.uint8)), dtype=np.float32)
+
+
+def _peaks(
+    score: NDArray[np.float32], differences: NDArray[np.intp], n_shifts: int, factor: int
+) -> Strips:
+    """Return the highest separate maxima of score (n_tilts, n_shifts)."""
+    score = score.copy()
+    shifts, scores = [], []
+    for _ in range(KEPT):
+        i, j = divmod(int(np.argmax(score)), score.shape[1])
+        if score[i, j] <= 0.0:
+            break
+        middle, half = j - n_shifts, 0.5 * differences[i]
+        shifts.append((factor * (middle - half), factor * (middle + half)))
+        scores.append(float(score[i, j]))
+        tilts, columns = NEIGHBOURS
+        score[max(0, i - tilts) : i + tilts + 1, max(0, j - columns) : j + columns + 1] = 0.0
+    return Strips(np.array(shifts).reshape(-1, 2), np.array(scores))
