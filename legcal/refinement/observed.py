@@ -1,0 +1,178 @@
+"""What was measured, as arrays that the residuals take: outlines in the image, readings."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.errors import DatasetError
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.measurements import Measurements
+from legcal.observations import Outlines
+from legcal.refinement.legs import FittedLegs
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import EPSILON
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedOutlines:
+    """The outlines that enter the fit, n of them.
+
+    Attributes
+    ----------
+    index : (n,) array of int
+        Rows of the table of outlines.
+    leg, view, pose, radius : (n,) array of int
+        Indices; ``radius`` counts in ``parts``.
+    feet : (n, 2, 2) array
+        Points of the measured outline at both ends of the used piece, on the sensor plane.
+    J_inverse_transposed : (n, 2, 2, 2) array
+        Inverse transposed derivative of pixels at these points [1/px].
+    epsilon : (n,) array
+        +1 or -1 of eq (5).
+    covariance : (n, 2, 2) array
+        Claimed covariance of the offsets at both ends [px^2].
+    parts : tuple of (int, str)
+        Leg index and part of each radius, sorted by leg and name.
+    """
+
+    index: IntArray
+    leg: IntArray
+    view: IntArray
+    pose: IntArray
+    radius: IntArray
+    feet: Array
+    J_inverse_transposed: Array
+    epsilon: Array
+    covariance: Array
+    parts: tuple[tuple[int, str], ...]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """The encoder readings that enter the fit, n of them.
+
+    Attributes
+    ----------
+    leg, pose : (n,) array of int
+        Indices.
+    length : (n,) array
+        sign * q: the leg length without its offset [m].
+    sigma : float
+        Standard deviation [m].
+    """
+
+    leg: IntArray
+    pose: IntArray
+    length: Array
+    sigma: float
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+
+def observed_outlines(
+    outlines: Outlines, measurements: Measurements, legs: FittedLegs
+) -> ObservedOutlines:
+    """Return the used outlines in the form that the residuals take.
+
+    Raises
+    ------
+    DatasetError
+        If an outline has a covariance that is not positive definite, or shows a part that the
+        mechanism does not have.
+    """
+    index = np.flatnonzero(outlines.used)
+    row, leg = outlines.row[index], outlines.leg[index]
+    view = measurements.view[row]
+    keys = [(int(j), outlines.part[i]) for i, j in zip(index, leg, strict=True)]
+    parts = tuple(sorted(set(keys)))
+    covariance = outlines.covariance[index]
+    problems = [
+        *_bad_covariances(covariance, row, leg, measurements, legs),
+        *(
+            f"The outlines of {legs.names[j]}.{part} could not be used: the mechanism has no such "
+            "cylinder; correct the part in the observations."
+            for j, part in parts
+            if (j, part) not in legs.radii
+        ),
+    ]
+    if problems:
+        raise DatasetError(problems)
+    feet = np.zeros((len(index), 2, 2))
+    J_inverse_transposed = np.zeros((len(index), 2, 2, 2))
+    for v in np.unique(view):
+        of_view = view == v
+        feet[of_view], J_inverse_transposed[of_view] = feet_of_ends(
+            measurements.views[v].camera, outlines.h[index][of_view], outlines.ends[index][of_view]
+        )
+    return ObservedOutlines(
+        index,
+        leg,
+        view,
+        measurements.pose[row],
+        np.array([parts.index(key) for key in keys], dtype=np.intp),
+        feet,
+        J_inverse_transposed,
+        EPSILON[outlines.edge[index] - 1],
+        covariance,
+        parts,
+    )
+
+
+def feet_of_ends(camera: Camera, h: Array, ends: Array) -> tuple[Array, Array]:
+    """Return the points of measured lines nearest to their ends, and the lens there.
+
+    Parameters
+    ----------
+    camera : Camera
+    h : (n, 3) array
+        Measured outlines (a, b, c).
+    ends : (n, 2, 2) array
+        Ends of the used pieces [px].
+
+    Returns
+    -------
+    feet : (n, 2, 2) array
+        Points of the sensor plane on the lines.
+    J_inverse_transposed : (n, 2, 2, 2) array
+        Inverse transposed derivative of pixels with respect to the sensor plane there [1/px].
+    """
+    xy = camera.undistort(ends)
+    normal = h[:, None, :2]
+    value = np.sum(normal * xy, axis=-1, keepdims=True) + h[:, None, 2:]
+    feet = xy - normal * value / np.sum(normal**2, axis=-1, keepdims=True)
+    J = camera.pixels_per_unit(feet)
+    return feet, np.swapaxes(np.linalg.inv(J), -1, -2)
+
+
+def readings(measurements: Measurements, legs: FittedLegs) -> Readings:
+    """Return the encoder readings, one row of them for each platform pose.
+
+    Images of one pose share one reading: that of the first row. Passive legs have none.
+    """
+    _, first_row = np.unique(measurements.pose, return_index=True)
+    length = legs.sign * measurements.q[first_row]
+    pose, leg = np.nonzero(np.isfinite(length))
+    return Readings(leg, pose, length[pose, leg], measurements.sigma_q)
+
+
+def has_offset(measurements: Measurements) -> BoolArray:
+    """Return which legs have readings (n_legs,): passive ones have none."""
+    return np.asarray(np.isfinite(measurements.q).any(axis=0))
+
+
+def _bad_covariances(
+    covariance: Array, row: IntArray, leg: IntArray, measurements: Measurements, legs: FittedLegs
+) -> list[str]:
+    """Return one sentence for each covariance that is not positive definite."""
+    s00, s01, s11 = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    good = (s00 > 0.0) & (s11 > 0.0) & (s00 * s11 > s01**2)
+    return [
+        f"The outline of {legs.names[leg[i]]} in {measurements.image[row[i]] or f'row {row[i]}'} "
+        f"could not be used: its covariance s00 = {s00[i]:g}, s01 = {s01[i]:g}, s11 = {s11[i]:g} "
+        "px^2 is not positive definite; correct it in the observations."
+        for i in np.flatnonzero(~good)
+    ]

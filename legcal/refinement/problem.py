@@ -1,0 +1,321 @@
+"""Building the fit: a CasADi problem over all measurements, ready for IPOPT.
+
+Building fixes only the structure: which unknowns each measurement depends on. References,
+measured values, weights and the width of the loss are parameters, so that one problem
+serves all rounds of a fit. Each kind of residual is mapped over its measurements; small dense
+Hessian blocks go to their places in the sparse Hessian by one constant selection matrix.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from legcal.geometry.types import Array, IntArray
+from legcal.refinement.loss import LossFunctions, robust_loss
+from legcal.refinement.observed import ObservedOutlines, Readings
+from legcal.refinement.residuals import (
+    Residual,
+    encoder_residual,
+    outline_residual,
+    prior_residual,
+)
+from legcal.refinement.state import Layout, State
+
+IPOPT_OPTIONS = {
+    "print_time": False,
+    "calc_lam_p": False,
+    "no_nlp_grad": True,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-3,
+    "ipopt.acceptable_iter": 0,
+    "ipopt.nlp_scaling_method": "none",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A Gaussian prior on single unknowns.
+
+    Attributes
+    ----------
+    position : (n,) array of int
+        Positions of the unknowns in x.
+    mean, sigma : (n,) array
+        Means and standard deviations [m or rad].
+    """
+
+    position: IntArray
+    mean: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FitProblem:
+    """A fit, built and not yet solved.
+
+    Attributes
+    ----------
+    layout : Layout
+    outlines : ObservedOutlines
+    readings : Readings
+    radius_prior : Prior
+    solver : casadi.Function
+        IPOPT on the whole problem; its parameter is that of :func:`parameter_of`.
+    outline_index, encoder_index : (n, 19) and (n, 13) array of int
+        Positions in x of the unknowns of each measurement; ``layout.size`` where fixed.
+    cost, gradient, hessian : casadi.Function
+        Of (x, parameter): the robust cost, its gradient and the upper triangle of its
+        Gauss-Newton Hessian.
+    """
+
+    layout: Layout
+    outlines: ObservedOutlines
+    readings: Readings
+    radius_prior: Prior
+    outline_index: IntArray
+    encoder_index: IntArray
+    cost: ca.Function
+    gradient: ca.Function
+    hessian: ca.Function
+    solver: ca.Function
+
+    @property
+    def n_equations(self) -> int:
+        """Number of residuals, priors left out."""
+        return 2 * len(self.outlines) + len(self.readings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Term:
+    """One kind of residual, mapped over its measurements."""
+
+    loss: LossFunctions
+    residual: Residual
+    index: IntArray
+    data: ca.MX
+
+
+def build_problem(
+    layout: Layout,
+    outlines: ObservedOutlines,
+    readings: Readings,
+    radius_prior: Prior,
+    max_iterations: int = 100,
+) -> FitProblem:
+    """Build the fit of everything.
+
+    Parameters
+    ----------
+    layout : Layout
+        The unknowns.
+    outlines : ObservedOutlines
+    readings : Readings
+    radius_prior : Prior
+        Prior on the radii.
+    max_iterations : int
+        Limit for IPOPT.
+
+    Returns
+    -------
+    FitProblem
+    """
+    outline_index = np.column_stack(
+        [
+            layout.base[outlines.leg],
+            layout.platform[outlines.leg],
+            layout.radius[outlines.radius],
+            layout.camera[outlines.view],
+            layout.pose[outlines.pose],
+        ]
+    )
+    encoder_index = np.column_stack(
+        [
+            layout.base[readings.leg],
+            layout.platform[readings.leg],
+            layout.offset[readings.leg],
+            layout.pose[readings.pose],
+        ]
+    )
+    kinds = [
+        (outline_residual(), outline_index),
+        (encoder_residual(), encoder_index),
+        (prior_residual(), radius_prior.position[:, None]),
+    ]
+    x = ca.MX.sym("x", layout.size)
+    terms = []
+    for residual, index in kinds:
+        data = ca.MX.sym(f"{residual.name}_data", residual.n_data, len(index))
+        terms.append(_Term(robust_loss(residual), residual, index, data))
+    parameter = ca.veccat(*[term.data for term in terms])
+    cost, gradient, hessian = _sums(terms, x)
+    # The terms' data are slices of one parameter vector for IPOPT, and inputs for us.
+    inputs = [x, *[term.data for term in terms]]
+    names = ["x", *[term.residual.name for term in terms]]
+    cost_function = ca.Function("cost", inputs, [cost], names, ["f"])
+    gradient_function = ca.Function("gradient", inputs, [gradient], names, ["g"])
+    hessian_function = ca.Function("hessian", inputs, [hessian], names, ["H"])
+    p = ca.MX.sym("p", parameter.size1())
+    solver = _ipopt(x, p, terms, cost_function, gradient_function, hessian_function, max_iterations)
+    return FitProblem(
+        layout,
+        outlines,
+        readings,
+        radius_prior,
+        outline_index,
+        encoder_index,
+        cost_function,
+        gradient_function,
+        hessian_function,
+        solver,
+    )
+
+
+def data_of(problem: FitProblem, state: State, whitening: Array, k: float) -> tuple[Array, ...]:
+    """Return what the residuals need besides the unknowns, one row a measurement.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    state : State
+        The reference: x = 0 is this state.
+    whitening : (n_outlines, 2, 2) array
+        Lower triangular T of each outline: T C T^T = 1 [1/px]; zero leaves an outline out.
+    k : float
+        Narrowness of the robust loss on outlines.
+
+    Returns
+    -------
+    tuple of array
+        (n_outlines, 48), (n_readings, 22) and (n_radii, 3).
+    """
+    o, e, prior = problem.outlines, problem.readings, problem.radius_prior
+    camera = _frames(state.R_camera, state.t_camera)
+    pose = _frames(state.R_pose, state.t_pose)
+    of_outlines = np.column_stack(
+        [
+            state.base_joints[o.leg],
+            state.platform_joints[o.leg],
+            state.radii[o.radius],
+            camera[o.view],
+            pose[o.pose],
+            o.feet.reshape(-1, 4),
+            np.swapaxes(o.J_inverse_transposed, -1, -2).reshape(-1, 8),
+            o.epsilon,
+            whitening[:, 0, 0],
+            whitening[:, 1, 0],
+            whitening[:, 1, 1],
+            np.full(len(o), k),
+        ]
+    )
+    of_readings = np.column_stack(
+        [
+            state.base_joints[e.leg],
+            state.platform_joints[e.leg],
+            state.offsets[e.leg],
+            pose[e.pose],
+            e.length,
+            np.full(len(e), 1.0 / e.sigma),
+            np.zeros(len(e)),
+        ]
+    )
+    of_prior = np.column_stack(
+        [state.radii - prior.mean, 1.0 / prior.sigma, np.zeros(len(prior.mean))]
+    )
+    return of_outlines, of_readings, of_prior
+
+
+def parameter_of(data: tuple[Array, ...]) -> Array:
+    """Return the parameter vector of the solver."""
+    return np.concatenate([part.ravel() for part in data])
+
+
+def evaluate_jacobian(residual: Residual, data: Array) -> tuple[Array, Array]:
+    """Return residuals (n, rows) and Jacobians (n, rows, locals) at the reference, x = 0."""
+    n = len(data)
+    if n == 0:
+        return np.zeros((0, residual.n_rows)), np.zeros((0, residual.n_rows, residual.n_local))
+    mapped = robust_loss(residual).jacobian.map(n)
+    r, J = mapped(ca.DM.zeros(residual.n_local, n), ca.DM(np.asfortranarray(data.T)))
+    columns = np.asarray(J).reshape(residual.n_rows, n, residual.n_local)
+    return np.asarray(r).T.copy(), np.swapaxes(columns, 0, 1).copy()
+
+
+def _frames(R: Array, t: Array) -> Array:
+    """Return rotations, column by column, and translations as rows of 12."""
+    return np.concatenate([np.swapaxes(R, -1, -2).reshape(-1, 9), t], axis=1)
+
+
+def _sums(terms: list[_Term], x: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """Return cost, gradient and upper triangle of the Hessian of all terms."""
+    size = x.size1()
+    x_and_zero = ca.vertcat(x, 0.0)
+    cost, gradient = ca.MX(0.0), ca.MX.zeros(size + 1)
+    blocks, rows, columns = [], [], []
+    for term in terms:
+        n, m = term.index.shape
+        if n == 0:
+            continue
+        local = ca.reshape(x_and_zero[term.index.ravel().tolist()], m, n)
+        cost += ca.sum2(term.loss.cost.map(n)(local, term.data))
+        local_gradient = ca.vec(term.loss.gradient.map(n)(local, term.data))
+        places = np.arange(n * m)
+        gradient += _selection(term.index.ravel(), places, size + 1, n * m) @ local_gradient
+        blocks.append(ca.vec(term.loss.hessian.map(n)(local, term.data)))
+        i, j = np.triu_indices(m)
+        a, b = term.index[:, i].ravel(), term.index[:, j].ravel()
+        rows.append(np.minimum(a, b))
+        columns.append(np.maximum(a, b))
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    place = np.flatnonzero(column < size)
+    entry, target = np.unique(column[place] * (size + 1) + row[place], return_inverse=True)
+    pattern = ca.Sparsity.triplet(
+        size, size, (entry % (size + 1)).tolist(), (entry // (size + 1)).tolist()
+    )
+    values = _selection(target, place, len(entry), len(row)) @ ca.vertcat(*blocks)
+    return cost, gradient[:size], ca.MX(pattern, values)
+
+
+def _selection(row: IntArray, column: IntArray, n_rows: int, n_columns: int) -> ca.DM:
+    """Return a 0/1 matrix with at most one entry in each column."""
+    occupied = np.zeros(n_columns, dtype=np.intp)
+    occupied[column] = 1
+    start = np.concatenate([[0], np.cumsum(occupied)])
+    return ca.DM.ones(ca.Sparsity(n_rows, n_columns, start.tolist(), row.tolist()))
+
+
+def _ipopt(
+    x: ca.MX,
+    p: ca.MX,
+    terms: list[_Term],
+    cost: ca.Function,
+    gradient: ca.Function,
+    hessian: ca.Function,
+    max_iterations: int,
+) -> ca.Function:
+    """Return IPOPT on the cost, with its gradient and the Gauss-Newton Hessian given."""
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
+    sizes = np.cumsum([0, *[term.data.numel() for term in terms]]).tolist()
+    data = [
+        ca.reshape(part, term.data.size1(), term.data.size2())
+        for part, term in zip(ca.vertsplit(p, sizes), terms, strict=True)
+    ]
+    f = cost(x, *data)
+    grad_f = ca.Function("grad_f", [x, p], [f, gradient(x, *data)], ["x", "p"], ["f", "grad_f_x"])
+    hess_lag = ca.Function(
+        "hess_lag",
+        [x, p, lam_f, lam_g],
+        [lam_f * hessian(x, *data)],
+        ["x", "p", "lam_f", "lam_g"],
+        ["hess_gamma_x_x"],
+    )
+    problem: dict[str, Any] = {"x": x, "p": p, "f": f}
+    options: dict[str, Any] = {
+        **IPOPT_OPTIONS,
+        "ipopt.max_iter": max_iterations,
+        "grad_f": grad_f,
+        "hess_lag": hess_lag,
+    }
+    return ca.nlpsol("refine", "ipopt", problem, options)

@@ -1,0 +1,76 @@
+"""The result of the fit of everything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry.types import Array
+from legcal.mechanism.parameters import KinematicParameters
+from legcal.observations import Outlines
+from legcal.refinement.covariance import WeakDirection
+from legcal.refinement.noise import NoiseModel
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A converged fit of everything.
+
+    Attributes
+    ----------
+    parameters : KinematicParameters
+        Joints in R_b and R_e, and offsets [m].
+    T_camera_Rb : tuple of RigidTransform
+        Camera poses, one a view. A view without outlines keeps that of the start.
+    T_Rb_Re : tuple of RigidTransform
+        Platform poses.
+    radii, sigma_radii : dict
+        Radius and its standard deviation [m] for each (leg index, part) that was observed.
+    names : tuple of str
+        Names of the estimated kinematic parameters, in the order of ``parameters.to_vector``.
+    covariance : (n, n) array
+        Their covariance [m^2], with cameras, poses and radii unknown.
+    sigma : (n,) array
+        Their standard deviations [m].
+    weak : tuple of WeakDirection
+        The directions known worst, worst first.
+    cost : float
+        Robust cost over all outlines that came in, rejected ones too, under one fixed noise:
+        comparable between fits of the same data.
+    chi2 : float
+        Sum of the squared whitened residuals of used outlines, readings and priors.
+    dof : int
+        Their number, less the unknowns.
+    rms_px : float
+        Root mean square of the offsets of used outlines [px].
+    noise : NoiseModel
+        The estimated errors of outlines; ``noise.bias_px`` is tau.
+    outlines : Outlines
+        The table that came in, with what the fit rejected and why.
+    start : str
+        Label of the start that led here.
+    iterations : int
+        Of IPOPT, all rounds.
+    notes : tuple of str
+        What else a reader should know, one sentence each.
+    """
+
+    parameters: KinematicParameters
+    T_camera_Rb: tuple[RigidTransform, ...]
+    T_Rb_Re: tuple[RigidTransform, ...]
+    radii: dict[tuple[int, str], float]
+    sigma_radii: dict[tuple[int, str], float]
+    names: tuple[str, ...]
+    covariance: Array
+    sigma: Array
+    weak: tuple[WeakDirection, ...]
+    cost: float
+    chi2: float
+    dof: int
+    rms_px: float
+    noise: NoiseModel
+    outlines: Outlines
+    start: str
+    iterations: int
+    notes: tuple[str, ...] = ()
