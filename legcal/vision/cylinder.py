@@ -42,13 +42,13 @@ def outlines_of_axis(u: Array, M: Array, radius: Array | float) -> Array:
     """
     foot = nearest_point_to_origin(u, M)
     distance = np.linalg.norm(foot, axis=-1)
-    sine = np.asarray(radius) / distance
-    if np.any(sine >= 1.0):
+    if np.any(distance <= radius):
         raise NotVisible(
             "The outline of a cylinder could not be drawn: the camera centre is "
             f"{1e3 * float(distance.min()):.1f} mm from an axis, inside the cylinder; it must "
             "stand outside every leg; check the camera pose of the view."
         )
+    sine = np.asarray(radius) / distance
     m = moment(u, M) / distance[..., None]
     toward = foot / distance[..., None]
     cosine = np.sqrt(1.0 - sine**2)
