@@ -151,7 +151,11 @@ def build_scalar_products(mechanism: NominalMechanism, joints: JointsInCamera) -
             in_camera = float((A_camera[g] - A_camera[j]) @ (A_camera[n] - A_camera[m]))
             residuals.append(ca.dot(A[:, g] - A[:, j], A[:, n] - A[:, m]) - in_camera)
     return LeastSquares(
-        "The base joints in the base frame (eq 9)", x, ca.vertcat(*residuals), _start(mechanism)
+        "The base joints in the base frame (eq 9)",
+        x,
+        ca.vertcat(*residuals),
+        _start(mechanism),
+        exact_hessian=True,
     )
 
 

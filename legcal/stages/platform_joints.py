@@ -21,7 +21,7 @@ from legcal.stages.nominal import Criteria, NominalMechanism
 from legcal.stages.offsets import Offsets, leg_end_covariance, leg_ends
 from legcal.stages.solve import LeastSquares, Solution, solve_least_squares
 
-_SIGMA_LENGTH = 1e-5  # [m], floor: A and B are not known better than this along a leg
+_RELATIVE_LENGTH = 1e-5  # floor of the sigma of a length: keeps exact readings well conditioned
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,13 @@ def build_mean_distances(
         float(np.mean(distances)) - ca.norm_2(B[:, j] - B[:, g])
         for (_, j, g), distances in sorted(found.items())
     ]
-    return LeastSquares("The platform joints (eq 16)", x, ca.vertcat(*residuals), _start(mechanism))
+    return LeastSquares(
+        "The platform joints (eq 16)",
+        x,
+        ca.vertcat(*residuals),
+        _start(mechanism),
+        exact_hessian=True,
+    )
 
 
 def build_rigid(
@@ -145,6 +151,8 @@ def build_rigid(
     offset_of = {int(j): offsets[k] for k, j in enumerate(with_offset)}
     ends = leg_ends(directions, np.where(np.isfinite(q0), q0, 0.0))
     covariance = leg_end_covariance(directions, q0, sigma_q)
+    typical = float(np.mean(q0[with_offset]))
+    sigma_length = float(np.hypot(sigma_q, _RELATIVE_LENGTH * typical))
     poses, residuals = [], []
     for index, group in enumerate(directions.groups()):
         legs = directions.leg[group]
@@ -163,7 +171,7 @@ def build_rigid(
         predicted = moved_points(step, start, B[:, legs.tolist()])
         for column, i in enumerate(group.tolist()):
             leg = predicted[:, column] - ca.DM(directions.A[i])
-            residuals.append(_leg_residual(leg, directions, i, offset_of, sigma_q))
+            residuals.append(_leg_residual(leg, directions, i, offset_of, sigma_length))
     return LeastSquares(
         "The platform joints (step 4)",
         ca.vertcat(x, offsets, *poses),
@@ -173,7 +181,11 @@ def build_rigid(
 
 
 def _leg_residual(
-    leg: ca.SX, directions: LegDirections, i: int, offset_of: dict[int, ca.SX], sigma_q: float
+    leg: ca.SX,
+    directions: LegDirections,
+    i: int,
+    offset_of: dict[int, ca.SX],
+    sigma_length: float,
 ) -> ca.SX:
     """Return direction and length residuals of a leg vector A B, in standard deviations."""
     along = ca.dot(ca.DM(directions.u[i]), leg)
@@ -183,9 +195,8 @@ def _leg_residual(
     offset = offset_of.get(int(directions.leg[i]))
     if offset is None:
         return residual
-    sigma = float(np.hypot(sigma_q, _SIGMA_LENGTH))
     length = ca.norm_2(leg) - (float(directions.reading[i]) + offset)
-    return ca.vertcat(residual, length / sigma)
+    return ca.vertcat(residual, length / sigma_length)
 
 
 def _distance_residual(

@@ -1,7 +1,7 @@
 """Least-squares problems in CasADi, solved with IPOPT: the one place of steps 2, 3 and 4.
 
 A step builds its residuals and a start; this module scales the unknowns, hands IPOPT the
-Gauss-Newton Hessian J'J and refuses an answer that did not converge.
+Gauss-Newton Hessian J'J (or leaves it the exact one) and refuses an answer that did not converge.
 """
 
 from __future__ import annotations
@@ -42,12 +42,16 @@ class LeastSquares:
         Residuals, one column, in units of their standard deviations or of eqs (9), (14), (16).
     start : (n,) array
         Values of the unknowns to start from.
+    exact_hessian : bool
+        Use second derivatives of the residuals instead of J'J. Criteria that do not decide some
+        unknown, as (9) and (16) with z, need it: J'J vanishes in that direction.
     """
 
     name: str
     x: ca.SX
     residuals: ca.SX
     start: Array
+    exact_hessian: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,17 +128,10 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
     scale = _column_scale(np.asarray(slope(problem.start).full()))
     z = ca.MX.sym("z", len(problem.start))
     x = problem.start + scale * z
-    r, J = value(x), ca.mtimes(slope(x), ca.diag(ca.sparsify(ca.DM(scale))))
-    p, lam_f, lam_g = ca.MX.sym("p", 0), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
-    gauss_newton = ca.Function(
-        "nlp_hess_l",
-        [z, p, lam_f, lam_g],
-        [lam_f * ca.triu(ca.mtimes(J.T, J))],
-        ["x", "p", "lam_f", "lam_g"],
-        ["triu_hess_gamma_x_x"],
-    )
-    nlp = {"x": z, "p": p, "f": 0.5 * ca.sumsqr(r)}
-    options: dict[str, Any] = {"hess_lag": gauss_newton, **_OPTIONS}
+    options: dict[str, Any] = dict(_OPTIONS)
+    if not problem.exact_hessian:
+        options["hess_lag"] = _gauss_newton(z, slope(x) @ ca.MX(ca.diag(ca.DM(scale))))
+    nlp: dict[str, Any] = {"x": z, "f": 0.5 * ca.sumsqr(value(x))}
     solver = ca.nlpsol("solver", "ipopt", nlp, options)
     found = problem.start + scale * np.asarray(solver(x0=0.0)["x"].full()).ravel()
     stats = solver.stats()
@@ -150,6 +147,18 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
         jacobian=np.asarray(slope(found).full()),
         n_iterations=int(stats["iter_count"]),
         status=str(stats["return_status"]),
+    )
+
+
+def _gauss_newton(z: ca.MX, jacobian: ca.MX) -> ca.Function:
+    """Return J'J as the Hessian of the Lagrangian that IPOPT asks for."""
+    p, lam_f, lam_g = ca.MX.sym("p", 0), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
+    return ca.Function(
+        "nlp_hess_l",
+        [z, p, lam_f, lam_g],
+        [lam_f * ca.triu(ca.mtimes(jacobian.T, jacobian))],
+        ["x", "p", "lam_f", "lam_g"],
+        ["triu_hess_gamma_x_x"],
     )
 
 
