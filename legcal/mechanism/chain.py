@@ -1,0 +1,212 @@
+"""The closed chain in Pinocchio: the URDF's tree, and anchors where loops close.
+
+This is the one module that touches Pinocchio. Two of its traps are kept in here: the Jacobian
+of an anchor is silently zero unless ``computeJointJacobians`` came first, and off the constraint
+the frame anchor's Jacobian is that of the logarithm only after ``Jlog6(M) Ad(M)^-1``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import ModelError
+from legcal.geometry.types import Array, IntArray
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Two frames of the tree that coincide: their points (``3d``) or the whole frames (``6d``)."""
+
+    kind: Literal["3d", "6d"]
+    frame_1: str
+    frame_2: str
+
+    @property
+    def rows(self) -> int:
+        """Number of equations."""
+        return 3 if self.kind == "3d" else 6
+
+
+class ClosedChain:
+    """A tree of joints with loop closures.
+
+    Configurations are Pinocchio's (quaternions for floating joints), velocities its tangent
+    vectors. The object holds Pinocchio's work space, so that one object serves one thread; it
+    pickles by being built again.
+
+    Parameters
+    ----------
+    text : str
+        A checked URDF.
+    closures : sequence of Closure
+        What coincides.
+
+    Raises
+    ------
+    ModelError
+        If Pinocchio cannot build the model.
+    """
+
+    def __init__(self, text: str, closures: Sequence[Closure]) -> None:
+        self.text = text
+        self.closures = tuple(closures)
+        try:
+            self._model: Any = pin.buildModelFromXML(text)
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise ModelError(
+                f"the URDF could not be built: found '{reason}' from Pinocchio, needed a tree that "
+                "it reads; correct the URDF."
+            ) from error
+        self._data: Any = self._model.createData()
+        self._anchors = [self._anchor(closure) for closure in self.closures]
+        self._anchor_data = [anchor.createData() for anchor in self._anchors]
+        self.nq: int = self._model.nq
+        self.nv: int = self._model.nv
+        self.n_rows = sum(closure.rows for closure in self.closures)
+
+    def __reduce__(self) -> tuple[type["ClosedChain"], tuple[str, tuple[Closure, ...]]]:
+        return ClosedChain, (self.text, self.closures)
+
+    def neutral(self) -> Array:
+        """Return the configuration with every joint at zero."""
+        return np.array(pin.neutral(self._model))
+
+    def integrate(self, configuration: Array, step: Array) -> Array:
+        """Return the configuration after a step in the tangent space."""
+        return np.asarray(pin.integrate(self._model, configuration, step))
+
+    def residual(self, configuration: Array) -> Array:
+        """Return how far every closure is from closed, (n_rows,) [m] and [rad]."""
+        pin.forwardKinematics(self._model, self._data, configuration)
+        pieces = []
+        for anchor, data in zip(self._anchors, self._anchor_data, strict=True):
+            anchor.calc(self._model, self._data, data)
+            pieces.append(data.constraint_position_error)
+        return np.concatenate(pieces) if pieces else np.zeros(0)
+
+    def linearize(self, configuration: Array) -> tuple[Array, Array]:
+        """Return the residual of the closures and its exact Jacobian.
+
+        Parameters
+        ----------
+        configuration : (nq,) array
+            Any configuration.
+
+        Returns
+        -------
+        residual : (n_rows,) array
+            Three rows [m] for a point, six [m, rad] for a frame, in the order of the closures.
+        jacobian : (n_rows, nv) array
+            Its derivative with respect to a tangent step.
+        """
+        model, data = self._model, self._data
+        pin.computeJointJacobians(model, data, configuration)
+        residual, jacobian = np.empty(self.n_rows), np.empty((self.n_rows, self.nv))
+        row = 0
+        for closure, anchor, anchor_data in zip(
+            self.closures, self._anchors, self._anchor_data, strict=True
+        ):
+            anchor.calc(model, data, anchor_data)
+            rows = slice(row, row + closure.rows)
+            residual[rows] = anchor_data.constraint_position_error
+            block = anchor.jacobian(model, data, anchor_data)
+            if closure.kind == "6d":
+                M = anchor_data.c1Mc2
+                block = pin.Jlog6(M) @ M.inverse().action @ block
+            jacobian[rows] = block
+            row = rows.stop
+        return residual, jacobian
+
+    def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
+        """Return T_base_frame between two frames at a configuration."""
+        pin.forwardKinematics(self._model, self._data, configuration)
+        M = self._placement(base).actInv(self._placement(frame))
+        return RigidTransform.from_components(M.translation, Rotation.from_matrix(M.rotation))
+
+    def distance(self, configuration: Array, frame_1: str, frame_2: str) -> float:
+        """Return the distance between the origins of two frames [m]."""
+        pin.forwardKinematics(self._model, self._data, configuration)
+        gap = self._placement(frame_1).translation - self._placement(frame_2).translation
+        return float(np.linalg.norm(gap))
+
+    def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
+        """Return residual and Jacobian of holding a frame at a pose, at the last linearisation.
+
+        Returns
+        -------
+        residual : (6,) array
+            Logarithm of the remaining motion [m, rad].
+        jacobian : (6, nv) array
+            Its derivative.
+        """
+        M = self._placement(base).actInv(self._placement(frame))
+        target = pin.SE3(T_base_frame.rotation.as_matrix(), np.array(T_base_frame.translation))
+        error = target.actInv(M)
+        J_frame, J_base = (
+            pin.getFrameJacobian(self._model, self._data, self._frame(name), pin.LOCAL)
+            for name in (frame, base)
+        )
+        relative = J_frame - M.inverse().action @ J_base
+        return np.array(pin.log6(error).vector), np.asarray(pin.Jlog6(error) @ relative)
+
+    def q_index(self, joint: str) -> int:
+        """Return where the value of a joint stands in a configuration."""
+        return int(self._model.joints[self._model.getJointId(joint)].idx_q)
+
+    def v_index(self, joint: str) -> int:
+        """Return where the rate of a joint stands in a tangent vector."""
+        return int(self._model.joints[self._model.getJointId(joint)].idx_v)
+
+    def rotation_columns(self) -> IntArray:
+        """Return the tangent coordinates that are angles."""
+        columns: list[int] = []
+        for joint in self._model.joints:
+            name, start, size = joint.shortname(), int(joint.idx_v), int(joint.nv)
+            if "Free" in name:
+                columns += range(start + 3, start + 6)
+            elif "Planar" in name:
+                columns.append(start + 2)
+            elif "R" in name.removeprefix("JointModel")[:1] and size == 1:
+                columns.append(start)
+        return np.array(columns, dtype=np.intp)
+
+    def with_floating(self, configuration: Array, joint: str, motion: RigidTransform) -> Array:
+        """Return the configuration with a floating joint set to a motion of its child."""
+        placed = configuration.copy()
+        start = self.q_index(joint)
+        placed[start : start + 3] = motion.translation
+        placed[start + 3 : start + 7] = motion.rotation.as_quat()
+        return placed
+
+    def _frame(self, name: str) -> int:
+        """Return the index of a link's frame, or of a joint's where no link has the name."""
+        if self._model.existBodyName(name):
+            return int(self._model.getFrameId(name, pin.BODY))
+        if not self._model.existFrame(name):
+            raise ModelError(
+                f"the frame '{name}' could not be found: the URDF has no link or joint of that "
+                "name, needed one; correct closed_loop."
+            )
+        return int(self._model.getFrameId(name))
+
+    def _placement(self, name: str) -> Any:
+        """Return the placement of a frame in the world at the last kinematics."""
+        frame = self._model.frames[self._frame(name)]
+        return self._data.oMi[frame.parentJoint] * frame.placement
+
+    def _anchor(self, closure: Closure) -> Any:
+        """Return Pinocchio's constraint for a closure."""
+        one, two = (
+            self._model.frames[self._frame(name)] for name in (closure.frame_1, closure.frame_2)
+        )
+        make = (
+            pin.PointAnchorConstraintModel
+            if closure.kind == "3d"
+            else pin.FrameAnchorConstraintModel
+        )
+        return make(self._model, one.parentJoint, one.placement, two.parentJoint, two.placement)

@@ -1,0 +1,170 @@
+"""Closing the chain with the platform held at a pose: every branch finds its own joint angles."""
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.model import Mechanism
+
+CLOSED = 1e-12  # [m], and [rad] for frames
+RESTARTS = 60
+
+
+def leg_vectors(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
+    return np.asarray(T_base_platform.apply(mechanism.B_platform)) - mechanism.A_base
+
+
+def readings_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
+    lengths = np.linalg.norm(leg_vectors(mechanism, T_base_platform), axis=1)
+    return np.asarray(mechanism.sign * (lengths - mechanism.q0))
+
+
+def close_at(
+    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None = None
+) -> Array:
+    """Return the configuration that closes every loop with the platform held at a pose.
+
+    Sliders are set from the distance of their joints, so that no leg is ever flipped; the joint
+    angles are found by Levenberg-Marquardt from ``start``, and from seeded random angles for
+    the legs that do not close from there.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+    T_base_platform : RigidTransform
+        Pose of the platform link.
+    start : (nq,) array, optional
+        Where the joint angles start; zero without it.
+
+    Returns
+    -------
+    (nq,) array
+        Closed to 1e-12 m.
+
+    Raises
+    ------
+    DidNotConverge
+        If a leg does not close, naming its closure and the distance left.
+    """
+    configuration = _placed(mechanism, T_base_platform, start)
+    free = _angles(mechanism)
+    rng = np.random.default_rng(20020701)
+    for _ in range(RESTARTS):
+        configuration, residual = _levenberg_marquardt(
+            mechanism, T_base_platform, configuration, free
+        )
+        if np.abs(residual).max() < CLOSED:
+            return configuration
+        stuck = np.abs(residual) > CLOSED
+        jacobian = _equations(mechanism, T_base_platform, configuration)[1]
+        columns = free & (np.abs(jacobian[stuck]).max(axis=0) > 1e-9)
+        step = np.where(columns, rng.uniform(-np.pi, np.pi, len(columns)), 0.0)
+        configuration = mechanism.chain.integrate(configuration, step)
+    raise DidNotConverge(
+        f"{mechanism.yaml_path}: the legs could not be closed with the platform at "
+        f"{_millimetres(T_base_platform)} mm: {worst_closure(mechanism, residual)}, needed less "
+        "than 1e-12 m; check that the legs reach this pose (legcal.home)."
+    )
+
+
+def worst_closure(mechanism: Mechanism, residual: Array) -> str:
+    """Return which closure is most open, in words."""
+    row = 0
+    worst = (0.0, "the platform pose")
+    for closure in mechanism.chain.closures:
+        gap = float(np.abs(residual[row : row + closure.rows]).max())
+        worst = max(worst, (gap, f"'{closure.frame_1}' and '{closure.frame_2}'"))
+        row += closure.rows
+    return f"{worst[1]} stay {worst[0]:.3g} m apart"
+
+
+def platform_pose(mechanism: Mechanism, configuration: Array) -> RigidTransform:
+    """Return T_base_platform at a configuration."""
+    return mechanism.chain.pose(configuration, mechanism.base, mechanism.platform)
+
+
+def slider_columns(mechanism: Mechanism, legs: tuple[int, ...]) -> tuple[list[int], list[int]]:
+    """Return where the sliders of some legs stand in configurations and in tangent vectors."""
+    names = [mechanism.legs[j].prismatic for j in legs]
+    joints = [name for name in names if name is not None]
+    chain = mechanism.chain
+    return [chain.q_index(j) for j in joints], [chain.v_index(j) for j in joints]
+
+
+def _placed(mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None) -> Array:
+    """Return a configuration with the platform and the sliders set."""
+    chain = mechanism.chain
+    configuration = chain.neutral() if start is None else start.copy()
+    if mechanism.platform_joint is not None:
+        joint = mechanism.urdf.joints[mechanism.platform_joint]
+        before = chain.pose(configuration, mechanism.base, joint.parent) * joint.T_parent_origin
+        after = chain.pose(configuration, joint.child, mechanism.platform)
+        motion = before.inv() * T_base_platform * after.inv()
+        configuration = chain.with_floating(configuration, joint.name, motion)
+    q = readings_at(mechanism, T_base_platform)
+    sliding = tuple(j for j, leg in enumerate(mechanism.legs) if leg.prismatic is not None)
+    configuration[slider_columns(mechanism, sliding)[0]] = q[list(sliding)]
+    return configuration
+
+
+def _angles(mechanism: Mechanism) -> BoolArray:
+    """Return the tangent coordinates that are joint angles of legs."""
+    chain = mechanism.chain
+    free = np.zeros(chain.nv, dtype=np.bool_)
+    for joint in mechanism.urdf.joints.values():
+        if joint.type in ("revolute", "continuous"):
+            free[chain.v_index(joint.name)] = True
+    return free
+
+
+def _equations(
+    mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array
+) -> tuple[Array, Array]:
+    """Return residual and Jacobian of the closures, and of the platform where legs carry it."""
+    residual, jacobian = mechanism.chain.linearize(configuration)
+    if mechanism.platform_joint is None:
+        held, held_jacobian = mechanism.chain.welded(
+            mechanism.base, mechanism.platform, T_base_platform
+        )
+        residual = np.concatenate([residual, held])
+        jacobian = np.concatenate([jacobian, held_jacobian])
+    return residual, jacobian
+
+
+def _levenberg_marquardt(
+    mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array, free: BoolArray
+) -> tuple[Array, Array]:
+    """Return where the angles end, and the residual there."""
+    residual, jacobian = _equations(mechanism, T_base_platform, configuration)
+    damping, cost = 1e-3, float(residual @ residual)
+    for _ in range(60):
+        if np.abs(residual).max() < 0.01 * CLOSED:
+            break
+        J = jacobian[:, free]
+        normal = J.T @ J
+        scale = damping * max(float(np.trace(normal)) / max(len(normal), 1), 1e-12)
+        step = np.zeros(len(free))
+        if damping < 1e-9:
+            step[free] = -np.linalg.lstsq(J, residual, rcond=1e-12)[0]
+        else:
+            step[free] = -np.linalg.solve(normal + scale * np.eye(len(normal)), J.T @ residual)
+        moved = mechanism.chain.integrate(configuration, step)
+        new_residual, new_jacobian = _equations(mechanism, T_base_platform, moved)
+        new_cost = float(new_residual @ new_residual)
+        if new_cost < cost:
+            configuration, residual, jacobian, cost = moved, new_residual, new_jacobian, new_cost
+            damping /= 10.0
+        elif damping > 1e6 or np.abs(residual).max() < CLOSED:
+            break
+        else:
+            damping = max(10.0 * damping, 1e-6)
+    return configuration, residual
+
+
+def _millimetres(T: RigidTransform) -> str:
+    """Return a position as a message shows it."""
+    return "(" + ", ".join(f"{1e3 * x:.1f}" for x in T.translation) + ")"

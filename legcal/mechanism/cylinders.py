@@ -1,0 +1,125 @@
+"""The cylinders that a camera sees of each leg, from the URDF's visuals."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry.types import Array
+from legcal.mechanism.axes import Step
+from legcal.mechanism.bodies import Bodies
+from legcal.mechanism.leg import Cylinder, Leg
+from legcal.mechanism.topology import LegChain
+from legcal.mechanism.urdf import Urdf
+
+PARALLEL = 1e-6
+COAXIAL = 1e-4  # [m], at both ends of a cylinder
+
+Half = tuple[Literal["base", "platform"], Array, Array]
+
+
+def with_cylinders(
+    legs: Sequence[Leg], urdf: Urdf, bodies: Bodies, chains: Sequence[LegChain]
+) -> tuple[Leg, ...]:
+    """Return the legs with the visual cylinders that are coaxial with them.
+
+    A cylinder counts on every link that moves rigidly with the base or the platform half of
+    the leg, or only turns about the leg's axis.
+
+    Parameters
+    ----------
+    legs : sequence of Leg
+        The legs, with their sign.
+    urdf : Urdf
+        The tree.
+    bodies : Bodies
+        Its rigid bodies.
+    chains : sequence of LegChain
+        The joints of the legs.
+    """
+    if not urdf.has_cylinders:
+        return tuple(legs)
+    shown = _visual_cylinders(urdf)
+    return tuple(
+        replace(leg, cylinders=_of_leg(leg, chain, bodies, shown))
+        for leg, chain in zip(legs, chains, strict=True)
+    )
+
+
+def _visual_cylinders(urdf: Urdf) -> list[tuple[str, RigidTransform, float, float]]:
+    """Return link, pose in the link, radius and length of every visual cylinder."""
+    from yourdfpy import URDF  # half a second: only where there is something to read
+
+    robot: Any = URDF.load(
+        io.BytesIO(urdf.content), build_scene_graph=False, load_meshes=False
+    ).robot
+    found = []
+    for link in robot.links:
+        for visual in link.visuals:
+            cylinder = visual.geometry.cylinder
+            if cylinder is not None:
+                T = np.eye(4) if visual.origin is None else np.asarray(visual.origin)
+                pose = RigidTransform.from_matrix(T)
+                found.append((str(link.name), pose, float(cylinder.radius), float(cylinder.length)))
+    return found
+
+
+def _of_leg(
+    leg: Leg,
+    chain: LegChain,
+    bodies: Bodies,
+    shown: Sequence[tuple[str, RigidTransform, float, float]],
+) -> tuple[Cylinder, ...]:
+    """Return the cylinders of one leg, in the order of the file."""
+    halves = _halves(leg, chain)
+    found = []
+    for link, T_link_cylinder, radius, length in shown:
+        if bodies.body_of[link] not in halves:
+            continue
+        side, origin, u = halves[bodies.body_of[link]]
+        T = bodies.T_body_link[link] * T_link_cylinder
+        ends = T.apply(np.array([[0.0, 0.0, -0.5 * length], [0.0, 0.0, 0.5 * length]])) - origin
+        along = ends @ u
+        if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < COAXIAL:
+            start, end = sorted(float(x) for x in along)
+            found.append(Cylinder(link, radius, side, start, end))
+    return tuple(found)
+
+
+def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
+    """Return the bodies that hold the leg's axis: their side, A or B, and u from A to B."""
+    halves: dict[str, Half] = {}
+    A, u = chain.base.centre_far, leg.sign * chain.u_lower
+    lower = list(zip(chain.steps, chain.bodies, strict=False))[: chain.n_lower]
+    for step, body in reversed(lower):
+        halves[body] = "base", A, u
+        if not _turns_about(step, step.far, u):
+            break
+        A, u = _across(step, step.far, step.near, A, u)
+    if chain.slider is None:
+        return halves
+    B, u = chain.platform.centre_near, leg.sign * chain.u_upper
+    for step, body in zip(
+        chain.steps[chain.n_lower + 1 :], chain.bodies[chain.n_lower :], strict=True
+    ):
+        halves[body] = "platform", B, u
+        if not _turns_about(step, step.near, u):
+            break
+        B, u = _across(step, step.near, step.far, B, u)
+    return halves
+
+
+def _turns_about(step: Step, side: int, u: Array) -> bool:
+    """Say whether a joint is a revolute about the leg's axis, which passes through its centre."""
+    parallel = np.linalg.norm(np.cross(step.line(side)[1], u)) < PARALLEL
+    return step.connection.type == "revolute" and bool(parallel)
+
+
+def _across(step: Step, here: int, there: int, point: Array, u: Array) -> tuple[Array, Array]:
+    """Return a point and a direction of a revolute's axis in the body on its other side."""
+    origin, axis = step.line(here)
+    along = float((point - origin) @ axis)
+    return step.point(there, along), np.sign(axis @ u) * step.line(there)[1]

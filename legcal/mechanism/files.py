@@ -1,0 +1,107 @@
+"""Finding and reading the files of a mechanism: a path, a URDF, or a shipped name."""
+
+from pathlib import Path
+
+from legcal import schema
+from legcal.errors import DatasetError, ModelError, OutOfClass
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def shipped_folders() -> tuple[Path, Path]:
+    """Return the folders of the shipped models and URDFs, in a wheel or in a checkout."""
+    for top in (_PACKAGE / "shipped", _PACKAGE.parent):
+        if (top / "models").is_dir() and (top / "urdf").is_dir():
+            return top / "models", top / "urdf"
+    return _PACKAGE / "shipped" / "models", _PACKAGE / "shipped" / "urdf"
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the shipped models."""
+    return sorted(path.stem for path in shipped_folders()[0].glob("*.yaml"))
+
+
+def find_yaml(model: str | Path) -> Path:
+    """Return the mechanism YAML of a path or of the name of a shipped model.
+
+    Parameters
+    ----------
+    model : str or Path
+        A mechanism YAML, a URDF with its YAML beside it or in ``../models``, or a shipped name.
+
+    Raises
+    ------
+    ModelError
+        If there is no such file and no such shipped model.
+    OutOfClass
+        If it is a URDF without a YAML: a tree alone closes no loop.
+    """
+    path = Path(model)
+    if path.is_dir():
+        raise ModelError(
+            f"{path}: the mechanism could not be read: found a folder, needed a YAML or a URDF "
+            "file; give the file."
+        )
+    if path.suffix.lower() in (".urdf", ".xml") and path.exists():
+        return _yaml_of_urdf(path)
+    if path.exists():
+        return path
+    names = shipped_names()
+    if str(model) in names:
+        return shipped_folders()[0] / f"{model}.yaml"
+    raise ModelError(
+        f"{path}: the mechanism could not be read: found no such file and no shipped model of that "
+        f"name, needed a mechanism YAML, its URDF, or one of {', '.join(names)}; check the path."
+    )
+
+
+def find_urdf(yaml_path: Path, written: str | None) -> Path:
+    """Return the URDF of a mechanism YAML: as written in it, or the same stem near it.
+
+    Raises
+    ------
+    ModelError
+        If there is none.
+    """
+    if written is not None:
+        return yaml_path.parent / written
+    near = [yaml_path.with_suffix(".urdf"), _sibling(yaml_path, "urdf").with_suffix(".urdf")]
+    for path in near:
+        if path.is_file():
+            return path
+    raise ModelError(
+        f"{yaml_path}: the URDF of the mechanism could not be found: looked for {near[0]} and "
+        f"{near[1]}, needed one of them; write its path in legcal.urdf."
+    )
+
+
+def read_file(path: Path, what: str) -> bytes:
+    """Return the bytes of a mechanism file.
+
+    Raises
+    ------
+    ModelError
+        If it is missing, a folder, unreadable or far too large.
+    """
+    try:
+        return schema.read_text(path, what)
+    except DatasetError as error:
+        raise ModelError(error.problems) from error
+
+
+def _yaml_of_urdf(path: Path) -> Path:
+    """Return the YAML that closes the loops of a URDF."""
+    near = [path.with_suffix(".yaml"), _sibling(path, "models").with_suffix(".yaml")]
+    for candidate in near:
+        if candidate.is_file():
+            return candidate
+    raise OutOfClass(
+        f"{path}: this is not a parallel mechanism: found a URDF, which is a tree without closed "
+        f"loops, and no YAML that closes them; write {near[0]} with closed_loop, type, name_mot "
+        "and a legcal block."
+    )
+
+
+def _sibling(path: Path, folder: str) -> Path:
+    """Return the path of the same file name in a folder beside its own."""
+    return path.resolve().parent.parent / folder / path.name

@@ -1,0 +1,140 @@
+"""The mechanism YAML: five keys that Gepetto's ``robot.yaml`` shares, and the ``legcal`` block."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from legcal import schema
+from legcal.errors import DatasetError, ModelError
+from legcal.mechanism.files import read_file
+
+WHAT = "mechanism file"
+Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Vector4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class PoseEntry(schema.FileSchema):
+    """``{xyz: [m], quat_xyzw: [-]}``: a pose of the platform link in the base link."""
+
+    xyz: Vector3
+    quat_xyzw: Vector4
+
+    @field_validator("quat_xyzw")
+    @classmethod
+    def _unit(cls, value: list[float]) -> list[float]:
+        norm = math.sqrt(float(np.dot(value, value)))
+        if abs(norm - 1.0) > 1e-3:
+            raise ValueError(
+                f"found a quaternion of norm {norm:.6g}, needed 1 within 0.001; normalise it."
+            )
+        return [x / norm for x in value]
+
+
+class LegcalBlock(schema.FileSchema):
+    """The block ``legcal``: what belongs to base, platform and legs."""
+
+    version: Literal[1]
+    urdf: str | None = None
+    base: str
+    platform: str
+    platform_joint: str | None = None
+    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)]
+    home: PoseEntry | None = None
+    legs: Annotated[dict[str, str], Field(min_length=1)]
+
+    @field_validator("base_frame")
+    @classmethod
+    def _different(cls, value: list[str]) -> list[str]:
+        repeated = sorted({name for name in value if value.count(name) > 1})
+        if repeated:
+            raise ValueError(
+                f"found the leg '{repeated[0]}' more than once, needed different legs; "
+                "name each once."
+            )
+        return value
+
+
+class MechanismFile(BaseModel):
+    """A mechanism YAML; keys of other programs beside ours are left alone."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="ignore")
+
+    closed_loop: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
+    type: list[str]
+    name_mot: list[str]
+    joint_name: list[str] = []
+    joint_type: list[str] = []
+    legcal: LegcalBlock
+
+
+def read_mechanism_file(path: Path) -> MechanismFile:
+    """Return a mechanism YAML, checked in itself (its names are checked against the URDF later).
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each problem, naming its place in the file.
+    """
+    content = read_file(path, WHAT)
+    try:
+        found = schema.parse_yaml(content, path, WHAT)
+        file = schema.validate(MechanismFile, _without_nulls(found), path)
+    except DatasetError as error:
+        raise ModelError(error.problems) from error
+    problems = _contradictions(file, path)
+    if problems:
+        raise ModelError(problems)
+    return file
+
+
+def _without_nulls(found: dict[str, Any]) -> dict[str, Any]:
+    """Drop empty optional lists, which YAML reads as null."""
+    return {
+        k: v for k, v in found.items() if v is not None or k not in ("joint_name", "joint_type")
+    }
+
+
+def _contradictions(file: MechanismFile, path: Path) -> list[str]:
+    """Return what does not fit together within the file."""
+    problems = []
+    if len(file.type) != len(file.closed_loop):
+        problems.append(
+            f"{path}: the loops could not be closed: found {len(file.closed_loop)} pairs in "
+            f"closed_loop and {len(file.type)} entries in type, needed equal numbers; write one "
+            "type for each pair."
+        )
+    problems += [
+        f"{path}: type.{i} could not be used: found '{kind}', needed '3d' (points coincide) or "
+        "'6d' (frames coincide); correct it."
+        for i, kind in enumerate(file.type)
+        if kind not in ("3d", "6d")
+    ]
+    if not file.closed_loop:
+        problems.append(
+            f"{path}: the mechanism could not be closed: found no pair in closed_loop, needed the "
+            "loops of a parallel mechanism; write the pairs of frames that coincide."
+        )
+    for key in ("joint_name", "joint_type"):
+        if getattr(file, key):
+            problems.append(
+                f"{path}: {key} could not be followed: found {len(getattr(file, key))} entries, "
+                "needed none, because joints that stand for others are not read; write the joints "
+                "as revolutes in the URDF."
+            )
+    repeated = sorted({name for name in file.name_mot if file.name_mot.count(name) > 1})
+    problems += [
+        f"{path}: name_mot could not be used: found '{name}' more than once, needed each motor "
+        "once; remove the repetition."
+        for name in repeated
+    ]
+    block = file.legcal
+    problems += [
+        f"{path}: legcal.base_frame could not be used: found '{name}', which is not a leg; "
+        f"{schema.closest(name, block.legs)}"
+        for name in block.base_frame
+        if name not in block.legs
+    ]
+    return problems
