@@ -16,8 +16,9 @@ from legcal.measurements import Measurements
 from legcal.observations import LegAxes
 from legcal.stages.nominal import Criteria, NominalMechanism
 
-_REWEIGHTINGS = 5
-_HUBER = 3.0  # axes whose residual exceeds this multiple of the median lose weight
+_REWEIGHTINGS = 10
+_OUTLIER = 3.0  # an axis that misses A by this many times the median has half its weight
+_NO_NOISE = 1e-3  # standard deviations: smaller misses are rounding
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
 _LARGEST_SIGMA = 0.1  # of the distance to the camera
 
@@ -125,8 +126,8 @@ def weighted_point(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Arra
         residual, spread = miss(axes, here, A)
         weight = np.linalg.inv(spread)
         chi = np.sqrt(np.einsum("ki,kij,kj->k", residual, weight, residual))
-        limit = _HUBER * float(np.median(chi))
-        weight = weight * np.minimum(1.0, limit / np.maximum(chi, 1e-300))[:, None, None]
+        limit = max(_OUTLIER * float(np.median(chi)), _NO_NOISE)
+        weight = weight / (1.0 + (chi / limit) ** 2)[:, None, None]
         E = axes.basis[here]
         normal = np.einsum("kia,kij,kjb->ab", E, weight, E)
         right = np.einsum("kia,kij,kjb,kb->a", E, weight, E, axes.M[here])

@@ -20,6 +20,8 @@ from legcal.stages.joints_in_base import JointsInBase
 from legcal.stages.joints_in_camera import JointsInCamera, miss
 from legcal.stages.nominal import NominalMechanism
 
+_FAR = 8.0  # an axis that misses its joint by so many deviations or medians is a wrong one
+
 
 @dataclass(frozen=True, eq=False)
 class LegDirections:
@@ -62,6 +64,26 @@ class LegDirections:
         return [np.flatnonzero(self.group == g) for g in np.unique(self.group)]
 
 
+def find_misses(
+    axes: LegAxes, measurements: Measurements, joints: JointsInCamera, base: JointsInBase
+) -> BoolArray:
+    """Return which axes miss their base joint by far, (n,): wrong outlines, as a rule.
+
+    The limit is a multiple of what the covariances promise, or of the median where they promise
+    too much.
+    """
+    view = measurements.view[axes.row]
+    A = joints.A_camera[view, axes.leg]
+    for v, T in enumerate(base.T_Rb_camera):
+        if T is not None:
+            A[view == v] = T.inv().apply(base.A_Rb[axes.leg[view == v]])
+    residual, spread = miss(axes, np.arange(len(axes)), A)
+    E = axes.basis
+    spread = spread + E @ joints.covariance[view, axes.leg] @ np.swapaxes(E, 1, 2)
+    chi = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(spread), residual))
+    return np.asarray(chi > _FAR * max(1.0, float(np.median(chi))))
+
+
 def observed_directions(
     mechanism: NominalMechanism,
     axes: LegAxes,
@@ -73,7 +95,7 @@ def observed_directions(
     Images of one pose in one view are averaged.
     """
     here = joints.located[measurements.view[axes.row], axes.leg]
-    axes = _selected(axes, here)
+    axes = select_axes(axes, here)
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     key = np.stack([view, pose, axes.leg], axis=1)
     distinct, which = np.unique(key, axis=0, return_inverse=True)
@@ -131,7 +153,7 @@ def directions_through_joints(
     view = measurements.view[axes.row]
     known = np.array([T is not None for T in base.T_Rb_camera])
     usable = known[view] | joints.located[view, axes.leg]
-    axes, view = _selected(axes, usable), view[usable]
+    axes, view = select_axes(axes, usable), view[usable]
     u, M, basis = axes.u.copy(), axes.M.copy(), axes.basis.copy()
     for v, T in enumerate(base.T_Rb_camera):
         if T is not None:
@@ -175,7 +197,7 @@ def condition_on_point(axes: LegAxes, A: Array) -> tuple[Array, Array, Array]:
     return u, np.stack([e1, np.cross(u, e1)], axis=1), symmetric
 
 
-def _selected(axes: LegAxes, keep: BoolArray) -> LegAxes:
+def select_axes(axes: LegAxes, keep: BoolArray) -> LegAxes:
     """Return some of the axes."""
     return LegAxes(
         axes.row[keep],

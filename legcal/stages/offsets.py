@@ -6,6 +6,7 @@ rigid platform: it is the same in all poses for the right offsets only.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -136,15 +137,17 @@ def build_constant_distances(
         d = ca.SX.sym(f"d_{j}_{g}")
         values = []
         for a, b in members:
-            apart = ends[a] - ends[b]
-            n = apart / np.linalg.norm(apart)
-            sigma = float(np.sqrt(n @ (covariance[a] + covariance[b]) @ n))
+            sigma = distance_sigma(ends, covariance, (a, b))
             residuals.append((ca.norm_2(B[:, a] - B[:, b]) - d) / sigma)
-            values.append(float(np.linalg.norm(apart)))
+            values.append(float(np.linalg.norm(ends[a] - ends[b])))
         unknowns.append(d)
         start.append(np.array([np.mean(values)]))
     return LeastSquares(
-        "The offsets (step 3)", ca.vertcat(*unknowns), _stacked(residuals), np.concatenate(start)
+        "The offsets (step 3)",
+        ca.vertcat(*unknowns),
+        _stacked(residuals),
+        np.concatenate(start),
+        block=np.arange(len(residuals)),
     )
 
 
@@ -160,6 +163,14 @@ def leg_end_covariance(directions: LegDirections, q0: Array, sigma_q: float) -> 
     across = np.swapaxes(directions.basis, 1, 2) @ directions.covariance @ directions.basis
     along = directions.u[:, :, None] * directions.u[:, None, :]
     return np.asarray(length[:, None, None] ** 2 * across + sigma_q**2 * along)
+
+
+def distance_sigma(ends: Array, covariance: Array, pair: Sequence[int] | IntArray) -> float:
+    """Return the standard deviation of the distance between two leg ends [m]."""
+    a, b = pair
+    apart = ends[a] - ends[b]
+    n = apart / np.linalg.norm(apart)
+    return float(np.sqrt(n @ (covariance[a] + covariance[b]) @ n))
 
 
 def _leg_ends(mechanism: NominalMechanism, directions: LegDirections) -> tuple[ca.SX, ca.SX]:

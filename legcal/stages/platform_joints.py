@@ -16,9 +16,9 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.parameters import free_coordinates
 from legcal.stages.leg_directions import LegDirections
-from legcal.stages.motion import moved_points, register_points
+from legcal.stages.motion import moved_points, register_points, whitener
 from legcal.stages.nominal import Criteria, NominalMechanism
-from legcal.stages.offsets import Offsets, leg_end_covariance, leg_ends
+from legcal.stages.offsets import Offsets, distance_sigma, leg_end_covariance, leg_ends
 from legcal.stages.solve import LeastSquares, Solution, solve_least_squares
 
 _RELATIVE_LENGTH = 1e-5  # floor of the sigma of a length: keeps exact readings well conditioned
@@ -149,76 +149,70 @@ def build_rigid(
     with_offset = np.flatnonzero(np.isfinite(q0))
     offsets = ca.SX.sym("q0", len(with_offset))
     offset_of = {int(j): offsets[k] for k, j in enumerate(with_offset)}
-    ends = leg_ends(directions, np.where(np.isfinite(q0), q0, 0.0))
+    ends = leg_ends(directions, q0)
     covariance = leg_end_covariance(directions, q0, sigma_q)
-    typical = float(np.mean(q0[with_offset]))
-    sigma_length = float(np.hypot(sigma_q, _RELATIVE_LENGTH * typical))
-    poses, residuals = [], []
-    for index, group in enumerate(directions.groups()):
+    sigma_length = float(np.hypot(sigma_q, _RELATIVE_LENGTH * np.mean(q0[with_offset])))
+    poses: list[ca.SX] = []
+    residuals: list[ca.SX] = []
+    block: list[int] = []
+    for group in directions.groups():
         legs = directions.leg[group]
-        with_end = np.isfinite(q0[legs])
-        if with_end.sum() < 3:
-            pair = group[with_end]
-            residuals += [_distance_residual(B, directions, pair, ends, covariance, offset_of)] * (
-                len(pair) == 2
-            )
+        with_end = group[np.isin(legs, with_offset)]
+        if len(with_end) == 2:
+            seen = _distance(directions, with_end, offset_of)
+            a, b = (int(j) for j in directions.leg[with_end])
+            sigma = distance_sigma(ends, covariance, with_end)
+            residuals.append((seen - ca.norm_2(B[:, a] - B[:, b])) / sigma)
+            block.append(len(residuals))
+        if len(with_end) < 3:
             continue
-        start = register_points(
-            mechanism.parameters.platform_joints[legs[with_end]], ends[group[with_end]]
-        )
-        step = ca.SX.sym(f"pose{index}", 6)
+        nominal = mechanism.parameters.platform_joints[directions.leg[with_end]]
+        step = ca.SX.sym(f"pose{len(poses)}", 6)
         poses.append(step)
-        predicted = moved_points(step, start, B[:, legs.tolist()])
+        predicted = moved_points(
+            step, register_points(nominal, ends[with_end]), B[:, legs.tolist()]
+        )
         for column, i in enumerate(group.tolist()):
             leg = predicted[:, column] - ca.DM(directions.A[i])
-            residuals.append(_leg_residual(leg, directions, i, offset_of, sigma_length))
+            residuals.append(_direction_residual(leg, directions, i))
+            block += 2 * [len(residuals)]
+            if i in with_end:
+                length = float(directions.reading[i]) + offset_of[int(directions.leg[i])]
+                residuals.append((ca.norm_2(leg) - length) / sigma_length)
+                block.append(-1)
+    _check_enough(residuals)
     return LeastSquares(
         "The platform joints (step 4)",
         ca.vertcat(x, offsets, *poses),
         ca.vertcat(*residuals),
         np.concatenate([_start(mechanism), q0[with_offset], np.zeros(6 * len(poses))]),
+        block=np.array(block, dtype=np.intp),
     )
 
 
-def _leg_residual(
-    leg: ca.SX,
-    directions: LegDirections,
-    i: int,
-    offset_of: dict[int, ca.SX],
-    sigma_length: float,
-) -> ca.SX:
-    """Return direction and length residuals of a leg vector A B, in standard deviations."""
+def _direction_residual(leg: ca.SX, directions: LegDirections, i: int) -> ca.SX:
+    """Return the direction of a leg vector A B against the observed one, in deviations, (2,)."""
     along = ca.dot(ca.DM(directions.u[i]), leg)
     across = ca.mtimes(ca.DM(directions.basis[i]), leg) / along
-    W = np.linalg.inv(np.linalg.cholesky(directions.covariance[i]))
-    residual = ca.mtimes(ca.DM(W), across)
-    offset = offset_of.get(int(directions.leg[i]))
-    if offset is None:
-        return residual
-    length = ca.norm_2(leg) - (float(directions.reading[i]) + offset)
-    return ca.vertcat(residual, length / sigma_length)
+    return ca.mtimes(ca.DM(whitener(directions.covariance[i])), across)
 
 
-def _distance_residual(
-    B: ca.SX,
-    directions: LegDirections,
-    pair: IntArray,
-    ends: Array,
-    covariance: Array,
-    offset_of: dict[int, ca.SX],
-) -> ca.SX:
-    """Return the weighted distance residual of a pose that shows two legs only."""
-    a, b = (int(i) for i in pair)
-    j, g = int(directions.leg[a]), int(directions.leg[b])
-    n = (ends[a] - ends[b]) / np.linalg.norm(ends[a] - ends[b])
-    sigma = float(np.sqrt(n @ (covariance[a] + covariance[b]) @ n))
-    end_a, end_b = (
-        ca.DM(directions.A[i])
-        + (float(directions.reading[i]) + offset_of[int(directions.leg[i])])
-        * ca.DM(directions.u[i])
-        for i in (a, b)
-    )
-    return (ca.norm_2(end_a - end_b) - ca.norm_2(B[:, j] - B[:, g])) / sigma
+def _distance(directions: LegDirections, pair: IntArray, offset_of: dict[int, ca.SX]) -> ca.SX:
+    """Return the distance between the ends (13) of two legs, for unknown offsets."""
+    ends = []
+    for i in pair.tolist():
+        length = float(directions.reading[i]) + offset_of[int(directions.leg[i])]
+        ends.append(ca.DM(directions.A[i]) + length * ca.DM(directions.u[i]))
+    return ca.norm_2(ends[0] - ends[1])
+
+
+def _check_enough(residuals: list[ca.SX]) -> None:
+    """Refuse an empty criterion."""
+    if not residuals:
+        raise NotIdentifiable(
+            "The platform joints could not be located: no pose shows two legs at once; needed "
+            "images of three or more; add images that show several legs at once."
+        )
 
 
 def _unknown_joints(mechanism: NominalMechanism) -> tuple[ca.SX, ca.SX]:

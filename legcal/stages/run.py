@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.geometry.types import BoolArray
 from legcal.measurements import Measurements
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations import LegAxes
 from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.stages.leg_directions import directions_through_joints, observed_directions
+from legcal.stages.leg_directions import (
+    directions_through_joints,
+    find_misses,
+    observed_directions,
+    select_axes,
+)
 from legcal.stages.nominal import Criteria, NominalMechanism
 from legcal.stages.offsets import Offsets, identify_offsets
 from legcal.stages.platform_joints import PlatformJoints, locate_platform_joints
@@ -75,6 +82,11 @@ def run_steps(
     """
     joints = locate_joints_in_cameras(mechanism, axes, measurements, criteria=criteria)
     base = locate_joints_in_base(mechanism, joints, criteria=criteria)
+    diagnostics = joints.diagnostics
+    if criteria == "default":
+        wrong = find_misses(axes, measurements, joints, base)
+        diagnostics += _describe_misses(mechanism, axes, measurements, wrong)
+        axes = select_axes(axes, ~wrong)
     directions = (
         observed_directions(mechanism, axes, measurements, joints)
         if criteria == "literal"
@@ -91,5 +103,17 @@ def run_steps(
         joints_in_base=base,
         offsets=offsets,
         platform_joints=platform,
-        diagnostics=joints.diagnostics,
+        diagnostics=diagnostics,
+    )
+
+
+def _describe_misses(
+    mechanism: NominalMechanism, axes: LegAxes, measurements: Measurements, wrong: BoolArray
+) -> tuple[str, ...]:
+    """Return a sentence for each axis that was left out of steps 3 and 4."""
+    return tuple(
+        f"Leg {mechanism.leg_names[int(axes.leg[i])]} in image "
+        f"{measurements.image[int(axes.row[i])] or int(axes.row[i]) + 1} was left out of steps "
+        "3 and 4: its axis misses its base joint by far; check its outlines."
+        for i in np.flatnonzero(wrong)
     )

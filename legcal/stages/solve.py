@@ -13,9 +13,13 @@ import casadi as ca
 import numpy as np
 
 from legcal.errors import DidNotConverge
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 _RANK = 1e-7  # singular values of the scaled Jacobian below this are directions that nothing shows
+_REWEIGHTINGS = 4
+_OUTLIER = 4.0  # an observation this many times the median has half its weight
+_SETTLED = 0.01  # change of a weight that no longer matters
+_NO_NOISE = 1e-3  # standard deviations: smaller residuals are rounding, and nobody's fault
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
     "ipopt.print_level": 0,
@@ -45,6 +49,9 @@ class LeastSquares:
     exact_hessian : bool
         Use second derivatives of the residuals instead of J'J. Criteria that do not decide some
         unknown, as (9) and (16) with z, need it: J'J vanishes in that direction.
+    block : (m,) array of int, optional
+        Residuals of one observation share a number and lose weight together where they are
+        outliers; -1 for residuals that keep theirs. Without it all do.
     """
 
     name: str
@@ -52,6 +59,7 @@ class LeastSquares:
     residuals: ca.SX
     start: Array
     exact_hessian: bool = False
+    block: IntArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +71,7 @@ class Solution:
     x : (n,) array
         The unknowns.
     residuals : (m,) array
-        The residuals there.
+        The residuals there, times the square root of their weights.
     jacobian : (m, n) array
         Their derivative there.
     n_iterations : int
@@ -106,7 +114,8 @@ class Solution:
 def solve_least_squares(problem: LeastSquares) -> Solution:
     """Minimise half the sum of squared residuals with IPOPT and a Gauss-Newton Hessian.
 
-    The unknowns are counted from the start in units of what one residual unit shows, so that
+    With blocks the problem is solved again with Cauchy weights until these have settled: an
+    observation far beyond the median loses its say. The unknowns are counted from the start in units of what one residual unit shows, so that
     tolerances do not depend on the units of length or on the noise.
 
     Parameters
@@ -123,36 +132,82 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
     DidNotConverge
         If IPOPT does not report success.
     """
-    value = ca.Function("value", [problem.x], [problem.residuals])
-    slope = ca.Function("slope", [problem.x], [ca.jacobian(problem.residuals, problem.x)])
-    scale = _column_scale(np.asarray(slope(problem.start).full()))
-    z = ca.MX.sym("z", len(problem.start))
+    built = _build(problem)
+    n_weights = problem.residuals.shape[0]
+    root_weight = np.ones(n_weights)
+    solution = _solve(problem, built, np.zeros(len(problem.start)), root_weight)
+    for _ in range(_REWEIGHTINGS if problem.block is not None else 0):
+        plain = solution.residuals / root_weight
+        new = _cauchy_root_weights(plain, problem.block)
+        settled = bool(np.max(np.abs(new - root_weight)) < _SETTLED)
+        root_weight = new
+        solution = _solve(problem, built, (solution.x - problem.start) / built.scale, root_weight)
+        if settled:
+            break
+    return solution
+
+
+@dataclass(frozen=True, eq=False)
+class _Built:
+    """A problem in scaled unknowns, ready to be solved with different weights."""
+
+    solver: ca.Function
+    value: ca.Function
+    slope: ca.Function
+    scale: Array
+
+
+def _build(problem: LeastSquares) -> _Built:
+    """Return the problem as IPOPT takes it; the weights are its parameters."""
+    w = ca.SX.sym("w", problem.residuals.shape[0])
+    weighted = w * problem.residuals
+    value = ca.Function("value", [problem.x, w], [weighted])
+    slope = ca.Function("slope", [problem.x, w], [ca.jacobian(weighted, problem.x)])
+    scale = _column_scale(np.asarray(slope(problem.start, 1.0).full()))
+    z, p = ca.MX.sym("z", len(problem.start)), ca.MX.sym("p", w.shape[0])
     x = problem.start + scale * z
     options: dict[str, Any] = dict(_OPTIONS)
     if not problem.exact_hessian:
-        options["hess_lag"] = _gauss_newton(z, slope(x) @ ca.MX(ca.diag(ca.DM(scale))))
-    nlp: dict[str, Any] = {"x": z, "f": 0.5 * ca.sumsqr(value(x))}
-    solver = ca.nlpsol("solver", "ipopt", nlp, options)
-    found = problem.start + scale * np.asarray(solver(x0=0.0)["x"].full()).ravel()
-    stats = solver.stats()
+        options["hess_lag"] = _gauss_newton(z, p, slope(x, p) @ ca.MX(ca.diag(ca.DM(scale))))
+    nlp: dict[str, Any] = {"x": z, "p": p, "f": 0.5 * ca.sumsqr(value(x, p))}
+    return _Built(ca.nlpsol("solver", "ipopt", nlp, options), value, slope, scale)
+
+
+def _solve(problem: LeastSquares, built: _Built, z: Array, root_weight: Array) -> Solution:
+    """Return the solution for given weights, or refuse."""
+    found = np.asarray(built.solver(x0=z, p=root_weight)["x"].full()).ravel()
+    stats = built.solver.stats()
     if not stats["success"]:
         raise DidNotConverge(
             f"{problem.name} could not be computed: IPOPT stopped after {stats['iter_count']} "
             f"iterations with {stats['return_status']}, needed Solve_Succeeded; check the "
             "nominal model and the observations, or reject the ones with large residuals."
         )
+    x = problem.start + built.scale * found
     return Solution(
-        x=found,
-        residuals=np.asarray(value(found).full()).ravel(),
-        jacobian=np.asarray(slope(found).full()),
+        x=x,
+        residuals=np.asarray(built.value(x, root_weight).full()).ravel(),
+        jacobian=np.asarray(built.slope(x, root_weight).full()),
         n_iterations=int(stats["iter_count"]),
         status=str(stats["return_status"]),
     )
 
 
-def _gauss_newton(z: ca.MX, jacobian: ca.MX) -> ca.Function:
+def _cauchy_root_weights(residuals: Array, block: IntArray) -> Array:
+    """Return square roots of 1 / (1 + (chi / limit)^2), chi being the size of each block."""
+    inside = block >= 0
+    size = np.zeros(int(block.max(initial=0)) + 1)
+    np.add.at(size, block[inside], residuals[inside] ** 2)
+    chi = np.sqrt(size)
+    limit = max(_OUTLIER * float(np.median(chi[np.unique(block[inside])])), _NO_NOISE)
+    root_weight = np.ones(len(block))
+    root_weight[inside] = 1.0 / np.sqrt(1.0 + (chi[block[inside]] / limit) ** 2)
+    return root_weight
+
+
+def _gauss_newton(z: ca.MX, p: ca.MX, jacobian: ca.MX) -> ca.Function:
     """Return J'J as the Hessian of the Lagrangian that IPOPT asks for."""
-    p, lam_f, lam_g = ca.MX.sym("p", 0), ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
     return ca.Function(
         "nlp_hess_l",
         [z, p, lam_f, lam_g],
