@@ -1,5 +1,57 @@
-"""Calibrate parallel robots from photographs of their legs."""
+"""Calibrate parallel robots from photographs of their legs.
 
+The method is Renaud, Andreff, Gogu, Martinet, *On vision-based kinematic calibration of
+n-leg parallel mechanisms* (IFAC 2002), followed by one fit of everything in the image.
+
+Notation, the same everywhere (the letters are the paper's):
+
+=====================  =====================================================================
+``T_to_from``          a rigid motion; neighbours cancel: ``p_base = T_base_camera.apply(p_camera)``
+frames                 world, base (link), platform (link), tool, camera, image;
+                       ``Rb`` and ``Re`` are the frames built on base and platform joint centres
+``A_j``, ``B_j``       joint centres of leg j on base and platform [m]
+``u``, ``M``           unit direction of a leg axis from base to platform; a point of it
+``h``, ``epsilon``     an outline as the unit normal of its plane (eqs 2, 3) and its sign (eq 5)
+``q``, ``q0``          encoder reading and offset [m]: leg length L = sign q + q0
+``sigma_x``, ``n_x``   a standard deviation, a count
+=====================  =====================================================================
+
+SI units and radians everywhere; pixel (0, 0) is the centre of the top-left pixel; camera axes
+are x right, y down, z forward.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from legcal.errors import LegcalError
 from legcal.version import __version__
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from legcal.dataset import load_dataset
+    from legcal.mechanism.load import load_mechanism
+    from legcal.pipeline import calibrate
+    from legcal.report.accuracy import evaluate
+
+__all__ = [
+    "LegcalError",
+    "__version__",
+    "calibrate",
+    "evaluate",
+    "load_dataset",
+    "load_mechanism",
+]
+
+_HOME = {
+    "calibrate": "legcal.pipeline",
+    "evaluate": "legcal.report.accuracy",
+    "load_dataset": "legcal.dataset",
+    "load_mechanism": "legcal.mechanism.load",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public functions when they are first used: a command loads what it needs."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'legcal' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_HOME[name]), name)

@@ -1,0 +1,184 @@
+"""The images of a dataset as one table of outlines: detected, cached, given or edited.
+
+The two passes of detection (hazard 14 of the method): first the camera of every view is
+aligned on all of its images and the legs are searched in wide windows; once a fit
+has told where everything is, they are searched again close to it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DatasetError
+from legcal.geometry.types import Array, BoolArray, Image, IntArray
+from legcal.measurements import Measurements
+from legcal.mechanism.leg import Cylinder
+from legcal.mechanism.model import Mechanism
+from legcal.observations import Outlines
+from legcal.outline_sets import (
+    choose_outlines,
+    is_edited,
+    join_outlines,
+    merge_edited,
+    no_outlines,
+    reject_unused_legs,
+)
+from legcal.progress import Report
+from legcal.vision.detect import align_views, detect_outlines
+
+NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
+
+SETTINGS: dict[str, object] = {"passes": 2, "near_fit_px": NEAR_FIT_PX}
+"""What detection depends on besides the dataset and the version."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Where everything is believed to be, in the base link.
+
+    Attributes
+    ----------
+    A_base, B_base : (n_rows, n_legs, 3) array
+        Joint centres at every row [m].
+    T_base_camera : tuple of RigidTransform or None
+        The camera of every view; None where nothing is known.
+    """
+
+    A_base: Array
+    B_base: Array
+    T_base_camera: tuple[RigidTransform | None, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """What is needed to search images.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+        Its legs, in the order of the measurements' columns.
+    measurements : Measurements
+        All rows.
+    load : callable
+        Returns the image of a row.
+    detect : (n,) array of int
+        The rows to search.
+    keep : Outlines
+        Outlines to use as they are; edited ones win over detected ones.
+    """
+
+    mechanism: Mechanism
+    measurements: Measurements
+    load: Callable[[int], Image]
+    detect: IntArray
+    keep: Outlines
+
+    @property
+    def searched(self) -> Measurements:
+        """The measurements, with an image only in the rows to search."""
+        wanted = set(self.detect.tolist())
+        images = tuple(
+            image if row in wanted else "" for row, image in enumerate(self.measurements.image)
+        )
+        return replace(self.measurements, image=images)
+
+    @property
+    def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
+        """What can be seen of each leg."""
+        return tuple(leg.cylinders for leg in self.mechanism.legs)
+
+    @property
+    def wanted(self) -> BoolArray:
+        """Which legs to use in each view, (n_views, n_legs)."""
+        return np.array(
+            [
+                [view.legs is None or name in view.legs for name in self.mechanism.leg_names]
+                for view in self.measurements.views
+            ],
+            dtype=np.bool_,
+        )
+
+
+def align(photographs: Photographs, scene: Scene, report: Report) -> Scene:
+    """Return the scene with the camera of every searched view aligned on its images.
+
+    Raises
+    ------
+    DatasetError
+        If a view that must be searched has no rough camera pose.
+    NotVisible
+        If the images of a view do not show the legs where they should be.
+    """
+    hints = _hints(photographs, scene)
+    poses = align_views(
+        photographs.load,
+        photographs.searched,
+        scene.A_base,
+        scene.B_base,
+        photographs.cylinders,
+        hints,
+        progress=_counted(report, "Aligning cameras", len(photographs.detect)),
+    )
+    known = [
+        aligned if hint is not None else None
+        for aligned, hint in zip(poses, scene.T_base_camera, strict=True)
+    ]
+    return replace(scene, T_base_camera=tuple(known))
+
+
+def detect(
+    photographs: Photographs, scene: Scene, report: Report, *, near_fit: bool = False
+) -> Outlines:
+    """Return all outlines: those searched for near the scene, those kept, edited ones first."""
+    window = {"joint_error": 0.0, "pixel_error": NEAR_FIT_PX} if near_fit else {}
+    stage = "Measuring outlines again" if near_fit else "Measuring outlines"
+    found = detect_outlines(
+        photographs.load,
+        photographs.searched,
+        scene.A_base,
+        scene.B_base,
+        photographs.cylinders,
+        _hints(photographs, scene),
+        photographs.wanted,
+        photographs.mechanism.leg_names,
+        progress=_counted(report, stage, len(photographs.detect)),
+        **window,
+    )
+    return given_outlines(photographs, found)
+
+
+def given_outlines(photographs: Photographs, found: Outlines | None = None) -> Outlines:
+    """Return found outlines and kept ones in one table, edited ones first.
+
+    Outlines of legs that the dataset leaves out of their view are rejected.
+    """
+    kept = photographs.keep
+    detected = no_outlines() if found is None else found
+    table = join_outlines([merge_edited(detected, kept), choose_outlines(kept, ~is_edited(kept))])
+    return reject_unused_legs(table, photographs.measurements, photographs.mechanism.leg_names)
+
+
+def _hints(photographs: Photographs, scene: Scene) -> list[RigidTransform]:
+    """Return a camera pose for every view; only views that are not searched may lack one."""
+    searched = set(photographs.measurements.view[photographs.detect].tolist())
+    problems = [
+        f"view {view.name}: its images could not be searched: found no T_base_camera, needed the "
+        "camera pose in the base link to about 2 cm and 2 degrees; add it to dataset.yaml."
+        for v, view in enumerate(photographs.measurements.views)
+        if v in searched and scene.T_base_camera[v] is None
+    ]
+    if problems:
+        raise DatasetError(problems)
+    return [T if T is not None else RigidTransform.identity() for T in scene.T_base_camera]
+
+
+def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:
+    """Return a callback that counts images, from any thread."""
+    done = itertools.count(1)
+    report(stage, 0, total)
+    return lambda row: report(stage, next(done), total)

@@ -1,0 +1,254 @@
+"""From photographs and readings to a calibrated mechanism: the whole method in one place.
+
+1. The nominal model and the readings say where each leg is (section 2).
+2. Each view's camera is aligned with what its images show, and the outlines of the legs are
+   measured near where they should be (section 3.1).
+3. The four steps give joint centres and offsets (3.2 to 3.5).
+4. One fit of everything, started from the nominal model and from the steps, ends the work.
+5. Photographs are searched again close to that fit, and 3 and 4 are repeated.
+
+Everything runs in an order of rows, views and legs that does not depend on the files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration import Calibration, Steps, in_file_order, judge
+from legcal.canonical_order import (
+    Order,
+    canonical_order,
+    inverse,
+    reorder_measurements,
+    reorder_outlines,
+    restore_outlines,
+)
+from legcal.dataset import Dataset, load_dataset
+from legcal.detection_cache import DetectionPlan, fingerprint, plan_dataset, store_outlines
+from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.leg_axes import axes_from_outlines
+from legcal.measurements import Measurements
+from legcal.mechanism.kinematics import forward_kinematics_many
+from legcal.mechanism.model import Mechanism
+from legcal.observations import Outlines
+from legcal.observe import SETTINGS, Photographs, Scene, align, detect, given_outlines
+from legcal.progress import Report, no_progress
+from legcal.refinement.legs import fitted_legs
+from legcal.refinement.refine import refine_from_best
+from legcal.refinement.solution import Solution
+from legcal.refinement.start import Start, start_from
+from legcal.report.files import check_destination
+from legcal.report.result import write_result
+from legcal.stages.run import run_steps
+
+
+def calibrate(
+    source: str | Path | Dataset,
+    *,
+    output: str | Path | None = None,
+    progress: Report = no_progress,
+    use_cache: bool = True,
+) -> Calibration:
+    """Compute joint positions and offsets of a mechanism from a dataset.
+
+    Parameters
+    ----------
+    source : path or Dataset
+        The dataset folder, or what :func:`legcal.load_dataset` returned.
+    output : path, optional
+        Write the result folder there: calibrated model, parameters, observations.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+    use_cache : bool
+        Use the outlines that an earlier run left beside the dataset, if they still fit.
+
+    Returns
+    -------
+    Calibration
+        Look at its ``verdict`` before you use it.
+
+    Raises
+    ------
+    DatasetError, ModelError, OutOfClass
+        If the input is malformed or not covered.
+    NotVisible
+        If the images do not show the legs.
+    NotIdentifiable
+        If the observations do not determine the parameters.
+    DidNotConverge
+        If no solver reached its tolerance. Nothing is written in any of these cases.
+    UsageError
+        If ``output`` holds something else.
+    """
+    if output is not None:
+        check_destination(Path(output))
+    dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    work = _workpiece(dataset, use_cache=use_cache)
+    scene = _nominal_scene(work)
+    photographs = work.photographs
+    if len(photographs.detect) == 0:
+        outlines = given_outlines(photographs)
+        steps, solution = _steps_and_fit(work, outlines, scene, progress)
+    else:
+        scene = align(photographs, scene, progress)
+        outlines = detect(photographs, scene, progress)
+        steps, solution = _steps_and_fit(work, outlines, scene, progress)
+        scene = _fitted_scene(work, solution)
+        outlines = detect(photographs, scene, progress, near_fit=True)
+        steps, solution = _steps_and_fit(work, outlines, scene, progress)
+    notes = [*dataset.notes, *_keep_outlines(work, outlines)]
+    calibration = judge(
+        dataset,
+        in_file_order(solution, work.order, dataset),
+        steps.in_file_order(work.order),
+        (*notes, *solution.notes),
+    )
+    if output is not None:
+        write_result(calibration, Path(output))
+    return calibration
+
+
+@dataclass(frozen=True, eq=False)
+class _Workpiece:
+    """A dataset in the order of work."""
+
+    dataset: Dataset
+    order: Order
+    plan: DetectionPlan
+    fingerprint: str
+    mechanism: Mechanism
+    measurements: Measurements
+
+    @property
+    def photographs(self) -> Photographs:
+        """The images, what to search in them and what to keep."""
+        return Photographs(
+            mechanism=self.mechanism,
+            measurements=self.measurements,
+            load=lambda row: self.dataset.read_image(int(self.order.rows[row])),
+            detect=np.sort(inverse(self.order.rows)[self.plan.detect]),
+            keep=reorder_outlines(self.plan.keep, self.order),
+        )
+
+    @cached_property
+    def nominal_poses(self) -> list[RigidTransform]:
+        """T_base_platform of every pose by the nominal model."""
+        first_row = np.unique(self.measurements.pose, return_index=True)[1]
+        return forward_kinematics_many(self.mechanism, self.measurements.q[first_row])
+
+
+def _workpiece(dataset: Dataset, *, use_cache: bool) -> _Workpiece:
+    """Put a dataset into the order of work, and see which images are still to be searched."""
+    names = dataset.mechanism.leg_names
+    order = canonical_order(dataset.measurements, names)
+    current = fingerprint(dataset, SETTINGS)
+    plan = plan_dataset(dataset, current if use_cache else "")
+    return _Workpiece(
+        dataset=dataset,
+        order=order,
+        plan=plan,
+        fingerprint=current,
+        mechanism=dataset.mechanism.with_leg_order([names[leg] for leg in order.legs]),
+        measurements=reorder_measurements(dataset.measurements, order),
+    )
+
+
+def _nominal_scene(work: _Workpiece) -> Scene:
+    """Return where the nominal model and the readings put the legs."""
+    B_base = np.array([T.apply(work.mechanism.B_platform) for T in work.nominal_poses])
+    A_base = np.broadcast_to(work.mechanism.A_base, B_base.shape)
+    at_row = work.measurements.pose
+    hints = tuple(view.T_base_camera for view in work.measurements.views)
+    return Scene(A_base[at_row], B_base[at_row], hints)
+
+
+def _fitted_scene(work: _Workpiece, solution: Solution) -> Scene:
+    """Return where a fit puts the legs; R_b is laid on the nominal R_b."""
+    T_base_Rb = work.mechanism.T_base_Rb
+    A = T_base_Rb.apply(solution.parameters.base_joints)
+    B = np.array(
+        [(T_base_Rb * T).apply(solution.parameters.platform_joints) for T in solution.T_Rb_Re]
+    )
+    at_row = work.measurements.pose
+    cameras = tuple(T_base_Rb * T.inv() for T in solution.T_camera_Rb)
+    return Scene(np.broadcast_to(A, B.shape)[at_row], B[at_row], cameras)
+
+
+def _steps_and_fit(
+    work: _Workpiece, outlines: Outlines, scene: Scene, progress: Report
+) -> tuple[Steps, Solution]:
+    """Run the four steps, then the fit of everything from the nominal model and from the steps."""
+    progress("Four steps", 0, 1)
+    steps = _four_steps(work, outlines)
+    progress("Four steps", 1, 1)
+    progress("Fit of everything", 0, 1)
+    legs = fitted_legs(work.mechanism.legs, work.mechanism.frame_legs)
+    starts = _starts(work, outlines, scene, steps)
+    solution = refine_from_best(legs, work.measurements, outlines, starts)
+    progress("Fit of everything", 1, 1)
+    return steps, solution
+
+
+def _four_steps(work: _Workpiece, outlines: Outlines) -> Steps:
+    """Return what the four steps give, or why they give nothing: the fit may do without."""
+    radii = {c.link: c.radius for leg in work.mechanism.legs for c in leg.cylinders}
+    try:
+        axes = axes_from_outlines(outlines, work.measurements, radii)
+        found = run_steps(work.mechanism, axes, work.measurements)
+    except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
+        return Steps(None, None, str(failure))
+    return Steps(found.parameters, found.T_Rb_camera, "")
+
+
+def _starts(work: _Workpiece, outlines: Outlines, scene: Scene, steps: Steps) -> list[Start]:
+    """Return the starts of the fit: the nominal model, and the steps where they gave a result."""
+    T_base_Rb, T_platform_Re = work.mechanism.T_base_Rb, work.mechanism.T_platform_Re
+    legs = fitted_legs(work.mechanism.legs, work.mechanism.frame_legs)
+    platform = [T_base_Rb.inv() * T * T_platform_Re for T in work.nominal_poses]
+    rough = [None if T is None else T.inv() * T_base_Rb for T in scene.T_base_camera]
+    staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
+    nominal_cameras = _cameras(work, outlines, rough, staged, steps)
+    starts = [(work.mechanism.parameters, nominal_cameras, "nominal")]
+    if steps.parameters is not None:
+        starts.append((steps.parameters, _cameras(work, outlines, staged, rough, steps), "staged"))
+    return [
+        start_from(parameters, work.measurements, legs, cameras, platform, label)
+        for parameters, cameras, label in starts
+    ]
+
+
+def _cameras(
+    work: _Workpiece,
+    outlines: Outlines,
+    first: Sequence[RigidTransform | None],
+    second: Sequence[RigidTransform | None],
+    steps: Steps,
+) -> list[RigidTransform]:
+    """Return a camera pose for every view, the first choice where there is one."""
+    cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
+    needed = set(work.measurements.view[outlines.row[outlines.used]].tolist())
+    problems = [
+        f"view {view.name}: its camera could not be placed: found no T_base_camera, and the four "
+        f"steps do not locate it ({steps.failure or 'fewer than three base joints are seen'}); "
+        "needed one of them; add a rough T_base_camera to dataset.yaml."
+        for v, view in enumerate(work.measurements.views)
+        if v in needed and cameras[v] is None
+    ]
+    if problems:
+        raise NotIdentifiable(problems)
+    return [T if T is not None else RigidTransform.identity() for T in cameras]
+
+
+def _keep_outlines(work: _Workpiece, outlines: Outlines) -> list[str]:
+    """Leave the outlines beside the dataset for the next run; return a note if that fails."""
+    if len(work.plan.detect) == 0:
+        return []
+    restored = restore_outlines(outlines, work.order)
+    note = store_outlines(work.dataset, restored, work.fingerprint, work.plan.given)
+    return [note] if note else []

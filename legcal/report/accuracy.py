@@ -1,0 +1,173 @@
+"""How far apart two models are: platform errors of eq (20), and every parameter.
+
+Both models are given the same encoder readings. Each answers with the pose of R_e in R_b;
+the difference is the displacement of the platform joint of the first frame leg (the origin of
+R_e) and the angle of the rotation between the two orientations.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.dataset import Dataset, load_dataset
+from legcal.errors import DidNotConverge, ModelError
+from legcal.geometry.types import Array
+from legcal.mechanism.kinematics import forward_kinematics, forward_kinematics_many
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parameters import parameter_names, to_vector
+from legcal.mechanism.platform import platform_in_base, pose_differences
+
+N_RANDOM_POSES = 100
+_SEED = 20020721
+_TRIES_PER_POSE = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The distance of a model from a reference.
+
+    Attributes
+    ----------
+    displacement : (n_poses,) array
+        Delta X of eq (20) at every pose [m].
+    rotation : (n_poses,) array
+        Delta E of eq (20), the angle of the rotation between both platforms [rad].
+    names : tuple of str
+        Parameter names.
+    values, references : (n_parameters,) array
+        The parameters of the model and of the reference [m].
+    """
+
+    displacement: Array
+    rotation: Array
+    names: tuple[str, ...]
+    values: Array
+    references: Array
+
+    def document(self) -> dict[str, Any]:
+        """Return the document that ``legcal evaluate --json`` prints."""
+        return {
+            "dX_m": float(self.displacement.mean()),
+            "dE_rad": float(self.rotation.mean()),
+            "dX_max_m": float(self.displacement.max()),
+            "poses": len(self.displacement),
+            "parameters": [
+                {"name": name, "value": v, "reference": r, "difference": v - r}
+                for name, v, r in zip(
+                    self.names, self.values.tolist(), self.references.tolist(), strict=True
+                )
+            ],
+        }
+
+
+def evaluate(
+    model: str | Path | Mechanism,
+    reference: str | Path | Mechanism,
+    *,
+    dataset: str | Path | None = None,
+) -> Evaluation:
+    """Compare a model with a reference, eq (20).
+
+    Parameters
+    ----------
+    model, reference : path, name or Mechanism
+        The two mechanisms; they must have the same legs and frames.
+    dataset : path, optional
+        Take the readings of this dataset; else those of 100 poses of the workspace, which are
+        the same at every call.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    ModelError
+        If the two models are not of the same machine.
+    DidNotConverge
+        If a model cannot reach a reading.
+    """
+    mechanism = model if isinstance(model, Mechanism) else load_mechanism(model)
+    truth = reference if isinstance(reference, Mechanism) else load_mechanism(reference)
+    truth = _in_the_order_of(truth, mechanism)
+    if dataset is None:
+        poses, reference_poses = _random_poses(mechanism, truth)
+    else:
+        q = _readings_of(load_dataset(dataset), mechanism)
+        poses = forward_kinematics_many(mechanism, q)
+        reference_poses = forward_kinematics_many(truth, q)
+    displacement, rotation = pose_differences(
+        [platform_in_base(mechanism, T) for T in poses],
+        [platform_in_base(truth, T) for T in reference_poses],
+    )
+    names = parameter_names(mechanism.leg_names, mechanism.frame_legs)
+    return Evaluation(
+        displacement,
+        rotation,
+        names,
+        to_vector(mechanism.parameters, mechanism.frame_legs),
+        to_vector(truth.parameters, truth.frame_legs),
+    )
+
+
+def _in_the_order_of(reference: Mechanism, model: Mechanism) -> Mechanism:
+    """Return the reference with legs and frame legs in the model's order."""
+    if set(reference.leg_names) != set(model.leg_names):
+        raise ModelError(
+            f"The models could not be compared: {model.name} has the legs "
+            f"{', '.join(model.leg_names)} and {reference.name} has "
+            f"{', '.join(reference.leg_names)}; both must describe the same machine; "
+            "check the two paths."
+        )
+    reference = reference.with_leg_order(model.leg_names)
+    if reference.frame_legs != model.frame_legs:
+        found = " and ".join(
+            ", ".join(m.leg_names[leg] for leg in m.frame_legs) for m in (model, reference)
+        )
+        raise ModelError(
+            f"The models could not be compared: their base_frame legs differ ({found}); "
+            "coordinates mean the same only in the same frame; give both the same base_frame."
+        )
+    return reference
+
+
+def _readings_of(dataset: Dataset, mechanism: Mechanism) -> Array:
+    """Return one row of readings for each pose of a dataset, in the mechanism's leg order [m]."""
+    names = list(dataset.mechanism.leg_names)
+    missing = [name for name in mechanism.leg_names if name not in names]
+    if missing:
+        raise ModelError(
+            f"The models could not be compared at the readings of {dataset.folder}: its mechanism "
+            f"has no {', '.join(missing)}; the dataset must belong to the same machine."
+        )
+    _, first_row = np.unique(dataset.measurements.pose, return_index=True)
+    return dataset.measurements.q[first_row][:, [names.index(n) for n in mechanism.leg_names]]
+
+
+def _random_poses(
+    mechanism: Mechanism, reference: Mechanism
+) -> tuple[list[RigidTransform], list[RigidTransform]]:
+    """Return platform poses of both models at the same random readings inside the travel."""
+    rng = np.random.default_rng(_SEED)
+    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    poses: list[RigidTransform] = []
+    reference_poses: list[RigidTransform] = []
+    for _ in range(_TRIES_PER_POSE * N_RANDOM_POSES):
+        q = rng.uniform(lower, upper)
+        try:
+            pair = forward_kinematics(mechanism, q), forward_kinematics(reference, q)
+        except DidNotConverge:  # the legs cannot have these lengths at the same time
+            continue
+        poses.append(pair[0])
+        reference_poses.append(pair[1])
+        if len(poses) == N_RANDOM_POSES:
+            return poses, reference_poses
+    raise DidNotConverge(
+        f"The models could not be compared: only {len(poses)} of {N_RANDOM_POSES} random poses "
+        "inside the travel could be reached by both; compare at the readings of a dataset with "
+        "--dataset."
+    )

@@ -1,0 +1,26 @@
+"""The comparison of two models as a table for people."""
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from legcal.report.accuracy import Evaluation
+
+
+def accuracy_table(evaluation: Evaluation) -> RenderableType:
+    """Return the platform errors and the parameters of an evaluation, in mm and degrees."""
+    dX, dE = 1e3 * evaluation.displacement, np.degrees(evaluation.rotation)
+    table = Table(title="Parameters [mm]", title_justify="left", box=None, pad_edge=False)
+    table.add_column("parameter")
+    for column in ("model", "reference", "difference"):
+        table.add_column(column, justify="right")
+    for name, value, reference in zip(
+        evaluation.names, 1e3 * evaluation.values, 1e3 * evaluation.references, strict=True
+    ):
+        table.add_row(name, f"{value:.4f}", f"{reference:.4f}", f"{value - reference:+.4f}")
+    headline = Text(
+        f"Platform error over {len(dX)} poses: displacement {dX.mean():.4f} mm "
+        f"(max {dX.max():.4f}), orientation {dE.mean():.4f} deg (max {dE.max():.4f})"
+    )
+    return Group(headline, Text(), table)

@@ -1,0 +1,90 @@
+"""What ``legcal calibrate`` shows at the end: a table, what steps and fit gave, the verdict."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration import Calibration
+from legcal.mechanism.platform import pose_differences
+from legcal.refinement.start import platform_poses
+from legcal.report.result import result_document
+
+
+def summary(calibration: Calibration, output: Path) -> RenderableType:
+    """Return the table of parameters in mm, and what it means."""
+    document = result_document(calibration)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("parameter [mm]")
+    for column in ("nominal", "calibrated", "change", "sigma"):
+        table.add_column(column, justify="right")
+    for row in document["parameters"]:
+        value, nominal, sigma = (1e3 * (row[key] or 0.0) for key in ("value", "nominal", "sigma"))
+        shown = f"{sigma:.4f}" if row["sigma"] is not None else row["status"]
+        table.add_row(
+            row["name"], f"{nominal:.4f}", f"{value:.4f}", f"{value - nominal:+.4f}", shown
+        )
+    lines = [
+        *(f"Note: {note}" for note in calibration.dataset.notes),
+        _outline_line(calibration),
+        _steps_line(calibration),
+        _fit_line(calibration),
+        f"Written to {output}.",
+    ]
+    verdict = Text(
+        calibration.verdict.sentence,
+        style="bold green" if calibration.verdict.trustworthy else "bold red",
+    )
+    return Group(table, Text(), *(Text(line) for line in lines), verdict)
+
+
+def _outline_line(calibration: Calibration) -> str:
+    outlines = calibration.solution.outlines
+    reasons = Counter(
+        reason.split(" by ")[0]
+        for reason, used in zip(outlines.reason, outlines.used, strict=True)
+        if not used
+    )
+    rejected = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common(4))
+    return (
+        f"Outlines: {int(outlines.used.sum())} of {len(outlines)} used"
+        + (f"; rejected: {rejected}" if rejected else "")
+        + "."
+    )
+
+
+def _steps_line(calibration: Calibration) -> str:
+    steps = calibration.steps
+    if steps.parameters is None:
+        return f"The four steps alone gave no result: {steps.failure}"
+    displacement, rotation = _apart(calibration)
+    return (
+        f"The four steps alone end {1e3 * displacement:.3f} mm / {np.degrees(rotation):.3f} deg "
+        "from the fit at the platform."
+    )
+
+
+def _apart(calibration: Calibration) -> tuple[float, float]:
+    """Return how far the platform of the four steps is from that of the fit [m, rad]."""
+    solution, mechanism = calibration.solution, calibration.dataset.mechanism
+    measurements, parameters = calibration.dataset.measurements, calibration.steps.parameters
+    assert parameters is not None
+    first_row = np.unique(measurements.pose, return_index=True)[1]
+    lengths = mechanism.sign * measurements.q[first_row] + parameters.offsets
+    poses: tuple[RigidTransform, ...] = platform_poses(parameters, lengths, solution.T_Rb_Re)
+    displacement, rotation = pose_differences(poses, solution.T_Rb_Re)
+    return float(displacement.mean()), float(rotation.mean())
+
+
+def _fit_line(calibration: Calibration) -> str:
+    solution = calibration.solution
+    return (
+        f"The fit of everything started from the {solution.start} model: chi2 {solution.chi2:.1f} "
+        f"for {solution.dof} degrees of freedom, {solution.rms_px:.3f} px rms."
+    )

@@ -1,0 +1,71 @@
+"""The house: what the README promises is what is checked on every change."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import requires
+from pathlib import Path
+
+import legcal
+
+ROOT = Path(__file__).parents[1]
+
+
+def _shell_blocks(text: str) -> list[str]:
+    return [block.strip() for block in re.findall(r"```sh\n(.*?)```", text, flags=re.DOTALL)]
+
+
+def test_the_two_commands_of_the_readme_are_the_ones_that_are_checked() -> None:
+    commands = _shell_blocks((ROOT / "README.md").read_text())
+    assert len(commands) == 2
+    assert all("\n" not in command for command in commands)
+    checked = [
+        line
+        for line in (ROOT / ".ci/run").read_text().splitlines()
+        if line.startswith("python3 -m venv")
+    ]
+    assert checked == commands
+
+
+def test_every_direct_dependency_is_pinned_to_the_version_that_was_tested() -> None:
+    pinned = {
+        re.split(r"==", line)[0].lower().replace("_", "-")
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+    }
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [name for group in project["optional-dependencies"].values() for name in group]
+    for requirement in [*project["dependencies"], *extras]:
+        name = re.split(r"[<>=!~ \[]", requirement)[0].lower().replace("_", "-")
+        assert name in pinned, f"{name} is not in constraints.txt"
+
+
+def test_the_constraints_name_no_host_and_no_path() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.+!-]+", line) for line in lines)
+
+
+def test_the_version_stands_in_one_place() -> None:
+    hits = [
+        path
+        for path in [ROOT / "pyproject.toml", *(ROOT / "legcal").rglob("*.py")]
+        if f'"{legcal.__version__}"' in path.read_text()
+    ]
+    assert hits == [ROOT / "legcal/version.py"]
+    assert f"## {legcal.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_python_snippet_of_the_readme_runs(tmp_path: Path) -> None:
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert len(snippets) == 1
+    code = snippets[0].replace('"calibrated"', repr(str(tmp_path / "calibrated")))
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "calibrated/calibrated.urdf").exists()
+
+
+def test_the_installed_package_asks_for_what_pyproject_says() -> None:
+    installed = requires("legcal") or []
+    assert any(name.startswith("pin") for name in installed)
