@@ -6,7 +6,6 @@ and one reading (their mean); a row without a label is a pose of its own.
 """
 
 import math
-import posixpath
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -165,7 +164,7 @@ def _view_problems(rows: Sequence[_Row], view_index: Mapping[str, int]) -> list[
 def _image_problems(rows: Sequence[_Row], folder: Path) -> list[str]:
     """Return images that are named twice or lie outside the dataset folder."""
     problems = []
-    first: dict[str, str] = {}
+    first: dict[Path, str] = {}
     for row in rows:
         image = row.cells["image"]
         if not image:
@@ -176,7 +175,8 @@ def _image_problems(rows: Sequence[_Row], folder: Path) -> list[str]:
                 f"{row.where}, column image: {image} could not be used: found {found}, needed a "
                 "relative path inside it; move the image there."
             )
-        earlier = first.setdefault(posixpath.normpath(image), row.where)
+            continue
+        earlier = first.setdefault((folder / image).resolve(), row.where)
         if earlier != row.where:
             problems.append(
                 f"{row.where}, column image: {image} could not be used: found it also in "

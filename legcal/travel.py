@@ -47,11 +47,9 @@ def check_travel(
         start = f"{path}, column {leg.prismatic}"
         travel = f"{lower:g} to {upper:g} m (the joint limits of the model)"
         if np.any(far):
-            metres = 1e-3 * column[far]
-            fits = np.all((metres >= lower - margin) & (metres <= upper + margin))
             remedy = (
                 "these look like millimetres: divide the column by 1000"
-                if fits
+                if _look_like_millimetres(column[far], lower, upper)
                 else "correct the readings or the limits"
             )
             problems.append(
@@ -62,6 +60,14 @@ def check_travel(
             found = _some(wheres, column, outside)
             notes.append(f"{start}: readings are a little outside the travel {travel}: {found}.")
     return tuple(problems), tuple(notes)
+
+
+def _look_like_millimetres(readings: Array, lower: float, upper: float) -> bool:
+    """Say whether readings lie far outside a travel [m], and in it when divided by 1000."""
+    metres, margin = 1e-3 * readings, TRAVEL_MARGIN * (upper - lower)
+    fit = (metres >= lower - margin) & (metres <= upper + margin)
+    far = (readings > 2.0 * upper - lower) | (readings < 2.0 * lower - upper)
+    return bool(np.all(fit & far))
 
 
 def _some(wheres: Sequence[str], column: Array, chosen: BoolArray) -> str:

@@ -68,7 +68,8 @@ def test_eq03_outline_is_the_moment_of_its_generating_line(seed: int) -> None:
 @given(SEEDS)
 def test_eq05_solution_is_the_axis_point_nearest_to_the_camera(seed: int) -> None:
     u, M, radius = cylinder(seed)
-    u_hat, M_hat = axis_of_outlines(*outlines_of_axis(u, M, radius), radius)
+    h1, h2 = outlines_of_axis(u, M, radius)
+    u_hat, M_hat = axis_of_outlines(h1, h2, radius)
     assert M_hat @ u_hat == pytest.approx(0.0, abs=1e-9)
 
 

@@ -25,7 +25,8 @@ _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATI
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
-_TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
+_TIFF_INTEGERS = {1: "B", 3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
+_TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # others have one
 
 
 class _BadImage(ValueError):
@@ -184,27 +185,24 @@ def _png_size(content: bytes) -> ImageSize:
 
 
 def _tiff_size(content: bytes) -> ImageSize:
-    """Read the first directory of a TIFF and see that its strips or tiles are there."""
+    """Read the first directory of a TIFF and see that all it points to is there."""
     order = "<" if content.startswith(b"II") else ">"
     (at,) = struct.unpack_from(order + "I", content, 4)
     (n_tags,) = struct.unpack_from(order + "H", content, at)
+    ends = [at + 2 + 12 * n_tags + 4]  # the directory, and the pointer to the next one
     tags: dict[int, tuple[int, ...]] = {}
-    for i in range(n_tags):
-        entry = at + 2 + 12 * i
+    for entry in range(at + 2, at + 2 + 12 * n_tags, 12):
         tag, kind, count = struct.unpack_from(order + "HHI", content, entry)
-        letter = _TIFF_TYPES.get(kind)
-        if letter is None or count > len(content):
-            continue
-        pattern = f"{order}{count}{letter}"
-        if struct.calcsize(pattern) > 4:
-            (entry_at,) = struct.unpack_from(order + "I", content, entry + 8)
-        else:
-            entry_at = entry + 8
-        tags[tag] = struct.unpack_from(pattern, content, entry_at)
-    if not (tags.get(256) and tags.get(257)):
-        raise _BadImage("a TIFF without a picture")
-    starts, lengths = (tags.get(273, tags.get(324, ())), tags.get(279, tags.get(325, ())))
-    ends = [start + length for start, length in zip(starts, lengths, strict=False)]
-    if not ends or max(ends) > len(content):
+        n_bytes = count * _TIFF_BYTES.get(kind, 1)
+        (pointer,) = struct.unpack_from(order + "I", content, entry + 8)
+        start = pointer if n_bytes > 4 else entry + 8
+        ends.append(start + n_bytes)
+        if kind in _TIFF_INTEGERS and ends[-1] <= len(content):
+            tags[tag] = struct.unpack_from(f"{order}{count}{_TIFF_INTEGERS[kind]}", content, start)
+    starts, lengths = tags.get(273, tags.get(324, ())), tags.get(279, tags.get(325, ()))
+    ends += [start + length for start, length in zip(starts, lengths, strict=False)]
+    if max(ends) > len(content):
         raise _BadImage(f"a TIFF cut off after {len(content)} bytes")
+    if not (starts and lengths and tags.get(256) and tags.get(257)):
+        raise _BadImage("a TIFF without a picture")
     return ImageSize(tags[256][0], tags[257][0])

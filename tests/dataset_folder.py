@@ -1,0 +1,91 @@
+"""A small dataset folder of the example hexapod, for tests to spoil."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+
+ROOT = Path(__file__).parents[1]
+HEXAPOD = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"
+JOINTS = [f"leg{j}_prismatic" for j in range(1, 7)]
+SIZE = (64, 48)
+
+
+@cache
+def hexapod() -> Mechanism:
+    """The example hexapod, loaded once."""
+    return load_mechanism(HEXAPOD)
+
+
+def readings(seed: int) -> list[float]:
+    """Readings inside the travel."""
+    return [round(float(q), 7) for q in np.random.default_rng(seed).uniform(0.0, 0.14, 6)]
+
+
+@dataclass
+class Folder:
+    """What the files say; tests change it before :meth:`write`."""
+
+    path: Path
+    rows: list[dict[str, Any]]
+    columns: list[str]
+    entry: dict[str, Any]
+    camera: dict[str, Any] = field(
+        default_factory=lambda: {
+            "image_width": SIZE[0],
+            "image_height": SIZE[1],
+            "camera_matrix": {"rows": 3, "cols": 3, "data": [80.0, 0, 32, 0, 80, 24, 0, 0, 1]},
+            "distortion_model": "plumb_bob",
+            "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
+        }
+    )
+
+    def write(self) -> Path:
+        """Write dataset.yaml, the table and the camera file."""
+        (self.path / "dataset.yaml").write_text(yaml.safe_dump(self.entry, sort_keys=False))
+        (self.path / "camera_info.yaml").write_text(yaml.safe_dump(self.camera))
+        lines = [[str(row.get(name, "")) for name in self.columns] for row in self.rows]
+        self.write_table([self.columns, *lines])
+        return self.path
+
+    def write_table(self, lines: Sequence[Sequence[str]]) -> Path:
+        """Write the table from its cells."""
+        text = "".join(",".join(cells) + "\n" for cells in lines)
+        (self.path / "measurements.csv").write_text(text)
+        return self.path
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Folder:
+    """Two views with two images each; reading the mechanism again is spared."""
+    monkeypatch.setattr("legcal.dataset.load_mechanism", lambda path: hexapod())
+    (tmp_path / "set" / "images").mkdir(parents=True)
+    rows: list[dict[str, Any]] = []
+    for seed, (view, number) in enumerate([("c1", 1), ("c1", 2), ("c2", 1), ("c2", 2)]):
+        name = f"images/{view}_{number}.png"
+        picture = np.random.default_rng(seed).integers(0, 255, (SIZE[1], SIZE[0]), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "set" / name), picture)
+        rows.append({"view": view, "image": name, **dict(zip(JOINTS, readings(seed), strict=True))})
+    pose = {"xyz": [0.9, 0.1, 0.2], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
+    entry = {
+        "legcal_dataset": 1,
+        "mechanism": str(HEXAPOD),
+        "measurements": "measurements.csv",
+        "encoder_sigma": 2e-6,
+        "views": {
+            "c1": {"camera": "camera_info.yaml", "T_base_camera": pose},
+            "c2": {"camera": "camera_info.yaml", "legs": ["leg1", "leg4"]},
+        },
+    }
+    made = Folder(tmp_path / "set", rows, ["view", "image", *JOINTS], entry)
+    made.write()
+    return made
