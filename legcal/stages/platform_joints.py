@@ -169,9 +169,8 @@ def build_rigid(
         nominal = mechanism.parameters.platform_joints[directions.leg[with_end]]
         step = ca.SX.sym(f"pose{len(poses)}", 6)
         poses.append(step)
-        predicted = moved_points(
-            step, register_points(nominal, ends[with_end]), B[:, legs.tolist()]
-        )
+        start = register_points(nominal, ends[with_end])
+        predicted = moved_points(step, start, B[:, legs.tolist()])
         for column, i in enumerate(group.tolist()):
             leg = predicted[:, column] - ca.DM(directions.A[i])
             residuals.append(_direction_residual(leg, directions, i))

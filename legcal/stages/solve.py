@@ -6,7 +6,7 @@ Gauss-Newton Hessian J'J (or leaves it the exact one) and refuses an answer that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -75,7 +75,7 @@ class Solution:
     jacobian : (m, n) array
         Their derivative there.
     n_iterations : int
-        Iterations that IPOPT took.
+        Iterations that IPOPT took, over all weights.
     status : str
         What IPOPT says about the end.
     """
@@ -115,8 +115,9 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
     """Minimise half the sum of squared residuals with IPOPT and a Gauss-Newton Hessian.
 
     With blocks the problem is solved again with Cauchy weights until these have settled: an
-    observation far beyond the median loses its say. The unknowns are counted from the start in units of what one residual unit shows, so that
-    tolerances do not depend on the units of length or on the noise.
+    observation far beyond the median loses its say. The unknowns are counted from the start in
+    units of what one residual unit shows, so that tolerances do not depend on the units of
+    length or on the noise.
 
     Parameters
     ----------
@@ -133,18 +134,19 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
         If IPOPT does not report success.
     """
     built = _build(problem)
-    n_weights = problem.residuals.shape[0]
-    root_weight = np.ones(n_weights)
+    root_weight = np.ones(problem.residuals.shape[0])
     solution = _solve(problem, built, np.zeros(len(problem.start)), root_weight)
-    for _ in range(_REWEIGHTINGS if problem.block is not None else 0):
-        plain = solution.residuals / root_weight
-        new = _cauchy_root_weights(plain, problem.block)
-        settled = bool(np.max(np.abs(new - root_weight)) < _SETTLED)
+    if problem.block is None:
+        return solution
+    n_iterations = solution.n_iterations
+    for _ in range(_REWEIGHTINGS):
+        new = _cauchy_root_weights(solution.residuals / root_weight, problem.block)
+        if np.max(np.abs(new - root_weight)) < _SETTLED:
+            break
         root_weight = new
         solution = _solve(problem, built, (solution.x - problem.start) / built.scale, root_weight)
-        if settled:
-            break
-    return solution
+        n_iterations += solution.n_iterations
+    return replace(solution, n_iterations=n_iterations)
 
 
 @dataclass(frozen=True, eq=False)
