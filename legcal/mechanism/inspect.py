@@ -1,0 +1,50 @@
+"""A mechanism as ``legcal inspect --json`` prints it."""
+
+from typing import Any
+
+from legcal.mechanism.leg import Leg
+from legcal.mechanism.model import Mechanism
+
+
+def describe(mechanism: Mechanism) -> dict[str, Any]:
+    """Return what was found in a mechanism: legs with types, frames, mobility, diagnostics.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+
+    Returns
+    -------
+    dict
+        The document of ``legcal inspect --json``: A in the base link and B in the platform link
+        [m], ``n_d`` the number of legs that define the frames.
+    """
+    return {
+        "name": mechanism.name,
+        "spatial": mechanism.spatial,
+        "mobility": mechanism.mobility,
+        "motors": len(mechanism.motors),
+        "n_d": len(mechanism.frame_legs),
+        "legs": [_leg(leg) for leg in mechanism.legs],
+        "diagnostics": list(mechanism.diagnostics),
+    }
+
+
+def _leg(leg: Leg) -> dict[str, Any]:
+    """Return one leg of the document."""
+    return {
+        "name": leg.name,
+        "type": leg.type,
+        "actuated": leg.kind.value == "actuated",
+        "kind": leg.kind.value,
+        "A": [float(x) for x in leg.A_base],
+        "B": [float(x) for x in leg.B_platform],
+        "q0": float(leg.q0),
+        "sign": leg.sign,
+        "base_axis": None if leg.base_axis is None else [float(x) for x in leg.base_axis],
+        "platform_axis": (
+            None if leg.platform_axis is None else [float(x) for x in leg.platform_axis]
+        ),
+        "cylinders": [{"link": c.link, "radius": c.radius} for c in leg.cylinders],
+    }
