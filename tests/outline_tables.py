@@ -1,0 +1,112 @@
+"""Outlines of random legs in a small camera, for tests of the tables that hold them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from legcal.geometry.types import Array
+from legcal.measurements import Measurements, View
+from legcal.mechanism.leg import Cylinder, Leg, LegKind
+from legcal.observations import Outlines
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import EPSILON, outlines_of_axis
+
+LENS = Camera(
+    np.array([[800.0, 0, 320], [0, 810.0, 240], [0, 0, 1]]),
+    640,
+    480,
+    np.array([-0.1, 0.02, 1e-3, -5e-4, 0.0]),
+)
+LEGS = tuple(
+    Leg(
+        name=name,
+        base_joint="U",
+        platform_joint="S",
+        kind=LegKind.ACTUATED,
+        prismatic=f"{name}_slider",
+        A_base=np.zeros(3),
+        B_platform=np.zeros(3),
+        q0=0.3,
+        sign=1,
+        travel=(0.0, 0.1),
+        cylinders=(
+            Cylinder(f"{name}_tube", 0.02, "base", 0.0, 0.2),
+            Cylinder(f"{name}_rod", 0.01, "platform", -0.3, 0.0),
+        ),
+    )
+    for name in ("legB", "legA", "leg, C")
+)
+LEG_NAMES = tuple(leg.name for leg in LEGS)
+
+
+def recorded(
+    images: Sequence[str] = ("i/2.png", "i/1.png", "", ""), labels: Sequence[str] = ()
+) -> Measurements:
+    """Rows in two views, alternating; each its own pose."""
+    n = len(images)
+    views = (View("right", LENS), View("left", LENS))
+    q = np.random.default_rng(n).uniform(0.0, 0.1, (n, len(LEGS)))
+    return Measurements(
+        views=views,
+        image=tuple(images),
+        view=np.arange(n, dtype=np.intp) % 2,
+        pose=np.arange(n, dtype=np.intp),
+        q=q,
+        sigma_q=1e-6,
+        pose_labels=tuple(labels),
+    )
+
+
+def legs_in_view(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
+    """Directions and points of n legs that the camera sees."""
+    u = rng.normal(size=(n, 3)) * [1.0, 1.0, 0.3]
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    M = rng.uniform([-0.1, -0.1, 0.8], [0.1, 0.1, 1.0], size=(n, 3))
+    return u, M
+
+
+def outlines_of(
+    seed: int,
+    rows: Sequence[int] = (0, 1, 2, 3),
+    *,
+    source: str = "detected",
+    legs: Sequence[int] = (0, 1, 2),
+    rejected: float = 0.3,
+) -> Outlines:
+    """Both edges of the rods of some legs in some rows; some of them rejected, some not found."""
+    rng = np.random.default_rng(seed)
+    places = [(row, leg, edge) for row in rows for leg in legs for edge in (0, 1)]
+    row, leg, edge = (np.array(index, dtype=np.intp) for index in zip(*places, strict=True))
+    u, M = legs_in_view(rng, len(rows) * len(legs))
+    h = outlines_of_axis(u, M, 0.01).reshape(-1, 3)
+    u, M = np.repeat(u, 2, axis=0), np.repeat(M, 2, axis=0)
+    P = M - 0.01 * EPSILON[edge][:, None] * h
+    ends = np.stack([LENS.project(P - 0.1 * u), LENS.project(P + 0.1 * u)], axis=1)
+    root = rng.normal(size=(len(places), 2, 2))
+    covariance = root @ np.swapaxes(root, 1, 2) + 1e-3 * np.eye(2)
+    covariance[:, 1, 0] = covariance[:, 0, 1]
+    used = rng.uniform(size=len(places)) > rejected
+    lost = ~used & (rng.uniform(size=len(places)) < 0.5)
+    for numbers in (h, ends, covariance):
+        numbers[lost] = np.nan
+    return Outlines(
+        row=row,
+        leg=leg,
+        part=tuple(LEGS[j].cylinders[1].link for j in leg),
+        edge=edge + 1,
+        h=h,
+        ends=ends,
+        covariance=covariance,
+        used=used,
+        reason=tuple("" if ok else 'hidden, by "another" leg' for ok in used),
+        source=(source,) * len(places),
+    )
+
+
+def assert_same(found: Outlines, expected: Outlines) -> None:
+    """Fail unless both tables are the same to the last bit."""
+    for name in ("row", "leg", "edge", "h", "ends", "covariance", "used"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+    assert found.part == expected.part
+    assert found.reason == expected.reason
+    assert found.source == expected.source
