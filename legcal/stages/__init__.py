@@ -1,1 +1,5 @@
-"""Sections 3.2 to 3.5: the four steps, one file a step."""
+"""Sections 3.2 to 3.5: the four steps, one file a step.
+
+``run.run_steps`` takes them in a row: ``locate_joints_in_cameras`` (3.2),
+``locate_joints_in_base`` (3.3), ``identify_offsets`` (3.4), ``locate_platform_joints`` (3.5).
+"""

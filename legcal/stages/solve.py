@@ -103,12 +103,15 @@ class Solution:
 
     def unseen(self, n_first: int) -> BoolArray:
         """Return which of the first unknowns can move without changing any residual, (n_first,)."""
-        scale = _column_scale(self.jacobian)
-        _, singular, rows = np.linalg.svd(self.jacobian * scale, full_matrices=True)
-        filled = np.zeros(len(rows))
-        filled[: len(singular)] = singular
-        null = rows[filled < _RANK * max(float(filled.max()), 1e-300)]
-        return np.asarray(np.abs(null[:, :n_first]).max(axis=0, initial=0.0) > 1e-3)
+        scaled = self.jacobian * _column_scale(self.jacobian)
+        # QR eliminates the unknowns that come later: what is left is about the first ones.
+        triangle = np.asarray(np.linalg.qr(np.roll(scaled, -n_first, axis=1), mode="r"))
+        n_rest = scaled.shape[1] - n_first
+        left = np.zeros((n_first, n_first))
+        left[: max(len(triangle) - n_rest, 0)] = triangle[n_rest:, n_rest:]
+        _, singular, rows = np.linalg.svd(left)
+        null = rows[singular < _RANK]
+        return np.asarray(np.abs(null).max(axis=0, initial=0.0) > 1e-3)
 
 
 def solve_least_squares(problem: LeastSquares) -> Solution:
@@ -166,6 +169,8 @@ def _build(problem: LeastSquares) -> _Built:
     value = ca.Function("value", [problem.x, w], [weighted])
     slope = ca.Function("slope", [problem.x, w], [ca.jacobian(weighted, problem.x)])
     scale = _column_scale(np.asarray(slope(problem.start, 1.0).full()))
+    if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
+        scale = np.full_like(scale, scale.min())
     z, p = ca.MX.sym("z", len(problem.start)), ca.MX.sym("p", w.shape[0])
     x = problem.start + scale * z
     options: dict[str, Any] = dict(_OPTIONS)
