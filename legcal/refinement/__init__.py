@@ -2,13 +2,8 @@
 
 from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.platform_error import PlatformError, predict_platform_error
-from legcal.refinement.refine import (
-    DEFAULT_SETTINGS,
-    RefinementSettings,
-    build_fit,
-    refine,
-    refine_from_best,
-)
+from legcal.refinement.refine import build_fit, refine, refine_from_best
+from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, cameras_from_hints, platform_poses, start_from
 

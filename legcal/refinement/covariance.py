@@ -15,6 +15,7 @@ from legcal.refinement.problem import FitProblem
 from legcal.refinement.residuals import UNIT
 
 _RANK = 1e-10  # eigenvalues of the scaled normal matrix below this part of the largest
+_LARGEST_SIGMA = 0.1  # of the size of the machine
 _NAMED = 0.3  # components of a direction that are named, relative to the largest
 
 
@@ -57,7 +58,11 @@ class Uncertainty:
 
 
 def uncertainty(
-    problem: FitProblem, normal: NormalEquations, names: tuple[str, ...], n_weak: int = 3
+    problem: FitProblem,
+    normal: NormalEquations,
+    names: tuple[str, ...],
+    size: float,
+    n_weak: int = 3,
 ) -> Uncertainty:
     """Return the covariance of the parameters, or refuse.
 
@@ -68,6 +73,8 @@ def uncertainty(
         From :func:`legcal.refinement.normal.information`.
     names : tuple of str
         Names of the kinematic parameters.
+    size : float
+        Largest joint coordinate of the machine [m].
     n_weak : int
         How many weak directions to name.
 
@@ -78,7 +85,8 @@ def uncertainty(
     Raises
     ------
     NotIdentifiable
-        If a direction of the parameters is not determined.
+        If a direction of the parameters is not determined, or known worse than to a tenth of
+        the size of the machine, where a covariance means nothing.
     """
     S = without_cameras(problem, normal)
     labels = (*names, *(f"radius of {part}" for _, part in problem.layout.parts))
@@ -91,24 +99,37 @@ def uncertainty(
         )
     scale = 1.0 / np.sqrt(diagonal)
     value, vector = np.linalg.eigh(scale[:, None] * S * scale)
-    if value[0] < _RANK * value[-1]:
-        direction = scale * vector[:, 0]
-        missing = int(np.sum(value < _RANK * value[-1]))
-        raise NotIdentifiable(
-            f"The fit is not determined: the measurements fix {len(S) - missing} of "
-            f"{len(S)} directions of the parameters; free is "
-            f"{_direction(direction / np.linalg.norm(direction), labels, 0.0)}; add images from "
-            "other directions, of other legs or at poses that differ more."
-        )
+    _refuse_free_directions(value, scale[:, None] * vector, labels)
     covariance = UNIT**2 * ((scale[:, None] * vector / value) @ (scale[:, None] * vector).T)
     n = len(names)
     kinematic = covariance[:n, :n]
     variances, directions = np.linalg.eigh(kinematic)
+    limit = _LARGEST_SIGMA * size
+    if variances[-1] > limit**2:
+        sigma = float(np.sqrt(variances[-1]))
+        raise NotIdentifiable(
+            f"The fit is hardly determined: {_direction(directions[:, -1], names, sigma)} is known "
+            f"to {1e3 * sigma:.3g} mm only, at least {1e3 * limit:.3g} mm is needed for a machine "
+            f"of {1e3 * size:.0f} mm; add images from other directions, of other legs or at poses "
+            "that differ more."
+        )
     weak = tuple(
         _direction(directions[:, -1 - i], names, float(np.sqrt(variances[-1 - i])))
         for i in range(min(n_weak, n))
     )
     return Uncertainty(kinematic, np.sqrt(np.diagonal(covariance)[n:]), weak)
+
+
+def _refuse_free_directions(value: Array, directions: Array, labels: tuple[str, ...]) -> None:
+    """Raise NotIdentifiable if a scaled normal matrix with these eigenvalues is singular."""
+    missing = int(np.sum(value < _RANK * value[-1]))
+    if missing:
+        free = directions[:, 0] / np.linalg.norm(directions[:, 0])
+        raise NotIdentifiable(
+            f"The fit is not determined: the measurements fix {len(value) - missing} of "
+            f"{len(value)} directions of the parameters; free is {_direction(free, labels, 0.0)}; "
+            "add images from other directions, of other legs or at poses that differ more."
+        )
 
 
 def without_cameras(problem: FitProblem, normal: NormalEquations) -> Array:

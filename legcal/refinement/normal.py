@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.geometry.types import Array, IntArray
+from legcal.refinement.inputs import evaluate_jacobian, inputs_of
 from legcal.refinement.loss import curvature, weights
-from legcal.refinement.problem import FitProblem, data_of, evaluate_jacobian
+from legcal.refinement.problem import FitProblem
 from legcal.refinement.residuals import encoder_residual, outline_residual
 from legcal.refinement.state import State
 
@@ -76,7 +77,7 @@ class NormalEquations:
 
 def linearize(problem: FitProblem, state: State, whitening: Array) -> Linearization:
     """Return residuals and Jacobians of all measurements at a state."""
-    of_outlines, of_readings, _ = data_of(problem, state, whitening, 0.0)
+    of_outlines, of_readings, _ = inputs_of(problem, state, whitening, 0.0)
     prior = problem.radius_prior
     return Linearization(
         *evaluate_jacobian(outline_residual(), of_outlines),

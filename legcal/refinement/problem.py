@@ -21,10 +21,11 @@ from legcal.refinement.residuals import (
     outline_residual,
     prior_residual,
 )
-from legcal.refinement.state import Layout, State
+from legcal.refinement.state import Layout
 
 IPOPT_OPTIONS = {
     "print_time": False,
+    "show_eval_warnings": False,
     "calc_lam_p": False,
     "no_nlp_grad": True,
     "ipopt.print_level": 0,
@@ -63,7 +64,8 @@ class FitProblem:
     readings : Readings
     radius_prior : Prior
     solver : casadi.Function
-        IPOPT on the whole problem; its parameter is that of :func:`parameter_of`.
+        IPOPT on the whole problem; its parameter is that of
+        :func:`legcal.refinement.inputs.parameter_of`.
     outline_index, encoder_index : (n, 19) and (n, 13) array of int
         Positions in x of the unknowns of each measurement; ``layout.size`` where fixed.
     cost, gradient, hessian : casadi.Function
@@ -171,81 +173,6 @@ def build_problem(
         hessian_function,
         solver,
     )
-
-
-def data_of(problem: FitProblem, state: State, whitening: Array, k: float) -> tuple[Array, ...]:
-    """Return what the residuals need besides the unknowns, one row a measurement.
-
-    Parameters
-    ----------
-    problem : FitProblem
-    state : State
-        The reference: x = 0 is this state.
-    whitening : (n_outlines, 2, 2) array
-        Lower triangular T of each outline: T C T^T = 1 [1/px]; zero leaves an outline out.
-    k : float
-        Narrowness of the robust loss on outlines.
-
-    Returns
-    -------
-    tuple of array
-        (n_outlines, 48), (n_readings, 22) and (n_radii, 3).
-    """
-    o, e, prior = problem.outlines, problem.readings, problem.radius_prior
-    camera = _frames(state.R_camera, state.t_camera)
-    pose = _frames(state.R_pose, state.t_pose)
-    of_outlines = np.column_stack(
-        [
-            state.base_joints[o.leg],
-            state.platform_joints[o.leg],
-            state.radii[o.radius],
-            camera[o.view],
-            pose[o.pose],
-            o.feet.reshape(-1, 4),
-            np.swapaxes(o.J_inverse_transposed, -1, -2).reshape(-1, 8),
-            o.epsilon,
-            whitening[:, 0, 0],
-            whitening[:, 1, 0],
-            whitening[:, 1, 1],
-            np.full(len(o), k),
-        ]
-    )
-    of_readings = np.column_stack(
-        [
-            state.base_joints[e.leg],
-            state.platform_joints[e.leg],
-            state.offsets[e.leg],
-            pose[e.pose],
-            e.length,
-            np.full(len(e), 1.0 / e.sigma),
-            np.zeros(len(e)),
-        ]
-    )
-    of_prior = np.column_stack(
-        [state.radii - prior.mean, 1.0 / prior.sigma, np.zeros(len(prior.mean))]
-    )
-    return of_outlines, of_readings, of_prior
-
-
-def parameter_of(data: tuple[Array, ...]) -> Array:
-    """Return the parameter vector of the solver."""
-    return np.concatenate([part.ravel() for part in data])
-
-
-def evaluate_jacobian(residual: Residual, data: Array) -> tuple[Array, Array]:
-    """Return residuals (n, rows) and Jacobians (n, rows, locals) at the reference, x = 0."""
-    n = len(data)
-    if n == 0:
-        return np.zeros((0, residual.n_rows)), np.zeros((0, residual.n_rows, residual.n_local))
-    mapped = robust_loss(residual).jacobian.map(n)
-    r, J = mapped(ca.DM.zeros(residual.n_local, n), ca.DM(np.asfortranarray(data.T)))
-    columns = np.asarray(J).reshape(residual.n_rows, n, residual.n_local)
-    return np.asarray(r).T.copy(), np.swapaxes(columns, 0, 1).copy()
-
-
-def _frames(R: Array, t: Array) -> Array:
-    """Return rotations, column by column, and translations as rows of 12."""
-    return np.concatenate([np.swapaxes(R, -1, -2).reshape(-1, 9), t], axis=1)
 
 
 def _sums(terms: list[_Term], x: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:

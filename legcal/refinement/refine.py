@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -17,61 +16,21 @@ from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.geometry.types import Array, BoolArray
 from legcal.measurements import Measurements
 from legcal.observations import Outlines
-from legcal.refinement.covariance import check_counts, explained_share, uncertainty
+from legcal.refinement.covariance import check_counts, uncertainty
+from legcal.refinement.inputs import inputs_of
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.loss import efficiency, width_to_k
-from legcal.refinement.noise import NoiseModel, estimate_noise, noise_of_the_median
+from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import Linearization, information, linearize
 from legcal.refinement.observed import has_offset, observed_outlines, readings
-from legcal.refinement.problem import FitProblem, Prior, build_problem, data_of
+from legcal.refinement.problem import FitProblem, Prior, build_problem
+from legcal.refinement.rounds import Fit, fit_in_rounds, offsets_of
+from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
 from legcal.refinement.solution import Solution
-from legcal.refinement.solve import polish, solve
 from legcal.refinement.start import Start
 from legcal.refinement.state import State, lay_out
 
-
-@dataclass(frozen=True)
-class RefinementSettings:
-    """Choices of the fit.
-
-    Attributes
-    ----------
-    radius_sigma : float
-        Standard deviation of the prior on radii, as a part of the radius.
-    loss_width : float
-        Whitened distance at which the loss of an outline turns from quadratic to linear.
-    rejection : float
-        Whitened distance beyond which an outline is rejected; a right one in 25,000 is, at 4.5.
-    rejection_rounds : int
-        Rounds, at most, until the rejected outlines stay the same.
-    noise_rounds : int
-        Rounds of noise estimation after that.
-    comparison_px : float
-        Bias of outlines [px] that is assumed when two fits are compared.
-    max_iterations : int
-        Limit for IPOPT in each solve.
-    """
-
-    radius_sigma: float = 0.02
-    loss_width: float = 3.0
-    rejection: float = 4.5
-    rejection_rounds: int = 6
-    noise_rounds: int = 2
-    comparison_px: float = 0.1
-    max_iterations: int = 100
-
-
-DEFAULT_SETTINGS = RefinementSettings()
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """A state with the noise and the outlines that it was fitted with."""
-
-    state: State
-    noise: NoiseModel
-    accepted: BoolArray
-    iterations: int
+_LARGEST_RADIUS_CHANGE = 0.5
 
 
 def build_fit(
@@ -191,91 +150,33 @@ def _refined(
     names = _estimated_names(problem, legs)
     begin = start.state(problem.radius_prior.mean)
     try:
-        fit = _fit_in_rounds(problem, begin, settings)
+        fit = fit_in_rounds(problem, begin, settings)
     except DidNotConverge:
         # A fit that nothing determines has no minimum to converge to: say so if that is why.
         linear = linearize(problem, begin, NoiseModel().whitening(problem.outlines.covariance))
-        uncertainty(problem, information(problem, linear, 1.0), names)
+        uncertainty(problem, information(problem, linear, 1.0), names, _size(begin))
         raise
+    _refuse_other_radii(problem, fit.state, legs)
     return _solution(problem, fit, outlines, names, start.label, settings)
 
 
-def _fit_in_rounds(problem: FitProblem, begin: State, settings: RefinementSettings) -> _Fit:
-    """Solve wide, reject what disagrees until that settles, then estimate the noise and solve."""
-    claimed = problem.outlines.covariance
-    noise, k = NoiseModel(), width_to_k(settings.loss_width)
-    first = noise.squared_norms(_offsets(problem, begin), claimed)
-    wide = max(settings.loss_width, float(np.sqrt(np.median(first)))) if len(first) else 1.0
-    state, iterations = solve(problem, begin, noise.whitening(claimed), width_to_k(wide))
-    accepted = np.ones(len(first), dtype=np.bool_)
-    for _ in range(settings.rejection_rounds if len(first) else 0):
-        before = accepted
-        noise = noise_of_the_median(_offsets(problem, state)[before], claimed[before])
-        accepted = _accepted(problem, state, noise, settings)
-        state, more = solve(problem, state, noise.whitening(claimed, accepted), k)
-        iterations += more
-        if np.array_equal(before, accepted):
-            break
-    for _ in range(settings.noise_rounds):
-        noise = _noise(problem, state, noise, accepted, settings)
-        accepted = _accepted(problem, state, noise, settings)
-        whitening = noise.whitening(claimed, accepted)
-        state, more = solve(problem, state, whitening, k)
-        state = polish(problem, state, whitening, k)
-        iterations += more
-    return _Fit(state, noise, accepted, iterations)
-
-
-def _noise(
-    problem: FitProblem,
-    state: State,
-    noise: NoiseModel,
-    accepted: BoolArray,
-    settings: RefinementSettings,
-) -> NoiseModel:
-    """Return the noise of the accepted outlines at a fit."""
-    if not accepted.any():
-        return noise
-    claimed = problem.outlines.covariance
-    linear = linearize(problem, state, noise.whitening(claimed, accepted))
-    normal = information(problem, linear, efficiency(width_to_k(settings.loss_width)))
-    L = np.linalg.cholesky(noise.covariance(claimed))
-    explained = L @ explained_share(problem, linear, normal) @ np.swapaxes(L, -1, -2)
-    offsets = np.einsum("nij,nj->ni", L, linear.outline_r)
-    return estimate_noise(offsets[accepted], explained[accepted], claimed[accepted])
-
-
-def _offsets(problem: FitProblem, state: State) -> Array:
-    """Return the offsets (n, 2) [px] of all outlines at a state."""
-    unit = np.broadcast_to(np.eye(2), (len(problem.outlines), 2, 2))
-    return linearize(problem, state, unit).outline_r
-
-
-def _accepted(
-    problem: FitProblem, state: State, noise: NoiseModel, settings: RefinementSettings
-) -> BoolArray:
-    """Return which outlines agree with a fit.
-
-    Raises
-    ------
-    DidNotConverge
-        If fewer than half of them do.
-    """
-    offsets = _offsets(problem, state)
-    s = noise.squared_norms(offsets, problem.outlines.covariance)
-    accepted = s <= settings.rejection**2
-    if 2 * int(accepted.sum()) < len(accepted):
-        raise DidNotConverge(
-            f"The fit of everything ended where {len(accepted) - int(accepted.sum())} of "
-            f"{len(accepted)} outlines disagree with it, by {np.median(np.abs(offsets)):.1f} px in "
-            "the median; most must agree; check the camera poses, the readings and the outlines."
-        )
-    return np.asarray(accepted)
+def _refuse_other_radii(problem: FitProblem, state: State, legs: FittedLegs) -> None:
+    """Raise DidNotConverge if the fit needs radii that are not those of the legs at all."""
+    problems = [
+        f"The fit of everything ended with a radius of {1e3 * radius:.2f} mm for "
+        f"{legs.names[leg]}.{part}, the model has {1e3 * legs.radii[leg, part]:.2f} mm; they must "
+        "agree to a half; check the radius, and the outlines for edges that are swapped or "
+        "belong to another leg."
+        for (leg, part), radius in zip(problem.layout.parts, state.radii, strict=True)
+        if not abs(radius / legs.radii[leg, part] - 1.0) < _LARGEST_RADIUS_CHANGE
+    ]
+    if problems:
+        raise DidNotConverge(problems)
 
 
 def _solution(
     problem: FitProblem,
-    fit: _Fit,
+    fit: Fit,
     outlines: Outlines,
     names: tuple[str, ...],
     label: str,
@@ -284,8 +185,9 @@ def _solution(
     """Put together what was found."""
     claimed, k = problem.outlines.covariance, width_to_k(settings.loss_width)
     linear = linearize(problem, fit.state, fit.noise.whitening(claimed, fit.accepted))
-    known = uncertainty(problem, information(problem, linear, efficiency(k)), names)
-    offsets = _offsets(problem, fit.state)
+    normal = information(problem, linear, efficiency(k))
+    known = uncertainty(problem, normal, names, _size(fit.state))
+    offsets = offsets_of(problem, fit.state)
     used = offsets[fit.accepted]
     n_residuals = used.size + len(problem.readings) + len(problem.radius_prior.mean)
     parts = problem.layout.parts
@@ -310,6 +212,11 @@ def _solution(
     )
 
 
+def _size(state: State) -> float:
+    """Return the largest joint coordinate [m]."""
+    return float(max(np.abs(state.base_joints).max(), np.abs(state.platform_joints).max()))
+
+
 def _chi2(linear: Linearization) -> float:
     parts = (linear.outline_r, linear.encoder_r, linear.prior_r)
     return float(sum(np.sum(part**2) for part in parts))
@@ -319,9 +226,9 @@ def _comparable_cost(problem: FitProblem, state: State, settings: RefinementSett
     """Return the robust cost of all outlines under the noise that all fits share."""
     noise = NoiseModel(1.0, settings.comparison_px)
     whitening = noise.whitening(problem.outlines.covariance)
-    data = data_of(problem, state, whitening, width_to_k(settings.loss_width))
+    inputs = inputs_of(problem, state, whitening, width_to_k(settings.loss_width))
     zero = ca.DM.zeros(problem.layout.size)
-    return float(problem.cost(zero, *[np.asfortranarray(part.T) for part in data]))
+    return float(problem.cost(zero, *[np.asfortranarray(part.T) for part in inputs]))
 
 
 def _with_rejections(

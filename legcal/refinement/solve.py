@@ -5,8 +5,9 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
+from legcal.refinement.inputs import inputs_of, parameter_of
 from legcal.refinement.normal import linearize, normal_equations
-from legcal.refinement.problem import FitProblem, data_of, parameter_of
+from legcal.refinement.problem import FitProblem
 from legcal.refinement.state import State
 
 _STEP = 1e-11  # [mm, mrad]; steps end at rounding, two orders below
@@ -23,7 +24,7 @@ def solve(problem: FitProblem, state: State, whitening: Array, k: float) -> tupl
     state : State
         Where to start.
     whitening : (n_outlines, 2, 2) array
-        Weights of the outlines, as in :func:`legcal.refinement.problem.data_of`.
+        Weights of the outlines, as in :func:`legcal.refinement.inputs.inputs_of`.
     k : float
         Narrowness of the robust loss.
 
@@ -39,7 +40,7 @@ def solve(problem: FitProblem, state: State, whitening: Array, k: float) -> tupl
     DidNotConverge
         If IPOPT stops without success.
     """
-    parameter = parameter_of(data_of(problem, state, whitening, k))
+    parameter = parameter_of(inputs_of(problem, state, whitening, k))
     solver = problem.solver
     found = solver(x0=ca.DM.zeros(problem.layout.size), p=parameter)
     stats = solver.stats()

@@ -1,0 +1,40 @@
+"""The choices of the fit of everything."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """Choices of the fit.
+
+    Attributes
+    ----------
+    radius_sigma : float
+        Standard deviation of the prior on radii, as a part of the radius.
+    loss_width : float
+        Whitened distance at which the loss of an outline turns from quadratic to linear.
+    rejection : float
+        Whitened distance beyond which an outline is rejected; a right one in 25,000 is, at 4.5.
+    rejection_rounds : int
+        Rounds, at most, until the rejected outlines stay the same.
+    noise_rounds : int
+        Rounds of noise estimation after that.
+    largest_rms_px : float
+        Root mean square of the offsets of accepted outlines beyond which a fit is refused [px].
+    comparison_px : float
+        Bias of outlines [px] that is assumed when two fits are compared.
+    max_iterations : int
+        Limit for IPOPT in each solve.
+    """
+
+    radius_sigma: float = 0.02
+    loss_width: float = 3.0
+    rejection: float = 4.5
+    rejection_rounds: int = 6
+    noise_rounds: int = 2
+    largest_rms_px: float = 3.0
+    comparison_px: float = 0.1
+    max_iterations: int = 100
+
+
+DEFAULT_SETTINGS = RefinementSettings()

@@ -1,0 +1,274 @@
+"""What the fit refuses, starting values, and the predicted platform error."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hexapod_session import (
+    FRAME_LEGS,
+    PINHOLE,
+    TRUTH,
+    Session,
+    disturbed_start,
+    joint_errors,
+    moved_outlines,
+    noisy_outlines,
+    noisy_readings,
+    simulate,
+)
+
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.geometry.frames import motion_from_xyz_quat
+from legcal.measurements import Measurements, View
+from legcal.mechanism.leg import Cylinder, Leg, LegKind
+from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
+from legcal.observations import Outlines
+from legcal.refinement import (
+    cameras_from_hints,
+    fitted_legs,
+    platform_poses,
+    predict_platform_error,
+    refine,
+    refine_from_best,
+    start_from,
+)
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(6, legs_seen=5)
+
+
+def test_two_images_are_too_few() -> None:
+    two = simulate(1, n_views=2)
+    with pytest.raises(
+        NotIdentifiable,
+        match=r"2 images with 16 outlines and 12 readings give \d+ equations for \d+ unknowns; add",
+    ):
+        refine(two.legs, two.measurements, two.outlines, disturbed_start(two))
+
+
+def one_pose_many_times(n_times: int) -> Session:
+    """Return a session in which three views see the same pose again and again."""
+    once = simulate(1, shared_poses=True)
+    m, o = once.measurements, once.outlines
+    n = 3 * n_times
+    measurements = Measurements(
+        m.views,
+        tuple(f"{i:03d}.png" for i in range(n)),
+        np.tile(m.view, n_times),
+        np.arange(n),
+        np.tile(m.q, (n_times, 1)),
+        m.sigma_q,
+    )
+    outlines = Outlines(
+        np.concatenate([o.row + 3 * i for i in range(n_times)]),
+        np.tile(o.leg, n_times),
+        o.part * n_times,
+        np.tile(o.edge, n_times),
+        np.tile(o.h, (n_times, 1)),
+        np.tile(o.ends, (n_times, 1, 1)),
+        np.tile(o.covariance, (n_times, 1, 1)),
+        np.tile(o.used, n_times),
+        o.reason * n_times,
+        o.source * n_times,
+    )
+    return dataclasses.replace(
+        once, measurements=measurements, outlines=outlines, T_Rb_Re=once.T_Rb_Re * n
+    )
+
+
+def test_the_same_pose_again_and_again_is_refused() -> None:
+    still = one_pose_many_times(6)
+    start = start_from(
+        TRUTH,
+        still.measurements,
+        still.legs,
+        disturbed_start(still).T_camera_Rb,
+        still.T_Rb_Re,
+        "nominal",
+    )
+    with pytest.raises(NotIdentifiable, match=r"fix \d+ of \d+ directions .* free is .*leg\d"):
+        refine(still.legs, still.measurements, still.outlines, start)
+
+
+def test_no_outline_at_all_is_refused(session: Session) -> None:
+    none = dataclasses.replace(session.outlines, used=np.zeros(len(session.outlines), np.bool_))
+    with pytest.raises(NotIdentifiable, match="with 0 outlines and 108 readings"):
+        refine(session.legs, session.measurements, none, disturbed_start(session))
+
+
+def test_one_leg_alone_leaves_the_others_hardly_determined() -> None:
+    session = simulate(15)
+    noisy = noisy_outlines(session, np.random.default_rng(0))
+    shown = dataclasses.replace(noisy, used=noisy.leg == 0)
+    start = start_from(
+        TRUTH,
+        session.measurements,
+        session.legs,
+        session.T_camera_Rb,
+        session.T_Rb_Re,
+        "nominal",
+    )
+    with pytest.raises(NotIdentifiable, match=r"hardly determined: .*leg.* known to \d+ mm only"):
+        refine(session.legs, session.measurements, shown, start)
+
+
+@pytest.mark.parametrize("n_left", [0, 1])
+def test_a_view_with_hardly_an_outline_neither_helps_nor_harms(n_left: int) -> None:
+    session = simulate(12, legs_seen=5)
+    of_last = np.flatnonzero(session.measurements.view[session.outlines.row] == 2)
+    used = session.outlines.used.copy()
+    used[of_last[n_left:]] = False
+    found = refine(
+        session.legs,
+        session.measurements,
+        dataclasses.replace(session.outlines, used=used),
+        disturbed_start(session),
+    )
+    assert np.abs(joint_errors(found.parameters)).max() < 1e-9
+
+
+def test_a_start_far_away_is_refused_with_the_solver_s_status(session: Session) -> None:
+    far = disturbed_start(session, joints=0.1, camera=0.5, angle=2.0)
+    with pytest.raises(DidNotConverge, match=r"IPOPT stopped with \w+|outlines disagree with it"):
+        refine(session.legs, session.measurements, session.outlines, far)
+    with pytest.raises(DidNotConverge, match="The start nominal was skipped"):
+        refine_from_best(session.legs, session.measurements, session.outlines, [far])
+    with pytest.raises(DidNotConverge, match="needs at least one"):
+        refine_from_best(session.legs, session.measurements, session.outlines, [])
+
+
+def test_swapped_edges_are_refused_instead_of_fitted_with_negative_radii(session: Session) -> None:
+    swapped = dataclasses.replace(session.outlines, edge=3 - session.outlines.edge)
+    with pytest.raises(DidNotConverge, match=r"radius of -\d+.* mm for leg1.rod, the model has 10"):
+        refine(session.legs, session.measurements, swapped, disturbed_start(session))
+
+
+def test_outlines_that_mostly_disagree_are_refused(session: Session) -> None:
+    rng = np.random.default_rng(0)
+    errors = rng.uniform(-15.0, 15.0, (len(session.outlines), 2))
+    wrong = moved_outlines(session.outlines, PINHOLE, errors)
+    with pytest.raises(DidNotConverge, match=r"disagree with it and the others are \d+.\d px off"):
+        refine(session.legs, session.measurements, wrong, disturbed_start(session))
+
+
+def test_a_covariance_that_is_none_is_refused(session: Session) -> None:
+    covariance = session.outlines.covariance.copy()
+    covariance[3] = [[0.01, 0.02], [0.02, 0.01]]
+    bad = dataclasses.replace(session.outlines, covariance=covariance)
+    with pytest.raises(DatasetError, match=r"leg\d in c1_000.png .* not positive definite"):
+        refine(session.legs, session.measurements, bad, disturbed_start(session))
+
+
+def test_a_part_that_the_mechanism_does_not_have_is_refused(session: Session) -> None:
+    o = session.outlines
+    bad = dataclasses.replace(o, part=("tube", *o.part[1:]))
+    with pytest.raises(DatasetError, match=r"leg\d\.tube could not be used"):
+        refine(session.legs, session.measurements, bad, disturbed_start(session))
+
+
+def test_views_without_a_rough_pose_are_named(session: Session) -> None:
+    T = motion_from_xyz_quat([0.1, 0.2, 0.3], [0.0, 0.0, 0.6, 0.8])
+    with pytest.raises(DatasetError, match="c1, c2, c3 have no T_base_camera"):
+        cameras_from_hints(session.measurements, T)
+    views = tuple(View(v.name, v.camera, T) for v in session.measurements.views)
+    hinted = dataclasses.replace(session.measurements, views=views)
+    for T_camera_Rb in cameras_from_hints(hinted, T):
+        np.testing.assert_allclose(T_camera_Rb.as_matrix(), np.eye(4), atol=1e-15)
+
+
+def test_platform_poses_have_the_lengths_of_the_readings(session: Session) -> None:
+    m = session.measurements
+    start = start_from(
+        TRUTH,
+        m,
+        session.legs,
+        session.T_camera_Rb,
+        disturbed_start(session, camera=0.02, angle=0.1).T_Rb_Re,
+        "nominal",
+    )
+    for found, true in zip(start.T_Rb_Re, session.T_Rb_Re, strict=True):
+        assert np.linalg.norm((found.inv() * true).translation) < 1e-11
+
+
+def test_lengths_that_no_pose_has_give_the_nearest_pose(session: Session) -> None:
+    lengths = session.measurements.q + TRUTH.offsets
+    lengths[0, 2] += 0.4
+    poses = platform_poses(TRUTH, lengths, session.T_Rb_Re)
+    assert np.all(np.isfinite(poses[0].as_matrix()))
+    np.testing.assert_allclose(poses[1].as_matrix(), session.T_Rb_Re[1].as_matrix(), atol=1e-9)
+
+
+def test_legs_of_a_mechanism_bring_names_signs_and_radii() -> None:
+    cylinder = Cylinder("leg1_rod", 0.01, "base", 0.0, 0.3)
+    leg = Leg(
+        "leg1",
+        "S",
+        "S",
+        LegKind.ACTUATED,
+        "leg1_prismatic",
+        np.zeros(3),
+        np.zeros(3),
+        0.3,
+        -1,
+        (0.0, 0.1),
+        (cylinder,),
+    )
+    legs = fitted_legs([leg] * 3, (0, 1, 2))
+    assert legs.sign.tolist() == [-1, -1, -1]
+    assert legs.radii[(2, "leg1_rod")] == 0.01
+
+
+def test_predicted_platform_error_agrees_with_monte_carlo(session: Session) -> None:
+    rng = np.random.default_rng(0)
+    m = noisy_readings(session, rng)
+    found = refine(session.legs, m, noisy_outlines(session, rng), disturbed_start(session))
+    poses = session.T_Rb_Re[:3]
+    covariance = 0.01 * found.covariance
+    predicted = predict_platform_error(TRUTH, covariance, FRAME_LEGS, poses)
+    lengths = np.array(
+        [np.linalg.norm(T.apply(TRUTH.platform_joints) - TRUTH.base_joints, axis=1) for T in poses]
+    )
+    q = lengths - TRUTH.offsets
+    shifts, turns = [], []
+    for xi in rng.multivariate_normal(to_vector(TRUTH, FRAME_LEGS), covariance, 300):
+        moved = from_vector(xi, 6, FRAME_LEGS)
+        for T, true in zip(platform_poses(moved, q + moved.offsets, poses), poses, strict=True):
+            shifts.append(np.sum((T.translation - true.translation) ** 2))
+            turns.append((T.rotation * true.rotation.inv()).magnitude() ** 2)
+    rms = np.sqrt(np.mean(np.reshape(shifts, (-1, 3)), axis=0))
+    np.testing.assert_allclose(predicted.displacement, rms, rtol=0.15)
+    turn = np.sqrt(np.mean(np.reshape(turns, (-1, 3)), axis=0))
+    np.testing.assert_allclose(predicted.rotation, turn, rtol=0.15)
+    assert predicted.mean_displacement == pytest.approx(np.sqrt(np.mean(rms**2)), rel=0.1)
+    assert predicted.mean_rotation == pytest.approx(np.sqrt(np.mean(turn**2)), rel=0.1)
+
+
+def test_a_pose_that_readings_do_not_determine_is_refused(session: Session) -> None:
+    offsets = TRUTH.offsets.copy()
+    offsets[5] = np.nan
+    passive = KinematicParameters(TRUTH.base_joints, TRUTH.platform_joints, offsets)
+    with pytest.raises(NotIdentifiable, match="the 5 readings do not determine platform pose 1"):
+        predict_platform_error(passive, np.eye(29), FRAME_LEGS, session.T_Rb_Re[:1])
+
+
+def test_a_passive_leg_needs_no_reading() -> None:
+    session = simulate(10, legs_seen=6)
+    q = session.measurements.q.copy()
+    q[:, 3] = np.nan
+    start = disturbed_start(session)
+    offsets = start.parameters.offsets.copy()
+    offsets[3] = np.nan
+    p = start.parameters
+    start = dataclasses.replace(
+        start, parameters=KinematicParameters(p.base_joints, p.platform_joints, offsets)
+    )
+    found = refine(
+        session.legs, dataclasses.replace(session.measurements, q=q), session.outlines, start
+    )
+    error = joint_errors(found.parameters)
+    assert np.isnan(error[-3])
+    assert np.nanmax(np.abs(error)) < 1e-9
+    assert "leg4.offset" not in found.names
+    assert found.covariance.shape == (29, 29)
