@@ -229,5 +229,5 @@ def _read_entry(path: Path) -> CacheEntry | None:
     except FileNotFoundError:
         return None
     except (OSError, ValidationError):
-        return CacheEntry(format=0, fingerprint="", given=[])
+        return CacheEntry(format=0, fingerprint="unreadable", given=[])
     return entry
