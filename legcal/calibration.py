@@ -107,7 +107,7 @@ def permuted(parameters: KinematicParameters, legs: IntArray) -> KinematicParame
 
 def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solution:
     """Return a solution found in the order of work, in the order of the dataset's files."""
-    mechanism, measurements = dataset.mechanism, dataset.measurements
+    mechanism = dataset.mechanism
     legs, views = inverse(order.legs), inverse(order.views)
     estimated = set(solution.names)
     names = tuple(

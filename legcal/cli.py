@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 ISSUES = "the issue tracker of legcal"
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="legcal",
@@ -162,8 +163,7 @@ def main() -> None:
         _fail("UsageError", getattr(error, "format_message", error.__str__)(), as_json=as_json)
         code = 2
     except (KeyboardInterrupt, typer.Abort):
-        _fail("Interrupted", "Stopped; nothing was written.", as_json=as_json)
-        code = 130
+        code = INTERRUPTED
     except Exception as error:  # the one place that may: the boundary to the shell
         traceback.print_exc()
         _fail(
@@ -174,4 +174,6 @@ def main() -> None:
             as_json=as_json,
         )
         code = 3
+    if code == INTERRUPTED:  # typer turns the interrupt of a command into this code
+        _fail("Interrupted", "Stopped; nothing was written.", as_json=as_json)
     sys.exit(code if isinstance(code, int) else 0)

@@ -59,10 +59,8 @@ def load_mechanism(model: str | Path) -> Mechanism:
 def _assemble(file: MechanismFile, urdf: Urdf, yaml_path: Path) -> Mechanism:
     """Return the mechanism, its chain not closed yet."""
     block = file.legcal
-    closures = [
-        Closure("3d" if kind == "3d" else "6d", one, two)
-        for kind, (one, two) in zip(file.type, file.closed_loop, strict=True)
-    ]
+    pairs = sorted(zip(file.closed_loop, file.type, strict=True))  # sums depend on their order
+    closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = agreement.legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform), bodies, urdf, file, yaml_path

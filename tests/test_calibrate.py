@@ -1,0 +1,216 @@
+"""The whole path, on the photographs of the example hexapod."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hexapod_example import HEXAPOD, TRUTH, Run, copy_of_the_example
+
+from legcal import LegcalError, calibrate, evaluate, load_dataset, load_mechanism
+from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
+
+
+def _table(folder: Path) -> list[list[str]]:
+    with (folder / "measurements.csv").open(newline="") as file:
+        return list(csv.reader(file))
+
+
+def _write_table(folder: Path, rows: list[list[str]]) -> None:
+    with (folder / "measurements.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+
+
+def _entry(folder: Path) -> dict[str, Any]:
+    entry: dict[str, Any] = yaml.safe_load((folder / "dataset.yaml").read_text())
+    return entry
+
+
+def _write_entry(folder: Path, entry: dict[str, Any]) -> None:
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(entry, sort_keys=False))
+
+
+def test_photographs_bring_the_platform_within_a_quarter_of_a_millimetre(
+    example_run: Run,
+) -> None:
+    nominal = evaluate(HEXAPOD / "models/hexapod.yaml", TRUTH, dataset=HEXAPOD)
+    found = evaluate(example_run.output / "calibrated.yaml", TRUTH, dataset=HEXAPOD)
+    assert nominal.displacement.mean() > 1.2e-3
+    assert nominal.rotation.mean() > np.radians(0.4)
+    assert found.displacement.mean() < 0.25e-3
+    assert found.rotation.mean() < np.radians(0.07)
+
+
+def test_the_verdict_is_positive_and_the_change_is_known_well(example_run: Run) -> None:
+    calibration = example_run.calibration
+    assert calibration.verdict.trustworthy
+    assert calibration.change.mean_displacement > 2.0 * calibration.sigma.mean_displacement
+    assert calibration.solution.start in {"nominal", "staged"}
+
+
+def test_the_result_document_has_what_the_format_says(example_run: Run) -> None:
+    document = json.loads((example_run.output / "result.json").read_text())
+    n_estimated = sum(row["status"] == "estimated" for row in document["parameters"])
+    covariance = np.array(document["covariance"])
+    assert document["legcal_result"] == 1
+    assert document["status"] == "converged"
+    assert covariance.shape == (n_estimated, n_estimated)
+    assert np.allclose(covariance, covariance.T, rtol=1e-9)
+    sigma = [row["sigma"] for row in document["parameters"] if row["status"] == "estimated"]
+    assert np.allclose(np.sqrt(np.diagonal(covariance)), sigma, rtol=1e-9)
+    assert np.array(document["base_joints"]).shape == (6, 3)
+    assert document["base_joints"][0] == [0.0, 0.0, 0.0]
+    assert set(document["views"]) == {"c1", "c2", "c3"}
+    assert len(document["stages"]["staged"]["offsets"]) == 6
+    assert [row["name"] for row in document["parameters"]][:3] == [
+        "leg2.base.x",
+        "leg2.base.y",
+        "leg2.base.z",
+    ]
+
+
+def test_the_written_model_is_the_one_that_was_computed(example_run: Run) -> None:
+    written = load_mechanism(example_run.output / "calibrated.yaml")
+    expected = example_run.calibration.solution.parameters
+    assert np.abs(written.parameters.base_joints - expected.base_joints).max() < 1e-12
+    assert np.abs(written.parameters.platform_joints - expected.platform_joints).max() < 1e-12
+    assert np.abs(written.parameters.offsets - expected.offsets).max() < 1e-12
+
+
+def test_a_second_run_reads_the_outlines_and_gives_the_same_result(example_run: Run) -> None:
+    stages: list[str] = []
+    again = calibrate(example_run.folder, progress=lambda stage, done, total: stages.append(stage))
+    assert "Aligning cameras" in example_run.stages
+    assert not any("outlines" in stage or "Aligning" in stage for stage in stages)
+    difference = (
+        again.solution.parameters.base_joints
+        - example_run.calibration.solution.parameters.base_joints
+    )
+    assert np.abs(difference).max() < 1e-12
+
+
+def test_an_edited_row_wins_and_is_kept(example_run: Run, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(example_run.folder, tmp_path / "edited"))
+    path = folder / "observations.csv"
+    lines = path.read_text().splitlines()
+    k = next(i for i, line in enumerate(lines) if line.endswith(",used,,detected"))
+    lines[k] = lines[k].replace(",used,,detected", ",rejected,a reflection,edited")
+    path.write_text("\n".join(lines) + "\n")
+    result = calibrate(folder, output=tmp_path / "out")
+    key = ",".join(lines[k].split(",")[:5])
+    for table in (path, tmp_path / "out/observations.csv"):
+        kept = [line for line in table.read_text().splitlines() if line.startswith(key + ",")]
+        assert len(kept) == 1
+        assert kept[0].endswith(",rejected,a reflection,edited")
+    assert (
+        result.solution.outlines.used.sum() < example_run.calibration.solution.outlines.used.sum()
+    )
+
+
+def _reordered(folder: Path) -> None:
+    """Turn the order of rows, columns, legs and views around."""
+    header, *rows = _table(folder)
+    columns = [*range(len(header) - 1, -1, -1)]
+    _write_table(folder, [[line[c] for c in columns] for line in [header, *rows[::-1]]])
+    entry = _entry(folder)
+    entry["views"] = dict(reversed(entry["views"].items()))
+    _write_entry(folder, entry)
+    model = folder / "models/hexapod.yaml"
+    mechanism = yaml.safe_load(model.read_text())
+    mechanism["legcal"]["legs"] = dict(reversed(mechanism["legcal"]["legs"].items()))
+    for key in ("closed_loop", "type", "name_mot"):
+        mechanism[key] = mechanism[key][::-1]
+    model.write_text(yaml.safe_dump(mechanism, sort_keys=False))
+
+
+def test_the_order_of_rows_columns_legs_and_views_does_not_matter(tmp_path: Path) -> None:
+    results = []
+    for name in ("given", "reordered"):
+        folder = copy_of_the_example(tmp_path / name)
+        header, *rows = _table(folder)
+        _write_table(folder, [header, *rows[0:4], *rows[15:19], *rows[30:34]])
+        if name == "reordered":
+            _reordered(folder)
+        results.append(calibrate(folder))
+    given, reordered = results
+    names = given.dataset.mechanism.leg_names
+    legs = [reordered.dataset.mechanism.leg_names.index(leg) for leg in names]
+    one, other = given.solution.parameters, reordered.solution.parameters
+    assert legs == [5, 4, 3, 2, 1, 0]
+    assert np.abs(one.base_joints - other.base_joints[legs]).max() < 1e-12
+    assert np.abs(one.platform_joints - other.platform_joints[legs]).max() < 1e-12
+    assert np.abs(one.offsets - other.offsets[legs]).max() < 1e-12
+    assert given.solution.names == reordered.solution.names or set(given.solution.names) == set(
+        reordered.solution.names
+    )
+    sigma = dict(zip(reordered.solution.names, reordered.solution.sigma, strict=True))
+    for parameter, value in zip(given.solution.names, given.solution.sigma, strict=True):
+        assert sigma[parameter] == pytest.approx(value, rel=1e-6)
+
+
+def test_outlines_without_photographs_are_enough(example_run: Run, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(example_run.folder, tmp_path / "outlines"))
+    shutil.rmtree(folder / "images")
+    (folder / ".legcal-cache.json").unlink()
+    result = calibrate(folder)
+    expected = example_run.calibration.solution.parameters
+    assert np.abs(result.solution.parameters.base_joints - expected.base_joints).max() < 1e-12
+
+
+def test_too_few_images_are_refused_with_both_numbers(tmp_path: Path) -> None:
+    folder = copy_of_the_example(tmp_path / "two")
+    header, *rows = _table(folder)
+    _write_table(folder, [header, rows[0], rows[15]])
+    with pytest.raises(NotIdentifiable, match=r"\d+ .*\d+"):
+        calibrate(folder, output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_pose_that_sees_no_leg_is_named(tmp_path: Path) -> None:
+    folder = copy_of_the_example(tmp_path / "away")
+    entry = _entry(folder)
+    entry["views"]["c2"]["T_base_camera"]["quat_xyzw"] = [0.0, 0.0, 0.0, 1.0]
+    _write_entry(folder, entry)
+    with pytest.raises(NotVisible, match="c2"):
+        calibrate(folder, output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_view_without_a_camera_pose_is_named(tmp_path: Path) -> None:
+    folder = copy_of_the_example(tmp_path / "unknown")
+    entry = _entry(folder)
+    del entry["views"]["c3"]["T_base_camera"]
+    _write_entry(folder, entry)
+    with pytest.raises(DatasetError, match=r"c3.*T_base_camera"):
+        calibrate(folder)
+
+
+def test_an_output_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/thesis.tex").write_text("years of work")
+    with pytest.raises(UsageError, match="other files"):
+        calibrate(HEXAPOD, output=tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+
+
+def test_an_interrupted_run_leaves_nothing_behind(
+    example_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("legcal.report.result.write_observations", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        calibrate(example_run.folder, output=tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_can_be_loaded_first(example_run: Run) -> None:
+    dataset = load_dataset(example_run.folder)
+    assert calibrate(dataset).solution.start == example_run.calibration.solution.start
+    with pytest.raises(LegcalError):
+        load_dataset(example_run.folder / "nothing")
