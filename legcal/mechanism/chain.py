@@ -122,17 +122,19 @@ class ClosedChain:
             row = rows.stop
         return residual, jacobian
 
-    def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
-        """Return T_base_frame between two frames at a configuration."""
+    def placement(self, configuration: Array, base: str, frame: str) -> tuple[Array, Array]:
+        """Return rotation (3, 3) and translation (3,) [m] of a frame in another at a configuration.
+
+        The same as :meth:`pose` without the cost of the type, for inner loops.
+        """
         pin.forwardKinematics(self._model, self._data, configuration)
         M = self._placement(base).actInv(self._placement(frame))
-        return RigidTransform.from_components(M.translation, Rotation.from_matrix(M.rotation))
+        return M.rotation, M.translation
 
-    def distance(self, configuration: Array, frame_1: str, frame_2: str) -> float:
-        """Return the distance between the origins of two frames [m]."""
-        pin.forwardKinematics(self._model, self._data, configuration)
-        gap = self._placement(frame_1).translation - self._placement(frame_2).translation
-        return float(np.linalg.norm(gap))
+    def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
+        """Return T_base_frame between two frames at a configuration."""
+        R, t = self.placement(configuration, base, frame)
+        return RigidTransform.from_components(t, Rotation.from_quat(pin.Quaternion(R).coeffs()))
 
     def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
         """Return residual and Jacobian of holding a frame at a pose, at the last linearisation.
@@ -175,12 +177,24 @@ class ClosedChain:
                 columns.append(start)
         return np.array(columns, dtype=np.intp)
 
-    def with_floating(self, configuration: Array, joint: str, motion: RigidTransform) -> Array:
-        """Return the configuration with a floating joint set to a motion of its child."""
+    def with_platform(
+        self,
+        configuration: Array,
+        joint: str,
+        base: str,
+        platform: str,
+        T_base_platform: RigidTransform,
+    ) -> Array:
+        """Return the configuration with the floating joint that carries the platform set."""
+        pin.forwardKinematics(self._model, self._data, configuration)
+        index = self._model.getJointId(joint)
+        before = self._data.oMi[self._model.parents[index]] * self._model.jointPlacements[index]
+        after = self._data.oMi[index].actInv(self._placement(platform))
+        matrix = T_base_platform.as_matrix()
+        wanted = self._placement(base) * pin.SE3(matrix[:3, :3], matrix[:3, 3]) * after.inverse()
         placed = configuration.copy()
         start = self.q_index(joint)
-        placed[start : start + 3] = motion.translation
-        placed[start + 3 : start + 7] = motion.rotation.as_quat()
+        placed[start : start + 7] = pin.SE3ToXYZQUAT(before.actInv(wanted))
         return placed
 
     def _frame(self, name: str) -> int:

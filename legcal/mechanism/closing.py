@@ -100,11 +100,13 @@ def _placed(mechanism: Mechanism, T_base_platform: RigidTransform, start: Array 
     chain = mechanism.chain
     configuration = chain.neutral() if start is None else start.copy()
     if mechanism.platform_joint is not None:
-        joint = mechanism.urdf.joints[mechanism.platform_joint]
-        before = chain.pose(configuration, mechanism.base, joint.parent) * joint.T_parent_origin
-        after = chain.pose(configuration, joint.child, mechanism.platform)
-        motion = before.inv() * T_base_platform * after.inv()
-        configuration = chain.with_floating(configuration, joint.name, motion)
+        configuration = chain.with_platform(
+            configuration,
+            mechanism.platform_joint,
+            mechanism.base,
+            mechanism.platform,
+            T_base_platform,
+        )
     q = readings_at(mechanism, T_base_platform)
     sliding = tuple(j for j, leg in enumerate(mechanism.legs) if leg.prismatic is not None)
     configuration[slider_columns(mechanism, sliding)[0]] = q[list(sliding)]

@@ -13,7 +13,6 @@ from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.closing import (
     CLOSED,
     close_at,
-    leg_vectors,
     platform_pose,
     readings_at,
     slider_columns,
@@ -95,9 +94,9 @@ def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransfo
     known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
     configurations = [mechanism.home_configuration]
     poses = []
-    for row in readings:
+    for i, row in enumerate(readings):
         nearest = int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))
-        configuration = _follow(mechanism, configurations[nearest], row)
+        configuration = _follow(mechanism, configurations[nearest], row, f" of row {i + 1}")
         known.append(row)
         configurations.append(configuration)
         poses.append(platform_pose(mechanism, configuration))
@@ -188,7 +187,7 @@ def _readings(mechanism: Mechanism, q: Array) -> Array:
     return readings
 
 
-def _follow(mechanism: Mechanism, configuration: Array, readings: Array) -> Array:
+def _follow(mechanism: Mechanism, configuration: Array, readings: Array, which: str = "") -> Array:
     """Return the closed configuration at readings, followed from a closed one."""
     q_columns, v_columns = slider_columns(mechanism, mechanism.motors)
     free = np.delete(np.arange(mechanism.chain.nv), v_columns)
@@ -207,8 +206,8 @@ def _follow(mechanism: Mechanism, configuration: Array, readings: Array) -> Arra
             step *= 0.5
             if step < SHORTEST:
                 raise DidNotConverge(
-                    f"{mechanism.yaml_path}: the pose at the readings could not be reached: at "
-                    f"{100 * done:.1f} % of the way from the starting pose "
+                    f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: "
+                    f"at {100 * done:.1f} % of the way from the starting pose "
                     f"{worst_closure(mechanism, residual)} or the mechanism is singular, needed "
                     "closure to 1e-12 m on a regular path; check the readings and legcal.home."
                 )
@@ -251,7 +250,10 @@ def _side(mechanism: Mechanism, configuration: Array) -> float:
     driven = [j for j, leg in enumerate(mechanism.legs) if leg.kind is not LegKind.PASSIVE]
     if len(driven) != 6:
         return 0.0
-    T = platform_pose(mechanism, configuration)
-    u = leg_vectors(mechanism, T)[driven]
-    arms = T.rotation.apply(mechanism.B_platform[driven])
-    return float(np.sign(np.linalg.det(np.hstack([u, np.cross(arms, u)]))))
+    R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
+    arms = mechanism.B_platform[driven] @ R.T
+    u = arms + t - mechanism.A_base[driven]
+    # the moments u x arm about the platform's origin, written out: np.cross is slow on six rows
+    (x, y, z), (a, b, c) = arms.T, u.T
+    lines = np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
+    return float(np.sign(np.linalg.det(lines)))
