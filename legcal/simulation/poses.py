@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -120,6 +122,35 @@ def follow(machine: Machine, lengths: Array, n_steps: int = 6) -> RigidTransform
         if np.linalg.svd(scaled, compute_uv=False)[-1] < 0.1:
             raise DidNotConverge("A simulated pose is near a singularity; draw another.")
     return T
+
+
+def platform_error(
+    machine: Machine, parameters: KinematicParameters, poses: Sequence[RigidTransform]
+) -> tuple[float, float]:
+    """Return the mean displacement and rotation of the platform that parameters cause, eq (20).
+
+    Parameters
+    ----------
+    machine : Machine
+        The true machine.
+    parameters : KinematicParameters
+        Other parameters, given the readings of the true machine.
+    poses : sequence of RigidTransform
+        True poses T_Rb_Re.
+
+    Returns
+    -------
+    float, float
+        Mean displacement of the origin of R_e [m] and mean angle [rad].
+    """
+    true = machine.parameters
+    displacement, angle = [], []
+    for T in poses:
+        lengths = np.linalg.norm(leg_vectors(true, T), axis=-1)
+        found = solve_pose(parameters, lengths - true.offsets + parameters.offsets, T)
+        displacement.append(float(np.linalg.norm(found.translation - T.translation)))
+        angle.append(float((found.rotation * T.rotation.inv()).magnitude()))
+    return float(np.mean(displacement)), float(np.mean(angle))
 
 
 def _jacobian(parameters: KinematicParameters, T_Rb_Re: RigidTransform) -> Array:

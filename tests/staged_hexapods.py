@@ -1,0 +1,67 @@
+"""Simulated hexapods and disturbed nominal models, shared by the tests of the steps."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from legcal.geometry.types import Array
+from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
+from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
+from legcal.simulation.machine import Machine, hexapod, perturb
+from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.session import SimulatedSession, simulate_session
+
+
+def exact_session(
+    seed: int = 0,
+    *,
+    coplanar: bool = False,
+    noise: OutlineNoise | TableNoise | None = None,
+    legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
+    n_poses: int = 6,
+) -> SimulatedSession:
+    """Return a session without noise of a hexapod 2 mm off its drawing."""
+    rng = np.random.default_rng(seed)
+    machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
+    return simulate_session(
+        machine,
+        cameras_around(machine, rng, legs=legs),
+        rng,
+        noise=noise or OutlineNoise(),
+        noisy=False,
+        n_poses=n_poses,
+    )
+
+
+def noisy_session(
+    seed: int, noise: OutlineNoise | TableNoise, *, coplanar: bool = False, n_poses: int = 15
+) -> tuple[SimulatedSession, Machine]:
+    """Return a session with noise, and a nominal machine up to 2 mm wrong in every parameter."""
+    rng = np.random.default_rng(seed)
+    machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
+    nominal = perturb(machine, rng, 0.002)
+    session = simulate_session(
+        machine,
+        cameras_around(machine, rng),
+        rng,
+        noise=noise,
+        n_poses=n_poses,
+        n_images=3 if isinstance(noise, TableNoise) else 1,
+    )
+    return session, nominal
+
+
+def five_millimetres_away(machine: Machine, seed: int = 0) -> Machine:
+    """Return the machine with every parameter exactly 5 mm wrong, z and offsets included."""
+    vector = to_vector(machine.parameters, machine.frame_legs)
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(vector))
+    parameters = from_vector(vector + 0.005 * signs, machine.n_legs, machine.frame_legs)
+    return replace(machine, parameters=parameters)
+
+
+def errors(parameters: KinematicParameters, machine: Machine) -> Array:
+    """Return the absolute error of every parameter [m]."""
+    difference = to_vector(parameters, machine.frame_legs) - to_vector(
+        machine.parameters, machine.frame_legs
+    )
+    return np.asarray(np.abs(difference))

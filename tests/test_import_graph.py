@@ -1,0 +1,98 @@
+"""Data flows down the layers and never up, and the method cannot see the simulated truth."""
+
+import ast
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LAYERS = (
+    "geometry",
+    "mechanism",
+    "vision",
+    "dataset",
+    "leg_axes",
+    "stages",
+    "refinement",
+    "report",
+    "pipeline",
+    "cli",
+)
+
+
+@cache
+def _modules() -> dict[str, Path]:
+    found = {}
+    for path in (ROOT / "legcal").rglob("*.py"):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+@cache
+def _imports(module: str) -> frozenset[str]:
+    """Return the modules of the package that a module names in an import, wherever it stands."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(_modules()[module].read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    # The root only hands out public names; every import passes through it.
+    return frozenset(names & _modules().keys() - {"legcal", module})
+
+
+def _reachable(module: str) -> set[str]:
+    seen: set[str] = set()
+    waiting = [module]
+    while waiting:
+        for name in _imports(waiting.pop()) - seen:
+            seen.add(name)
+            waiting.append(name)
+    return seen
+
+
+def _unit(module: str) -> str:
+    return module.split(".")[1] if "." in module else module
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    circles = [module for module in _modules() if module in _reachable(module)]
+    assert circles == []
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_layer_reaches_only_layers_below_it(layer: str) -> None:
+    above = set(LAYERS[LAYERS.index(layer) + 1 :])
+    modules = [module for module in _modules() if _unit(module) == layer]
+    assert modules, f"the layer {layer} has no module"
+    up = {(m, other) for m in modules for other in _reachable(m) if _unit(other) in above}
+    assert up == set()
+
+
+def test_steps_and_fit_do_not_know_each_other() -> None:
+    for here, there in (("stages", "refinement"), ("refinement", "stages")):
+        modules = [module for module in _modules() if _unit(module) == here]
+        assert not {other for m in modules for other in _reachable(m) if _unit(other) == there}
+
+
+def test_geometry_knows_no_robot_and_no_camera() -> None:
+    modules = [module for module in _modules() if _unit(module) == "geometry"]
+    units = {_unit(other) for module in modules for other in _reachable(module)}
+    assert units <= {"geometry"}
+
+
+def test_nobody_imports_the_simulation() -> None:
+    users = {
+        module
+        for module in _modules()
+        if _unit(module) != "simulation"
+        and any(_unit(other) == "simulation" for other in _reachable(module))
+    }
+    assert users == set()
+
+
+def test_no_module_names_the_true_model_of_the_example() -> None:
+    users = [m for m, path in _modules().items() if "hexapod-truth" in path.read_text()]
+    assert users == []

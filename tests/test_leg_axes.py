@@ -1,0 +1,133 @@
+"""Axes and their covariances from outlines."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from staged_hexapods import exact_session
+
+from legcal.errors import NotVisible
+from legcal.geometry.lines import distance_to_line
+from legcal.geometry.types import Array
+from legcal.leg_axes import axes_from_outlines, join_axes, outline_derivative
+from legcal.observations import LegAxes, Outlines
+from legcal.simulation.cameras import cameras_around, sample_camera
+from legcal.simulation.machine import hexapod, perturb
+from legcal.simulation.observe import OutlineNoise, shifted_outlines
+from legcal.simulation.session import SimulatedSession, simulate_session
+from legcal.vision.camera import Camera
+
+LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
+
+
+def _session(camera: Camera, n_poses: int = 2) -> SimulatedSession:
+    rng = np.random.default_rng(3)
+    machine = perturb(hexapod(), rng, 0.002)
+    views = cameras_around(machine, rng, camera=camera)
+    return simulate_session(machine, views, rng, noise=OutlineNoise(), noisy=False, n_poses=n_poses)
+
+
+def _axes(session: SimulatedSession, outlines: Outlines) -> LegAxes:
+    return axes_from_outlines(outlines, session.measurements, session.machine.radius_of_part())
+
+
+def _coordinates(axes: LegAxes, reference: LegAxes) -> Array:
+    """Return (alpha1, alpha2, beta1, beta2) of axes in the bases of others, (n, 4)."""
+    u = axes.u / np.sum(axes.u * reference.u, axis=1, keepdims=True)
+    along = np.sum(reference.u * (reference.M - axes.M), axis=1, keepdims=True)
+    alpha = np.einsum("nia,na->ni", reference.basis, u)
+    beta = np.einsum("nia,na->ni", reference.basis, axes.M + along * u - reference.M)
+    return np.concatenate([alpha, beta], axis=1)
+
+
+@pytest.mark.parametrize("camera", [sample_camera(), LENS])
+def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> None:
+    session = _session(camera)
+    axes = _axes(session, session.outlines or pytest.fail("no outlines"))
+    for i in range(len(axes)):
+        row = int(axes.row[i])
+        T_camera_Rb = session.viewpoints[session.measurements.view[row]].T_Rb_camera.inv()
+        pose = session.T_Rb_Re[session.measurements.pose[row]]
+        A = T_camera_Rb.apply(session.machine.parameters.base_joints[axes.leg[i]])
+        B_Rb = pose.apply(session.machine.parameters.platform_joints[axes.leg[i]])
+        B = T_camera_Rb.apply(B_Rb)
+        assert distance_to_line(A, axes.u[i], axes.M[i]) < 1e-9
+        assert distance_to_line(B, axes.u[i], axes.M[i]) < 1e-9
+        assert axes.u[i] @ (B - A) > 0.0
+        # M is in the middle of the piece that is seen.
+        assert abs(axes.u[i] @ (axes.M[i] - 0.5 * (A + B))) < 0.1 * np.linalg.norm(B - A)
+
+
+def test_the_basis_is_normal_to_the_axis() -> None:
+    axes = exact_session().axes
+    assert np.allclose(np.cross(axes.basis[:, 0], axes.basis[:, 1]), axes.u, atol=1e-12)
+
+
+def test_normals_follow_offsets_as_finite_differences_say() -> None:
+    session = _session(LENS)
+    outlines = session.outlines or pytest.fail("no outlines")
+    _, derivative = outline_derivative(LENS, outlines.h, outlines.ends)
+    step = 1e-3
+    for end in range(2):
+        offset = step * np.eye(2)[end]
+        plus, _ = shifted_outlines(LENS, outlines.h, outlines.ends, offset)
+        minus, _ = shifted_outlines(LENS, outlines.h, outlines.ends, -offset)
+        found = (plus - minus) / (2.0 * step)
+        assert np.allclose(found, derivative[:, end], rtol=1e-4, atol=1e-7)
+
+
+def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
+    session = _session(LENS)
+    outlines = session.outlines or pytest.fail("no outlines")
+    exact = _axes(session, outlines)
+    rng = np.random.default_rng(0)
+    root = np.linalg.cholesky(exact.covariance)
+    normalised = []
+    for _ in range(150):
+        offsets = rng.multivariate_normal(np.zeros(2), OutlineNoise().covariance, len(outlines))
+        h, ends = shifted_outlines(LENS, outlines.h, outlines.ends, offsets)
+        axes = _axes(session, replace(outlines, h=h, ends=ends))
+        normalised.append(np.linalg.solve(root, _coordinates(axes, exact)[..., None])[..., 0])
+    samples = np.concatenate(normalised)
+    assert np.allclose(samples.mean(axis=0), 0.0, atol=0.08)
+    assert np.allclose(np.cov(samples.T), np.eye(4), atol=0.1)
+
+
+def test_tilt_towards_the_camera_is_known_far_worse_than_the_angle_in_the_image() -> None:
+    covariance = exact_session().axes.covariance[:, :2, :2]
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance))
+    assert np.all(sigma[:, 1] > 20.0 * sigma[:, 0])
+
+
+def test_tube_and_rod_of_a_leg_are_joined_with_the_weight_of_their_covariances() -> None:
+    axes = exact_session(n_poses=2).axes
+    moved = replace(axes, M=axes.M + 1e-4 * axes.basis[:, 0], covariance=3.0 * axes.covariance)
+    both = LegAxes(
+        *(
+            np.concatenate([getattr(axes, name), getattr(moved, name)])
+            for name in ("row", "leg", "u", "M", "basis", "covariance")
+        )
+    )
+    joined = join_axes(both, both.row)
+    assert np.array_equal(joined.row, axes.row)
+    assert np.array_equal(joined.leg, axes.leg)
+    shift = np.sum((joined.M - axes.M) * axes.basis[:, 0], axis=1)
+    assert np.allclose(shift, 0.25e-4, atol=1e-10)
+    assert np.allclose(joined.covariance, 0.75 * axes.covariance, rtol=1e-6)
+
+
+def test_legs_with_one_used_outline_are_passed_over() -> None:
+    session = _session(sample_camera())
+    outlines = session.outlines or pytest.fail("no outlines")
+    used = outlines.used.copy()
+    used[0] = False
+    axes = _axes(session, replace(outlines, used=used))
+    assert len(axes) == len(session.axes) - 1
+    assert (int(axes.row[0]), int(axes.leg[0])) == (0, int(outlines.leg[2]))
+
+
+def test_no_pair_of_outlines_is_refused() -> None:
+    session = _session(sample_camera())
+    outlines = session.outlines or pytest.fail("no outlines")
+    with pytest.raises(NotVisible, match="no leg has both outlines in any image"):
+        _axes(session, replace(outlines, used=outlines.edge == 1))

@@ -1,0 +1,139 @@
+"""The simulator: poses, cameras, and noise of the spread that it claims."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from staged_hexapods import exact_session, noisy_session
+
+from legcal.errors import DidNotConverge, NotVisible
+from legcal.geometry.lines import moment
+from legcal.simulation.cameras import cameras_around, look_at, sample_camera
+from legcal.simulation.machine import hexapod, perturb
+from legcal.simulation.observe import OutlineNoise, TableNoise, observe_axes, shifted_outlines
+from legcal.simulation.poses import extreme_poses, follow, leg_vectors, platform_error, solve_pose
+from legcal.simulation.session import simulate_session
+
+
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=10, deadline=None)
+def test_forward_kinematics_returns_the_lengths_it_was_given(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    machine = perturb(hexapod(), rng, 0.002)
+    lengths = rng.uniform(0.40, 0.44, 6)
+    pose = solve_pose(machine.parameters, lengths, machine.home)
+    found = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
+    assert np.abs(found - lengths).max() < 1e-13
+
+
+def test_extreme_poses_have_every_leg_near_an_end_of_its_travel() -> None:
+    machine = hexapod()
+    for pose in extreme_poses(machine, 10, np.random.default_rng(1)):
+        lengths = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
+        part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
+        assert np.all((part < 0.121) | (part > 0.879))
+        assert pose.translation[2] > 0.2  # above the base: the assembly mode of home
+
+
+def test_lengths_that_no_pose_has_are_refused() -> None:
+    machine = hexapod()
+    with pytest.raises(DidNotConverge, match="simulated pose"):
+        follow(machine, np.array([0.1, 0.9, 0.1, 0.9, 0.1, 0.9]))
+
+
+def test_platform_error_of_the_truth_is_zero_and_of_an_offset_is_not() -> None:
+    machine = hexapod()
+    poses = extreme_poses(machine, 3, np.random.default_rng(1))
+    assert platform_error(machine, machine.parameters, poses) == (0.0, 0.0)
+    other = perturb(machine, np.random.default_rng(2), 0.002).parameters
+    assert platform_error(machine, other, poses)[0] > 1e-4
+
+
+def test_a_camera_sees_its_target_on_its_optical_axis_and_up_as_up() -> None:
+    T = look_at(np.array([1.0, 0.2, 0.3]), np.zeros(3)).inv()
+    assert np.allclose(T.apply(np.zeros(3))[:2], 0.0, atol=1e-12)
+    assert T.apply(np.zeros(3))[2] > 0.0
+    assert T.apply([0.0, 0.0, 0.1])[1] < 0.0
+
+
+def test_simulated_cameras_see_the_machine_inside_the_image() -> None:
+    session = exact_session()
+    assert session.outlines is not None
+    camera = sample_camera()
+    inside = (session.outlines.ends > 0.0) & (
+        session.outlines.ends < np.array([camera.width, camera.height])
+    )
+    assert inside.mean() > 0.95
+
+
+def test_exact_outlines_touch_the_cylinder_on_the_side_of_their_edge() -> None:
+    session = exact_session()
+    outlines, axes = session.outlines, session.axes
+    assert outlines is not None
+    epsilon = np.where(outlines.edge == 1, 1.0, -1.0)
+    distance = np.sum(outlines.h * np.repeat(axes.M, 2, axis=0), axis=1)
+    assert np.allclose(distance, 0.010 * epsilon, atol=1e-10)
+    assert np.all(np.sum(outlines.h * np.repeat(moment(axes.u, axes.M), 2, axis=0), axis=1) > 0)
+
+
+def test_a_shift_of_an_outline_in_pixels_is_the_offset_that_the_camera_measures() -> None:
+    session = exact_session()
+    assert session.outlines is not None
+    camera, outlines = sample_camera(), session.outlines
+    h, _ = shifted_outlines(camera, outlines.h, outlines.ends, np.array([0.3, -0.2]))
+    offset = camera.line_offset(h[:, None], camera.undistort(outlines.ends))
+    assert np.allclose(offset, [-0.3, 0.2], atol=2e-3)
+
+
+def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
+    u = np.tile([0.2, -0.95, 0.24], (4000, 1))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    A = np.tile([0.1, 0.2, 0.9], (4000, 1))
+    noise = TableNoise()
+    u_hat, M_hat, _, _ = observe_axes(u, A, noise, np.random.default_rng(0))
+    exact = observe_axes(u, A, noise, None)
+    _, M, basis, covariance = (part[0] for part in exact)
+    beta = (M_hat - M) @ basis.T
+    alpha = (u_hat / (u_hat @ u[0])[:, None]) @ basis.T
+    found = np.cov(np.hstack([alpha, beta]).T)
+    scale = np.sqrt(np.diag(covariance))
+    assert np.allclose(
+        found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.1
+    )
+    assert np.isclose(np.rad2deg(noise.psi), 0.05)
+
+
+def test_table_1_does_not_exist_for_a_leg_parallel_to_the_image_x_axis() -> None:
+    u, A = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.1, 0.9]])
+    with pytest.raises(NotVisible, match="parallel to the image x axis"):
+        observe_axes(u, A, TableNoise(), None)
+
+
+def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:
+    noise = OutlineNoise(sigma_px=0.2, n_points=50)
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 1.0, 50)
+    fits = np.polyfit(t, rng.normal(scale=0.2, size=(50, 20000)), 1)
+    ends = np.stack([fits[1], fits[0] + fits[1]])
+    assert np.allclose(np.cov(ends), noise.covariance, rtol=0.1, atol=2e-4)
+
+
+def test_images_of_one_pose_share_readings_and_views_may_share_poses() -> None:
+    session, _ = noisy_session(0, TableNoise(), n_poses=2)
+    m = session.measurements
+    assert m.n_rows == 3 * 2 * 3
+    assert m.n_poses == 6
+    assert np.array_equal(m.q[0], m.q[2])
+    rng = np.random.default_rng(0)
+    machine = hexapod()
+    views = cameras_around(machine, rng)
+    shared = simulate_session(
+        machine, views, rng, noise=OutlineNoise(), n_poses=2, share_poses=True
+    )
+    assert shared.measurements.pose.tolist() == [0, 1, 0, 1, 0, 1]
+
+
+def test_the_same_seed_gives_the_same_session() -> None:
+    first, second = (noisy_session(7, OutlineNoise(), n_poses=2)[0] for _ in range(2))
+    assert np.array_equal(first.axes.u, second.axes.u)
+    assert np.array_equal(first.measurements.q, second.measurements.q)
