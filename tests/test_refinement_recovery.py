@@ -24,7 +24,7 @@ from legcal.measurements import Measurements
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations import Outlines
 from legcal.refinement import FittedLegs, Solution, Start, refine, refine_from_best
-from legcal.refinement.noise import NoiseModel, estimate_noise
+from legcal.refinement.noise import NoiseModel, estimate_noise, noise_of_the_median
 
 
 @pytest.fixture(scope="module")
@@ -158,6 +158,32 @@ def test_a_bias_common_to_both_ends_is_told_from_noise_at_each() -> None:
     noise = estimate_noise(offsets, np.zeros((4000, 2, 2)), C)
     assert noise.scale == pytest.approx(1.5, rel=0.05)
     assert noise.bias_px == pytest.approx(0.3, rel=0.05)
+
+
+def test_an_error_opposite_at_both_ends_is_told_from_noise_at_each() -> None:
+    rng = np.random.default_rng(2)
+    C = np.tile(0.01 * np.eye(2), (4000, 1, 1))
+    offsets = 0.05 * rng.standard_normal((4000, 2))
+    offsets += 0.2 * rng.standard_normal((4000, 1)) * np.array([1.0, -1.0])
+    for noise in (
+        estimate_noise(offsets, np.zeros((4000, 2, 2)), C),
+        noise_of_the_median(offsets, C),
+    ):
+        assert noise.scale == pytest.approx(0.5, rel=0.06)
+        assert noise.tilt_px == pytest.approx(0.2, rel=0.06)
+        assert noise.bias_px == 0.0
+
+
+def test_wrong_outlines_hardly_move_the_noise_of_the_median() -> None:
+    rng = np.random.default_rng(2)
+    C = np.tile(0.01 * np.eye(2), (4000, 1, 1))
+    offsets = 0.1 * rng.standard_normal((4000, 2)) + 0.3 * rng.standard_normal((4000, 1))
+    clean = noise_of_the_median(offsets, C)
+    offsets[:800] += rng.uniform(2.0, 30.0, (800, 1))
+    dirty = noise_of_the_median(offsets, C)
+    assert clean.bias_px == pytest.approx(0.3, rel=0.1)
+    assert dirty.bias_px < 1.6 * clean.bias_px
+    assert dirty.scale == pytest.approx(1.0, rel=0.1)
 
 
 def test_biased_outlines_widen_the_covariance(session: Session) -> None:

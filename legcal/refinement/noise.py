@@ -1,9 +1,10 @@
 """How much the claimed covariances of outlines can be trusted, estimated from the residuals.
 
-The covariance that enters the fit is ``scale^2 C + bias^2 [[1, 1], [1, 1]]``: C is what
-detection claims, and the bias is an error that both ends of an outline share (shading, blur). The
-difference of the offsets at both ends does not feel the bias, which is why both can be told
-apart.
+The covariance that enters the fit is ``scale^2 C + bias^2 [[1, 1], [1, 1]] + tilt^2 [[1, -1],
+[-1, 1]]``: C is what detection claims, the bias is an error that both ends of an outline share
+(shading, blur), the tilt one that has opposite signs there. The difference of the offsets at both
+ends does not feel the bias and their sum does not feel the tilt: the smaller of what
+these two say is the scale, and the excess of the other is bias or tilt.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scipy.optimize import brentq
 
 from legcal.geometry.types import Array, BoolArray
 
-_ONES = np.ones((2, 2))
+_SUM = np.array([1.0, 1.0])
 _DIFFERENCE = np.array([-1.0, 1.0])
 _MEDIAN_OF_1 = 0.454936423119573  # of the square of a unit Gaussian
 _MEDIAN_OF_2 = 2.0 * np.log(2.0)  # of the squared norm of two
@@ -33,14 +34,19 @@ class NoiseModel:
         Factor on the claimed standard deviations.
     bias_px : float
         Standard deviation of the error that is common to both ends of an outline [px].
+    tilt_px : float
+        Standard deviation of the error that is opposite at both ends [px].
     """
 
     scale: float = 1.0
     bias_px: float = 0.0
+    tilt_px: float = 0.0
 
     def covariance(self, claimed: Array) -> Array:
         """Return the covariances (n, 2, 2) [px^2] that claimed ones stand for."""
-        return np.asarray(self.scale**2 * claimed + self.bias_px**2 * _ONES)
+        added = self.bias_px**2 * np.outer(_SUM, _SUM)
+        added = added + self.tilt_px**2 * np.outer(_DIFFERENCE, _DIFFERENCE)
+        return np.asarray(self.scale**2 * claimed + added)
 
     def whitening(self, claimed: Array, used: BoolArray | None = None) -> Array:
         """Return lower triangular T (n, 2, 2) with T C T^T = 1 [1/px]; zero where not used."""
@@ -69,15 +75,15 @@ def noise_of_the_median(offsets: Array, claimed: Array) -> NoiseModel:
     -------
     NoiseModel
     """
-    measured = (offsets @ _DIFFERENCE) ** 2
-    expected = np.einsum("i,nij,j->n", _DIFFERENCE, claimed, _DIFFERENCE)
-    scale = max(float(np.sqrt(np.median(measured / expected) / _MEDIAN_OF_1)), _SMALLEST_SCALE)
 
-    def excess(bias: float) -> float:
-        s = NoiseModel(scale, bias).squared_norms(offsets, claimed)
-        return float(np.median(s) - _MEDIAN_OF_2)
+    def scale_of(mode: Array) -> float:
+        share = (offsets @ mode) ** 2 / np.einsum("i,nij,j->n", mode, claimed, mode)
+        return float(np.sqrt(np.median(share) / _MEDIAN_OF_1))
 
-    return NoiseModel(scale, _root(excess, offsets))
+    def excess(noise: NoiseModel) -> float:
+        return float(np.median(noise.squared_norms(offsets, claimed)) - _MEDIAN_OF_2)
+
+    return _balanced(scale_of(_SUM), scale_of(_DIFFERENCE), excess, offsets)
 
 
 def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseModel:
@@ -95,22 +101,33 @@ def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseMod
     Returns
     -------
     NoiseModel
-        The scale from the differences of both ends, then the bias from all.
     """
     moments = offsets[:, :, None] * offsets[:, None, :] + explained
-    measured = np.einsum("i,nij,j->n", _DIFFERENCE, moments, _DIFFERENCE)
-    expected = np.einsum("i,nij,j->n", _DIFFERENCE, claimed, _DIFFERENCE)
-    scale = max(float(np.sqrt(np.mean(measured / expected))), _SMALLEST_SCALE)
 
-    def excess(bias: float) -> float:
-        S = NoiseModel(scale, bias).covariance(claimed)
-        return float(np.mean(np.trace(np.linalg.solve(S, moments), axis1=1, axis2=2))) - 2.0
+    def scale_of(mode: Array) -> float:
+        measured, expected = (np.einsum("i,nij,j->n", mode, M, mode) for M in (moments, claimed))
+        return float(np.sqrt(np.mean(measured / expected)))
 
-    return NoiseModel(scale, _root(excess, offsets))
+    def excess(noise: NoiseModel) -> float:
+        shares = np.linalg.solve(noise.covariance(claimed), moments)
+        return float(np.mean(np.trace(shares, axis1=1, axis2=2))) - 2.0
+
+    return _balanced(scale_of(_SUM), scale_of(_DIFFERENCE), excess, offsets)
+
+
+def _balanced(
+    of_sums: float, of_differences: float, excess: Callable[[NoiseModel], float], offsets: Array
+) -> NoiseModel:
+    """Return the scale of the better mode, and the excess of the other as bias or tilt."""
+    if of_differences <= of_sums:
+        scale = max(of_differences, _SMALLEST_SCALE)
+        return NoiseModel(scale, _root(lambda px: excess(NoiseModel(scale, px)), offsets))
+    scale = max(of_sums, _SMALLEST_SCALE)
+    return NoiseModel(scale, 0.0, _root(lambda px: excess(NoiseModel(scale, 0.0, px)), offsets))
 
 
 def _root(excess: Callable[[float], float], offsets: Array) -> float:
-    """Return where a falling function of the bias crosses zero, 0 if it starts below."""
+    """Return where a falling function of an added error crosses zero, 0 if it starts below."""
     if excess(0.0) <= 0.0:
         return 0.0
     largest = 2.0 * float(np.abs(offsets).max())

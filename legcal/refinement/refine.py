@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -24,13 +25,14 @@ from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import Linearization, information, linearize
 from legcal.refinement.observed import has_offset, observed_outlines, readings
 from legcal.refinement.problem import FitProblem, Prior, build_problem
-from legcal.refinement.rounds import Fit, fit_in_rounds, offsets_of
+from legcal.refinement.rounds import Fit, first_minimum, fit_in_rounds, offsets_of
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start
 from legcal.refinement.state import State, lay_out
 
 _LARGEST_RADIUS_CHANGE = 0.5
+_EQUAL_COSTS = 1e-6  # relative: the same minimum
 
 
 def build_fit(
@@ -97,9 +99,9 @@ def refine(
     DatasetError
         If an outline cannot be used.
     """
-    return _refined(
-        build_fit(legs, measurements, outlines, settings), legs, outlines, start, settings
-    )
+    problem = build_fit(legs, measurements, outlines, settings)
+    candidate = _candidate(problem, legs, start, settings)
+    return _refined(problem, legs, outlines, candidate, settings)
 
 
 def refine_from_best(
@@ -111,7 +113,9 @@ def refine_from_best(
 ) -> Solution:
     """Fit everything from several starts and keep the lowest cost (hazard 10 of the method).
 
-    A start that fails is skipped with a note; between equal costs the earlier start wins.
+    The first minima are compared; only the lowest is worked out, the others stand in for it if
+    that fails. A start that fails is skipped with a note; between equal costs the earlier
+    start wins.
 
     Raises
     ------
@@ -119,45 +123,71 @@ def refine_from_best(
         If no start leads to a fit.
     """
     problem = build_fit(legs, measurements, outlines, settings)
-    best: Solution | None = None
+    candidates: list[_Candidate] = []
     notes: list[str] = []
     failures: list[LegcalError] = []
     for start in starts:
         try:
-            found = _refined(problem, legs, outlines, start, settings)
+            candidate = _candidate(problem, legs, start, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
             notes.append(f"The start {start.label} was skipped. {failure}")
             continue
-        notes.append(f"The start {start.label} led to a cost of {found.cost:.6g}.")
-        if best is None or found.cost < (1.0 - 1e-6) * best.cost:
-            best = found
-    if best is not None:
-        return dataclasses.replace(best, notes=(*best.notes, *notes))
+        notes.append(f"The start {start.label} led to a cost of {candidate.cost:.6g}.")
+        place = sum(other.cost <= (1.0 + _EQUAL_COSTS) * candidate.cost for other in candidates)
+        candidates.insert(place, candidate)
+    for candidate in candidates:
+        try:
+            found = _refined(problem, legs, outlines, candidate, settings)
+        except (DidNotConverge, NotIdentifiable) as failure:
+            failures.append(failure)
+            notes.append(f"The start {candidate.label} was given up. {failure}")
+            continue
+        return dataclasses.replace(found, notes=(*found.notes, *notes))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
     raise DidNotConverge(notes or ["The fit was given no starting values; it needs at least one."])
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A first minimum."""
+
+    label: str
+    state: State
+    cost: float
+    iterations: int
+
+
+def _candidate(
+    problem: FitProblem, legs: FittedLegs, start: Start, settings: RefinementSettings
+) -> _Candidate:
+    """Return the first minimum that a start leads to."""
+    begin = start.state(problem.radius_prior.mean)
+    try:
+        state, iterations = first_minimum(problem, begin, settings)
+    except DidNotConverge:
+        # A fit that nothing determines has no minimum to converge to: say so if that is why.
+        linear = linearize(problem, begin, NoiseModel().whitening(problem.outlines.covariance))
+        normal = information(problem, linear, 1.0)
+        uncertainty(problem, normal, _estimated_names(problem, legs), _size(begin))
+        raise
+    cost = _comparable_cost(problem, state, settings)
+    return _Candidate(start.label, state, cost, iterations)
 
 
 def _refined(
     problem: FitProblem,
     legs: FittedLegs,
     outlines: Outlines,
-    start: Start,
+    candidate: _Candidate,
     settings: RefinementSettings,
 ) -> Solution:
-    """Fit from one start with a problem that is already built."""
-    names = _estimated_names(problem, legs)
-    begin = start.state(problem.radius_prior.mean)
-    try:
-        fit = fit_in_rounds(problem, begin, settings)
-    except DidNotConverge:
-        # A fit that nothing determines has no minimum to converge to: say so if that is why.
-        linear = linearize(problem, begin, NoiseModel().whitening(problem.outlines.covariance))
-        uncertainty(problem, information(problem, linear, 1.0), names, _size(begin))
-        raise
+    """Work out a first minimum with a problem that is already built."""
+    fit = fit_in_rounds(problem, candidate.state, candidate.iterations, settings)
     _refuse_other_radii(problem, fit.state, legs)
-    return _solution(problem, fit, outlines, names, start.label, settings)
+    names = _estimated_names(problem, legs)
+    return _solution(problem, fit, outlines, names, candidate.label, settings)
 
 
 def _refuse_other_radii(problem: FitProblem, state: State, legs: FittedLegs) -> None:
@@ -223,9 +253,8 @@ def _chi2(linear: Linearization) -> float:
 
 
 def _comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:
-    """Return the robust cost of all outlines under the noise that all fits share."""
-    noise = NoiseModel(1.0, settings.comparison_px)
-    whitening = noise.whitening(problem.outlines.covariance)
+    """Return the robust cost of all outlines with their claimed covariances."""
+    whitening = NoiseModel().whitening(problem.outlines.covariance)
     inputs = inputs_of(problem, state, whitening, width_to_k(settings.loss_width))
     zero = ca.DM.zeros(problem.layout.size)
     return float(problem.cost(zero, *[np.asfortranarray(part.T) for part in inputs]))

@@ -28,28 +28,72 @@ class Fit:
     iterations: int
 
 
-def fit_in_rounds(problem: FitProblem, begin: State, settings: RefinementSettings) -> Fit:
-    """Solve wide, reject what disagrees until that settles, then estimate the noise and solve.
+def first_minimum(
+    problem: FitProblem, begin: State, settings: RefinementSettings
+) -> tuple[State, int]:
+    """Solve with all outlines and claimed covariances: wide at first, then as all fits do.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    begin : State
+        Where to start.
+    settings : RefinementSettings
+
+    Returns
+    -------
+    state : State
+        A minimum that depends on the start only if there are several.
+    iterations : int
+        Of IPOPT.
+
+    Raises
+    ------
+    DidNotConverge
+        If a solve fails.
+    """
+    claimed, noise = problem.outlines.covariance, NoiseModel()
+    whitening = noise.whitening(claimed)
+    norms = np.sqrt(noise.squared_norms(offsets_of(problem, begin), claimed))
+    wide = max(settings.loss_width, float(np.median(norms))) if len(norms) else 1.0
+    state, iterations = solve(problem, begin, whitening, width_to_k(wide))
+    state, more = solve(problem, state, whitening, width_to_k(settings.loss_width))
+    return state, iterations + more
+
+
+def fit_in_rounds(
+    problem: FitProblem, first: State, iterations: int, settings: RefinementSettings
+) -> Fit:
+    """Reject what disagrees until that settles, then estimate the noise and solve, in rounds.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    first : State
+        What :func:`first_minimum` found.
+    iterations : int
+        What it needed.
+    settings : RefinementSettings
+
+    Returns
+    -------
+    Fit
 
     Raises
     ------
     DidNotConverge
         If a solve fails, or most outlines disagree with what was found.
     """
-    claimed = problem.outlines.covariance
-    noise, k = NoiseModel(), width_to_k(settings.loss_width)
-    first = noise.squared_norms(offsets_of(problem, begin), claimed)
-    wide = max(settings.loss_width, float(np.sqrt(np.median(first)))) if len(first) else 1.0
-    state, iterations = solve(problem, begin, noise.whitening(claimed), width_to_k(wide))
-    accepted = np.ones(len(first), dtype=np.bool_)
-    for _ in range(settings.rejection_rounds if len(first) else 0):
+    claimed, k, state = problem.outlines.covariance, width_to_k(settings.loss_width), first
+    accepted, noise = np.ones(len(claimed), dtype=np.bool_), NoiseModel()
+    for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
         noise = noise_of_the_median(offsets_of(problem, state)[before], claimed[before])
         accepted = _accepted(problem, state, noise, settings)
-        state, more = solve(problem, state, noise.whitening(claimed, accepted), k)
-        iterations += more
         if np.array_equal(before, accepted):
             break
+        state, more = solve(problem, state, noise.whitening(claimed, accepted), k)
+        iterations += more
     for _ in range(settings.noise_rounds):
         noise = _noise(problem, state, noise, accepted, settings)
         accepted = _accepted(problem, state, noise, settings)

@@ -21,8 +21,6 @@ class RefinementSettings:
         Rounds of noise estimation after that.
     largest_rms_px : float
         Root mean square of the offsets of accepted outlines beyond which a fit is refused [px].
-    comparison_px : float
-        Bias of outlines [px] that is assumed when two fits are compared.
     max_iterations : int
         Limit for IPOPT in each solve.
     """
@@ -33,7 +31,6 @@ class RefinementSettings:
     rejection_rounds: int = 6
     noise_rounds: int = 2
     largest_rms_px: float = 3.0
-    comparison_px: float = 0.1
     max_iterations: int = 100
 
 

@@ -36,8 +36,8 @@ class Solution:
     weak : tuple of WeakDirection
         The directions known worst, worst first.
     cost : float
-        Robust cost over all outlines that came in, rejected ones too, under one fixed noise:
-        comparable between fits of the same data.
+        Robust cost over all outlines that came in, rejected ones too, with their claimed
+        covariances: comparable between fits of the same data.
     chi2 : float
         Sum of the squared whitened residuals of used outlines, readings and priors.
     dof : int
