@@ -26,10 +26,9 @@ from legcal.outline_sets import (
     join_outlines,
     merge_edited,
     no_outlines,
-    reject_unused_legs,
 )
 from legcal.progress import Report
-from legcal.vision.detect import align_views, detect_outlines
+from legcal.vision.detect import JOINT_ERROR, PIXEL_ERROR, align_views, detect_outlines
 
 NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 
@@ -134,8 +133,7 @@ def align(photographs: Photographs, scene: Scene, report: Report) -> Scene:
 def detect(
     photographs: Photographs, scene: Scene, report: Report, *, near_fit: bool = False
 ) -> Outlines:
-    """Return all outlines: those searched for near the scene, those kept, edited ones first."""
-    window = {"joint_error": 0.0, "pixel_error": NEAR_FIT_PX} if near_fit else {}
+    """Return all outlines: those searched for near the scene, and those kept."""
     stage = "Measuring outlines again" if near_fit else "Measuring outlines"
     found = detect_outlines(
         photographs.load,
@@ -147,20 +145,17 @@ def detect(
         photographs.wanted,
         photographs.mechanism.leg_names,
         progress=_counted(report, stage, len(photographs.detect)),
-        **window,
+        joint_error=0.0 if near_fit else JOINT_ERROR,
+        pixel_error=NEAR_FIT_PX if near_fit else PIXEL_ERROR,
     )
     return given_outlines(photographs, found)
 
 
 def given_outlines(photographs: Photographs, found: Outlines | None = None) -> Outlines:
-    """Return found outlines and kept ones in one table, edited ones first.
-
-    Outlines of legs that the dataset leaves out of their view are rejected.
-    """
+    """Return found outlines and kept ones in one table; edited ones win."""
     kept = photographs.keep
     detected = no_outlines() if found is None else found
-    table = join_outlines([merge_edited(detected, kept), choose_outlines(kept, ~is_edited(kept))])
-    return reject_unused_legs(table, photographs.measurements, photographs.mechanism.leg_names)
+    return join_outlines([merge_edited(detected, kept), choose_outlines(kept, ~is_edited(kept))])
 
 
 def _hints(photographs: Photographs, scene: Scene) -> list[RigidTransform]:

@@ -38,6 +38,7 @@ from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.model import Mechanism
 from legcal.observations import Outlines
 from legcal.observe import SETTINGS, Photographs, Scene, align, detect, given_outlines
+from legcal.outline_sets import reject_unused_legs
 from legcal.progress import Report, no_progress
 from legcal.refinement.legs import fitted_legs
 from legcal.refinement.refine import refine_from_best
@@ -184,6 +185,7 @@ def _steps_and_fit(
     work: _Workpiece, outlines: Outlines, scene: Scene, progress: Report
 ) -> tuple[Steps, Solution]:
     """Run the four steps, then the fit of everything from the nominal model and from the steps."""
+    outlines = reject_unused_legs(outlines, work.measurements, work.mechanism.leg_names)
     progress("Four steps", 0, 1)
     steps = _four_steps(work, outlines)
     progress("Four steps", 1, 1)
