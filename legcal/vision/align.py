@@ -36,6 +36,29 @@ class _Votes:
     tolerance: Array  # (n_legs,) [px]
 
 
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """The predicted legs of a view as arrays: joint centres, and both ends of their bands."""
+
+    A: Array  # (n_legs, 3) [m]
+    B: Array  # (n_legs, 3) [m]
+    rays: Array  # (n_legs, 2, 3) points (x, y, 1) of the axes
+    normal: Array  # (n_legs, 2)
+    scale: Array  # (n_legs,)
+
+    @classmethod
+    def of(cls, legs: Sequence[PredictedLeg]) -> "_Ends":
+        """Gather the legs."""
+        xy = [leg.band.points(np.array([0.0, leg.band.length]), np.zeros(2)) for leg in legs]
+        return cls(
+            np.array([leg.A_camera for leg in legs]),
+            np.array([leg.B_camera for leg in legs]),
+            np.concatenate([np.array(xy), np.ones((len(legs), 2, 1))], axis=-1),
+            np.array([leg.band.normal for leg in legs]),
+            np.array([leg.band.scale for leg in legs]),
+        )
+
+
 def align_camera(
     view: str,
     T_base_camera: RigidTransform,
@@ -73,14 +96,15 @@ def align_camera(
             f"The camera of view {view!r} could not be aligned: its pose puts {len(legs)} legs "
             f"inside its images, needed {LEAST_LEGS}; check T_base_camera of the view."
         )
-    votes = _collect(legs, strips, tolerance)
+    ends = _Ends.of(legs)
+    votes = _collect(ends, strips, tolerance)
     best, best_gain = np.zeros(6), -np.inf
     for start in _trials(votes):
-        xi = _refine(legs, votes, start)
-        gain = _gain(votes, _shifts(legs, xi)) - _prior(xi)
+        xi = _refine(ends, votes, start)
+        gain = _gain(votes, _shifts(ends, xi)) - _prior(xi)
         if gain > best_gain + 1e-9:
             best, best_gain = xi, gain
-    agreeing = int(np.count_nonzero(_agreeing(votes, _shifts(legs, best)) > 0.0))
+    agreeing = int(np.count_nonzero(_agreeing(votes, _shifts(ends, best)) > 0.0))
     needed = max(LEAST_LEGS, int(np.ceil(LEAST_AGREEMENT * len(legs))))
     if agreeing < needed:
         raise NotVisible(
@@ -96,33 +120,29 @@ def _motion(xi: Array) -> RigidTransform:
     return RigidTransform.from_components(xi[3:], Rotation.from_rotvec(xi[:3]))
 
 
-def _shifts(legs: Sequence[PredictedLeg], xi: Array) -> Array:
+def _shifts(legs: _Ends, xi: Array) -> Array:
     """Return the sideways shifts (n_legs, 2) [px] of the axes at both ends of their bands."""
     T = _motion(xi).inv()
-    A = T.apply(np.array([leg.A_camera for leg in legs]))
-    B = T.apply(np.array([leg.B_camera for leg in legs]))
+    A, B = T.apply(legs.A), T.apply(legs.B)
     moments = np.cross(B - A, A)
-    return np.array(
-        [
-            leg.band.offsets(m, np.array([0.0, leg.band.length]))
-            for leg, m in zip(legs, moments, strict=True)
-        ]
+    value = np.einsum("nki,ni->nk", legs.rays, moments)
+    across = np.einsum("ni,ni->n", moments[:, :2], legs.normal)
+    return np.asarray(-(legs.scale / across)[:, None] * value)
+
+
+def _jacobian(legs: _Ends, xi: Array) -> Array:
+    """Return the derivative (n_legs, 2, 6) of the shifts by central differences."""
+    step = 1e-5
+    return np.stack(
+        [(_shifts(legs, xi + d) - _shifts(legs, xi - d)) / (2 * step) for d in step * np.eye(6)],
+        axis=-1,
     )
 
 
-def _jacobian(legs: Sequence[PredictedLeg], xi: Array) -> Array:
-    """Return the derivative (n_legs, 2, 6) of the shifts by central differences."""
-    step = 1e-5
-    columns = [
-        (_shifts(legs, xi + d) - _shifts(legs, xi - d)) / (2 * step) for d in step * np.eye(6)
-    ]
-    return np.stack(columns, axis=-1)
-
-
-def _collect(legs: Sequence[PredictedLeg], strips: Sequence[Strips], tolerance: Array) -> _Votes:
+def _collect(legs: _Ends, strips: Sequence[Strips], tolerance: Array) -> _Votes:
     """Pad the candidates to one array."""
     n_kept = max(1, max(len(s.score) for s in strips))
-    shift, score = np.zeros((len(legs), n_kept, 2)), np.zeros((len(legs), n_kept))
+    shift, score = np.zeros((len(strips), n_kept, 2)), np.zeros((len(strips), n_kept))
     for i, candidates in enumerate(strips):
         n = len(candidates.score)
         shift[i, :n], score[i, :n] = candidates.shift, candidates.score
@@ -172,7 +192,7 @@ def _prior(xi: Array) -> float:
     return 0.1 * float(np.sum((xi / SIGMA_POSE) ** 2))
 
 
-def _refine(legs: Sequence[PredictedLeg], votes: _Votes, xi: Array) -> Array:
+def _refine(legs: _Ends, votes: _Votes, xi: Array) -> Array:
     """Return the pose that fits the agreeing candidates, by Gauss-Newton steps."""
     sigma = votes.tolerance / 3.0
     J = _jacobian(legs, xi)  # changes little within the few degrees of a rough pose

@@ -40,9 +40,8 @@ class Band:
 
     def points(self, t: Array, v: Array) -> Array:
         """Return the points (x, y) of the sensor plane with coordinates t, v [px], (..., 2)."""
-        t, v = np.broadcast_arrays(t, v)
-        step = t[..., None] * self.along + v[..., None] * self.normal
-        return np.asarray(self.origin + step / self.scale)
+        along = self.origin + t[..., None] * (self.along / self.scale)
+        return np.asarray(along + v[..., None] * (self.normal / self.scale))
 
     def coordinates(self, xy: Array) -> Array:
         """Return (t, v) [px] of points of the sensor plane, both (..., 2)."""
@@ -123,8 +122,9 @@ def in_picture(camera: Camera, P_camera: Array, nearest: float) -> BoolArray:
 
 def pixels_inside(camera: Camera, pixels: Array, margin: float = 0.0) -> BoolArray:
     """Return whether pixels (..., 2) lie in the image, at least ``margin`` px from its border."""
-    size = np.array([camera.width - 1.0, camera.height - 1.0])
-    return np.asarray(np.all((pixels >= margin) & (pixels <= size - margin), axis=-1))
+    x, y = pixels[..., 0], pixels[..., 1]
+    inside = (x >= margin) & (x <= camera.width - 1.0 - margin)
+    return np.asarray(inside & (y >= margin) & (y <= camera.height - 1.0 - margin))
 
 
 def longest_run(flags: BoolArray) -> tuple[int, int]:

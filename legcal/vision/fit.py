@@ -13,9 +13,12 @@ import numpy as np
 from legcal.geometry.types import Array, BoolArray
 from legcal.vision.limb import N_BASIS, Samples, basis
 
-BLURS = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8])  # [px]
-BLUR_BLOCKS = 80
-RIDGE = np.array([1e-6, 1e-3, 1e-6, 1e-4, 1e-3])  # keeps unseen amplitudes at zero
+BLURS = (0.3, 2.7, 7)  # first trials, least to greatest [px]
+BLUR_BLOCKS = 40
+BLUR_ROUNDS = 3
+DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
+# Prior precision of the amplitudes, in units of the contrast of a block.
+RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
 STEP = 0.8  # largest step of a block [px]
 
 
@@ -42,7 +45,7 @@ class BlockFit:
 
 
 def fit_blocks(
-    d: Samples, grey: Samples, inside: BoolArray, half_width: Samples, blur: float
+    d: Samples, grey: Samples, inside: BoolArray, half_width: Samples, blur: Samples | float
 ) -> BlockFit:
     """Fit the limb model to blocks, by one Gauss-Newton step from the current line.
 
@@ -54,54 +57,84 @@ def fit_blocks(
         Samples to use.
     half_width : (n, 1) array of float32
         Half-width of the cylinder [px].
-    blur : float
+    blur : float or (n, 1) array of float32
         Standard deviation of the blur [px].
     """
     values, slopes = basis(d, half_width, blur)
     weight = inside.astype(np.float32)
     n_samples = weight.sum(axis=1).astype(np.float64)
-    level = (grey * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
+    level = np.einsum("nm,nm->n", grey, weight) / np.maximum(weight.sum(axis=1), 1)
     y = (grey - level[:, None]) * weight
-    X = values * weight[..., None]
+    X = values * weight[:, None, :]
     Xt = X.swapaxes(1, 2)
-    normal = (Xt @ X).astype(np.float64)
-    normal += RIDGE * np.maximum(n_samples, 1.0)[:, None, None] * np.eye(N_BASIS)
-    amplitude = np.linalg.solve(normal, (Xt @ y[..., None]).astype(np.float64))
-    residual = y - (X @ amplitude.astype(np.float32))[..., 0]
+    normal = (X @ Xt).astype(np.float64)
+    # Amplitudes that the noise of a block leaves open are drawn to zero.
+    right = (X @ y[..., None]).astype(np.float64)
+    power = np.einsum("nm,nm->n", y, y).astype(np.float64) / np.maximum(n_samples, 1.0) + 1e-3
+    inverse = np.linalg.inv(normal + 1e-3 * np.eye(N_BASIS))
+    unexplained = power - np.sum(right * (inverse @ right), axis=(1, 2)) / np.maximum(
+        n_samples, 1.0
+    )
+    share = np.clip(unexplained / power, 1e-4, 1.0)
+    inverse = np.linalg.inv(normal + (share[:, None] * RIDGE)[:, :, None] * np.eye(N_BASIS))
+    amplitude = inverse @ right
+    residual = y - (Xt @ amplitude.astype(np.float32))[..., 0]
     # The outline at distance s further inside lowers d by s.
-    change = -(slopes @ amplitude.astype(np.float32))[..., 0] * weight
-    eliminated = np.linalg.solve(normal, (Xt @ change[..., None]).astype(np.float64))
-    change = change - (X @ eliminated.astype(np.float32))[..., 0]
-    information = np.sum(change * change, axis=1, dtype=np.float64)
-    gradient = np.sum(change * residual, axis=1, dtype=np.float64)
-    noise = np.sum(residual * residual, axis=1, dtype=np.float64)
+    change = -(slopes.swapaxes(1, 2) @ amplitude.astype(np.float32))[..., 0] * weight
+    eliminated = inverse @ (X @ change[..., None]).astype(np.float64)
+    change -= (Xt @ eliminated.astype(np.float32))[..., 0]
+    information = np.einsum("nm,nm->n", change, change).astype(np.float64)
+    gradient = np.einsum("nm,nm->n", change, residual).astype(np.float64)
+    noise = np.einsum("nm,nm->n", residual, residual).astype(np.float64)
     freedom = np.maximum(n_samples - N_BASIS - 1.0, 1.0)
     seen = (information > 1e-9) & (n_samples > 4 * N_BASIS)
     safe = np.where(seen, information, 1.0)
     shift = np.where(seen, np.clip(gradient / safe, -STEP, STEP), 0.0)
     noise = np.maximum(noise - np.where(seen, gradient**2 / safe, 0.0), 0.0) / freedom
-    reference = np.broadcast_to(np.float32(1.5 + blur), (len(d), 1))
+    reference = np.broadcast_to(np.asarray(1.5 + blur, dtype=np.float32), (len(d), 1))
     at, _ = basis(reference, half_width, blur)
-    contrast = np.sum(at[:, 0, 2:] * amplitude[:, 2:, 0], axis=1)
+    contrast = np.sum(at[:, 2:, 0] * amplitude[:, 2:, 0], axis=1)
     return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast)
 
 
 def estimate_blur(d: Samples, grey: Samples, inside: BoolArray, half_width: Samples) -> float:
-    """Return the blur [px] that explains the best blocks of an image best."""
+    """Return the blur [px] that explains the best blocks of an image best.
+
+    Parameters
+    ----------
+    d, grey, inside, half_width
+        As for :func:`fit_blocks`.
+    """
     start = fit_blocks(d, grey, inside, half_width, 1.0)
     merit = np.where(np.isfinite(start.variance), np.abs(start.contrast), 0.0)
     best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
     d, grey, inside, half_width = d[best], grey[best], inside[best], half_width[best]
-    misfit = np.empty((len(BLURS), len(best)))
-    for i, blur in enumerate(BLURS):
-        moved = d
-        for _ in range(3):
-            fit = fit_blocks(moved, grey, inside, half_width, float(blur))
-            moved = moved - fit.shift[:, None].astype(np.float32)
-        misfit[i] = np.log(fit.noise + 1e-3)
-    total = misfit.mean(axis=1)
-    i = int(np.clip(np.argmin(total), 1, len(BLURS) - 2))
-    left, middle, right = total[i - 1 : i + 2]
+    blurs = np.geomspace(*BLURS)
+    rough = blurs[int(np.argmin(_misfits(d, grey, inside, half_width, blurs)))]
+    near = np.abs(d) <= depth_for_blur(float(rough))
+    ratio = np.sqrt(blurs[1] / blurs[0])
+    fine = rough * ratio ** np.arange(-2.0, 3.0)
+    misfit = _misfits(d, grey, inside & near, half_width, fine)
+    i = int(np.clip(np.argmin(misfit), 1, len(fine) - 2))
+    left, middle, right = misfit[i - 1 : i + 2]
     bend = left - 2.0 * middle + right
     offset = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
-    return float(np.exp(np.interp(i + offset, np.arange(len(BLURS)), np.log(BLURS))))
+    return float(fine[i] * ratio**offset)
+
+
+def depth_for_blur(blur: float) -> float:
+    """Return how far from an outline pixels are used [px]: little more than the blur reaches."""
+    return DEPTH[0] + DEPTH[1] * blur
+
+
+def _misfits(
+    d: Samples, grey: Samples, inside: BoolArray, half_width: Samples, blurs: Array
+) -> Array:
+    """Return, for each of some blurs, the mean logarithm of the noise of the fitted blocks."""
+    n = len(blurs)
+    blur = np.repeat(blurs, len(d)).astype(np.float32)[:, None]
+    d, grey, inside, half_width = (np.concatenate([x] * n) for x in (d, grey, inside, half_width))
+    for _ in range(BLUR_ROUNDS):
+        fit = fit_blocks(d, grey, inside, half_width, blur)
+        d = d - fit.shift[:, None].astype(np.float32)
+    return np.asarray(np.log(fit.noise + 1e-3).reshape(n, -1).mean(axis=1))

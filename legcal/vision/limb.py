@@ -14,41 +14,44 @@ Basis functions of d, the distance inside the outline in pixels:
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
+from scipy.special import ndtr
 
 Samples = NDArray[np.float32]
 
 N_BASIS = 5
-_LIMIT, _STEPS = 40.0, 64  # range of the table of the blurred square root, and entries per unit
+_BEFORE, _AFTER, _PER_UNIT = 6.0, 40.0, 1024  # range of the table, and entries per unit
 
 
 def _gauss(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi))
 
 
-def _blurred_root() -> tuple[Samples, Samples]:
-    """Tabulate sqrt(max(x, 0)) blurred by a Gaussian of unit width, and its derivative."""
-    x = np.arange(-6.0, _LIMIT + 1e-9, 1.0 / _STEPS)
-    root = np.linspace(0.0, 7.0, 2801)  # substitute D = root^2: integrands are smooth
-    step = root[1] - root[0]
-    kernel = _gauss(x[:, None] - root**2)
-    value = 2.0 * step * np.sum(root**2 * kernel, axis=1)
-    slope = 2.0 * step * np.sum(root**2 * (root**2 - x[:, None]) * kernel, axis=1)
-    return value.astype(np.float32), slope.astype(np.float32)
+def _tabulate() -> Samples:
+    """Tabulate blurred functions of x, (4, n).
+
+    The step and its derivative, and sqrt(max(x, 0)) and its derivative, all blurred by a Gaussian
+    of unit width, for x in [-_BEFORE, _AFTER].
+    """
+    coarse = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / 32.0)
+    root = np.linspace(0.0, 7.0, 2801)  # substitute x = root^2: the integrands are smooth
+    kernel = 2.0 * (root[1] - root[0]) * root**2 * _gauss(coarse[:, None] - root**2)
+    x = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / _PER_UNIT)
+    value = np.interp(x, coarse, np.sum(kernel, axis=1))
+    slope = np.interp(x, coarse, np.sum(kernel * (root**2 - coarse[:, None]), axis=1))
+    return np.stack([ndtr(x), _gauss(x), value, slope]).astype(np.float32)
 
 
-_ROOT, _ROOT_SLOPE = _blurred_root()
+_TABLE = _tabulate()
 
 
-def _look_up(table: Samples, x: Samples) -> Samples:
-    """Interpolate a table over [-6, _LIMIT] linearly."""
-    place = np.clip((x + 6.0) * _STEPS, 0.0, len(table) - 2.0)
+def _look_up(x: Samples) -> list[Samples]:
+    """Return the four functions at x (n, m), from the nearest entries of the table."""
+    place = np.clip((x + _BEFORE) * _PER_UNIT + 0.5, 0.0, _TABLE.shape[1] - 1.0)
     index = place.astype(np.int32)
-    low = table[index]
-    return np.asarray(low + (place - index) * (table[index + 1] - low), dtype=np.float32)
+    return [function[index] for function in _TABLE]
 
 
-def basis(d: Samples, half_width: Samples, blur: float) -> tuple[Samples, Samples]:
+def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Samples, Samples]:
     """Return the basis functions and their derivatives with respect to d.
 
     Parameters
@@ -57,29 +60,28 @@ def basis(d: Samples, half_width: Samples, blur: float) -> tuple[Samples, Sample
         Distances inside the outline [px], negative outside.
     half_width : (n, 1) array of float32
         Half-width of the cylinder in the image [px].
-    blur : float
+    blur : float or (n, 1) array of float32
         Standard deviation of the blur [px].
 
     Returns
     -------
-    values, slopes : (n, m, 5) array of float32
+    values, slopes : (n, 5, m) array of float32
         In the order of the list above; the limb is one at the depth ``half_width``.
     """
-    z = d / np.float32(blur)
-    step = np.float32(0.5) * (1 + erf(z * np.float32(np.sqrt(0.5))))
-    peak = np.exp(np.float32(-0.5) * z * z) * np.float32(1.0 / np.sqrt(2.0 * np.pi))
-    depth = np.float32(blur) * (z * step + peak)  # the blurred ramp max(d, 0)
+    blur = np.asarray(blur, dtype=np.float32)
+    z = d / blur
+    step, peak, root, root_slope = _look_up(z)
+    depth = blur * (z * step + peak)  # the blurred ramp max(d, 0)
     rho = np.clip(depth / half_width, 0.0, 1.0)
     bend = np.sqrt(2.0 - rho)
-    root_scale = np.sqrt(np.float32(blur) / half_width)
-    root = _look_up(_ROOT, z) * root_scale
-    root_slope = _look_up(_ROOT_SLOPE, z) * (root_scale / np.float32(blur))
-    values = np.empty((*d.shape, N_BASIS), dtype=np.float32)
+    root_scale = np.sqrt(blur / half_width)
+    root, root_slope = root * root_scale, root_slope * (root_scale / blur)
+    values = np.empty((len(d), N_BASIS, d.shape[1]), dtype=np.float32)
     slopes = np.empty_like(values)
-    values[..., 0], slopes[..., 0] = 1.0, 0.0
-    values[..., 1], slopes[..., 1] = (depth - d) / half_width, (step - 1.0) / half_width
-    values[..., 2], slopes[..., 2] = step, peak / np.float32(blur)
-    values[..., 3] = root * bend
-    slopes[..., 3] = root_slope * bend - root * step / (2.0 * half_width * bend)
-    values[..., 4], slopes[..., 4] = depth / half_width, step / half_width
+    values[:, 0], slopes[:, 0] = 1.0, 0.0
+    values[:, 1], slopes[:, 1] = (depth - d) / half_width, (step - 1.0) / half_width
+    values[:, 2], slopes[:, 2] = step, peak / blur
+    values[:, 3] = root * bend
+    slopes[:, 3] = root_slope * bend - root * step / (2.0 * half_width * bend)
+    values[:, 4], slopes[:, 4] = depth / half_width, step / half_width
     return values, slopes

@@ -13,20 +13,12 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.vision.band import Band, band_of_leg
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.fit import BlockFit, estimate_blur, fit_blocks
-from legcal.vision.limb import Samples
+from legcal.vision.measure import Edge, MeasuredEdge, measure_edges
 from legcal.vision.pairs import block_positions, find_pair
 from legcal.vision.picture import Grey
 from legcal.vision.pieces import Piece
 from legcal.vision.prediction import PredictedLeg, hidden_by
-from legcal.vision.profiles import Profiles, read_profiles
-from legcal.vision.straight import StraightFit, fit_straight
 
-DEPTH = 6.0  # distance from an outline up to which pixels are used [px]
-REACH = 9  # pixels read to each side: DEPTH over the cosine of 45 degrees
-INNERMOST = 0.8  # largest used depth, in half-widths
-SATURATED = 250.0  # grey level from which a pixel says no more than "bright"
-ROUNDS = 3
 MARGIN = 4.0  # beside a leg in front [px]
 LEAST_LENGTH = (30.0, 1.0)  # of an outline: [px] and in widths of the leg
 NARROWEST = 5.0  # [px]
@@ -175,79 +167,40 @@ def _in_front(
 
 
 def _measure(grey: Grey, camera: Camera, parts: Sequence[_Part]) -> list[PartOutlines]:
-    """Measure the outlines of parts whose edges are known to a pixel."""
-    profiles: list[Profiles] = []
-    for part in parts:
-        depth = min(DEPTH, INNERMOST * part.half_width)
-        for v, epsilon in zip(part.v, EPSILON, strict=True):
-            read = read_profiles(grey, camera, part.band, v, epsilon, (-DEPTH, depth), REACH)
-            block = np.searchsorted(block_positions(part.band), read.t)
-            profiles.append(read.take(~part.hidden[np.minimum(block, len(part.hidden) - 1)]))
-    counts = [len(p.t) for p in profiles]
-    if sum(counts) == 0:
-        return [_rejected(part.leg, part.piece, "too short") for part in parts]
-    half_width = np.repeat([p.half_width for p in parts for _ in EPSILON], counts)
-    lines, fit = _fit_all(profiles, half_width.astype(np.float32)[:, None], parts)
-    splits = np.cumsum(counts)[:-1]
-    contrast = [
-        float(np.median(np.abs(c))) if len(c) else 0.0 for c in np.split(fit.contrast, splits)
+    """Measure and judge the outlines of parts whose edges are known to a pixel."""
+    edges = [
+        Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
+        for part in parts
+        for v, epsilon in zip(part.v, EPSILON, strict=True)
     ]
+    measured, _ = measure_edges(grey, camera, edges)
     return [
-        _judge(camera, part, lines[2 * i : 2 * i + 2], contrast[2 * i : 2 * i + 2])
-        for i, part in enumerate(parts)
+        _judge(camera, part, one, two)
+        for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True)
     ]
-
-
-def _fit_all(
-    profiles: Sequence[Profiles], half_width: Samples, parts: Sequence[_Part]
-) -> tuple[list[StraightFit | None], BlockFit]:
-    """Fit the limb model and the lines in turn; the lines hold the whole shift from the start."""
-    d = np.concatenate([p.d for p in profiles])
-    grey = np.concatenate([p.grey for p in profiles])
-    inside = np.concatenate([p.inside for p in profiles])
-    bounds = np.cumsum([0, *(len(p.t) for p in profiles)])
-    moved = np.zeros(len(d))
-    blur = 1.0
-    for turn in range(ROUNDS + 1):
-        at = d - moved[:, None].astype(np.float32)
-        if turn == 1:
-            blur = estimate_blur(at, grey, inside, half_width)
-        fit = fit_blocks(at, grey, inside, half_width, blur)
-        lines: list[StraightFit | None] = []
-        for i, p in enumerate(profiles):
-            block = slice(bounds[i], bounds[i + 1])
-            position = p.t / parts[i // 2].band.length
-            shift = (moved[block] + fit.shift[block]) / p.gain
-            line = fit_straight(position, shift, fit.variance[block] / p.gain**2)
-            lines.append(line)
-            if line is not None:
-                along = line.ends[0] + (line.ends[1] - line.ends[0]) * position
-                moved[block] = along * p.gain
-    return lines, fit
 
 
 def _judge(
-    camera: Camera, part: _Part, lines: Sequence[StraightFit | None], contrast: Sequence[float]
+    camera: Camera, part: _Part, one: MeasuredEdge | None, two: MeasuredEdge | None
 ) -> PartOutlines:
-    """Turn the fitted lines of a part into outlines with a verdict."""
-    if lines[0] is None or lines[1] is None:
+    """Turn the measured edges of a part into outlines with a verdict."""
+    if one is None or two is None:
         return _rejected(part.leg, part.piece, "no straight edge")
-    fits = [lines[0], lines[1]]
-    v = np.stack([v + e * f.ends for v, e, f in zip(part.v, EPSILON, fits, strict=True)])
-    h = np.stack([part.band.line(*edge) for edge in v])
+    h = np.stack([part.band.line(*edge.v) for edge in (one, two)])
     ends = np.empty((2, 2, 2))
-    for i, f in enumerate(fits):
-        place = np.array([f.first, f.last])
-        offset = v[i, 0] + (v[i, 1] - v[i, 0]) * place
+    for i, edge in enumerate((one, two)):
+        place = np.array([edge.line.first, edge.line.last])
+        offset = edge.v[0] + (edge.v[1] - edge.v[0]) * place
         ends[i] = camera.distort(part.band.points(place * part.band.length, offset))
-    covariance = np.stack([f.covariance for f in fits])
-    reason = _reason(part, v, fits, contrast)
+    covariance = np.stack([one.covariance, two.covariance])
+    reason = _reason(part, one, two)
     return PartOutlines(part.leg.leg, part.piece.link, h, ends, covariance, reason)
 
 
-def _reason(part: _Part, v: Array, fits: Sequence[StraightFit], contrast: Sequence[float]) -> str:
+def _reason(part: _Part, one: MeasuredEdge, two: MeasuredEdge) -> str:
     """Return why a part cannot be trusted, "" if it can."""
-    width, expected = v[1] - v[0], part.predicted[1] - part.predicted[0]
+    fits = (one.line, two.line)
+    width, expected = two.v - one.v, part.predicted[1] - part.predicted[0]
     mismatch = np.abs(width - expected) / (WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected)
     if mismatch.max() > 1.0:
         i = int(np.argmax(mismatch))
@@ -259,12 +212,13 @@ def _reason(part: _Part, v: Array, fits: Sequence[StraightFit], contrast: Sequen
     kept = min(float(np.mean(f.kept)) for f in fits)
     if kept < LEAST_KEPT:
         return f"edge not straight, {100 * kept:.0f} % of it on one line"
-    if min(contrast) < LEAST_CONTRAST:
-        return f"low contrast, {min(contrast):.1f} grey levels"
+    contrast = min(one.contrast, two.contrast)
+    if contrast < LEAST_CONTRAST:
+        return f"low contrast, {contrast:.1f} grey levels"
     scatter = max(f.scatter for f in fits)
     if scatter > LARGEST_SCATTER:
         return f"edge too rough, scatter {scatter:.2f} px"
-    sigma = max(float(np.sqrt(np.diag(f.covariance).max())) for f in fits)
+    sigma = max(float(np.sqrt(np.diag(edge.covariance).max())) for edge in (one, two))
     if sigma > LARGEST_SIGMA:
         return f"edge too uncertain, sigma {sigma:.2f} px"
     return ""

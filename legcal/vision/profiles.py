@@ -15,6 +15,8 @@ from legcal.vision.limb import Samples
 from legcal.vision.picture import Grey
 
 ROWS = 8  # of a block
+SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
+FEW = 4  # such pixels of a block that may be noise
 MAX_BLOCKS = 64  # along one outline
 NODE_SPACING = 16.0  # between points at which the lens distortion is computed [px]
 
@@ -111,6 +113,7 @@ def read_profiles(
         np.clip(columns, 0, width - 1).astype(np.intp),
     ]
     shape = (n_blocks, ROWS * (2 * reach + 1))
+    inside = _unsaturated(d.reshape(shape), values.reshape(shape), inside.reshape(shape))
     # A step dv moves the outline by dv across; its part normal to the tangent is the gain.
     gain = np.abs(
         np.interp(rows, along, across[order, 0] - across[order, 1] * np.gradient(offset, along))
@@ -120,5 +123,12 @@ def read_profiles(
         (gain * cosine / band.scale).reshape(n_blocks, ROWS).mean(axis=1),
         d.reshape(shape).astype(np.float32),
         values.reshape(shape).astype(np.float32),
-        inside.reshape(shape),
+        inside,
     )
+
+
+def _unsaturated(d: Array, grey: Grey, inside: BoolArray) -> BoolArray:
+    """Leave out the depths of each block from which on the leg saturates the picture."""
+    bright = np.where(inside & (grey >= SATURATED) & (d > 0.0), d, np.inf)
+    limit = np.partition(bright, FEW, axis=1)[:, FEW]
+    return np.asarray(inside & (d < limit[:, None]))

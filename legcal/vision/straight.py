@@ -12,7 +12,9 @@ import numpy as np
 from legcal.geometry.types import Array, BoolArray
 
 TUKEY = 4.0  # sigmas at which a block counts no longer
-N_ROUNDS = 15
+N_ROUNDS = 10
+N_SCALES = 4  # rounds in which the scale of the scatter is estimated
+LARGEST_VARIANCE = 1.0  # of a block that says anything [px^2]
 LEAST_SCATTER = 0.01  # [px]
 COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
 LEAST_BLOCKS = 4
@@ -61,51 +63,51 @@ def fit_straight(position: Array, shift: Array, variance: Array) -> StraightFit 
     StraightFit or None
         None if fewer than ``LEAST_BLOCKS`` blocks agree.
     """
-    usable = np.isfinite(variance) & (variance < 1.0)
+    usable = variance < LARGEST_VARIANCE
     if np.count_nonzero(usable) < LEAST_BLOCKS:
         return None
-    design = np.column_stack([1.0 - position, position])
-    base = np.where(usable, 1.0 / np.where(usable, variance + LEAST_SCATTER**2, 1.0), 0.0)
-    ends = np.full(2, _weighted_median(shift, base))
-    weight, factor = base, 1.0
-    for _ in range(N_ROUNDS):
-        pull = (shift - design @ ends) * np.sqrt(base)
-        factor = max(1.0, 1.4826 * float(np.median(np.abs(pull[usable]))))
+    along, moved, base = (
+        position[usable],
+        shift[usable],
+        1.0 / (variance[usable] + LEAST_SCATTER**2),
+    )
+    design = np.stack([1.0 - along, along])
+    products = np.stack([design[0] ** 2, design[0] * design[1], design[1] ** 2])
+    root = np.sqrt(base)
+    ends, factor = np.full(2, _weighted_median(moved, base)), 1.0
+    for turn in range(N_ROUNDS):
+        pull = np.abs(moved - ends @ design) * root
+        if turn < N_SCALES:
+            factor = max(1.0, 1.4826 * _median(pull))
         robust = np.maximum(1.0 - (pull / (TUKEY * factor)) ** 2, 0.0) ** 2
         weight = base * robust
-        kept = usable & (robust > 0.0)
-        if np.count_nonzero(kept) < LEAST_BLOCKS:
+        a, b, c = products @ weight
+        determinant = a * c - b * b
+        if np.count_nonzero(robust) < LEAST_BLOCKS or determinant < 1e-9 * a * c:
             return None
-        normal = design.T @ (design * weight[:, None])
-        new = np.linalg.lstsq(normal, design.T @ (weight * shift), rcond=None)[0]
-        done = bool(np.all(np.abs(new - ends) < 1e-5))
-        ends = np.asarray(new)
+        p, q = design @ (weight * moved)
+        new = np.array([c * p - b * q, a * q - b * p]) / determinant
+        done = turn >= N_SCALES and abs(new - ends).max() < 1e-4
+        ends = new
         if done:
             break
+    kept = usable.copy()
+    kept[usable] = robust > 0.0
     first, last = float(position[kept].min()), float(position[kept].max())
     if last - first < 1e-6:
         return None
-    residual = shift - design @ ends
-    scatter = 1.4826 * float(np.median(np.abs(residual[kept])))
-    covariance = _covariance(position, residual, base, kept, factor, first, last)
+    residual = (moved - ends @ design)[robust > 0.0]
+    scatter = 1.4826 * _median(np.abs(residual))
+    covariance = _covariance(along[robust > 0.0], residual, base[robust > 0.0], factor)
     return StraightFit(ends, kept, first, last, covariance, scatter)
 
 
-def _covariance(
-    position: Array,
-    residual: Array,
-    base: Array,
-    kept: BoolArray,
-    factor: float,
-    first: float,
-    last: float,
-) -> Array:
+def _covariance(along: Array, residual: Array, base: Array, factor: float) -> Array:
     """Return the covariance of the offsets at the ends of the kept piece."""
-    along = (position[kept] - first) / (last - first)
+    along = (along - along.min()) / (along.max() - along.min())
     design = np.column_stack([1.0 - along, along])
-    normal = design.T @ (design * base[kept, None])
-    covariance = np.linalg.inv(normal + 1e-12 * np.eye(2)) * factor**2
-    covariance *= _correlation_length(residual[kept] * np.sqrt(base[kept]))
+    covariance = np.linalg.inv(design.T @ (design * base[:, None])) * factor**2
+    covariance *= _correlation_length(residual * np.sqrt(base))
     bias = COMMON_BIAS**2 * np.ones((2, 2)) + TILT_BIAS**2 * np.eye(2)
     return np.asarray(0.5 * (covariance + covariance.T) + bias)
 
@@ -120,6 +122,12 @@ def _correlation_length(pull: Array) -> float:
     rho = max(0.0, *(float(pull[lag:] @ pull[:-lag]) / power for lag in (1, 2)))
     rho = min(rho, 0.8)
     return (1.0 + rho) / (1.0 - rho)
+
+
+def _median(values: Array) -> float:
+    """Return the middle value, the upper one of two."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
 
 
 def _weighted_median(values: Array, weight: Array) -> float:

@@ -1,0 +1,217 @@
+"""Sub-pixel lines of all outlines of an image, from edges known to about a pixel.
+
+A first round with a wide blur and every second block pulls the lines in; then the blur of the
+image is estimated from its best blocks; the last rounds use the pixels that the blurred outline
+reaches and little more, since the further inside, the less the shading is that of a limb.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.vision.band import Band
+from legcal.vision.camera import Camera
+from legcal.vision.fit import depth_for_blur, estimate_blur, fit_blocks
+from legcal.vision.limb import Samples
+from legcal.vision.picture import Grey
+from legcal.vision.profiles import read_profiles
+from legcal.vision.straight import StraightFit, fit_straight
+
+FIRST_BLUR = 1.0  # [px]
+SHALLOWEST = 0.8  # largest used depth, in half-widths
+FIRST_ROUNDS, LAST_ROUNDS = 2, 6  # at most
+SHADING = 0.8  # that the limb model leaves out [grey levels]
+SETTLED = 0.01  # movement of every line below which the rounds end [px]
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """An outline that is known to about a pixel.
+
+    Attributes
+    ----------
+    band : Band
+        The frame of its part.
+    v : (2,) array
+        Offsets at both ends of the band [px].
+    epsilon : float
+        +1 for edge 1, -1 for edge 2.
+    half_width : float
+        Half of the width of the part in the image [px].
+    hidden : (n,) array of bool
+        Which of n equal stretches of the band other legs hide.
+    """
+
+    band: Band
+    v: Array
+    epsilon: float
+    half_width: float
+    hidden: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredEdge:
+    """The line of an outline.
+
+    Attributes
+    ----------
+    v : (2,) array
+        Offsets at both ends of the band [px].
+    line : StraightFit
+        How the blocks lie about it.
+    contrast : float
+        Median step from the background to the leg, without sign [grey levels].
+    covariance : (2, 2) array
+        Of the offsets at both ends of the used piece [px^2]: that of the line, and what shading
+        that the model leaves out does to an outline of this contrast.
+    """
+
+    v: Array
+    line: StraightFit
+    contrast: float
+    covariance: Array
+
+
+def measure_edges(
+    grey: Grey, camera: Camera, edges: Sequence[Edge]
+) -> tuple[list[MeasuredEdge | None], float]:
+    """Fit the limb model and straight lines to all edges of an image.
+
+    Parameters
+    ----------
+    grey : Grey
+        The image.
+    camera : Camera
+        Its camera.
+    edges : sequence of Edge
+        All outlines to measure.
+
+    Returns
+    -------
+    measured : list of MeasuredEdge or None
+        None for an edge that no straight line fits.
+    blur : float
+        Standard deviation of the blur of the image [px].
+    """
+    v = [edge.v for edge in edges]
+    blocks = _Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=2)
+    if len(blocks.moved) == 0:
+        return [None] * len(edges), FIRST_BLUR
+    blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
+    blur = estimate_blur(*blocks.samples(slice(None)))
+    v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
+    blocks = _Blocks.read(grey, camera, edges, v, blur, step=1)
+    if len(blocks.moved) == 0:
+        return [None] * len(edges), blur
+    blocks.settle(blur, LAST_ROUNDS)
+    return [
+        None if line is None else _measured(_moved(edge, at, line), line, step, blur)
+        for edge, at, line, step in zip(edges, v, blocks.lines, blocks.contrasts(), strict=True)
+    ], blur
+
+
+def _measured(v: Array, line: StraightFit, contrasts: Array, blur: float) -> MeasuredEdge:
+    """Return a measured edge; shading moves it by its grey levels over the slope of the step."""
+    contrast = float(np.median(contrasts[line.kept]))
+    bias = SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3)
+    return MeasuredEdge(v, line, contrast, line.covariance + bias**2)
+
+
+def _moved(edge: Edge, v: Array, line: StraightFit | None) -> Array:
+    """Return the offsets of an edge moved by a line of shifts towards the inside."""
+    return v if line is None else np.asarray(v + edge.epsilon * line.ends)
+
+
+@dataclass(eq=False)
+class _Blocks:
+    """The blocks of all edges of an image, and how far their lines have moved."""
+
+    d: Samples  # (n, m) from the lines at which they were read
+    grey: Samples  # (n, m)
+    inside: BoolArray  # (n, m)
+    gain: Array  # (n,)
+    bounds: IntArray  # (n_edges + 1,) first block of each edge
+    position: Array  # (n,) as fractions of the bands
+    half_width: Samples  # (n, 1)
+    moved: Array  # (n,) [px]
+    contrast: Array  # (n,) [grey levels]
+    lines: list[StraightFit | None]
+
+    @classmethod
+    def read(
+        cls,
+        grey: Grey,
+        camera: Camera,
+        edges: Sequence[Edge],
+        v: Sequence[Array],
+        blur: float,
+        step: int,
+    ) -> "_Blocks":
+        """Read every ``step``-th unhidden block of all edges."""
+        outer = depth_for_blur(blur)
+        reach = int(np.ceil(1.42 * outer))
+        profiles = []
+        for edge, at in zip(edges, v, strict=True):
+            inner = min(outer, SHALLOWEST * edge.half_width)
+            read = read_profiles(grey, camera, edge.band, at, edge.epsilon, (-outer, inner), reach)
+            n = len(edge.hidden)
+            stretch = np.clip((read.t / edge.band.length * n).astype(np.intp), 0, n - 1)
+            free = ~edge.hidden[stretch]
+            free[np.arange(len(free)) % step != 0] = False
+            profiles.append(read.take(free))
+        counts = [len(p.t) for p in profiles]
+        half_width = np.repeat([edge.half_width for edge in edges], counts)
+        return cls(
+            np.concatenate([p.d for p in profiles]),
+            np.concatenate([p.grey for p in profiles]),
+            np.concatenate([p.inside for p in profiles]),
+            np.concatenate([p.gain for p in profiles]),
+            np.cumsum([0, *counts]),
+            np.concatenate(
+                [p.t / edge.band.length for p, edge in zip(profiles, edges, strict=True)]
+            ),
+            half_width.astype(np.float32)[:, None],
+            np.zeros(sum(counts)),
+            np.zeros(sum(counts)),
+            [None] * len(edges),
+        )
+
+    def samples(self, blocks: slice | BoolArray) -> tuple[Samples, Samples, BoolArray, Samples]:
+        """Return distances from the current lines, grey levels, use, half-widths."""
+        d = self.d[blocks] - self.moved[blocks, None].astype(np.float32)
+        return d, self.grey[blocks], self.inside[blocks], self.half_width[blocks]
+
+    def contrasts(self) -> list[Array]:
+        """Return the contrasts of the blocks of each edge, without sign."""
+        return np.split(np.abs(self.contrast), self.bounds[1:-1])
+
+    def settle(self, blur: float, n_rounds: int) -> None:
+        """Fit the blocks and a line to each edge in turn, until no line moves any more."""
+        active = np.ones(len(self.lines), dtype=np.bool_)
+        counts = np.diff(self.bounds)
+        for _ in range(n_rounds):
+            chosen = np.repeat(active, counts)
+            fit = fit_blocks(*self.samples(chosen), blur)
+            self.contrast[chosen] = fit.contrast
+            shift, variance = np.zeros(len(chosen)), np.full(len(chosen), np.inf)
+            shift[chosen], variance[chosen] = fit.shift, fit.variance
+            for i in np.flatnonzero(active):
+                block = slice(self.bounds[i], self.bounds[i + 1])
+                movement = self._fit_line(int(i), shift[block], variance[block])
+                active[i] = movement > SETTLED
+            if not np.any(active):
+                break
+
+    def _fit_line(self, i: int, shift: Array, variance: Array) -> float:
+        """Fit the line of an edge, which holds the whole shift; return its movement [px]."""
+        block = slice(self.bounds[i], self.bounds[i + 1])
+        gain, position, before = self.gain[block], self.position[block], self.moved[block].copy()
+        line = fit_straight(position, (before + shift) / gain, variance / gain**2)
+        self.lines[i] = line
+        if line is None:
+            return 0.0
+        along = line.ends[0] + (line.ends[1] - line.ends[0]) * position
+        self.moved[block] = along * gain
+        return float(np.abs(along * gain - before).max())
