@@ -47,7 +47,7 @@ def summary(calibration: Calibration, output: Path) -> RenderableType:
 def _outline_line(calibration: Calibration) -> str:
     outlines = calibration.solution.outlines
     reasons = Counter(
-        reason.split(" by ")[0]
+        reason.split(",")[0].split(" by ")[0]
         for reason, used in zip(outlines.reason, outlines.used, strict=True)
         if not used
     )
