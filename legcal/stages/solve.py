@@ -104,13 +104,16 @@ class Solution:
     def unseen(self, n_first: int) -> BoolArray:
         """Return which of the first unknowns can move without changing any residual, (n_first,)."""
         scaled = self.jacobian * _column_scale(self.jacobian)
+        n = scaled.shape[1]
+        n_rest = n - n_first
         # QR eliminates the unknowns that come later: what is left is about the first ones.
-        triangle = np.asarray(np.linalg.qr(np.roll(scaled, -n_first, axis=1), mode="r"))
-        n_rest = scaled.shape[1] - n_first
-        left = np.zeros((n_first, n_first))
-        left[: max(len(triangle) - n_rest, 0)] = triangle[n_rest:, n_rest:]
-        _, singular, rows = np.linalg.svd(left)
-        null = rows[singular < _RANK]
+        triangle = np.zeros((n, n))
+        reduced = np.asarray(np.linalg.qr(np.roll(scaled, -n_first, axis=1), mode="r"))
+        triangle[: len(reduced)] = reduced
+        if np.linalg.svd(triangle[n_rest:, n_rest:], compute_uv=False)[-1] >= _RANK:
+            return np.zeros(n_first, dtype=np.bool_)
+        _, singular, rows = np.linalg.svd(triangle)
+        null = rows[singular < _RANK, n_rest:]
         return np.asarray(np.abs(null).max(axis=0, initial=0.0) > 1e-3)
 
 
