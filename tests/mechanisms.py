@@ -30,6 +30,7 @@ class Layout:
     sign: int = 1
     mounts: bool = False  # turned fixed links between base or platform and the leg
     slid: float = 0.0  # joint origins moved along their own axes [m]
+    carried: bool = False  # leg 1 carries the platform, there is no virtual joint
 
 
 LAYOUTS = {
@@ -44,6 +45,7 @@ LAYOUTS = {
     "UPS, flipped sliders": Layout(hung="base", sign=-1),
     "SPU, mounts": Layout(mounts=True),
     "UPS, mounts, slid origins": Layout(hung="base", mounts=True, slid=0.02),
+    "UPS, platform on leg 1": Layout(hung="base", carried=True),
     "SPS, slid origins": Layout(hung="base", first="S", slid=0.013),
 }
 
@@ -123,20 +125,19 @@ def write_hexapod(
     text = _Text()
     for link in ("base", "platform"):
         text.link(link)
-    text.joint("platform_free", "floating", "base", "platform", EYE)
-    closures = []
-    for j in range(6):
-        closures.append(_leg(text, j, layout, machine))
+    if not layout.carried:
+        text.joint("platform_free", "floating", "base", "platform", EYE)
+    closures = [frames for j in range(6) if (frames := _leg(text, j, layout, machine)) is not None]
     names = [f"leg{j + 1}" for j in range(6)]
     document = {
         "closed_loop": closures,
-        "type": ["6d" if layout.welded else "3d"] * 6,
+        "type": ["6d" if layout.welded else "3d"] * len(closures),
         "name_mot": [f"{name}_prismatic" for name in names],
         "legcal": {
             "version": 1,
             "base": "base",
             "platform": "platform",
-            "platform_joint": "platform_free",
+            "platform_joint": None if layout.carried else "platform_free",
             "base_frame": ["leg1", "leg3", "leg5"],
             "home": {
                 "xyz": [float(x) for x in machine.home.translation],
@@ -153,8 +154,8 @@ def write_hexapod(
     return path
 
 
-def _leg(text: _Text, j: int, layout: Layout, machine: Geometry) -> list[str]:
-    """Write one leg and return the frames of its closure."""
+def _leg(text: _Text, j: int, layout: Layout, machine: Geometry) -> list[str] | None:
+    """Write one leg and return the frames of its closure, None if it carries the platform."""
     name, from_base = f"leg{j + 1}", layout.hung == "base"
     root, other = ("base", "platform") if from_base else ("platform", "base")
     T_base = {"base": EYE, "platform": machine.home}
@@ -177,11 +178,15 @@ def _leg(text: _Text, j: int, layout: Layout, machine: Geometry) -> list[str]:
         f"0 0 {layout.sign}", travel,
     )  # fmt: skip
     link = f"{name}_tube"
-    if layout.welded:
+    carries = layout.carried and j == 0
+    if layout.welded or carries:
         link = _revolutes(text, f"{name}_c", link, EYE, ["0 0 1", "0 1 0", "1 0 0"], 0.0, None)
+    T_other = T_base[other].inv() * RigidTransform.from_components(end, T_base_leg.rotation)
+    if carries:
+        text.joint("platform_carried", "fixed", link, other, T_other.inv())
+        return None
     text.link(f"{name}_end")
     text.joint(f"{name}_end_frame", "fixed", link, f"{name}_end", EYE)
-    T_other = T_base[other].inv() * RigidTransform.from_components(end, T_base_leg.rotation)
     text.link(f"{name}_seat")
     text.joint(f"{name}_seat_frame", "fixed", other, f"{name}_seat", T_other)
     return [f"{name}_end", f"{name}_seat"]

@@ -167,7 +167,7 @@ class ClosedChain:
     def rotation_columns(self) -> IntArray:
         """Return the tangent coordinates that are angles."""
         columns: list[int] = []
-        for joint in self._model.joints:
+        for joint in list(self._model.joints)[1:]:  # the first is the universe
             name, start, size = joint.shortname(), int(joint.idx_v), int(joint.nv)
             if "Free" in name:
                 columns += range(start + 3, start + 6)

@@ -1,10 +1,10 @@
-"""A home pose for a mechanism file that gives none: the legs at mid-travel."""
+"""The home pose: found where a file gives none, and settled on the lengths of rods."""
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge
+from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array
 from legcal.mechanism.closing import leg_vectors
 from legcal.mechanism.leg import LegKind
@@ -55,6 +55,43 @@ def find_home(mechanism: Mechanism) -> RigidTransform:
             f"loops did not close from {TRIALS} starts, needed a closed pose; write legcal.home."
         )
     return best[1]
+
+
+def settle_home(mechanism: Mechanism, home: RigidTransform) -> RigidTransform:
+    """Return the pose nearest to home that keeps the length of every leg of constant length.
+
+    Files give home with few digits; legs with sliders absorb that, rods cannot.
+
+    Raises
+    ------
+    ModelError
+        If home is more than 1 % of a leg length away from any such pose.
+    """
+    rods = [j for j, leg in enumerate(mechanism.legs) if leg.kind is LegKind.CONSTANT]
+    if not rods:
+        return home
+    T = home
+    for _ in range(20):
+        vectors = leg_vectors(mechanism, T)[rods]
+        lengths = np.linalg.norm(vectors, axis=1)
+        miss = lengths - mechanism.q0[rods]
+        if np.abs(miss).max() < 1e-15:
+            break
+        if np.abs(miss).max() > 0.01 * lengths.mean():
+            leg = mechanism.legs[rods[int(np.argmax(np.abs(miss)))]]
+            raise ModelError(
+                f"{mechanism.yaml_path}: legcal.home could not be used: found leg '{leg.name}' "
+                f"{1e3 * np.abs(miss).max():.3g} mm off its constant length there, needed a closed "
+                "pose; correct legcal.home."
+            )
+        u = vectors / lengths[:, None]
+        arms = T.rotation.apply(mechanism.B_platform[rods])
+        scale = float(lengths.mean())
+        jacobian = np.hstack([u, np.cross(arms, u) / scale])
+        step = -np.linalg.lstsq(jacobian, miss, rcond=None)[0]
+        turn = Rotation.from_rotvec(step[3:] / scale)
+        T = RigidTransform.from_components(T.translation + step[:3], turn * T.rotation)
+    return T
 
 
 def _pose(x: Array) -> RigidTransform:

@@ -14,7 +14,7 @@ from legcal.mechanism.chain import ClosedChain, Closure
 from legcal.mechanism.closing import close_at
 from legcal.mechanism.cylinders import with_cylinders
 from legcal.mechanism.files import find_urdf, find_yaml
-from legcal.mechanism.home import find_home
+from legcal.mechanism.home import find_home, settle_home
 from legcal.mechanism.leg import Leg, LegKind
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
@@ -47,8 +47,8 @@ def load_mechanism(model: str | Path) -> Mechanism:
     agreement.check_class(file, urdf, yaml_path)
     mechanism = _assemble(file, urdf, yaml_path)
     home = mechanism.home if file.legcal.home is not None else find_home(mechanism)
-    mechanism = replace(mechanism, home=home)
-    mechanism = replace(mechanism, home_configuration=close_at(mechanism, home))
+    mechanism = replace(mechanism, home=settle_home(mechanism, home))
+    mechanism = replace(mechanism, home_configuration=close_at(mechanism, mechanism.home))
     mechanism = replace(mechanism, mobility=mobility(mechanism))
     agreement.check_length_law(mechanism)
     return replace(

@@ -117,13 +117,12 @@ def _contradictions(file: MechanismFile, path: Path) -> list[str]:
             f"{path}: the mechanism could not be closed: found no pair in closed_loop, needed the "
             "loops of a parallel mechanism; write the pairs of frames that coincide."
         )
-    for key in ("joint_name", "joint_type"):
-        if getattr(file, key):
-            problems.append(
-                f"{path}: {key} could not be followed: found {len(getattr(file, key))} entries, "
-                "needed none, because joints that stand for others are not read; write the joints "
-                "as revolutes in the URDF."
-            )
+    if len(file.joint_name) != len(file.joint_type):
+        problems.append(
+            f"{path}: joint_name could not be used: found {len(file.joint_name)} names and "
+            f"{len(file.joint_type)} entries in joint_type, needed equal numbers; write one type "
+            "for each joint."
+        )
     repeated = sorted({name for name in file.name_mot if file.name_mot.count(name) > 1})
     problems += [
         f"{path}: name_mot could not be used: found '{name}' more than once, needed each motor "

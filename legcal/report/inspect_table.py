@@ -25,32 +25,41 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     )
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("leg", overflow="fold")
-    table.add_column("type")
+    table.add_column("type", overflow="fold", min_width=_type_width(description["legs"]))
     table.add_column(r"A in base \[mm]", justify="right", no_wrap=True)
     table.add_column(r"B in platform \[mm]", justify="right", no_wrap=True)
-    table.add_column(r"q0 \[mm]", justify="right", no_wrap=True)
+    table.add_column(r"length \[mm]", justify="right", no_wrap=True)
     table.add_column(r"R \[mm]", justify="right")
-    for leg in description["legs"]:
+    A, B = (_points([leg[end] for leg in description["legs"]]) for end in ("A", "B"))
+    for leg, A_text, B_text in zip(description["legs"], A, B, strict=True):
         radii = dict.fromkeys(f"{1e3 * c['radius']:.4g}" for c in leg["cylinders"])
         kind = "" if leg["actuated"] else f" {leg['kind']}"
-        sign = "" if leg["sign"] > 0 else "-q"
         table.add_row(
-            leg["name"],
-            Text(f"{leg['type']}{kind}"),
-            _point(leg["A"]),
-            _point(leg["B"]),
-            f"{sign}{1e3 * leg['q0']:{'+' if sign else ''}.3f}",
+            leg["name"], f"{leg['type']}{kind}", A_text, B_text, _length(leg),
             ", ".join(radii) or "none",
-        )
+        )  # fmt: skip
     notes = [Text(f"note: {note}") for note in description["diagnostics"]]
     legend = Text(
-        f"R_b and R_e stand on the joints of {description['n_d']} legs. Leg length L = q + q0"
-        + (" (-q where shown)." if any(leg["sign"] < 0 for leg in description["legs"]) else "."),
+        f"R_b and R_e stand on the joints of {description['n_d']} legs; q is the reading.",
         style="dim",
     )
     return Group(heading, Text(), table, Text(), legend, *notes)
 
 
-def _point(xyz: Sequence[float]) -> str:
-    """Return a point in millimetres, signs and decimals aligned."""
-    return " ".join(f"{1e3 * x + 0.0:7.1f}" for x in xyz)
+def _type_width(legs: Sequence[dict[str, Any]]) -> int:
+    """Return what the kinds of legs need, each on a line of its own."""
+    return max(4, *(0 if leg["actuated"] else len(leg["kind"]) for leg in legs))
+
+
+def _points(points: Sequence[Sequence[float]]) -> list[str]:
+    """Return points in millimetres, decimals aligned."""
+    words = [[f"{round(1e3 * x, 1) + 0.0:.1f}" for x in point] for point in points]
+    width = max(len(word) for row in words for word in row)
+    return [" ".join(word.rjust(width) for word in row) for row in words]
+
+
+def _length(leg: dict[str, Any]) -> str:
+    """Return the length law of a leg in millimetres."""
+    if leg["kind"] == "constant":
+        return f"{1e3 * leg['q0']:.3f}"
+    return f"{1e3 * leg['q0']:.3f} {'+' if leg['sign'] > 0 else '-'} q"

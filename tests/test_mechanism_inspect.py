@@ -1,0 +1,60 @@
+"""What ``legcal inspect`` prints."""
+
+import io
+import json
+from pathlib import Path
+
+from mechanisms import Layout, write_hexapod
+from rich.console import Console
+
+from legcal.mechanism.inspect import describe
+from legcal.mechanism.load import load_mechanism
+from legcal.report.inspect_table import inspect_table
+
+
+def _table(description: dict[str, object]) -> str:
+    console = Console(file=io.StringIO(), width=80, highlight=False)
+    console.print(inspect_table(description))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert isinstance(text, str)
+    return text
+
+
+def test_the_document_has_every_key_of_the_contract() -> None:
+    document = json.loads(json.dumps(describe(load_mechanism("hexapod")), allow_nan=False))
+    assert list(document) == [
+        "name", "spatial", "mobility", "motors", "n_d", "legs", "diagnostics",
+    ]  # fmt: skip
+    assert document["name"] == "hexapod"
+    assert document["spatial"] is True
+    assert (document["mobility"], document["motors"], document["n_d"]) == (6, 6, 3)
+    assert [leg["name"] for leg in document["legs"]] == [f"leg{j}" for j in range(1, 7)]
+    leg = document["legs"][0]
+    assert list(leg) == [
+        "name", "type", "actuated", "kind", "A", "B", "q0", "sign", "base_axis", "platform_axis",
+        "cylinders",
+    ]  # fmt: skip
+    assert (leg["type"], leg["actuated"], leg["kind"]) == ("SPU", True, "actuated")
+    assert (leg["base_axis"], leg["platform_axis"], leg["sign"]) == (None, None, 1)
+    assert {c["radius"] for c in leg["cylinders"]} == {0.01}
+    assert {c["link"] for c in leg["cylinders"]} == {"leg1_b2_link", "leg1_tube"}
+
+
+def test_the_table_fits_80_columns_and_shows_millimetres() -> None:
+    text = _table(describe(load_mechanism("hexapod")))
+    assert max(len(line) for line in text.splitlines()) <= 80
+    assert "A in base [mm]" in text
+    assert "mobility 6, 6 motors" in text
+    row = next(line for line in text.splitlines() if line.startswith("leg5"))
+    numbers = ["0.0", "270.0", "0.0", "0.0", "195.0", "0.0", "345.000"]
+    assert row.split() == ["leg5", "SPU", *numbers, "+", "q", "10"]
+
+
+def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
+    path = write_hexapod(tmp_path, Layout(first="S", sign=-1))
+    path.write_text(path.read_text().replace("- leg2_prismatic\n", "", 1))
+    text = _table(describe(load_mechanism(path)))
+    assert "passive" in text
+    assert "344.217 - q" in text
+    assert "note: the motors do not determine the pose" in text
+    assert max(len(line) for line in text.splitlines()) <= 80
