@@ -62,6 +62,7 @@ def uncertainty(
     normal: NormalEquations,
     names: tuple[str, ...],
     size: float,
+    added: Array | None = None,
     n_weak: int = 3,
 ) -> Uncertainty:
     """Return the covariance of the parameters, or refuse.
@@ -75,6 +76,8 @@ def uncertainty(
         Names of the kinematic parameters.
     size : float
         Largest joint coordinate of the machine [m].
+    added : (n_kept, n_kept) array, optional
+        Covariance to add, of the unknowns other than poses [mm^2, mrad^2].
     n_weak : int
         How many weak directions to name.
 
@@ -101,6 +104,8 @@ def uncertainty(
     value, vector = np.linalg.eigh(scale[:, None] * S * scale)
     _refuse_free_directions(value, scale[:, None] * vector, labels)
     covariance = UNIT**2 * ((scale[:, None] * vector / value) @ (scale[:, None] * vector).T)
+    if added is not None:
+        covariance += UNIT**2 * added[: len(S), : len(S)]
     n = len(names)
     kinematic = covariance[:n, :n]
     variances, directions = np.linalg.eigh(kinematic)
@@ -140,25 +145,28 @@ def without_cameras(problem: FitProblem, normal: NormalEquations) -> Array:
     return np.asarray(0.5 * (S + S.T))
 
 
+def reduced_jacobian(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> Array:
+    """Return the whitened offsets (n, 2, n_kept) by the kept unknowns, poses following them."""
+    n_kept = problem.layout.n_kept
+    J, pose = linear.outline_J, problem.outlines.pose
+    at = np.minimum(problem.outline_index[:, :13], n_kept)
+    G = np.zeros((len(J), 2, n_kept + 1))
+    outline, row = np.arange(len(J))[:, None, None], np.arange(2)[None, :, None]
+    np.add.at(G, (outline, row, at[:, None, :]), J[..., :13])
+    follow = normal.V_inverse[pose] @ np.swapaxes(normal.W[pose], -1, -2)
+    return np.asarray(G[..., :n_kept] - J[..., 13:] @ follow)
+
+
 def explained_share(problem: FitProblem, linear: Linearization, normal: NormalEquations) -> Array:
     """Return the covariance (n, 2, 2) of the predicted whitened offsets of every outline.
 
     The residuals of a right fit have covariance one minus this.
     """
-    n_kept = problem.layout.n_kept
-    covariance = inverse_on_range(normal.reduced())
-    J, pose = linear.outline_J, problem.outlines.pose
-    at = np.minimum(problem.outline_index[:, :13], n_kept)
-    G = np.zeros((len(J), 2, n_kept + 1))
-    np.add.at(
-        G,
-        (np.arange(len(J))[:, None, None], np.arange(2)[None, :, None], at[:, None, :]),
-        J[..., :13],
-    )
-    through_pose = J[..., 13:] @ normal.V_inverse[pose]
-    G = G[..., :n_kept] - through_pose @ np.swapaxes(normal.W[pose], -1, -2)
-    share = (G @ covariance) @ np.swapaxes(G, -1, -2)
-    return np.asarray(share + through_pose @ np.swapaxes(J[..., 13:], -1, -2))
+    G = reduced_jacobian(problem, linear, normal)
+    J_pose = linear.outline_J[..., 13:]
+    share = (G @ inverse_on_range(normal.reduced())) @ np.swapaxes(G, -1, -2)
+    through_pose = J_pose @ normal.V_inverse[problem.outlines.pose]
+    return np.asarray(share + through_pose @ np.swapaxes(J_pose, -1, -2))
 
 
 def check_counts(problem: FitProblem, n_images: int) -> None:

@@ -27,6 +27,7 @@ from legcal.refinement.observed import has_offset, observed_outlines, readings
 from legcal.refinement.problem import FitProblem, Prior, build_problem
 from legcal.refinement.rounds import Fit, first_minimum, fit_in_rounds, offsets_of
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
+from legcal.refinement.shared_errors import shared_errors
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start
 from legcal.refinement.state import State, lay_out
@@ -214,9 +215,11 @@ def _solution(
 ) -> Solution:
     """Put together what was found."""
     claimed, k = problem.outlines.covariance, width_to_k(settings.loss_width)
-    linear = linearize(problem, fit.state, fit.noise.whitening(claimed, fit.accepted))
+    whitening = fit.noise.whitening(claimed, fit.accepted)
+    linear = linearize(problem, fit.state, whitening)
     normal = information(problem, linear, efficiency(k))
-    known = uncertainty(problem, normal, names, _size(fit.state))
+    shared = shared_errors(problem, linear, normal, whitening)
+    known = uncertainty(problem, normal, names, _size(fit.state), shared.covariance)
     offsets = offsets_of(problem, fit.state)
     used = offsets[fit.accepted]
     n_residuals = used.size + len(problem.readings) + len(problem.radius_prior.mean)
@@ -236,6 +239,8 @@ def _solution(
         dof=n_residuals - problem.layout.size,
         rms_px=float(np.sqrt(np.mean(used**2))) if used.size else 0.0,
         noise=fit.noise,
+        shared_bias_px=shared.bias_px,
+        shared_tilt_px=shared.tilt_px,
         outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,

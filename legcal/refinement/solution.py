@@ -46,6 +46,9 @@ class Solution:
         Root mean square of the offsets of used outlines [px].
     noise : NoiseModel
         The estimated errors of outlines; ``noise.bias_px`` is tau.
+    shared_bias_px, shared_tilt_px : float
+        Standard deviations [px] of errors that all images of one edge of a leg in a view share;
+        0 where the residuals do not show them. They are part of ``covariance``.
     outlines : Outlines
         The table that came in, with what the fit rejected and why.
     start : str
@@ -70,6 +73,8 @@ class Solution:
     dof: int
     rms_px: float
     noise: NoiseModel
+    shared_bias_px: float
+    shared_tilt_px: float
     outlines: Outlines
     start: str
     iterations: int
