@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mechanisms import SHIPPED_URDF
+from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
 from legcal.errors import ModelError
+from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.urdf import read_urdf
 
 SHIPPED = SHIPPED_URDF.read_text()
@@ -148,6 +149,33 @@ def test_an_undeclared_entity_is_refused(tmp_path: Path) -> None:
 def test_utf16_is_refused(tmp_path: Path) -> None:
     text = SHIPPED.replace('encoding="utf-8"', 'encoding="utf-16"')
     assert "needed UTF-8" in _problems(tmp_path, text.encode("utf-16"))[0]
+
+
+def test_a_robot_without_a_name_is_refused(tmp_path: Path) -> None:
+    assert "<robot> without a name" in _problems(tmp_path, _with(' name="hexapod"', ""))[0]
+
+
+def test_sizes_that_overflow_are_refused(tmp_path: Path) -> None:
+    assert "1e300" in _problems(tmp_path, _with("0.195", "1e300"))[0]
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        "<visual/>",
+        "<visual><geometry/></visual>",
+        '<visual><geometry><mesh filename="package://lost/lost.stl"/></geometry></visual>',
+        '<visual><material name="m"><color rgba="a b"/></material></visual>',
+    ],
+)
+def test_visuals_that_are_no_cylinder_do_no_harm(tmp_path: Path, part: str) -> None:
+    for name in ("models", "urdf"):
+        (tmp_path / name).mkdir()
+    text = _with('<link name="leg1_tube">', f'<link name="leg1_tube">{part}')
+    (tmp_path / "urdf" / "hexapod.urdf").write_text(text)
+    (tmp_path / "models" / "hexapod.yaml").write_bytes(SHIPPED_YAML.read_bytes())
+    mechanism = load_mechanism(tmp_path / "models" / "hexapod.yaml")
+    assert [len(leg.cylinders) for leg in mechanism.legs] == [2] * 6
 
 
 def test_a_folder_and_a_missing_file_are_refused(tmp_path: Path) -> None:

@@ -6,12 +6,14 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
+from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
 from legcal.mechanism.axes import Step
 from legcal.mechanism.bodies import Bodies
 from legcal.mechanism.leg import Cylinder, Leg
+from legcal.mechanism.robot_xml import parse_robot
 from legcal.mechanism.topology import LegChain
 from legcal.mechanism.urdf import Urdf
 
@@ -54,7 +56,7 @@ def _visual_cylinders(urdf: Urdf) -> list[tuple[str, RigidTransform, float, floa
     from yourdfpy import URDF  # half a second: only where there is something to read
 
     robot: Any = URDF.load(
-        io.BytesIO(urdf.content), build_scene_graph=False, load_meshes=False
+        io.BytesIO(_cylinders_alone(urdf)), build_scene_graph=False, load_meshes=False
     ).robot
     found = []
     for link in robot.links:
@@ -65,6 +67,29 @@ def _visual_cylinders(urdf: Urdf) -> list[tuple[str, RigidTransform, float, floa
                 pose = RigidTransform.from_matrix(T)
                 found.append((str(link.name), pose, float(cylinder.radius), float(cylinder.length)))
     return found
+
+
+def _cylinders_alone(urdf: Urdf) -> bytes:
+    """Return the file with nothing but its cylinders: the rest may hold anything."""
+    alone = etree.Element("robot", {"name": "cylinders"})
+    for link in parse_robot(urdf.path, urdf.content).findall("link"):
+        kept = etree.SubElement(alone, "link", {"name": link.get("name", "")})
+        for visual in link.findall("visual"):
+            cylinder = visual.find("geometry/cylinder")
+            if cylinder is not None:
+                shown = etree.SubElement(kept, "visual")
+                origin = visual.find("origin")
+                if origin is not None:
+                    etree.SubElement(shown, "origin", _attributes(origin, "xyz", "rpy"))
+                geometry = etree.SubElement(shown, "geometry")
+                size = _attributes(cylinder, "radius", "length")
+                etree.SubElement(geometry, "cylinder", size)
+    return etree.tostring(alone)
+
+
+def _attributes(element: etree._Element, *names: str) -> dict[str, str]:
+    """Return those attributes that an element has."""
+    return {name: value for name in names if (value := element.get(name)) is not None}
 
 
 def _of_leg(

@@ -64,7 +64,8 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
         If there is none.
     """
     if written is not None:
-        return yaml_path.parent / written
+        path = yaml_path.parent / written
+        return path.resolve() if ".." in path.parts else path
     near = [yaml_path.with_suffix(".urdf"), _sibling(yaml_path, "urdf").with_suffix(".urdf")]
     for path in near:
         if path.is_file():

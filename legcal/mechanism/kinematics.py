@@ -1,23 +1,16 @@
 """Forward and inverse kinematics of the closed chain, and its mobility (section 2).
 
-Forward kinematics holds the motors at their readings and closes all loops by Newton on
-Pinocchio's constraints. It follows the solution from a known one in steps that contract, so
-that it stays in one assembly mode: a hexapod has at least nine at its home lengths.
+Forward kinematics holds the motors at their readings and closes all loops on Pinocchio's
+constraints, followed from home or from a given pose so that it stays in one assembly mode.
 """
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.closing import (
-    CLOSED,
-    close_at,
-    platform_pose,
-    readings_at,
-    slider_columns,
-    worst_closure,
-)
+from legcal.errors import NotIdentifiable, UsageError
+from legcal.geometry.types import Array
+from legcal.mechanism.closing import close_at, platform_pose, readings_at, slider_columns
+from legcal.mechanism.following import follow
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
@@ -29,10 +22,6 @@ __all__ = [
     "mobility",
     "outside_travel",
 ]
-
-NEWTON_STEPS = 12
-SHORTEST = 1.0 / 4096.0  # of the way from known readings to the wanted ones
-CONTRACTION = 0.5
 
 
 def forward_kinematics(
@@ -67,7 +56,7 @@ def forward_kinematics(
     configuration = mechanism.home_configuration
     if start is not None:
         configuration = close_at(mechanism, start, configuration)
-    return platform_pose(mechanism, _follow(mechanism, configuration, readings))
+    return platform_pose(mechanism, follow(mechanism, configuration, readings))
 
 
 def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransform]:
@@ -96,7 +85,7 @@ def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransfo
     poses = []
     for i, row in enumerate(readings):
         nearest = int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))
-        configuration = _follow(mechanism, configurations[nearest], row, f" of row {i + 1}")
+        configuration = follow(mechanism, configurations[nearest], row, f" of row {i + 1}")
         known.append(row)
         configurations.append(configuration)
         poses.append(platform_pose(mechanism, configuration))
@@ -185,75 +174,3 @@ def _readings(mechanism: Mechanism, q: Array) -> Array:
                     "correct the reading."
                 )
     return readings
-
-
-def _follow(mechanism: Mechanism, configuration: Array, readings: Array, which: str = "") -> Array:
-    """Return the closed configuration at readings, followed from a closed one."""
-    q_columns, v_columns = slider_columns(mechanism, mechanism.motors)
-    free = np.delete(np.arange(mechanism.chain.nv), v_columns)
-    first = configuration[q_columns]
-    side = _side(mechanism, configuration)
-    done, step = 0.0, 1.0
-    residual = np.full(mechanism.chain.n_rows, np.inf)
-    while done < 1.0:
-        wanted = min(done + step, 1.0)
-        trial = configuration.copy()
-        trial[q_columns] = readings if wanted == 1.0 else first + wanted * (readings - first)
-        trial, residual, contracts = _newton(mechanism, trial, free)
-        if contracts and _side(mechanism, trial) == side:
-            configuration, done, step = trial, wanted, 2.0 * step
-        else:
-            step *= 0.5
-            if step < SHORTEST:
-                raise DidNotConverge(
-                    f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: "
-                    f"at {100 * done:.1f} % of the way from the starting pose "
-                    f"{worst_closure(mechanism, residual)} or the mechanism is singular, needed "
-                    "closure to 1e-12 m on a regular path; check the readings and legcal.home."
-                )
-    return configuration
-
-
-def _newton(
-    mechanism: Mechanism, configuration: Array, free: IntArray
-) -> tuple[Array, Array, bool]:
-    """Close the loops by Newton; the last value says whether its steps contracted to the end."""
-    chain = mechanism.chain
-    step = np.zeros(chain.nv)
-    previous = 1.0
-    for _ in range(NEWTON_STEPS):
-        residual, jacobian = chain.linearize(configuration)
-        worst = float(np.abs(residual).max())
-        if worst < 0.01 * CLOSED:
-            return configuration, residual, True
-        J = jacobian[:, free]
-        try:
-            change = (
-                np.linalg.solve(J, residual)
-                if J.shape[0] == J.shape[1]
-                else np.linalg.lstsq(J, residual, rcond=1e-10)[0]
-            )
-        except np.linalg.LinAlgError:
-            return configuration, residual, False
-        size = float(np.abs(change).max())
-        if size > CONTRACTION * previous:
-            return configuration, residual, worst < CLOSED
-        previous = size
-        step[free] = -change
-        configuration = chain.integrate(configuration, step)
-    residual = chain.residual(configuration)
-    return configuration, residual, float(np.abs(residual).max()) < CLOSED
-
-
-def _side(mechanism: Mechanism, configuration: Array) -> float:
-    """Return on which side of a singularity a pose lies: the sign of the leg lines' determinant."""
-    driven = [j for j, leg in enumerate(mechanism.legs) if leg.kind is not LegKind.PASSIVE]
-    if len(driven) != 6:
-        return 0.0
-    R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
-    arms = mechanism.B_platform[driven] @ R.T
-    u = arms + t - mechanism.A_base[driven]
-    # the moments u x arm about the platform's origin, written out: np.cross is slow on six rows
-    (x, y, z), (a, b, c) = arms.T, u.T
-    lines = np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
-    return float(np.sign(np.linalg.det(lines)))

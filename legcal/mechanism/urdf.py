@@ -6,15 +6,15 @@ or ``<loop_joint>``: all of these are refused here, all problems of a file at on
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import ModelError
 from legcal.geometry.types import Array
 from legcal.mechanism.files import read_file
+from legcal.mechanism.robot_xml import parse_robot
 from legcal.mechanism.urdf_checks import Problems, check_numbers, check_tree, number_list
 
 JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
@@ -106,7 +106,7 @@ def read_urdf(path: Path) -> Urdf:
         joints or numbers do not describe one tree; one sentence a problem, with line numbers.
     """
     content = read_file(path, "URDF")
-    robot = _parse(path, content)
+    robot = parse_robot(path, content)
     problems = Problems(path)
     links = [e for e in robot if e.tag == "link"]
     joints = [e for e in robot if e.tag == "joint"]
@@ -131,41 +131,6 @@ def read_urdf(path: Path) -> Urdf:
         root=root,
         has_cylinders=any(e.find("visual/geometry/cylinder") is not None for e in links),
     )
-
-
-def _parse(path: Path, content: bytes) -> etree._Element:
-    """Parse XML without entities, document types or the network."""
-    parser = etree.XMLParser(
-        resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False,
-        remove_comments=True, remove_pis=True,
-    )  # fmt: skip
-    try:
-        robot = etree.fromstring(content, parser)
-    except etree.XMLSyntaxError as error:
-        line = error.lineno or 1
-        raise ModelError(
-            f"{path}, line {line}: the URDF could not be read: found {error.msg}, needed "
-            "well-formed XML; mend that line, or copy the file again if it was cut off."
-        ) from error
-    document: Any = robot.getroottree().docinfo
-    if document.doctype or document.internalDTD is not None:
-        raise ModelError(
-            f"{path}: the URDF could not be read: found a document type (<!DOCTYPE>), whose "
-            "entities are never expanded, needed plain XML; remove it."
-        )
-    try:
-        content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ModelError(
-            f"{path}: the URDF could not be read: found text in {document.encoding}, needed "
-            "UTF-8; save it as UTF-8."
-        ) from error
-    if robot.tag != "robot":
-        raise ModelError(
-            f"{path}, line {robot.sourceline}: the URDF could not be read: found <{robot.tag}> "
-            "as its outermost element, needed <robot>; give the URDF of the mechanism."
-        )
-    return robot
 
 
 def _joint(element: etree._Element, problems: Problems) -> UrdfJoint | None:

@@ -11,6 +11,8 @@ from legcal.errors import ModelError
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
+LARGEST = 1e12  # squares of larger numbers overflow; none of them is a length, an angle or a limit
+
 # element -> attribute -> how many numbers it holds, and whether they must be positive
 _NUMERIC: dict[str, dict[str, tuple[int, bool]]] = {
     "origin": {"xyz": (3, False), "rpy": (3, False)},
@@ -51,12 +53,12 @@ class Problems:
 
 
 def number_list(text: str, count: int) -> list[float] | None:
-    """Return ``count`` finite numbers written with spaces between them, or None."""
+    """Return ``count`` finite numbers of sensible size, with spaces between them, or None."""
     words = text.split()
     if len(words) != count or not all(_NUMBER.match(word) for word in words):
         return None
     numbers = [float(word) for word in words]
-    return numbers if all(math.isfinite(x) for x in numbers) else None
+    return numbers if all(math.isfinite(x) and abs(x) < LARGEST for x in numbers) else None
 
 
 def check_numbers(element: etree._Element, problems: Problems) -> None:
