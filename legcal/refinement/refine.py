@@ -10,24 +10,25 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.geometry.types import Array, BoolArray
 from legcal.measurements import Measurements
 from legcal.observations import Outlines
+from legcal.refinement.assembly import (
+    assemble_solution,
+    comparable_cost,
+    estimated_names,
+    machine_size,
+)
 from legcal.refinement.covariance import check_counts, uncertainty
-from legcal.refinement.inputs import inputs_of
 from legcal.refinement.legs import FittedLegs
-from legcal.refinement.loss import efficiency, width_to_k
 from legcal.refinement.noise import NoiseModel
-from legcal.refinement.normal import Linearization, information, linearize
+from legcal.refinement.normal import information, linearize
 from legcal.refinement.observed import has_offset, observed_outlines, readings
 from legcal.refinement.problem import FitProblem, Prior, build_problem
-from legcal.refinement.rounds import Fit, first_minimum, fit_in_rounds, offsets_of
+from legcal.refinement.rounds import first_minimum, fit_in_rounds
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
-from legcal.refinement.shared_errors import shared_errors
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start
 from legcal.refinement.state import State, lay_out
@@ -171,9 +172,9 @@ def _candidate(
         # A fit that nothing determines has no minimum to converge to: say so if that is why.
         linear = linearize(problem, begin, NoiseModel().whitening(problem.outlines.covariance))
         normal = information(problem, linear, 1.0)
-        uncertainty(problem, normal, _estimated_names(problem, legs), _size(begin))
+        uncertainty(problem, normal, estimated_names(problem, legs), machine_size(begin))
         raise
-    cost = _comparable_cost(problem, state, settings)
+    cost = comparable_cost(problem, state, settings)
     return _Candidate(start.label, state, cost, iterations)
 
 
@@ -187,8 +188,8 @@ def _refined(
     """Work out a first minimum with a problem that is already built."""
     fit = fit_in_rounds(problem, candidate.state, candidate.iterations, settings)
     _refuse_other_radii(problem, fit.state, legs)
-    names = _estimated_names(problem, legs)
-    return _solution(problem, fit, outlines, names, candidate.label, settings)
+    names = estimated_names(problem, legs)
+    return assemble_solution(problem, fit, outlines, names, candidate.label, settings)
 
 
 def _refuse_other_radii(problem: FitProblem, state: State, legs: FittedLegs) -> None:
@@ -203,84 +204,3 @@ def _refuse_other_radii(problem: FitProblem, state: State, legs: FittedLegs) -> 
     ]
     if problems:
         raise DidNotConverge(problems)
-
-
-def _solution(
-    problem: FitProblem,
-    fit: Fit,
-    outlines: Outlines,
-    names: tuple[str, ...],
-    label: str,
-    settings: RefinementSettings,
-) -> Solution:
-    """Put together what was found."""
-    claimed, k = problem.outlines.covariance, width_to_k(settings.loss_width)
-    whitening = fit.noise.whitening(claimed, fit.accepted)
-    linear = linearize(problem, fit.state, whitening)
-    normal = information(problem, linear, efficiency(k))
-    shared = shared_errors(problem, linear, normal, whitening)
-    known = uncertainty(problem, normal, names, _size(fit.state), shared.covariance)
-    offsets = offsets_of(problem, fit.state)
-    used = offsets[fit.accepted]
-    n_residuals = used.size + len(problem.readings) + len(problem.radius_prior.mean)
-    parts = problem.layout.parts
-    return Solution(
-        parameters=fit.state.parameters,
-        T_camera_Rb=fit.state.T_camera_Rb,
-        T_Rb_Re=fit.state.T_Rb_Re,
-        radii=dict(zip(parts, fit.state.radii.tolist(), strict=True)),
-        sigma_radii=dict(zip(parts, known.sigma_radii.tolist(), strict=True)),
-        names=names,
-        covariance=known.covariance,
-        sigma=np.sqrt(np.diagonal(known.covariance)),
-        weak=known.weak,
-        cost=_comparable_cost(problem, fit.state, settings),
-        chi2=_chi2(linear),
-        dof=n_residuals - problem.layout.size,
-        rms_px=float(np.sqrt(np.mean(used**2))) if used.size else 0.0,
-        noise=fit.noise,
-        shared_bias_px=shared.bias_px,
-        shared_tilt_px=shared.tilt_px,
-        outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
-        start=label,
-        iterations=fit.iterations,
-    )
-
-
-def _size(state: State) -> float:
-    """Return the largest joint coordinate [m]."""
-    return float(max(np.abs(state.base_joints).max(), np.abs(state.platform_joints).max()))
-
-
-def _chi2(linear: Linearization) -> float:
-    parts = (linear.outline_r, linear.encoder_r, linear.prior_r)
-    return float(sum(np.sum(part**2) for part in parts))
-
-
-def _comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:
-    """Return the robust cost of all outlines with their claimed covariances."""
-    whitening = NoiseModel().whitening(problem.outlines.covariance)
-    inputs = inputs_of(problem, state, whitening, width_to_k(settings.loss_width))
-    zero = ca.DM.zeros(problem.layout.size)
-    return float(problem.cost(zero, *[np.asfortranarray(part.T) for part in inputs]))
-
-
-def _with_rejections(
-    outlines: Outlines, problem: FitProblem, accepted: BoolArray, offsets: Array
-) -> Outlines:
-    """Return the table with what the fit rejected, and by how much it disagrees."""
-    used, reason = outlines.used.copy(), list(outlines.reason)
-    worst = np.abs(offsets).max(axis=1, initial=0.0)
-    for i in np.flatnonzero(~accepted):
-        row = int(problem.outlines.index[i])
-        used[row] = False
-        reason[row] = f"disagrees with the fit by {worst[i]:.1f} px"
-    return dataclasses.replace(outlines, used=used, reason=tuple(reason))
-
-
-def _estimated_names(problem: FitProblem, legs: FittedLegs) -> tuple[str, ...]:
-    """Return the names of the kinematic parameters that are unknowns of the fit."""
-    is_free = problem.layout.offset < problem.layout.size
-    joints = legs.parameter_names[: -legs.n_legs]
-    offsets = legs.parameter_names[-legs.n_legs :]
-    return (*joints, *(name for name, free in zip(offsets, is_free, strict=True) if free))
