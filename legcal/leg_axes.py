@@ -19,6 +19,8 @@ from legcal.observations import LegAxes, Outlines
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import axis_of_outlines
 
+_FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a file claims
+
 
 def axes_from_outlines(
     outlines: Outlines, measurements: Measurements, radius_of_part: Mapping[str, float]
@@ -65,6 +67,7 @@ def axes_from_outlines(
     offsets = np.zeros((len(pairs), 4, 4))
     offsets[:, :2, :2] = outlines.covariance[pairs[:, 0]]
     offsets[:, 2:, 2:] = outlines.covariance[pairs[:, 1]]
+    offsets += _FLOOR_PX**2 * np.eye(4)
     covariance = derivative @ offsets @ np.swapaxes(derivative, -1, -2)
     separate = LegAxes(
         outlines.row[pairs[:, 0]], outlines.leg[pairs[:, 0]], u, M, basis, covariance

@@ -24,8 +24,9 @@ _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
-    "ipopt.tol": 1e-10,
-    "ipopt.acceptable_tol": 1e-8,
+    "ipopt.tol": 1e-8,
+    "ipopt.acceptable_tol": 1e-6,  # of a standard deviation: where rounding ends the progress
+    "ipopt.acceptable_iter": 8,
     "ipopt.max_iter": 300,
     "ipopt.mu_init": 1e-9,
     "ipopt.nlp_scaling_method": "none",
