@@ -1,6 +1,7 @@
 """Simulated hexapods and disturbed nominal models, shared by the tests of the steps."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from legcal.simulation.observe import OutlineNoise, TableNoise
 from legcal.simulation.session import SimulatedSession, simulate_session
 
 
+@cache
 def exact_session(
     seed: int = 0,
     *,
@@ -19,6 +21,7 @@ def exact_session(
     noise: OutlineNoise | TableNoise | None = None,
     legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
     n_poses: int = 6,
+    share_poses: bool = False,
 ) -> SimulatedSession:
     """Return a session without noise of a hexapod 2 mm off its drawing."""
     rng = np.random.default_rng(seed)
@@ -30,9 +33,11 @@ def exact_session(
         noise=noise or OutlineNoise(),
         noisy=False,
         n_poses=n_poses,
+        share_poses=share_poses,
     )
 
 
+@cache
 def noisy_session(
     seed: int, noise: OutlineNoise | TableNoise, *, coplanar: bool = False, n_poses: int = 15
 ) -> tuple[SimulatedSession, Machine]:

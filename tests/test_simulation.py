@@ -44,7 +44,7 @@ def test_lengths_that_no_pose_has_are_refused() -> None:
 def test_platform_error_of_the_truth_is_zero_and_of_an_offset_is_not() -> None:
     machine = hexapod()
     poses = extreme_poses(machine, 3, np.random.default_rng(1))
-    assert platform_error(machine, machine.parameters, poses) == (0.0, 0.0)
+    assert max(platform_error(machine, machine.parameters, poses)) < 1e-12
     other = perturb(machine, np.random.default_rng(2), 0.002).parameters
     assert platform_error(machine, other, poses)[0] > 1e-4
 
@@ -134,6 +134,6 @@ def test_images_of_one_pose_share_readings_and_views_may_share_poses() -> None:
 
 
 def test_the_same_seed_gives_the_same_session() -> None:
-    first, second = (noisy_session(7, OutlineNoise(), n_poses=2)[0] for _ in range(2))
+    first, second = (noisy_session.__wrapped__(7, OutlineNoise(), n_poses=2)[0] for _ in "12")
     assert np.array_equal(first.axes.u, second.axes.u)
     assert np.array_equal(first.measurements.q, second.measurements.q)

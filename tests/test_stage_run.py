@@ -49,7 +49,8 @@ def test_exact_recovery_on_other_machines_with_other_starts(seed: int) -> None:
 
 
 def test_exact_recovery_from_three_cameras_that_share_poses_and_see_everything() -> None:
-    session = exact_session(legs=((0, 1, 2, 3, 4, 5),) * 3)
+    session = exact_session(legs=((0, 1, 2, 3, 4, 5),) * 3, share_poses=True)
+    assert session.measurements.n_poses == 6
     result = _run(session, five_millimetres_away(session.machine))
     assert errors(result.parameters, session.machine).max() < 1e-9
 
@@ -160,11 +161,11 @@ def _improvement(seeds: range, noise: OutlineNoise | TableNoise, criteria: Crite
 
 
 def test_with_the_noise_of_table_1_the_default_improves_the_model_fivefold() -> None:
-    assert _improvement(range(3), TableNoise(), "default") > 5.0
+    assert _improvement(range(2), TableNoise(), "default") > 5.0
 
 
 def test_with_the_noise_of_table_1_the_literal_criteria_make_the_model_worse() -> None:
-    assert _improvement(range(3), TableNoise(), "literal") < 1.0
+    assert _improvement(range(2), TableNoise(), "literal") < 1.0
 
 
 def test_with_good_outlines_of_thin_distant_legs_the_default_improves_the_model_fivefold() -> None:

@@ -44,20 +44,23 @@ def solve_pose(
     DidNotConverge
         If the legs cannot reach these lengths from this start.
     """
-    T = start
+    A, B = parameters.base_joints, parameters.platform_joints
+    t, R = start.translation, start.rotation.as_matrix()
     tolerance = 1e-14 * float(np.max(lengths))
     best = np.inf
     for _ in range(_ITERATIONS):
-        legs = leg_vectors(parameters, T)
-        norms = np.linalg.norm(legs, axis=-1)
+        arms = B @ R.T
+        legs = arms + t - A
+        norms = np.sqrt(np.sum(legs * legs, axis=1))
         error = lengths - norms
         size = float(np.abs(error).max())
         if size < tolerance or (size < 100 * tolerance and size >= best):
-            return T
+            return RigidTransform.from_components(t, Rotation.from_matrix(R))
         best = min(best, size)
-        step = np.linalg.lstsq(_jacobian(parameters, T), error, rcond=None)[0]
-        turn = Rotation.from_rotvec(_limited(step[3:], 0.3))
-        T = RigidTransform.from_components(T.translation + step[:3], turn * T.rotation)
+        u = legs / norms[:, None]
+        step = np.linalg.lstsq(np.hstack([u, np.cross(arms, u)]), error, rcond=None)[0]
+        t = t + step[:3]
+        R = Rotation.from_rotvec(_limited(step[3:], 0.3)).as_matrix() @ R
     raise DidNotConverge(
         f"A simulated pose was not found: leg lengths are still {1e3 * best:.2g} mm off after "
         f"{_ITERATIONS} iterations; choose lengths that the machine can reach."
