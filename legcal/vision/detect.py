@@ -13,10 +13,11 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, Image
-from legcal.measurements import Measurements, View
+from legcal.measurements import Measurements
 from legcal.mechanism.leg import Cylinder
 from legcal.observations import Outlines
 from legcal.vision.align import align_camera
+from legcal.vision.camera import Camera
 from legcal.vision.outline import PartOutlines, outline_parts
 from legcal.vision.picture import reduce, to_grey
 from legcal.vision.prediction import PredictedLeg, predict_legs
@@ -37,6 +38,7 @@ def align_views(
     B_base: Array,
     cylinders: Sequence[Sequence[Cylinder]],
     T_base_camera: Sequence[RigidTransform],
+    wanted: BoolArray | None = None,
     *,
     joint_error: float = JOINT_ERROR,
     progress: Progress | None = None,
@@ -56,6 +58,8 @@ def align_views(
         What can be seen of the legs.
     T_base_camera : sequence of RigidTransform, for each view
         Rough poses, 2 cm and 2 degrees off.
+    wanted : (n_views, n_legs) array of bool, optional
+        Legs to use in each view; all of them when it is missing.
     joint_error : float
         How far the predicted joint centres may be off [m].
     progress : callable, optional
@@ -78,7 +82,9 @@ def align_views(
         view = int(measurements.view[row])
         camera, T = measurements.views[view].camera, T_base_camera[view]
         legs = predict_legs(camera, T, A_base[row], B_base[row], cylinders, row)
-        found = _search_image(load(row), measurements.views[view], legs, joint_error)
+        if wanted is not None:
+            legs = [leg for leg in legs if wanted[view, leg.leg]]
+        found = _search_image(load(row), camera, legs, joint_error)
         if progress is not None:
             progress(row)
         return found
@@ -173,7 +179,7 @@ def _pixels_per_metre(leg: PredictedLeg) -> float:
 
 
 def _search_image(
-    image: Image, view: View, legs: Sequence[PredictedLeg], joint_error: float
+    image: Image, camera: Camera, legs: Sequence[PredictedLeg], joint_error: float
 ) -> list[tuple[PredictedLeg, Strips, float]]:
     """Find the candidate strips of all legs of an image, with the tolerance of each [px]."""
     grey = to_grey(image)
@@ -186,7 +192,7 @@ def _search_image(
         ends = leg.edge_offsets(np.array([0.02, 0.98]) * leg.band.length)
         factor = reduction(window, float(np.min(ends[1] - ends[0])))
         small = reduce(grey, factor)
-        strips = find_strips(small, factor, view.camera, leg, window + tolerance, tilt)
+        strips = find_strips(small, factor, camera, leg, window + tolerance, tilt)
         found.append((leg, strips, tolerance))
     return found
 

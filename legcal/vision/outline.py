@@ -23,7 +23,8 @@ MARGIN = 4.0  # beside a leg in front [px]
 LEAST_LENGTH = (30.0, 1.0)  # of an outline: [px] and in widths of the leg
 NARROWEST = 5.0  # [px]
 LEAST_CONTRAST = 4.0  # [grey levels]
-LEAST_KEPT = 0.5  # share of the unhidden blocks that must lie on the line
+LEAST_AGREEMENT = 0.6  # share of the blocks with an edge that must lie on the line
+LEAST_KEPT = 0.25  # share of all unhidden blocks that must
 LARGEST_SCATTER = 0.6  # [px]
 LARGEST_SIGMA = 0.5  # [px]
 WIDTH_TOLERANCE = (0.7, 0.06)  # [px] and share of the predicted width
@@ -185,7 +186,7 @@ def _judge(
 ) -> PartOutlines:
     """Turn the measured edges of a part into outlines with a verdict."""
     if one is None or two is None:
-        return _rejected(part.leg, part.piece, "no straight edge")
+        return _rejected(part.leg, part.piece, "edge hardly visible")
     h = np.stack([part.band.line(*edge.v) for edge in (one, two)])
     ends = np.empty((2, 2, 2))
     for i, edge in enumerate((one, two)):
@@ -209,9 +210,12 @@ def _reason(part: _Part, one: MeasuredEdge, two: MeasuredEdge) -> str:
     length = min((f.last - f.first) * part.band.length for f in fits)
     if length < least:
         return f"too short, {length:.0f} px visible"
+    agreement = min(f.agreement for f in fits)
+    if agreement < LEAST_AGREEMENT:
+        return f"edge not straight, {100 * agreement:.0f} % of it on one line"
     kept = min(float(np.mean(f.kept)) for f in fits)
     if kept < LEAST_KEPT:
-        return f"edge not straight, {100 * kept:.0f} % of it on one line"
+        return f"edge hardly visible, found on {100 * kept:.0f} % of it"
     contrast = min(one.contrast, two.contrast)
     if contrast < LEAST_CONTRAST:
         return f"low contrast, {contrast:.1f} grey levels"

@@ -14,7 +14,7 @@ from legcal.geometry.types import Array, BoolArray
 TUKEY = 4.0  # sigmas at which a block counts no longer
 N_ROUNDS = 10
 N_SCALES = 4  # rounds in which the scale of the scatter is estimated
-LARGEST_VARIANCE = 1.0  # of a block that says anything [px^2]
+LARGEST_VARIANCE = 0.25  # of a block that says anything [px^2]
 LEAST_SCATTER = 0.01  # [px]
 COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
 LEAST_BLOCKS = 4
@@ -36,6 +36,8 @@ class StraightFit:
         Covariance of the shifts at ``first`` and ``last`` [px^2].
     scatter : float
         Robust standard deviation of the blocks about the line [px].
+    agreement : float
+        Share of the blocks that show an edge at all which lie on the line.
     """
 
     ends: Array
@@ -44,6 +46,7 @@ class StraightFit:
     last: float
     covariance: Array
     scatter: float
+    agreement: float
 
 
 def fit_straight(position: Array, shift: Array, variance: Array) -> StraightFit | None:
@@ -99,7 +102,8 @@ def fit_straight(position: Array, shift: Array, variance: Array) -> StraightFit 
     residual = (moved - ends @ design)[robust > 0.0]
     scatter = 1.4826 * _median(np.abs(residual))
     covariance = _covariance(along[robust > 0.0], residual, base[robust > 0.0], factor)
-    return StraightFit(ends, kept, first, last, covariance, scatter)
+    agreement = float(np.mean(robust > 0.0))
+    return StraightFit(ends, kept, first, last, covariance, scatter, agreement)
 
 
 def _covariance(along: Array, residual: Array, base: Array, factor: float) -> Array:
