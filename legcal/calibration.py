@@ -110,23 +110,25 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     mechanism = dataset.mechanism
     legs, views = inverse(order.legs), inverse(order.views)
     estimated = set(solution.names)
+    by_leg = {int(leg): k for k, leg in enumerate(legs)}
+    radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
+    radii = dict(sorted(radii.items()))
     names = tuple(
         name
-        for name in parameter_names(mechanism.leg_names, mechanism.frame_legs)
+        for name in (
+            *parameter_names(mechanism.leg_names, mechanism.frame_legs),
+            *(f"{mechanism.leg_names[leg]}.radius.{part}" for leg, part in radii),
+        )
         if name in estimated
     )
     where = np.array([solution.names.index(name) for name in names], dtype=np.intp)
     poses = _poses_in_file_order(order, dataset)
-    by_leg = {int(leg): k for k, leg in enumerate(legs)}
     return replace(
         solution,
         parameters=permuted(solution.parameters, legs),
         T_camera_Rb=tuple(solution.T_camera_Rb[v] for v in views.tolist()),
         T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses.tolist()),
-        radii={(by_leg[leg], part): value for (leg, part), value in solution.radii.items()},
-        sigma_radii={
-            (by_leg[leg], part): value for (leg, part), value in solution.sigma_radii.items()
-        },
+        radii=radii,
         names=names,
         covariance=solution.covariance[np.ix_(where, where)],
         sigma=solution.sigma[where],
@@ -150,7 +152,10 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
     displacement, rotation = pose_differences(solution.T_Rb_Re, nominal)
     change = PlatformError(displacement, rotation)
     sigma = predict_platform_error(
-        solution.parameters, solution.covariance, mechanism.frame_legs, solution.T_Rb_Re
+        solution.parameters,
+        solution.kinematic_covariance,
+        mechanism.frame_legs,
+        solution.T_Rb_Re,
     )
     return Calibration(
         dataset, solution, steps, change, sigma, _verdict(change, sigma), tuple(notes)

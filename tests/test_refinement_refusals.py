@@ -225,7 +225,7 @@ def test_predicted_platform_error_agrees_with_monte_carlo(session: Session) -> N
     m = noisy_readings(session, rng)
     found = refine(session.legs, m, noisy_outlines(session, rng), disturbed_start(session))
     poses = session.T_Rb_Re[:3]
-    covariance = 0.01 * found.covariance
+    covariance = 0.01 * found.kinematic_covariance
     predicted = predict_platform_error(TRUTH, covariance, FRAME_LEGS, poses)
     lengths = np.array(
         [np.linalg.norm(T.apply(TRUTH.platform_joints) - TRUTH.base_joints, axis=1) for T in poses]
@@ -271,4 +271,4 @@ def test_a_passive_leg_needs_no_reading() -> None:
     assert np.isnan(error[-3])
     assert np.nanmax(np.abs(error)) < 1e-9
     assert "leg4.offset" not in found.names
-    assert found.covariance.shape == (29, 29)
+    assert found.kinematic_covariance.shape == (29, 29)

@@ -24,12 +24,13 @@ from legcal.refinement.state import State
 def assemble_solution(
     problem: FitProblem,
     fit: Fit,
+    legs: FittedLegs,
     outlines: Outlines,
-    names: tuple[str, ...],
     label: str,
     settings: RefinementSettings,
 ) -> Solution:
     """Put together what was found."""
+    names = estimated_names(problem, legs)
     claimed, k = problem.outlines.covariance, width_to_k(settings.loss_width)
     whitening = fit.noise.whitening(claimed, fit.accepted)
     linear = linearize(problem, fit.state, whitening)
@@ -45,8 +46,7 @@ def assemble_solution(
         T_camera_Rb=fit.state.T_camera_Rb,
         T_Rb_Re=fit.state.T_Rb_Re,
         radii=dict(zip(parts, fit.state.radii.tolist(), strict=True)),
-        sigma_radii=dict(zip(parts, known.sigma_radii.tolist(), strict=True)),
-        names=names,
+        names=(*names, *(f"{legs.names[leg]}.radius.{part}" for leg, part in parts)),
         covariance=known.covariance,
         sigma=np.sqrt(np.diagonal(known.covariance)),
         weak=known.weak,

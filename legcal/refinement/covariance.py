@@ -44,16 +44,13 @@ class Uncertainty:
 
     Attributes
     ----------
-    covariance : (n_parameters, n_parameters) array
-        Of the kinematic parameters [m^2].
-    sigma_radii : (n_radii,) array
-        Standard deviations of the radii [m].
+    covariance : (n, n) array
+        Of the kinematic parameters and then the radii [m^2].
     weak : tuple of WeakDirection
         The worst-known directions, worst first.
     """
 
     covariance: Array
-    sigma_radii: Array
     weak: tuple[WeakDirection, ...]
 
 
@@ -122,7 +119,7 @@ def uncertainty(
         _direction(directions[:, -1 - i], names, float(np.sqrt(variances[-1 - i])))
         for i in range(min(n_weak, n))
     )
-    return Uncertainty(kinematic, np.sqrt(np.diagonal(covariance)[n:]), weak)
+    return Uncertainty(covariance, weak)
 
 
 def _refuse_free_directions(value: Array, directions: Array, labels: tuple[str, ...]) -> None:

@@ -188,8 +188,7 @@ def _refined(
     """Work out a first minimum with a problem that is already built."""
     fit = fit_in_rounds(problem, candidate.state, candidate.iterations, settings)
     _refuse_other_radii(problem, fit.state, legs)
-    names = estimated_names(problem, legs)
-    return assemble_solution(problem, fit, outlines, names, candidate.label, settings)
+    return assemble_solution(problem, fit, legs, outlines, candidate.label, settings)
 
 
 def _refuse_other_radii(problem: FitProblem, state: State, legs: FittedLegs) -> None:

@@ -25,12 +25,13 @@ class Solution:
         Camera poses, one a view. A view without outlines keeps that of the start.
     T_Rb_Re : tuple of RigidTransform
         Platform poses.
-    radii, sigma_radii : dict
-        Radius and its standard deviation [m] for each (leg index, part) that was observed.
+    radii : dict
+        Radius [m] for each (leg index, part) that was observed.
     names : tuple of str
-        Names of the estimated kinematic parameters, in the order of ``parameters.to_vector``.
+        Names of the estimated parameters: the kinematic ones in the order of
+        ``parameters.to_vector``, then the radii in the order of ``radii``.
     covariance : (n, n) array
-        Their covariance [m^2], with cameras, poses and radii unknown.
+        Their covariance [m^2], with cameras and poses unknown.
     sigma : (n,) array
         Their standard deviations [m].
     weak : tuple of WeakDirection
@@ -63,7 +64,6 @@ class Solution:
     T_camera_Rb: tuple[RigidTransform, ...]
     T_Rb_Re: tuple[RigidTransform, ...]
     radii: dict[tuple[int, str], float]
-    sigma_radii: dict[tuple[int, str], float]
     names: tuple[str, ...]
     covariance: Array
     sigma: Array
@@ -79,3 +79,9 @@ class Solution:
     start: str
     iterations: int
     notes: tuple[str, ...] = ()
+
+    @property
+    def kinematic_covariance(self) -> Array:
+        """Covariance of the kinematic parameters alone [m^2]."""
+        n = len(self.names) - len(self.radii)
+        return self.covariance[:n, :n]

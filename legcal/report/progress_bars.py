@@ -11,7 +11,7 @@ from legcal.progress import Report
 
 @contextmanager
 def progress_on_stderr() -> Iterator[Report]:
-    """Show one line a stage on stderr: a moving bar on a terminal, the finished stages elsewhere."""
+    """Show one line a stage on stderr: a moving bar on a terminal, else finished stages."""
     console = Console(stderr=True, highlight=False)
     if not console.is_terminal:
         yield _finished_stages(console)

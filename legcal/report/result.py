@@ -11,7 +11,6 @@ import numpy as np
 from legcal.calibration import Calibration
 from legcal.errors import DidNotConverge
 from legcal.geometry.frames import motion_to_xyz_quat
-from legcal.geometry.types import Array
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.parameters import KinematicParameters, parameter_names, to_vector
 from legcal.observation_table import write_observations
@@ -35,7 +34,7 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
         **_joints(solution.parameters),
         "base_axes": {},
         "platform_axes": {},
-        "parameters": [*_kinematic_rows(calibration), *_radius_rows(calibration)],
+        "parameters": _parameter_rows(calibration),
         "covariance": solution.covariance.tolist(),
         "views": {
             view.name: {"T_base_camera": motion_to_xyz_quat(T)}
@@ -113,40 +112,22 @@ def _steps(calibration: Calibration) -> dict[str, Any]:
     return _joints(steps.parameters)
 
 
-def _kinematic_rows(calibration: Calibration) -> list[dict[str, Any]]:
+def _parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
     mechanism, solution = calibration.dataset.mechanism, calibration.solution
-    names = parameter_names(mechanism.leg_names, mechanism.frame_legs)
-    values = to_vector(solution.parameters, mechanism.frame_legs)
-    nominal = to_vector(mechanism.parameters, mechanism.frame_legs)
-    return _rows(names, values, nominal, solution.names, solution.sigma)
-
-
-def _radius_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    mechanism, solution = calibration.dataset.mechanism, calibration.solution
-    nominal = {
+    nominal_radii = {
         (j, cylinder.link): cylinder.radius
         for j, leg in enumerate(mechanism.legs)
         for cylinder in leg.cylinders
     }
-    keys = sorted(solution.radii)
-    names = tuple(f"{mechanism.leg_names[leg]}.radius.{part}" for leg, part in keys)
-    return _rows(
-        names,
-        np.array([solution.radii[key] for key in keys]),
-        np.array([nominal[key] for key in keys]),
-        names,
-        np.array([solution.sigma_radii[key] for key in keys]),
+    names = (
+        *parameter_names(mechanism.leg_names, mechanism.frame_legs),
+        *(f"{mechanism.leg_names[leg]}.radius.{part}" for leg, part in solution.radii),
     )
-
-
-def _rows(
-    names: tuple[str, ...],
-    values: Array,
-    nominal: Array,
-    estimated: tuple[str, ...],
-    sigma: Array,
-) -> list[dict[str, Any]]:
-    sigma_of = dict(zip(estimated, sigma.tolist(), strict=True))
+    values = to_vector(solution.parameters, mechanism.frame_legs).tolist()
+    nominal = to_vector(mechanism.parameters, mechanism.frame_legs).tolist()
+    values += solution.radii.values()
+    nominal += (nominal_radii[key] for key in solution.radii)
+    sigma_of = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
     return [
         {
             "name": name,
@@ -156,5 +137,5 @@ def _rows(
             "unit": "m",
             "status": "estimated" if name in sigma_of else "fixed",
         }
-        for name, value, start in zip(names, values.tolist(), nominal.tolist(), strict=True)
+        for name, value, start in zip(names, values, nominal, strict=True)
     ]
