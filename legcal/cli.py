@@ -6,6 +6,7 @@ Heavy imports happen inside the commands, so that ``legcal --help`` answers at o
 from __future__ import annotations
 
 import json
+import os
 import sys
 import traceback
 from pathlib import Path
@@ -152,6 +153,8 @@ def _fail(kind: str, message: str, *, as_json: bool) -> None:
 
 def main() -> None:
     """Run the command line and exit with 0, 1 (data), 2 (use), 3 (internal) or 130 (stopped)."""
+    # Thousands of small matrices: threads inside a product only get in each other's way.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     as_json = "--json" in sys.argv
     try:
