@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.dataset import load_dataset
+from legcal.dataset.folder import load_dataset
 from legcal.geometry.types import Array, Image
-from legcal.measurements import Measurements
 from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.detect import align_views, detect_outlines
 

@@ -1,6 +1,6 @@
 """Draw the picture of the README: the outlines of a result over one of its photographs.
 
-    python docs/draw_outlines.py examples/hexapod calibrated images/c1_k01.jpg docs/outlines.jpg
+python docs/draw_outlines.py examples/hexapod calibrated images/c1_k01.jpg docs/outlines.jpg
 """
 
 import sys
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from legcal import load_dataset
-from legcal.observation_table import read_observations
+from legcal.observations.table import read_observations
 
 USED, REJECTED = (80, 220, 60), (60, 60, 240)
 SHIFT = 4  # fractional bits of OpenCV's drawing coordinates

@@ -26,7 +26,7 @@ from legcal.errors import LegcalError
 from legcal.version import __version__
 
 if TYPE_CHECKING:
-    from legcal.dataset import load_dataset
+    from legcal.dataset.folder import load_dataset
     from legcal.mechanism.load import load_mechanism
     from legcal.pipeline import calibrate
     from legcal.report.accuracy import evaluate
@@ -43,7 +43,7 @@ __all__ = [
 _HOME = {
     "calibrate": "legcal.pipeline",
     "evaluate": "legcal.report.accuracy",
-    "load_dataset": "legcal.dataset",
+    "load_dataset": "legcal.dataset.folder",
     "load_mechanism": "legcal.mechanism.load",
 }
 

@@ -8,12 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.canonical_order import Order, inverse, reorder_measurements, restore_outlines
-from legcal.dataset import Dataset
+from legcal.dataset.folder import Dataset
 from legcal.geometry.types import IntArray
 from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.parameters import KinematicParameters, parameter_names
 from legcal.mechanism.platform import platform_in_base, pose_differences
+from legcal.observations.canonical_order import (
+    Order,
+    inverse,
+    reorder_measurements,
+    restore_outlines,
+)
 from legcal.refinement.platform_error import PlatformError, predict_platform_error
 from legcal.refinement.solution import Solution
 

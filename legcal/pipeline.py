@@ -21,7 +21,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import Calibration, Steps, in_file_order, judge
-from legcal.canonical_order import (
+from legcal.dataset.cache import DetectionPlan, fingerprint, plan_dataset, store_outlines
+from legcal.dataset.folder import Dataset, load_dataset
+from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.mechanism.kinematics import forward_kinematics_many
+from legcal.mechanism.model import Mechanism
+from legcal.observations.canonical_order import (
     Order,
     canonical_order,
     inverse,
@@ -29,16 +34,11 @@ from legcal.canonical_order import (
     reorder_outlines,
     restore_outlines,
 )
-from legcal.dataset import Dataset, load_dataset
-from legcal.detection_cache import DetectionPlan, fingerprint, plan_dataset, store_outlines
-from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.leg_axes import axes_from_outlines
-from legcal.measurements import Measurements
-from legcal.mechanism.kinematics import forward_kinematics_many
-from legcal.mechanism.model import Mechanism
-from legcal.observations import Outlines
-from legcal.observe import SETTINGS, Photographs, Scene, align, detect, given_outlines
-from legcal.outline_sets import reject_unused_legs
+from legcal.observations.leg_axes import axes_from_outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.observe import SETTINGS, Photographs, Scene, align, detect, given_outlines
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import reject_unused_legs
 from legcal.progress import Report, no_progress
 from legcal.refinement.legs import fitted_legs
 from legcal.refinement.refine import refine_from_best

@@ -6,14 +6,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, IntArray
-from legcal.measurements import Measurements, View
 from legcal.mechanism.parameters import (
     KinematicParameters,
     free_coordinates,
     from_vector,
     to_vector,
 )
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements, View
+from legcal.observations.outlines import Outlines
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.start import Start
 from legcal.vision.camera import Camera

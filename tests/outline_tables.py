@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.measurements import Measurements, View
 from legcal.mechanism.leg import Cylinder, Leg, LegKind
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements, View
+from legcal.observations.outlines import Outlines
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 

@@ -12,18 +12,17 @@ import pytest
 from dataset_folder import JOINTS, Folder, folder, hexapod
 from outline_tables import assert_same, outlines_of
 
-from legcal.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset, load_dataset
-from legcal.detection_cache import (
+from legcal.dataset.cache import (
     fingerprint,
     plan_dataset,
     plan_detection,
     store_outlines,
 )
+from legcal.dataset.folder import CACHE_NAME, OBSERVATIONS_NAME, Dataset, load_dataset
 from legcal.errors import DatasetError
 from legcal.geometry.types import BoolArray
-from legcal.observation_table import write_observations
-from legcal.observations import Outlines
-from legcal.outline_sets import (
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import (
     choose_outlines,
     is_edited,
     join_outlines,
@@ -31,6 +30,7 @@ from legcal.outline_sets import (
     no_outlines,
     outline_keys,
 )
+from legcal.observations.table import write_observations
 
 __all__ = ["folder"]
 
@@ -225,7 +225,7 @@ def test_settings_model_and_version_change_the_fingerprint(
     urdf.write_bytes(dataset.mechanism.urdf_path.read_bytes() + b"\n")
     other = replace(dataset, mechanism=replace(dataset.mechanism, urdf_path=urdf))
     assert fingerprint(other, SETTINGS) != before
-    monkeypatch.setattr("legcal.detection_cache.__version__", "0.0.0")
+    monkeypatch.setattr("legcal.dataset.cache.__version__", "0.0.0")
     assert fingerprint(dataset, SETTINGS) != before
 
 

@@ -30,7 +30,9 @@ def test_help_and_version_load_nothing_heavy() -> None:
         "heavy = {'numpy', 'scipy', 'casadi', 'pinocchio', 'cv2', 'yourdfpy', 'pydantic'}\n"
         "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     for command in ("inspect", "calibrate", "evaluate"):
         assert command in done.stdout

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from legcal.atomic import write_atomically
 from legcal.errors import UsageError
+from legcal.files.atomic import write_atomically
 from legcal.report.files import check_destination, result_folder
 
 RESULT = '{"legcal_result": 1}'

@@ -9,12 +9,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = (
     "geometry",
+    "files",
     "mechanism",
     "vision",
     "dataset",
-    "leg_axes",
+    "observations",
     "stages",
     "refinement",
+    "calibration",
     "report",
     "pipeline",
     "cli",

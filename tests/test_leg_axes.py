@@ -9,8 +9,8 @@ from staged_hexapods import exact_session
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array
-from legcal.leg_axes import axes_from_outlines, join_axes, outline_derivative
-from legcal.observations import LegAxes, Outlines
+from legcal.observations.leg_axes import LegAxes, axes_from_outlines, join_axes, outline_derivative
+from legcal.observations.outlines import Outlines
 from legcal.simulation.cameras import cameras_around, sample_camera
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise, shifted_outlines

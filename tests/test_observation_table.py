@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
 from legcal.errors import DatasetError
-from legcal.measurements import View
-from legcal.observation_row import COLUMNS
-from legcal.observation_table import read_observations, row_names, write_observations
-from legcal.observations import Outlines
-from legcal.outline_sets import no_outlines, reject_unused_legs
+from legcal.observations.measurements import View
+from legcal.observations.outlines import Outlines
+from legcal.observations.row import COLUMNS
+from legcal.observations.sets import no_outlines, reject_unused_legs
+from legcal.observations.table import read_observations, row_names, write_observations
 
 FAST = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -20,9 +20,9 @@ from hexapod_session import (
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.measurements import Measurements
 from legcal.mechanism.parameters import KinematicParameters
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 from legcal.refinement import (
     FittedLegs,
     RefinementSettings,

@@ -19,10 +19,10 @@ from hexapod_session import (
 
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.frames import motion_from_xyz_quat
-from legcal.measurements import Measurements, View
 from legcal.mechanism.leg import Cylinder, Leg, LegKind
 from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements, View
+from legcal.observations.outlines import Outlines
 from legcal.refinement import (
     cameras_from_hints,
     fitted_legs,

@@ -9,7 +9,7 @@ from staged_hexapods import exact_session, noisy_session
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.observations import LegAxes
+from legcal.observations.leg_axes import LegAxes
 from legcal.simulation.observe import OutlineNoise
 from legcal.simulation.session import SimulatedSession
 from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_session
 
 from legcal.geometry.types import IntArray
-from legcal.leg_axes import axes_from_outlines
 from legcal.mechanism.parameters import KinematicParameters
-from legcal.observations import LegAxes
+from legcal.observations.leg_axes import LegAxes, axes_from_outlines
 from legcal.simulation.machine import Machine
 from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
 from legcal.simulation.poses import extreme_poses, platform_error

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.errors import ModelError, OutOfClass
+from legcal.files.schema import closest
 from legcal.geometry.frames import frame_on_points
 from legcal.mechanism.bodies import Bodies
 from legcal.mechanism.closing import leg_vectors, platform_pose, slider_columns
@@ -15,7 +16,6 @@ from legcal.mechanism.model import Mechanism
 from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.topology import LegChain
 from legcal.mechanism.urdf import Urdf
-from legcal.schema import closest
 
 LENGTH_LAW = 1e-9  # [m]
 

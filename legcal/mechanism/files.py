@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from legcal import schema
 from legcal.errors import DatasetError, ModelError, OutOfClass
+from legcal.files import schema
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 

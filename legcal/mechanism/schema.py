@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from legcal import schema
 from legcal.errors import DatasetError, ModelError
+from legcal.files import schema
 from legcal.mechanism.files import read_file
 
 WHAT = "mechanism file"

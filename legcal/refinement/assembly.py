@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from legcal.geometry.types import Array, BoolArray
-from legcal.observations import Outlines
+from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import uncertainty
 from legcal.refinement.inputs import inputs_of
 from legcal.refinement.legs import FittedLegs

@@ -6,8 +6,8 @@ import numpy as np
 
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.measurements import Measurements
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 from legcal.refinement.legs import FittedLegs
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.measurements import Measurements
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 from legcal.refinement.assembly import (
     assemble_solution,
     comparable_cost,

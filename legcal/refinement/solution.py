@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
 from legcal.mechanism.parameters import KinematicParameters
-from legcal.observations import Outlines
+from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import WeakDirection
 from legcal.refinement.noise import NoiseModel
 

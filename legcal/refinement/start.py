@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array
-from legcal.measurements import Measurements
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.observations.measurements import Measurements
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.state import State, motions, turned
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.dataset import Dataset, load_dataset
+from legcal.dataset.folder import Dataset, load_dataset
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array
 from legcal.mechanism.kinematics import forward_kinematics, forward_kinematics_many

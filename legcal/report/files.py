@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from legcal.atomic import temporary_folder
 from legcal.errors import UsageError
+from legcal.files.atomic import temporary_folder
 
 RESULT_NAME = "result.json"
 RESULT_KEY = "legcal_result"

@@ -13,7 +13,7 @@ from legcal.errors import DidNotConverge
 from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.parameters import KinematicParameters, parameter_names, to_vector
-from legcal.observation_table import write_observations
+from legcal.observations.table import write_observations
 from legcal.report.files import result_folder
 from legcal.report.urdf import check_closes, write_calibrated_urdf, write_calibrated_yaml
 

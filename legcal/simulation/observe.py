@@ -9,7 +9,8 @@ import numpy as np
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, IntArray
-from legcal.observations import LegAxes, Outlines
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.outlines import Outlines
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis, point_with_zero_y
 

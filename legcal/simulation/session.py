@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.leg_axes import axes_from_outlines
-from legcal.measurements import Measurements, View
-from legcal.observations import LegAxes, Outlines
+from legcal.observations.leg_axes import LegAxes, axes_from_outlines
+from legcal.observations.measurements import Measurements, View
+from legcal.observations.outlines import Outlines
 from legcal.simulation.cameras import Viewpoint
 from legcal.simulation.machine import Machine
 from legcal.simulation.observe import (

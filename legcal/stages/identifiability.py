@@ -13,8 +13,8 @@ from math import comb
 
 import numpy as np
 
-from legcal.measurements import Measurements
-from legcal.observations import LegAxes
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.measurements import Measurements
 
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
 

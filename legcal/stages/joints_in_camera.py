@@ -12,8 +12,8 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.measurements import Measurements
-from legcal.observations import LegAxes
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.measurements import Measurements
 from legcal.stages.nominal import Criteria, NominalMechanism
 
 _REWEIGHTINGS = 10

@@ -13,9 +13,8 @@ import numpy as np
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.leg_axes import join_axes
-from legcal.measurements import Measurements
-from legcal.observations import LegAxes
+from legcal.observations.leg_axes import LegAxes, join_axes
+from legcal.observations.measurements import Measurements
 from legcal.stages.joints_in_base import JointsInBase
 from legcal.stages.joints_in_camera import JointsInCamera, miss
 from legcal.stages.nominal import NominalMechanism

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import BoolArray
-from legcal.measurements import Measurements
 from legcal.mechanism.parameters import KinematicParameters
-from legcal.observations import LegAxes
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.measurements import Measurements
 from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.stages.leg_directions import (

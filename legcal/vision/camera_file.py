@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from legcal.errors import DatasetError
+from legcal.files.schema import parse_yaml, read_text, validate
 from legcal.geometry.types import Array
-from legcal.schema import parse_yaml, read_text, validate
 from legcal.vision.camera import Camera, DistortionModel
 from legcal.vision.camera_schema import KalibrEntry, MatrixEntry, OpenCVEntry, RosEntry
 from legcal.vision.quiet import quiet_opencv

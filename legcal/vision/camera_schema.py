@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from legcal.schema import FileSchema
+from legcal.files.schema import FileSchema
 
 Pixels = Annotated[int, Field(gt=0)]
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, Image
-from legcal.measurements import Measurements
 from legcal.mechanism.leg import Cylinder
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 from legcal.vision.align import align_camera
 from legcal.vision.camera import Camera
 from legcal.vision.outline import PartOutlines, outline_parts

@@ -16,11 +16,11 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
-from legcal.measurements import Measurements
 from legcal.mechanism.leg import Cylinder
 from legcal.mechanism.model import Mechanism
-from legcal.observations import Outlines
-from legcal.outline_sets import (
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import (
     choose_outlines,
     is_edited,
     join_outlines,

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 from scipy.spatial.transform import RigidTransform
 
+from legcal.files.schema import FileSchema
 from legcal.geometry.frames import motion_from_xyz_quat
-from legcal.schema import FileSchema
 
 QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
 

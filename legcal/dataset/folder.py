@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.dataset_schema import DatasetEntry, ViewEntry
+from legcal.dataset.entry import DatasetEntry, ViewEntry
+from legcal.dataset.measurement_table import read_measurements
 from legcal.errors import DatasetError
+from legcal.files.inside import path_problem
+from legcal.files.schema import closest, describe, parse_yaml, read_text, validate
 from legcal.geometry.types import Image
-from legcal.inside import path_problem
-from legcal.measurement_table import read_measurements
-from legcal.measurements import Measurements, View
 from legcal.mechanism.files import shipped_folders, shipped_names
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.observation_table import read_observations
-from legcal.observations import Outlines
-from legcal.schema import closest, describe, parse_yaml, read_text, validate
+from legcal.observations.measurements import Measurements, View
+from legcal.observations.outlines import Outlines
+from legcal.observations.table import read_observations
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import image_problem, read_image

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.atomic import write_atomically
-from legcal.csv_file import read_lines
 from legcal.errors import DatasetError
+from legcal.files.atomic import write_atomically
+from legcal.files.csv_file import read_lines
 from legcal.geometry.types import Array
-from legcal.measurements import Measurements
 from legcal.mechanism.leg import Leg
-from legcal.observation_row import (
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
+from legcal.observations.row import (
     COLUMNS,
     VERDICTS,
     OutlineRow,
@@ -28,7 +29,6 @@ from legcal.observation_row import (
     place_of,
     rows_to_outlines,
 )
-from legcal.observations import Outlines
 
 LINE_TOLERANCE_PX = 5.0  # ends further from the line contradict it
 

@@ -5,7 +5,7 @@ import io
 from pathlib import Path
 
 from legcal.errors import DatasetError
-from legcal.schema import read_text
+from legcal.files.schema import read_text
 
 Line = tuple[int, list[str]]
 

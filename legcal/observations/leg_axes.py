@@ -8,18 +8,49 @@ the camera.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from legcal.errors import NotVisible
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, IntArray
-from legcal.measurements import Measurements
-from legcal.observations import LegAxes, Outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import axis_of_outlines
 
 _FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a file claims
+
+
+@dataclass(frozen=True, eq=False)
+class LegAxes:
+    """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.
+
+    Attributes
+    ----------
+    row, leg : (n,) array of int
+        Indices of the image and of the leg.
+    u : (n, 3) array
+        Unit directions in the camera frame, from base to platform.
+    M : (n, 3) array
+        A point of each axis in the camera frame [m].
+    basis : (n, 2, 3) array
+        Unit vectors e1, e2 normal to u, in which the covariance is written.
+    covariance : (n, 4, 4) array
+        Covariance of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m], where the axis is known
+        as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
+    """
+
+    row: IntArray
+    leg: IntArray
+    u: Array
+    M: Array
+    basis: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.row)
 
 
 def axes_from_outlines(

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry.types import IntArray
-from legcal.measurements import Measurements
-from legcal.observations import Outlines
-from legcal.outline_sets import sort_outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import sort_outlines
 
 
 @dataclass(frozen=True, eq=False)

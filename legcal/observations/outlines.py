@@ -14,7 +14,7 @@ class Outlines:
     Attributes
     ----------
     row : (n,) array of int
-        Index into the rows of :class:`legcal.measurements.Measurements`.
+        Index into the rows of :class:`legcal.observations.measurements.Measurements`.
     leg : (n,) array of int
         Index into the legs of the mechanism.
     part : tuple of str, length n
@@ -48,36 +48,6 @@ class Outlines:
     used: BoolArray
     reason: tuple[str, ...]
     source: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.row)
-
-
-@dataclass(frozen=True, eq=False)
-class LegAxes:
-    """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.
-
-    Attributes
-    ----------
-    row, leg : (n,) array of int
-        Indices of the image and of the leg.
-    u : (n, 3) array
-        Unit directions in the camera frame, from base to platform.
-    M : (n, 3) array
-        A point of each axis in the camera frame [m].
-    basis : (n, 2, 3) array
-        Unit vectors e1, e2 normal to u, in which the covariance is written.
-    covariance : (n, 4, 4) array
-        Covariance of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m], where the axis is known
-        as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
-    """
-
-    row: IntArray
-    leg: IntArray
-    u: Array
-    M: Array
-    basis: Array
-    covariance: Array
 
     def __len__(self) -> int:
         return len(self.row)

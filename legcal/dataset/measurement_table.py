@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.csv_file import Line, read_lines
+from legcal.dataset.travel import check_travel
 from legcal.errors import DatasetError
+from legcal.files.csv_file import Line, read_lines
+from legcal.files.inside import path_problem
+from legcal.files.schema import closest, describe
 from legcal.geometry.types import Array, IntArray
-from legcal.inside import path_problem
-from legcal.measurements import Measurements, View
 from legcal.mechanism.leg import Leg, LegKind
-from legcal.schema import closest, describe
-from legcal.travel import check_travel
+from legcal.observations.measurements import Measurements, View
 
 SAME_READING = 10.0  # sigma by which rows of one pose may differ
 

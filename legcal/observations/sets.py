@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from legcal.geometry.types import BoolArray, IntArray
-from legcal.measurements import Measurements
-from legcal.observations import Outlines
+from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 
 Key = tuple[int, int, str, int]
 

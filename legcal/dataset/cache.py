@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from legcal.atomic import write_atomically
-from legcal.canonical_order import canonical_order, reorder_measurements
-from legcal.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
+from legcal.dataset.folder import CACHE_NAME, OBSERVATIONS_NAME, Dataset
+from legcal.files.atomic import write_atomically
+from legcal.files.schema import FileSchema
 from legcal.geometry.types import BoolArray, IntArray
-from legcal.observation_table import row_names, write_observations
-from legcal.observations import Outlines
-from legcal.outline_sets import choose_outlines, is_edited, no_outlines
-from legcal.schema import FileSchema
+from legcal.observations.canonical_order import canonical_order, reorder_measurements
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import choose_outlines, is_edited, no_outlines
+from legcal.observations.table import row_names, write_observations
 from legcal.version import __version__
 
 FORMAT = 1

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from legcal.files.schema import closest, describe
 from legcal.mechanism.leg import Leg
-from legcal.observations import Outlines
-from legcal.schema import closest, describe
+from legcal.observations.outlines import Outlines
 
 NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 COLUMNS = ("view", "image", "leg", "part", "edge", *NUMBERS, "verdict", "reason", "source")

@@ -1,0 +1,1 @@
+"""Reading and writing files safely: schemas, tables, paths, all or nothing."""

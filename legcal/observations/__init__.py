@@ -1,0 +1,1 @@
+"""What the images show: outlines and leg axes, found, kept, corrected and tabulated."""
