@@ -25,8 +25,8 @@ class Light:
     """How bars are lit: a surface is albedo * (ambient + lambert + gloss), light from infinity."""
 
     direction: tuple[float, float, float] = (0.4, -0.3, -0.9)
-    ambient: float = 0.2
-    diffuse: float = 0.9
+    ambient: float = 0.6
+    diffuse: float = 0.5
     gloss: float = 0.0
 
 

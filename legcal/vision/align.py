@@ -21,7 +21,8 @@ SIGMA_POSE = np.array([2e-2, 2e-2, 2e-2, 0.015, 0.015, 0.015])  # rough pose [ra
 N_TRIALS = 3000
 SEED = 20020721
 BEST = 8  # trials that are refined
-N_STEPS = 12
+N_STEPS = 10
+REACH = (2.0, 1.2)  # of a candidate that counts in a step, in tolerances: first, last
 LEAST_AGREEMENT = 0.35  # share of the legs that must agree
 LEAST_LEGS = 3
 
@@ -196,10 +197,10 @@ def _refine(legs: _Ends, votes: _Votes, xi: Array) -> Array:
     """Return the pose that fits the agreeing candidates, by Gauss-Newton steps."""
     sigma = votes.tolerance / 3.0
     J = _jacobian(legs, xi)  # changes little within the few degrees of a rough pose
-    for _ in range(N_STEPS):
+    for reach in np.linspace(*REACH, N_STEPS):
         predicted = _shifts(legs, xi)
         residual = votes.shift - predicted[:, None, :]
-        gap = np.abs(residual).max(axis=-1) / (2.0 * votes.tolerance[:, None])
+        gap = np.abs(residual).max(axis=-1) / (reach * votes.tolerance[:, None])
         closeness = np.maximum(1.0 - gap**2, 0.0) ** 2 * votes.score
         nearest = np.argmax(closeness, axis=1)
         rows = np.arange(len(nearest))
@@ -208,6 +209,4 @@ def _refine(legs: _Ends, votes: _Votes, xi: Array) -> Array:
         right = np.einsum("nki,n,nk->i", J, weight, residual[rows, nearest])
         change = np.linalg.solve(normal, right - xi / SIGMA_POSE**2)
         xi = xi + change
-        if np.all(np.abs(change) < 1e-6):
-            break
     return xi

@@ -36,12 +36,15 @@ class BlockFit:
         Mean square residual of the block [grey levels^2].
     contrast : (n,) array
         Step from the background to the leg, a pixel and a half inside [grey levels].
+    gain : (n,) array
+        How much chi^2 falls by there being an edge at all.
     """
 
     shift: Array
     variance: Array
     noise: Array
     contrast: Array
+    gain: Array
 
 
 def fit_blocks(
@@ -68,15 +71,8 @@ def fit_blocks(
     X = values * weight[:, None, :]
     Xt = X.swapaxes(1, 2)
     normal = (X @ Xt).astype(np.float64)
-    # Amplitudes that the noise of a block leaves open are drawn to zero.
     right = (X @ y[..., None]).astype(np.float64)
-    power = np.einsum("nm,nm->n", y, y).astype(np.float64) / np.maximum(n_samples, 1.0) + 1e-3
-    inverse = np.linalg.inv(normal + 1e-3 * np.eye(N_BASIS))
-    unexplained = power - np.sum(right * (inverse @ right), axis=(1, 2)) / np.maximum(
-        n_samples, 1.0
-    )
-    share = np.clip(unexplained / power, 1e-4, 1.0)
-    inverse = np.linalg.inv(normal + (share[:, None] * RIDGE)[:, :, None] * np.eye(N_BASIS))
+    inverse = _regularised_inverse(normal, right, y, n_samples)
     amplitude = inverse @ right
     residual = y - (Xt @ amplitude.astype(np.float32))[..., 0]
     # The outline at distance s further inside lowers d by s.
@@ -94,19 +90,39 @@ def fit_blocks(
     reference = np.broadcast_to(np.asarray(1.5 + blur, dtype=np.float32), (len(d), 1))
     at, _ = basis(reference, half_width, blur)
     contrast = np.sum(at[:, 2:, 0] * amplitude[:, 2:, 0], axis=1)
-    return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast)
+    gain = _without_edge(normal, right, y) / np.maximum(noise, 1e-9) - freedom
+    return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast, gain)
 
 
-def estimate_blur(d: Samples, grey: Samples, inside: BoolArray, half_width: Samples) -> float:
+def _without_edge(normal: Array, right: Array, y: Samples) -> Array:
+    """Return the sum of squares that a background with a slope leaves unexplained."""
+    background = normal[:, :2, :2] + 1e-3 * np.eye(2)
+    explained = np.sum(right[:, :2] * np.linalg.solve(background, right[:, :2]), axis=(1, 2))
+    return np.asarray(np.einsum("nm,nm->n", y, y).astype(np.float64) - explained)
+
+
+def _regularised_inverse(normal: Array, right: Array, y: Samples, n_samples: Array) -> Array:
+    """Invert normal matrices, drawing amplitudes that the noise of a block leaves open to zero."""
+    count = np.maximum(n_samples, 1.0)
+    power = np.einsum("nm,nm->n", y, y).astype(np.float64) / count + 1e-3
+    free = np.linalg.solve(normal + 1e-3 * np.eye(N_BASIS), right)
+    unexplained = power - np.sum(right * free, axis=(1, 2)) / count
+    prior = np.clip(unexplained / power, 1e-4, 1.0)[:, None] * RIDGE
+    return np.asarray(np.linalg.inv(normal + prior[:, :, None] * np.eye(N_BASIS)))
+
+
+def estimate_blur(
+    d: Samples, grey: Samples, inside: BoolArray, half_width: Samples, merit: Array
+) -> float:
     """Return the blur [px] that explains the best blocks of an image best.
 
     Parameters
     ----------
     d, grey, inside, half_width
         As for :func:`fit_blocks`.
+    merit : (n,) array
+        How much each block tells, such as its contrast.
     """
-    start = fit_blocks(d, grey, inside, half_width, 1.0)
-    merit = np.where(np.isfinite(start.variance), np.abs(start.contrast), 0.0)
     best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
     d, grey, inside, half_width = d[best], grey[best], inside[best], half_width[best]
     blurs = np.geomspace(*BLURS)

@@ -21,6 +21,11 @@ from legcal.vision.straight import StraightFit, fit_straight
 
 FIRST_BLUR = 1.0  # [px]
 SHALLOWEST = 0.8  # largest used depth, in half-widths
+ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
+ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
+VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
+LEAST_GAIN = 30  # in chi^2, by which a block shows an edge at all
+FIRST_STEP = 2
 FIRST_ROUNDS, LAST_ROUNDS = 2, 6  # at most
 SHADING = 0.8  # that the limb model leaves out [grey levels]
 SETTLED = 0.01  # movement of every line below which the rounds end [px]
@@ -63,6 +68,8 @@ class MeasuredEdge:
         How the blocks lie about it.
     contrast : float
         Median step from the background to the leg, without sign [grey levels].
+    blur : float
+        Standard deviation of the blur of the image [px].
     covariance : (2, 2) array
         Of the offsets at both ends of the used piece [px^2]: that of the line, and what shading
         that the model leaves out does to an outline of this contrast.
@@ -71,6 +78,7 @@ class MeasuredEdge:
     v: Array
     line: StraightFit
     contrast: float
+    blur: float
     covariance: Array
 
 
@@ -96,16 +104,16 @@ def measure_edges(
         Standard deviation of the blur of the image [px].
     """
     v = [edge.v for edge in edges]
-    blocks = _Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=2)
+    blocks = _Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=FIRST_STEP)
     if len(blocks.moved) == 0:
         return [None] * len(edges), FIRST_BLUR
-    blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
-    blur = estimate_blur(*blocks.samples(slice(None)))
+    blocks.settle(FIRST_BLUR, FIRST_ROUNDS, least_gain=-np.inf)
+    blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
     v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     blocks = _Blocks.read(grey, camera, edges, v, blur, step=1)
     if len(blocks.moved) == 0:
         return [None] * len(edges), blur
-    blocks.settle(blur, LAST_ROUNDS)
+    blocks.settle(blur, LAST_ROUNDS, least_gain=LEAST_GAIN)
     return [
         None if line is None else _measured(_moved(edge, at, line), line, step, blur)
         for edge, at, line, step in zip(edges, v, blocks.lines, blocks.contrasts(), strict=True)
@@ -116,7 +124,7 @@ def _measured(v: Array, line: StraightFit, contrasts: Array, blur: float) -> Mea
     """Return a measured edge; shading moves it by its grey levels over the slope of the step."""
     contrast = float(np.median(contrasts[line.kept]))
     bias = SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3)
-    return MeasuredEdge(v, line, contrast, line.covariance + bias**2)
+    return MeasuredEdge(v, line, contrast, blur, line.covariance + bias**2)
 
 
 def _moved(edge: Edge, v: Array, line: StraightFit | None) -> Array:
@@ -152,10 +160,12 @@ class _Blocks:
         """Read every ``step``-th unhidden block of all edges."""
         outer = depth_for_blur(blur)
         reach = int(np.ceil(1.42 * outer))
+        rows = ROWS if step > 1 else ROWS * int(np.clip(np.rint(blur / ROWS_PER_BLUR), 1, 4))
         profiles = []
         for edge, at in zip(edges, v, strict=True):
             inner = min(outer, SHALLOWEST * edge.half_width)
-            read = read_profiles(grey, camera, edge.band, at, edge.epsilon, (-outer, inner), reach)
+            depths = (-outer, inner)
+            read = read_profiles(grey, camera, edge.band, at, edge.epsilon, depths, reach, rows)
             n = len(edge.hidden)
             stretch = np.clip((read.t / edge.band.length * n).astype(np.intp), 0, n - 1)
             free = ~edge.hidden[stretch]
@@ -187,28 +197,32 @@ class _Blocks:
         """Return the contrasts of the blocks of each edge, without sign."""
         return np.split(np.abs(self.contrast), self.bounds[1:-1])
 
-    def settle(self, blur: float, n_rounds: int) -> None:
+    def settle(self, blur: float, n_rounds: int, least_gain: float) -> None:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""
         active = np.ones(len(self.lines), dtype=np.bool_)
         counts = np.diff(self.bounds)
-        for _ in range(n_rounds):
+        for turn in range(n_rounds):
+            least = least_gain if turn > 1 else -np.inf  # a line that is off shows bad fits
             chosen = np.repeat(active, counts)
             fit = fit_blocks(*self.samples(chosen), blur)
             self.contrast[chosen] = fit.contrast
             shift, variance = np.zeros(len(chosen)), np.full(len(chosen), np.inf)
-            shift[chosen], variance[chosen] = fit.shift, fit.variance
+            shift[chosen] = fit.shift
+            variance[chosen] = np.where(fit.gain > least, fit.variance, np.inf)
             for i in np.flatnonzero(active):
                 block = slice(self.bounds[i], self.bounds[i + 1])
-                movement = self._fit_line(int(i), shift[block], variance[block])
+                movement = self._fit_line(
+                    int(i), shift[block], variance[block], min(VAGUE[0] * blur, VAGUE[1]) ** 2
+                )
                 active[i] = movement > SETTLED
             if not np.any(active):
                 break
 
-    def _fit_line(self, i: int, shift: Array, variance: Array) -> float:
+    def _fit_line(self, i: int, shift: Array, variance: Array, largest: float) -> float:
         """Fit the line of an edge, which holds the whole shift; return its movement [px]."""
         block = slice(self.bounds[i], self.bounds[i + 1])
         gain, position, before = self.gain[block], self.position[block], self.moved[block].copy()
-        line = fit_straight(position, (before + shift) / gain, variance / gain**2)
+        line = fit_straight(position, (before + shift) / gain, variance / gain**2, largest)
         self.lines[i] = line
         if line is None:
             return 0.0

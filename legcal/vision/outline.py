@@ -25,9 +25,9 @@ NARROWEST = 5.0  # [px]
 LEAST_CONTRAST = 4.0  # [grey levels]
 LEAST_AGREEMENT = 0.6  # share of the blocks with an edge that must lie on the line
 LEAST_KEPT = 0.25  # share of all unhidden blocks that must
-LARGEST_SCATTER = 0.6  # [px]
+LARGEST_SCATTER = (0.6, 1.2)  # of the blocks of an edge: [px] and in blurs
 LARGEST_SIGMA = 0.5  # [px]
-WIDTH_TOLERANCE = (0.7, 0.06)  # [px] and share of the predicted width
+WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ def _reason(part: _Part, one: MeasuredEdge, two: MeasuredEdge) -> str:
     if contrast < LEAST_CONTRAST:
         return f"low contrast, {contrast:.1f} grey levels"
     scatter = max(f.scatter for f in fits)
-    if scatter > LARGEST_SCATTER:
+    if scatter > max(LARGEST_SCATTER[0], LARGEST_SCATTER[1] * one.blur):
         return f"edge too rough, scatter {scatter:.2f} px"
     sigma = max(float(np.sqrt(np.diag(edge.covariance).max())) for edge in (one, two))
     if sigma > LARGEST_SIGMA:

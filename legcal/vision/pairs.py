@@ -22,7 +22,7 @@ MAX_BLOCKS = 80
 MARGIN = 6  # columns beyond the search window, to judge what an edge is
 KEPT = 8
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
-LEAST_SCORE = 0.2
+LEAST_SCORE = 0.15
 
 
 @dataclass(frozen=True, eq=False)

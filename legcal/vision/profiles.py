@@ -14,7 +14,6 @@ from legcal.vision.camera import Camera
 from legcal.vision.limb import Samples
 from legcal.vision.picture import Grey
 
-ROWS = 8  # of a block
 SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
 FEW = 4  # such pixels of a block that may be noise
 MAX_BLOCKS = 64  # along one outline
@@ -64,6 +63,7 @@ def read_profiles(
     epsilon: float,
     depth_range: tuple[float, float],
     reach: int,
+    n_rows: int,
 ) -> Profiles:
     """Read the pixels beside an outline.
 
@@ -83,6 +83,8 @@ def read_profiles(
         Least and greatest distance inside the outline that is read [px].
     reach : int
         Pixels read to each side, the same for all outlines of an image.
+    n_rows : int
+        Rows of a block.
     """
     n_nodes = max(3, int(band.length / NODE_SPACING) + 1)
     t = np.linspace(0.0, band.length, n_nodes)
@@ -95,12 +97,13 @@ def read_profiles(
     order = np.argsort(nodes[:, 1], kind="stable")
     along, offset = nodes[order, 1], nodes[order, 0]
     first, last = np.ceil(along[0]), np.floor(along[-1])
-    n_rows = max(0, int(last - first) + 1)
-    stride = max(1, int(np.ceil(n_rows / (ROWS * MAX_BLOCKS))))
-    n_blocks = n_rows // (ROWS * stride)
-    rows = first + stride * np.arange(n_blocks * ROWS)
+    available = max(0, int(last - first) + 1)
+    stride = max(1, int(np.ceil(available / (n_rows * MAX_BLOCKS))))
+    n_blocks = available // (n_rows * stride)
+    rows = first + stride * np.arange(n_blocks * n_rows)
     centre = np.interp(rows, along, offset)
-    tangent = np.interp(rows, along, np.gradient(offset, along))
+    slope = np.gradient(offset, along)
+    tangent = np.interp(rows, along, slope)
     cosine = 1.0 / np.sqrt(1.0 + tangent**2)
     columns = np.rint(centre)[:, None] + np.arange(-reach, reach + 1.0)
     sign = epsilon * np.sign(np.interp(rows, along, across[order, 0]))
@@ -112,15 +115,13 @@ def read_profiles(
         np.clip(rows, 0, height - 1).astype(np.intp)[:, None],
         np.clip(columns, 0, width - 1).astype(np.intp),
     ]
-    shape = (n_blocks, ROWS * (2 * reach + 1))
+    shape = (n_blocks, n_rows * (2 * reach + 1))
     inside = _unsaturated(d.reshape(shape), values.reshape(shape), inside.reshape(shape))
     # A step dv moves the outline by dv across; its part normal to the tangent is the gain.
-    gain = np.abs(
-        np.interp(rows, along, across[order, 0] - across[order, 1] * np.gradient(offset, along))
-    )
+    gain = np.abs(np.interp(rows, along, across[order, 0] - across[order, 1] * slope))
     return Profiles(
-        np.interp(rows, along, t[order]).reshape(n_blocks, ROWS).mean(axis=1),
-        (gain * cosine / band.scale).reshape(n_blocks, ROWS).mean(axis=1),
+        np.interp(rows, along, t[order]).reshape(n_blocks, n_rows).mean(axis=1),
+        (gain * cosine / band.scale).reshape(n_blocks, n_rows).mean(axis=1),
         d.reshape(shape).astype(np.float32),
         values.reshape(shape).astype(np.float32),
         inside,

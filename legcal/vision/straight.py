@@ -13,8 +13,7 @@ from legcal.geometry.types import Array, BoolArray
 
 TUKEY = 4.0  # sigmas at which a block counts no longer
 N_ROUNDS = 10
-N_SCALES = 4  # rounds in which the scale of the scatter is estimated
-LARGEST_VARIANCE = 0.25  # of a block that says anything [px^2]
+N_SCALES = 3  # rounds in which the scale of the scatter is estimated
 LEAST_SCATTER = 0.01  # [px]
 COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
 LEAST_BLOCKS = 4
@@ -30,26 +29,49 @@ class StraightFit:
         Shift of the outline at t = 0 and at t = length [px of the band].
     kept : (n,) array of bool
         The blocks that lie on it.
-    first, last : float
-        Positions of the first and the last kept block, as fractions of the length.
-    covariance : (2, 2) array
-        Covariance of the shifts at ``first`` and ``last`` [px^2].
-    scatter : float
-        Robust standard deviation of the blocks about the line [px].
     agreement : float
         Share of the blocks that show an edge at all which lie on the line.
+    position, residual, variance : (n_kept,) array
+        Places of the kept blocks as fractions of the length, their distances from the line
+        [px], and the variances of these by noise, scaled to the scatter seen [px^2].
     """
 
     ends: Array
     kept: BoolArray
-    first: float
-    last: float
-    covariance: Array
-    scatter: float
     agreement: float
+    position: Array
+    residual: Array
+    variance: Array
+
+    @property
+    def first(self) -> float:
+        """Position of the first kept block, as a fraction of the length."""
+        return float(self.position.min())
+
+    @property
+    def last(self) -> float:
+        """Position of the last kept block, as a fraction of the length."""
+        return float(self.position.max())
+
+    @property
+    def scatter(self) -> float:
+        """Robust standard deviation of the blocks about the line [px]."""
+        return 1.4826 * _median(np.abs(self.residual))
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (2, 2) of the shifts at ``first`` and ``last`` [px^2]."""
+        along = (self.position - self.first) / (self.last - self.first)
+        design = np.column_stack([1.0 - along, along])
+        covariance = np.linalg.inv(design.T @ (design / self.variance[:, None]))
+        covariance *= _correlation_length(self.residual / np.sqrt(self.variance))
+        bias = COMMON_BIAS**2 * np.ones((2, 2)) + TILT_BIAS**2 * np.eye(2)
+        return np.asarray(0.5 * (covariance + covariance.T) + bias)
 
 
-def fit_straight(position: Array, shift: Array, variance: Array) -> StraightFit | None:
+def fit_straight(
+    position: Array, shift: Array, variance: Array, largest: float = np.inf
+) -> StraightFit | None:
     """Fit a line to the shifts of blocks by iteratively reweighted least squares.
 
     Parameters
@@ -60,60 +82,42 @@ def fit_straight(position: Array, shift: Array, variance: Array) -> StraightFit 
         Shifts of the outline there [px].
     variance : (n,) array
         Their variances by noise [px^2], infinite where a block shows nothing.
+    largest : float
+        Blocks with this variance or a larger one are left out [px^2].
 
     Returns
     -------
     StraightFit or None
         None if fewer than ``LEAST_BLOCKS`` blocks agree.
     """
-    usable = variance < LARGEST_VARIANCE
+    usable = variance < largest
     if np.count_nonzero(usable) < LEAST_BLOCKS:
         return None
-    along, moved, base = (
-        position[usable],
-        shift[usable],
-        1.0 / (variance[usable] + LEAST_SCATTER**2),
-    )
+    along, moved = position[usable], shift[usable]
+    floored = variance[usable] + LEAST_SCATTER**2
     design = np.stack([1.0 - along, along])
     products = np.stack([design[0] ** 2, design[0] * design[1], design[1] ** 2])
-    root = np.sqrt(base)
-    ends, factor = np.full(2, _weighted_median(moved, base)), 1.0
+    ends, factor = np.full(2, _weighted_median(moved, 1.0 / floored)), 1.0
     for turn in range(N_ROUNDS):
-        pull = np.abs(moved - ends @ design) * root
+        pull = np.abs(moved - ends @ design) / np.sqrt(floored)
         if turn < N_SCALES:
             factor = max(1.0, 1.4826 * _median(pull))
         robust = np.maximum(1.0 - (pull / (TUKEY * factor)) ** 2, 0.0) ** 2
-        weight = base * robust
+        weight = robust / floored
         a, b, c = products @ weight
         determinant = a * c - b * b
         if np.count_nonzero(robust) < LEAST_BLOCKS or determinant < 1e-9 * a * c:
             return None
         p, q = design @ (weight * moved)
-        new = np.array([c * p - b * q, a * q - b * p]) / determinant
-        done = turn >= N_SCALES and abs(new - ends).max() < 1e-4
-        ends = new
-        if done:
+        before, ends = ends, np.array([c * p - b * q, a * q - b * p]) / determinant
+        if turn >= N_SCALES and np.abs(ends - before).max() < 1e-4:
             break
+    on_line = robust > 0.0
     kept = usable.copy()
-    kept[usable] = robust > 0.0
-    first, last = float(position[kept].min()), float(position[kept].max())
-    if last - first < 1e-6:
-        return None
-    residual = (moved - ends @ design)[robust > 0.0]
-    scatter = 1.4826 * _median(np.abs(residual))
-    covariance = _covariance(along[robust > 0.0], residual, base[robust > 0.0], factor)
-    agreement = float(np.mean(robust > 0.0))
-    return StraightFit(ends, kept, first, last, covariance, scatter, agreement)
-
-
-def _covariance(along: Array, residual: Array, base: Array, factor: float) -> Array:
-    """Return the covariance of the offsets at the ends of the kept piece."""
-    along = (along - along.min()) / (along.max() - along.min())
-    design = np.column_stack([1.0 - along, along])
-    covariance = np.linalg.inv(design.T @ (design * base[:, None])) * factor**2
-    covariance *= _correlation_length(residual * np.sqrt(base))
-    bias = COMMON_BIAS**2 * np.ones((2, 2)) + TILT_BIAS**2 * np.eye(2)
-    return np.asarray(0.5 * (covariance + covariance.T) + bias)
+    kept[usable] = on_line
+    residual = (moved - ends @ design)[on_line]
+    scaled = floored[on_line] * factor**2
+    return StraightFit(ends, kept, float(np.mean(on_line)), along[on_line], residual, scaled)
 
 
 def _correlation_length(pull: Array) -> float:

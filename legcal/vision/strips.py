@@ -26,6 +26,7 @@ BLOCK = 4  # rows of a block
 ROW_STEP = 2.0  # reduced pixels between rows
 MAX_BLOCKS = 100
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
+BESIDE = 0.8  # what an edge counts in the columns beside it
 TILT_STEP = 2  # columns between tilts, at the end of the leg
 KEPT = 6
 NEIGHBOURS = (3, 3)  # suppressed around a kept strip: tilts, columns
@@ -125,7 +126,7 @@ def edge_sharpness(profiles: NDArray[np.float32], seen: NDArray[np.bool_]) -> ND
     """Return how much each column of profiles (n_blocks, n) looks like an edge, 0 to 1.
 
     The maxima of the smoothed gradient along each profile, against the median of the patch,
-    widened by one column to each side.
+    widened by one column to each side, where they count less.
     """
     smooth = cv2.GaussianBlur(profiles, (5, 1), 0.8)
     gradient = np.zeros_like(profiles)
@@ -136,7 +137,8 @@ def edge_sharpness(profiles: NDArray[np.float32], seen: NDArray[np.bool_]) -> ND
     typical = float(np.median(gradient[seen])) if np.any(seen) else 0.0
     level = np.float32((NOISE_LEVELS * typical) ** 2 + 1e-3)
     sharpness = peak**2 / (peak**2 + level)
-    return np.asarray(cv2.dilate(sharpness, np.ones((1, 3), dtype=np.uint8)), dtype=np.float32)
+    beside = np.asarray(cv2.dilate(sharpness, np.ones((1, 3), dtype=np.uint8)), dtype=np.float32)
+    return np.asarray(np.maximum(sharpness, np.float32(BESIDE) * beside), dtype=np.float32)
 
 
 def _peaks(

@@ -1,0 +1,46 @@
+import pytest
+
+from legcal.mechanism.leg import Cylinder
+from legcal.vision.pieces import END_COVER, Piece, visible_pieces
+
+
+def tube(radius: float = 0.012) -> Cylinder:
+    return Cylinder("tube", radius, "base", 0.0, 0.25)
+
+
+def rod(radius: float = 0.008) -> Cylinder:
+    return Cylinder("rod", radius, "platform", -0.3, 0.0)
+
+
+def test_where_two_cylinders_overlap_the_thicker_one_is_seen() -> None:
+    pieces = visible_pieces([tube(), rod()], 0.4)
+    assert [piece.link for piece in pieces] == ["tube", "rod"]
+    assert pieces[0].start == pytest.approx(END_COVER * 0.012)
+    assert pieces[0].end == pytest.approx(0.25)
+    assert pieces[1].start == pytest.approx(0.25 + END_COVER * 0.012)
+    assert pieces[1].end == pytest.approx(0.4 - END_COVER * 0.008)
+
+
+def test_the_order_of_the_cylinders_does_not_matter() -> None:
+    assert visible_pieces([tube(), rod()], 0.4) == visible_pieces([rod(), tube()], 0.4)
+
+
+def test_equally_thick_cylinders_look_like_one_named_by_the_longest() -> None:
+    (piece,) = visible_pieces([tube(0.01), rod(0.01)], 0.4)
+    assert piece == Piece("rod", 0.01, END_COVER * 0.01, 0.4 - END_COVER * 0.01)
+
+
+def test_a_rod_that_is_all_inside_the_tube_is_not_seen() -> None:
+    pieces = visible_pieces([tube(), Cylinder("rod", 0.008, "platform", -0.1, 0.0)], 0.26)
+    assert [piece.link for piece in pieces] == ["tube"]
+
+
+def test_the_longest_stretch_of_a_rod_with_a_collar_is_used() -> None:
+    collar = Cylinder("collar", 0.02, "base", 0.1, 0.12)
+    pieces = visible_pieces([Cylinder("rod", 0.008, "base", 0.0, 0.4), collar], 0.4)
+    (piece,) = [piece for piece in pieces if piece.link == "rod"]
+    assert piece.start == pytest.approx(0.12 + END_COVER * 0.02)
+
+
+def test_a_leg_without_cylinders_shows_nothing() -> None:
+    assert visible_pieces([], 0.4) == ()

@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+from legcal.vision.straight import COMMON_BIAS, TILT_BIAS, StraightFit, fit_straight
+
+
+def fitted(line: StraightFit | None) -> StraightFit:
+    assert line is not None
+    return line
+
+
+def test_line_through_exact_blocks_is_exact() -> None:
+    position = np.linspace(0.1, 0.9, 30)
+    line = fitted(fit_straight(position, 0.5 - 0.8 * position, np.full(30, 1e-4)))
+    np.testing.assert_allclose(line.ends, [0.5, -0.3], atol=1e-9)
+    assert line.first == pytest.approx(0.1)
+    assert line.last == pytest.approx(0.9)
+    assert line.agreement == 1.0
+
+
+def test_an_occlusion_does_not_move_the_line_and_is_left_out() -> None:
+    rng = np.random.default_rng(0)
+    position = np.linspace(0.0, 1.0, 50)
+    shift = 0.2 + 0.02 * rng.standard_normal(50)
+    shift[20:35] += 0.7
+    line = fitted(fit_straight(position, shift, np.full(50, 4e-4)))
+    np.testing.assert_allclose(line.ends, 0.2, atol=0.03)
+    assert not np.any(line.kept[20:35])
+    assert line.agreement == pytest.approx(0.7, abs=0.03)
+
+
+def test_ends_that_bend_away_are_not_part_of_the_piece() -> None:
+    position = np.linspace(0.0, 1.0, 41)
+    shift = np.where(position > 0.9, 0.8, 0.0)
+    line = fitted(fit_straight(position, shift, np.full(41, 1e-4)))
+    assert line.last == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("position_range", [(0.0, 1.0), (0.3, 0.6)])
+def test_covariance_agrees_with_monte_carlo(position_range: tuple[float, float]) -> None:
+    rng = np.random.default_rng(2)
+    position = np.linspace(*position_range, 40)
+    lines = [
+        fitted(fit_straight(position, 0.1 * rng.standard_normal(40), np.full(40, 0.01)))
+        for _ in range(400)
+    ]
+    ends = np.array([[(1 - p) * f.ends[0] + p * f.ends[1] for p in position_range] for f in lines])
+    claimed = np.mean([f.covariance for f in lines], axis=0)
+    bias = COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2)
+    seen = np.cov(ends.T) + bias
+    np.testing.assert_allclose(np.diag(claimed), np.diag(seen), rtol=0.5)
+    assert np.all(np.diag(claimed) > 0.8 * np.diag(seen))
+
+
+def test_covariance_never_claims_more_than_the_model_is_good_for() -> None:
+    position = np.linspace(0.0, 1.0, 64)
+    line = fitted(fit_straight(position, np.zeros(64), np.full(64, 1e-8)))
+    assert np.all(np.diag(line.covariance) >= COMMON_BIAS**2)
+
+
+def test_blocks_that_share_their_errors_count_for_fewer() -> None:
+    rng = np.random.default_rng(3)
+    position = np.linspace(0.0, 1.0, 64)
+    white = 0.1 * rng.standard_normal(64)
+    smooth = np.repeat(white[:16], 4)
+    independent = fitted(fit_straight(position, white, np.full(64, 0.01))).covariance
+    shared = fitted(fit_straight(position, smooth, np.full(64, 0.01))).covariance
+    assert np.trace(shared) > 1.5 * np.trace(independent)
+
+
+def test_too_few_blocks_give_no_line() -> None:
+    position = np.linspace(0.0, 1.0, 10)
+    variance = np.where(np.arange(10) < 3, 1e-3, np.inf)
+    assert fit_straight(position, np.zeros(10), variance) is None
+    assert fit_straight(np.full(10, 0.5), np.zeros(10), np.full(10, 1e-3)) is None
