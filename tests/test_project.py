@@ -58,7 +58,7 @@ def test_the_version_stands_in_one_place() -> None:
 def test_the_python_snippet_of_the_readme_runs(tmp_path: Path) -> None:
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert len(snippets) == 1
-    code = snippets[0].replace('"calibrated"', repr(str(tmp_path / "calibrated")))
+    code = snippets[0].replace('"calibrated', f'"{tmp_path}/calibrated')
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
