@@ -42,7 +42,7 @@ def align_views(
     *,
     joint_error: float = JOINT_ERROR,
     progress: Progress | None = None,
-    workers: int = 2,
+    workers: int = 1,
 ) -> list[RigidTransform]:
     """Find the camera pose of every view from all of its images.
 
@@ -65,7 +65,7 @@ def align_views(
     progress : callable, optional
         Called with the row of each image when it has been searched.
     workers : int
-        Threads.
+        Threads; more than one pays only where loading an image is slow.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def detect_outlines(
     joint_error: float = JOINT_ERROR,
     pixel_error: float = PIXEL_ERROR,
     progress: Progress | None = None,
-    workers: int = 2,
+    workers: int = 1,
 ) -> Outlines:
     """Find and measure the outlines of all legs, near where aligned cameras should see them.
 
