@@ -8,7 +8,6 @@ the inside of the leg. The truth is read here and in tests only.
 """
 
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.dataset.folder import load_dataset
+from legcal.detection.detect import align_views, detect_outlines
 from legcal.geometry.types import Array, Image
 from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.detect import align_views, detect_outlines
 
 ROOT = Path(__file__).resolve().parents[1]
 DATASET = ROOT / "examples" / "hexapod"
@@ -114,7 +113,6 @@ def spread(values: Array, centre: float | None = None) -> float:
 
 def main() -> None:
     """Measure both passes."""
-    workers = int(sys.argv[1]) if len(sys.argv) > 1 else 1
     dataset = load_dataset(DATASET)
     mechanism, measurements = dataset.mechanism, dataset.measurements
     truth = json.loads(TRUTH.read_text())
@@ -131,18 +129,16 @@ def main() -> None:
     A, B = joint_centres(mechanism, measurements)
     hints = [T for T in (view.T_base_camera for view in measurements.views) if T is not None]
     start = time.perf_counter()
-    poses = align_views(load, measurements, A, B, cylinders, hints, workers=workers)
+    poses = align_views(load, measurements, A, B, cylinders, hints)
     print(f"alignment: {time.perf_counter() - start:.2f} s")
     start = time.perf_counter()
-    first = detect_outlines(
-        load, measurements, A, B, cylinders, poses, wanted, names, workers=workers
-    )
+    first = detect_outlines(load, measurements, A, B, cylinders, poses, wanted, names)
     seconds = time.perf_counter() - start
     show("near the nominal model", first, *errors(truth, measurements, first), seconds)
     A, B, poses = true_scene(truth, measurements)
     start = time.perf_counter()
     again = detect_outlines(
-        load, measurements, A, B, cylinders, poses, wanted, names, joint_error=0.0, workers=workers
+        load, measurements, A, B, cylinders, poses, wanted, names, joint_error=0.0
     )
     seconds = time.perf_counter() - start
     show("near the true scene", again, *errors(truth, measurements, again), seconds)

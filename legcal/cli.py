@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 ISSUES = "the issue tracker of legcal"
 INTERRUPTED = 130
+MOST_WORKERS = 8  # processes that search images; each takes about 150 MB
 
 app = typer.Typer(
     name="legcal",
@@ -95,7 +96,13 @@ def calibrate(
     from legcal.report.result import result_document
 
     with progress_on_stderr() as progress:
-        calibration = run(dataset, output=output, progress=progress, use_cache=not fresh)
+        calibration = run(
+            dataset,
+            output=output,
+            progress=progress,
+            use_cache=not fresh,
+            workers=min(os.cpu_count() or 1, MOST_WORKERS),
+        )
     if as_json:
         _print_json(result_document(calibration))
     else:

@@ -25,6 +25,9 @@ class LegcalError(Exception):
         self.problems = (problems,) if isinstance(problems, str) else tuple(problems)
         super().__init__("\n".join(self.problems))
 
+    def __reduce__(self) -> tuple[type, tuple[tuple[str, ...]]]:
+        return type(self), (self.problems,)
+
 
 class UsageError(LegcalError):
     """A command or a function was asked for something that it does not offer."""

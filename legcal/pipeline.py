@@ -5,7 +5,8 @@
    measured near where they should be (section 3.1).
 3. The four steps give joint centres and offsets (3.2 to 3.5).
 4. One fit of everything, started from the nominal model and from the steps, ends the work.
-5. Photographs are searched again close to that fit, and 3 and 4 are repeated.
+5. Photographs in which anything was left in doubt are searched again close to that fit, and 3
+   and 4 are repeated.
 
 Everything runs in an order of rows, views and legs that does not depend on the files.
 """
@@ -23,6 +24,16 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration import Calibration, Steps, in_file_order, judge
 from legcal.dataset.cache import DetectionPlan, fingerprint, plan_dataset, store_outlines
 from legcal.dataset.folder import Dataset, load_dataset
+from legcal.detection.observe import (
+    SETTINGS,
+    Photographs,
+    Scene,
+    align,
+    detect,
+    doubtful_rows,
+    given_outlines,
+)
+from legcal.detection.workers import Run, worker_pool
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.model import Mechanism
@@ -36,7 +47,6 @@ from legcal.observations.canonical_order import (
 )
 from legcal.observations.leg_axes import axes_from_outlines
 from legcal.observations.measurements import Measurements
-from legcal.observations.observe import SETTINGS, Photographs, Scene, align, detect, given_outlines
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import reject_unused_legs
 from legcal.progress import Report, no_progress
@@ -55,6 +65,7 @@ def calibrate(
     output: str | Path | None = None,
     progress: Report = no_progress,
     use_cache: bool = True,
+    workers: int = 1,
 ) -> Calibration:
     """Compute joint positions and offsets of a mechanism from a dataset.
 
@@ -68,6 +79,9 @@ def calibrate(
         Called as ``progress(stage, done, total)``.
     use_cache : bool
         Use the outlines that an earlier run left beside the dataset, if they still fit.
+    workers : int
+        Search the images in that many processes. With more than one, the program that calls
+        this must be safe to import (``if __name__ == "__main__":``).
 
     Returns
     -------
@@ -90,19 +104,9 @@ def calibrate(
     if output is not None:
         check_destination(Path(output))
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    work = _workpiece(dataset, use_cache=use_cache)
-    scene = _nominal_scene(work)
-    photographs = work.photographs
-    if len(photographs.detect) == 0:
-        outlines = given_outlines(photographs)
-        steps, solution = _steps_and_fit(work, outlines, scene, progress)
-    else:
-        scene = align(photographs, scene, progress)
-        outlines = detect(photographs, scene, progress)
-        steps, solution = _steps_and_fit(work, outlines, scene, progress)
-        scene = _fitted_scene(work, solution)
-        outlines = detect(photographs, scene, progress, near_fit=True)
-        steps, solution = _steps_and_fit(work, outlines, scene, progress)
+    with worker_pool(workers) as run:
+        work = _workpiece(dataset, run, use_cache=use_cache)
+        outlines, steps, solution = _observe_and_fit(work, progress)
     notes = [*dataset.notes, *_keep_outlines(work, outlines)]
     calibration = judge(
         dataset,
@@ -115,6 +119,24 @@ def calibrate(
     return calibration
 
 
+def _observe_and_fit(work: _Workpiece, progress: Report) -> tuple[Outlines, Steps, Solution]:
+    """Return the outlines of all images, what the four steps make of them, and the fit."""
+    photographs, scene = work.photographs, _nominal_scene(work)
+    if len(photographs.detect) == 0:
+        outlines = given_outlines(photographs)
+        return outlines, *_steps_and_fit(work, outlines, scene, progress)
+    scene = align(photographs, scene, progress)
+    outlines = detect(photographs, scene, progress)
+    steps, solution = _steps_and_fit(work, outlines, scene, progress)
+    doubtful = doubtful_rows(photographs, solution.outlines)
+    if len(doubtful) == 0:
+        return outlines, steps, solution
+    scene = _fitted_scene(work, solution)
+    again = photographs.narrowed(doubtful, outlines)
+    outlines = detect(again, scene, progress, near_fit=True)
+    return outlines, *_steps_and_fit(work, outlines, scene, progress)
+
+
 @dataclass(frozen=True, eq=False)
 class _Workpiece:
     """A dataset in the order of work."""
@@ -125,14 +147,16 @@ class _Workpiece:
     fingerprint: str
     mechanism: Mechanism
     measurements: Measurements
+    run: Run
 
-    @property
+    @cached_property
     def photographs(self) -> Photographs:
         """The images, what to search in them and what to keep."""
         return Photographs(
             mechanism=self.mechanism,
             measurements=self.measurements,
-            load=lambda row: self.dataset.read_image(int(self.order.rows[row])),
+            load=self.dataset.image_reader(self.order.rows.tolist()),
+            run=self.run,
             detect=np.sort(inverse(self.order.rows)[self.plan.detect]),
             keep=reorder_outlines(self.plan.keep, self.order),
         )
@@ -144,7 +168,7 @@ class _Workpiece:
         return forward_kinematics_many(self.mechanism, self.measurements.q[first_row])
 
 
-def _workpiece(dataset: Dataset, *, use_cache: bool) -> _Workpiece:
+def _workpiece(dataset: Dataset, run: Run, *, use_cache: bool) -> _Workpiece:
     """Put a dataset into the order of work, and see which images are still to be searched."""
     names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, names)
@@ -157,6 +181,7 @@ def _workpiece(dataset: Dataset, *, use_cache: bool) -> _Workpiece:
         fingerprint=current,
         mechanism=dataset.mechanism.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
+        run=run,
     )
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.detection.align import align_camera
+from legcal.detection.prediction import PredictedLeg, predict_legs
+from legcal.detection.strips import Strips
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import Cylinder
-from legcal.vision.align import align_camera
 from legcal.vision.camera import Camera
-from legcal.vision.prediction import PredictedLeg, predict_legs
-from legcal.vision.strips import Strips
 
 CAMERA = Camera(np.array([[1000.0, 0.0, 320.0], [0.0, 1000.0, 240.0], [0.0, 0.0, 1.0]]), 640, 480)
 CYLINDERS = [(Cylinder("rod", 0.008, "base", 0.0, 0.25),)] * 4

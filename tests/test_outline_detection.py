@@ -9,13 +9,13 @@ import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
+from legcal.detection.detect import align_views, detect_outlines
 from legcal.geometry.types import Array, Image
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
-from legcal.vision.detect import align_views, detect_outlines
 
 ROOT = Path(__file__).resolve().parents[1]
 IDENTITY = RigidTransform.identity()

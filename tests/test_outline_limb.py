@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from legcal.vision.fit import estimate_blur, fit_blocks
-from legcal.vision.limb import N_BASIS, Samples, basis
+from legcal.detection.fit import estimate_blur, fit_blocks
+from legcal.detection.limb import N_BASIS, Samples, basis
 
 HALF_WIDTH = 14.0
 

@@ -1,7 +1,7 @@
 import pytest
 
+from legcal.detection.pieces import END_COVER, Piece, visible_pieces
 from legcal.mechanism.leg import Cylinder
-from legcal.vision.pieces import END_COVER, Piece, visible_pieces
 
 
 def tube(radius: float = 0.012) -> Cylinder:

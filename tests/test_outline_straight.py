@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from legcal.vision.straight import COMMON_BIAS, TILT_BIAS, StraightFit, fit_straight
+from legcal.detection.straight import COMMON_BIAS, TILT_BIAS, StraightFit, fit_straight
 
 
 def fitted(line: StraightFit | None) -> StraightFit:

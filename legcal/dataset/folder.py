@@ -71,13 +71,15 @@ class Dataset:
         DatasetError
             If the row has no image, or its file cannot be used.
         """
-        path, where = self.image_path(row), self._where(row)
-        if path is None:
-            raise DatasetError(
-                f"{where}: its image could not be read: found an empty cell, needed an image; name "
-                f"one or give its outlines in {OBSERVATIONS_NAME}."
-            )
-        return read_image(path, self._camera(row), where)
+        return self.image_reader([row])(0)
+
+    def image_reader(self, rows: Sequence[int]) -> "ImageReader":
+        """Return what reads the images of these rows, in this order, in any process."""
+        return ImageReader(
+            tuple(self.image_path(row) for row in rows),
+            tuple(self._camera(row) for row in rows),
+            tuple(self._where(row) for row in rows),
+        )
 
     def image_problem(self, row: int) -> str | None:
         """Return what keeps the image of a row from being used, or None; nothing is decoded."""
@@ -91,6 +93,35 @@ class Dataset:
     def _where(self, row: int) -> str:
         """Return the place of a row for a message."""
         return f"{self.table_path}, row {row + 1}"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageReader:
+    """Reads images by their number.
+
+    Attributes
+    ----------
+    paths : tuple of Path or None
+        The files; None where a row has no image.
+    cameras : tuple of Camera
+        The camera of each image.
+    places : tuple of str
+        Where each image is named, for messages.
+    """
+
+    paths: tuple[Path | None, ...]
+    cameras: tuple[Camera, ...]
+    places: tuple[str, ...]
+
+    def __call__(self, k: int) -> Image:
+        """Return image k as (height, width) grey levels 0 to 255, float32."""
+        path = self.paths[k]
+        if path is None:
+            raise DatasetError(
+                f"{self.places[k]}: its image could not be read: found an empty cell, needed an "
+                f"image; name one or give its outlines in {OBSERVATIONS_NAME}."
+            )
+        return read_image(path, self.cameras[k], self.places[k])
 
 
 def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:

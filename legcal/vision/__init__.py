@@ -1,1 +1,1 @@
-"""Section 3.1: from pixels to the axes of cylinders."""
+"""Section 3.1: the camera, its files and images, and cylinders in its view (eqs 1-5)."""

@@ -9,16 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from legcal.detection.band import Band, band_of_leg
+from legcal.detection.measure import Edge, MeasuredEdge, measure_edges
+from legcal.detection.pairs import block_positions, find_pair
+from legcal.detection.picture import Grey
+from legcal.detection.pieces import Piece
+from legcal.detection.prediction import PredictedLeg, hidden_by
 from legcal.geometry.types import Array, BoolArray
-from legcal.vision.band import Band, band_of_leg
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.measure import Edge, MeasuredEdge, measure_edges
-from legcal.vision.pairs import block_positions, find_pair
-from legcal.vision.picture import Grey
-from legcal.vision.pieces import Piece
-from legcal.vision.prediction import PredictedLeg, hidden_by
 
+OUTSIDE = "outside the image"  # a reason
 MARGIN = 4.0  # beside a leg in front [px]
 LEAST_LENGTH = (30.0, 1.0)  # of an outline: [px] and in widths of the leg
 NARROWEST = 5.0  # [px]
@@ -133,7 +134,7 @@ def _find(
     """Find the pair of edges of a part, or say why not."""
     band = band_of_leg(camera, leg.A_camera, leg.B_camera, piece.start, piece.end)
     if band is None:
-        return "outside the image"
+        return OUTSIDE
     predicted = band.offsets(h[:, None, :], np.array([0.0, band.length]))
     width = float(np.mean(predicted[1] - predicted[0]))
     least = max(LEAST_LENGTH[0], LEAST_LENGTH[1] * width)

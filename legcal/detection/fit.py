@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from legcal.detection.limb import N_BASIS, Samples, basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.vision.limb import N_BASIS, Samples, basis
 
 BLURS = (0.3, 2.7, 7)  # first trials, least to greatest [px]
 BLUR_BLOCKS = 40

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from legcal.detection.band import Band
+from legcal.detection.limb import Samples
+from legcal.detection.picture import Grey
 from legcal.geometry.types import Array, BoolArray
-from legcal.vision.band import Band
 from legcal.vision.camera import Camera
-from legcal.vision.limb import Samples
-from legcal.vision.picture import Grey
 
 SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
 FEW = 4  # such pixels of a block that may be noise

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from legcal.detection.picture import Grey, sample
+from legcal.detection.prediction import PredictedLeg
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
-from legcal.vision.picture import Grey, sample
-from legcal.vision.prediction import PredictedLeg
 
 COLUMNS = 70  # columns to each side that a search window is reduced to
 NARROWEST = 6.0  # pixels that the width of a leg keeps in the reduced image

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.detection.prediction import PredictedLeg
+from legcal.detection.strips import Strips
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array
-from legcal.vision.prediction import PredictedLeg
-from legcal.vision.strips import Strips
 
 SIGMA_POSE = np.array([2e-2, 2e-2, 2e-2, 0.015, 0.015, 0.015])  # rough pose [rad, m]
 N_TRIALS = 3000

@@ -2,7 +2,7 @@
 
 The two passes of detection (hazard 14 of the method): first the camera of every view is
 aligned on all of its images and the legs are searched in wide windows; once a fit
-has told where everything is, they are searched again close to it.
+has told where everything is, images that left doubts are searched again close to it.
 """
 
 from __future__ import annotations
@@ -14,8 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.detection.detect import (
+    JOINT_ERROR,
+    PIXEL_ERROR,
+    Load,
+    align_views,
+    detect_outlines,
+)
+from legcal.detection.outline import OUTSIDE
+from legcal.detection.workers import Run
 from legcal.errors import DatasetError
-from legcal.geometry.types import Array, BoolArray, Image, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.leg import Cylinder
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements
@@ -28,7 +37,6 @@ from legcal.observations.sets import (
     no_outlines,
 )
 from legcal.progress import Report
-from legcal.vision.detect import JOINT_ERROR, PIXEL_ERROR, align_views, detect_outlines
 
 NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 
@@ -64,7 +72,9 @@ class Photographs:
     measurements : Measurements
         All rows.
     load : callable
-        Returns the image of a row.
+        Returns the image of a row; it can travel to another process.
+    run : callable
+        How images are searched: in turn or by several processes.
     detect : (n,) array of int
         The rows to search.
     keep : Outlines
@@ -73,7 +83,8 @@ class Photographs:
 
     mechanism: Mechanism
     measurements: Measurements
-    load: Callable[[int], Image]
+    load: Load
+    run: Run
     detect: IntArray
     keep: Outlines
 
@@ -102,6 +113,26 @@ class Photographs:
             dtype=np.bool_,
         )
 
+    def narrowed(self, rows: IntArray, outlines: Outlines) -> Photographs:
+        """Return the search of some rows again; edited and other rows' outlines are kept."""
+        kept = ~np.isin(outlines.row, rows) | is_edited(outlines)
+        return replace(self, detect=rows, keep=choose_outlines(outlines, kept))
+
+
+def doubtful_rows(photographs: Photographs, outlines: Outlines) -> IntArray:
+    """Return the searched rows in which an outline was not found, or rejected by the fit.
+
+    Parameters
+    ----------
+    photographs : Photographs
+        The images.
+    outlines : Outlines
+        All outlines after a fit, with what it rejected.
+    """
+    unused = ~outlines.used & ~is_edited(outlines)
+    unused &= np.array([reason != OUTSIDE for reason in outlines.reason], dtype=np.bool_)
+    return np.intersect1d(photographs.detect, outlines.row[unused])
+
 
 def align(photographs: Photographs, scene: Scene, report: Report) -> Scene:
     """Return the scene with the camera of every searched view aligned on its images.
@@ -121,6 +152,8 @@ def align(photographs: Photographs, scene: Scene, report: Report) -> Scene:
         scene.B_base,
         photographs.cylinders,
         hints,
+        photographs.wanted,
+        run=photographs.run,
         progress=_counted(report, "Aligning cameras", len(photographs.detect)),
     )
     known = [
@@ -144,6 +177,7 @@ def detect(
         _hints(photographs, scene),
         photographs.wanted,
         photographs.mechanism.leg_names,
+        run=photographs.run,
         progress=_counted(report, stage, len(photographs.detect)),
         joint_error=0.0 if near_fit else JOINT_ERROR,
         pixel_error=NEAR_FIT_PX if near_fit else PIXEL_ERROR,
@@ -173,7 +207,7 @@ def _hints(photographs: Photographs, scene: Scene) -> list[RigidTransform]:
 
 
 def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:
-    """Return a callback that counts images, from any thread."""
+    """Return a callback that counts images."""
     done = itertools.count(1)
     report(stage, 0, total)
     return lambda row: report(stage, next(done), total)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.detection.band import Band, band_of_leg
+from legcal.detection.pieces import Piece, visible_pieces
 from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.leg import Cylinder
-from legcal.vision.band import Band, band_of_leg
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
-from legcal.vision.pieces import Piece, visible_pieces
 
 
 @dataclass(frozen=True, eq=False)

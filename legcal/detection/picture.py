@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from legcal.detection.band import pixels_inside
 from legcal.geometry.types import Array, Image
-from legcal.vision.band import pixels_inside
 from legcal.vision.camera import Camera
 
 Grey = NDArray[np.float32]

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from legcal.detection.band import Band
+from legcal.detection.fit import depth_for_blur, estimate_blur, fit_blocks
+from legcal.detection.limb import Samples
+from legcal.detection.picture import Grey
+from legcal.detection.profiles import read_profiles
+from legcal.detection.straight import StraightFit, fit_straight
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.vision.band import Band
 from legcal.vision.camera import Camera
-from legcal.vision.fit import depth_for_blur, estimate_blur, fit_blocks
-from legcal.vision.limb import Samples
-from legcal.vision.picture import Grey
-from legcal.vision.profiles import read_profiles
-from legcal.vision.straight import StraightFit, fit_straight
 
 FIRST_BLUR = 1.0  # [px]
 SHALLOWEST = 0.8  # largest used depth, in half-widths

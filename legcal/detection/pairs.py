@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from legcal.detection.band import Band
+from legcal.detection.picture import Grey, sample
+from legcal.detection.strips import edge_sharpness
 from legcal.geometry.types import Array, BoolArray
-from legcal.vision.band import Band
 from legcal.vision.camera import Camera
-from legcal.vision.picture import Grey, sample
-from legcal.vision.strips import edge_sharpness
 
 BLOCK_LENGTH = 8.0  # [px]
 ROWS = 4  # rows of a block

@@ -6,24 +6,27 @@ first calibration the second verb is called again with the fitted poses and a na
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.detection.align import align_camera
+from legcal.detection.outline import OUTSIDE, PartOutlines, outline_parts
+from legcal.detection.picture import reduce, to_grey
+from legcal.detection.prediction import PredictedLeg, predict_legs
+from legcal.detection.strips import Strips, find_strips, reduction
+from legcal.detection.workers import Run, in_turn
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
-from legcal.vision.align import align_camera
 from legcal.vision.camera import Camera
-from legcal.vision.outline import PartOutlines, outline_parts
-from legcal.vision.picture import reduce, to_grey
-from legcal.vision.prediction import PredictedLeg, predict_legs
-from legcal.vision.strips import Strips, find_strips, reduction
 
 Load = Callable[[int], Image]
+_Candidates = tuple[PredictedLeg, Strips, float]
 Progress = Callable[[int], None]
 
 ROUGH_POSITION, ROUGH_ANGLE = 0.02, np.deg2rad(2.0)  # of T_base_camera [m, rad]
@@ -42,7 +45,7 @@ def align_views(
     *,
     joint_error: float = JOINT_ERROR,
     progress: Progress | None = None,
-    workers: int = 1,
+    run: Run = in_turn,
 ) -> list[RigidTransform]:
     """Find the camera pose of every view from all of its images.
 
@@ -64,8 +67,9 @@ def align_views(
         How far the predicted joint centres may be off [m].
     progress : callable, optional
         Called with the row of each image when it has been searched.
-    workers : int
-        Threads; more than one pays only where loading an image is slow.
+    run : callable
+        How the images are searched: in turn, or by the processes of
+        :func:`legcal.detection.workers.worker_pool`.
 
     Returns
     -------
@@ -77,34 +81,24 @@ def align_views(
     NotVisible
         One sentence for every view whose camera pose cannot be found.
     """
-
-    def search(row: int) -> list[tuple[PredictedLeg, Strips, float]]:
-        view = int(measurements.view[row])
-        camera, T = measurements.views[view].camera, T_base_camera[view]
-        legs = predict_legs(camera, T, A_base[row], B_base[row], cylinders, row)
-        if wanted is not None:
-            legs = [leg for leg in legs if wanted[view, leg.leg]]
-        found = _search_image(load(row), camera, legs, joint_error)
+    guide = _Guide(load, measurements, A_base, B_base, cylinders, T_base_camera, wanted)
+    rows = _rows_with_images(measurements)
+    found: dict[int, list[_Candidates]] = {}
+    for row, items in zip(
+        rows, run(partial(_search_strips, guide, joint_error), rows), strict=True
+    ):
+        found.setdefault(int(measurements.view[row]), []).extend(items)
         if progress is not None:
             progress(row)
-        return found
-
     poses = list(T_base_camera)
     problems: list[str] = []
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        for index, view in enumerate(measurements.views):
-            rows = [
-                row for row in _rows_with_images(measurements) if measurements.view[row] == index
-            ]
-            if not rows:
-                continue
-            found = [item for items in pool.map(search, rows) for item in items]
-            legs, strips = [item[0] for item in found], [item[1] for item in found]
-            tolerance = np.array([item[2] for item in found])
-            try:
-                poses[index] = align_camera(view.name, poses[index], legs, strips, tolerance)
-            except NotVisible as error:
-                problems.extend(error.problems)
+    for view, candidates in found.items():
+        legs, strips, tolerance = zip(*candidates, strict=True) if candidates else ((), (), ())
+        name = measurements.views[view].name
+        try:
+            poses[view] = align_camera(name, poses[view], legs, strips, np.array(tolerance))
+        except NotVisible as error:
+            problems.extend(error.problems)
     if problems:
         raise NotVisible(problems)
     return poses
@@ -123,13 +117,13 @@ def detect_outlines(
     joint_error: float = JOINT_ERROR,
     pixel_error: float = PIXEL_ERROR,
     progress: Progress | None = None,
-    workers: int = 1,
+    run: Run = in_turn,
 ) -> Outlines:
     """Find and measure the outlines of all legs, near where aligned cameras should see them.
 
     Parameters
     ----------
-    load, measurements, A_base, B_base, cylinders, progress, workers
+    load, measurements, A_base, B_base, cylinders, progress, run
         As for :func:`align_views`.
     T_base_camera : sequence of RigidTransform, for each view
         Aligned poses.
@@ -148,24 +142,60 @@ def detect_outlines(
         Two rows for each part of each wanted leg of each image, by row, leg and part from base to
         platform; what was not found or cannot be trusted is rejected with the reason.
     """
-
-    def search(row: int) -> list[PartOutlines]:
-        view = int(measurements.view[row])
-        camera, T = measurements.views[view].camera, T_base_camera[view]
-        legs = predict_legs(camera, T, A_base[row], B_base[row], cylinders, row)
-        window = np.zeros(A_base.shape[1])
-        for leg in legs:
-            window[leg.leg] = pixel_error + joint_error * _pixels_per_metre(leg)
-        found = outline_parts(to_grey(load(row)), camera, legs, leg_names, wanted[view], window)
-        missing = set(np.flatnonzero(wanted[view]).tolist()) - {leg.leg for leg in legs}
-        found.extend(_outside(leg, cylinders[leg]) for leg in missing if len(cylinders[leg]))
+    guide = _Guide(load, measurements, A_base, B_base, cylinders, T_base_camera, wanted)
+    search = partial(_search_outlines, guide, tuple(leg_names), joint_error, pixel_error)
+    rows = _rows_with_images(measurements)
+    found = []
+    for row, parts in zip(rows, run(search, rows), strict=True):
+        found.append(parts)
         if progress is not None:
             progress(row)
-        return sorted(found, key=lambda part: part.leg)
+    return _table(rows, found)
 
-    rows = _rows_with_images(measurements)
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        return _table(rows, list(pool.map(search, rows)))
+
+@dataclass(frozen=True, eq=False)
+class _Guide:
+    """Where the legs of every image should be; it travels to worker processes."""
+
+    load: Load
+    measurements: Measurements
+    A_base: Array
+    B_base: Array
+    cylinders: Sequence[Sequence[Cylinder]]
+    T_base_camera: Sequence[RigidTransform]
+    wanted: BoolArray | None
+
+    def legs(self, row: int) -> tuple[Camera, int, list[PredictedLeg]]:
+        """Return the camera of a row, its view, and the legs that should be in the image."""
+        view = int(self.measurements.view[row])
+        camera, T = self.measurements.views[view].camera, self.T_base_camera[view]
+        legs = predict_legs(camera, T, self.A_base[row], self.B_base[row], self.cylinders, row)
+        return camera, view, legs
+
+
+def _search_strips(guide: _Guide, joint_error: float, row: int) -> list[_Candidates]:
+    """Find the candidate strips of all wanted legs of an image."""
+    camera, view, legs = guide.legs(row)
+    if guide.wanted is not None:
+        legs = [leg for leg in legs if guide.wanted[view, leg.leg]]
+    return _search_image(guide.load(row), camera, legs, joint_error)
+
+
+def _search_outlines(
+    guide: _Guide, leg_names: tuple[str, ...], joint_error: float, pixel_error: float, row: int
+) -> list[PartOutlines]:
+    """Find and measure the outlines of all wanted legs of an image."""
+    camera, view, legs = guide.legs(row)
+    wanted = np.ones(len(leg_names), np.bool_) if guide.wanted is None else guide.wanted[view]
+    window = np.zeros(len(leg_names))
+    for leg in legs:
+        window[leg.leg] = pixel_error + joint_error * _pixels_per_metre(leg)
+    grey = to_grey(guide.load(row))
+    found = outline_parts(grey, camera, legs, leg_names, wanted, window)
+    missing = set(np.flatnonzero(wanted).tolist()) - {leg.leg for leg in legs}
+    cylinders = guide.cylinders
+    found.extend(_outside(leg, cylinders[leg]) for leg in missing if len(cylinders[leg]))
+    return sorted(found, key=lambda part: part.leg)
 
 
 def _rows_with_images(measurements: Measurements) -> list[int]:
@@ -180,7 +210,7 @@ def _pixels_per_metre(leg: PredictedLeg) -> float:
 
 def _search_image(
     image: Image, camera: Camera, legs: Sequence[PredictedLeg], joint_error: float
-) -> list[tuple[PredictedLeg, Strips, float]]:
+) -> list[_Candidates]:
     """Find the candidate strips of all legs of an image, with the tolerance of each [px]."""
     grey = to_grey(image)
     found = []
@@ -201,7 +231,7 @@ def _outside(leg: int, cylinders: Sequence[Cylinder]) -> PartOutlines:
     """Return the verdict on a leg that is not in the image."""
     h, square = np.full((2, 3), np.nan), np.full((2, 2, 2), np.nan)
     longest = max(cylinders, key=lambda cylinder: (cylinder.end - cylinder.start, cylinder.link))
-    return PartOutlines(leg, longest.link, h, square, square, "outside the image")
+    return PartOutlines(leg, longest.link, h, square, square, OUTSIDE)
 
 
 def _table(rows: Sequence[int], found: Sequence[Sequence[PartOutlines]]) -> Outlines:

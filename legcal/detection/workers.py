@@ -1,0 +1,59 @@
+"""Searching images one after the other, or in several processes.
+
+Threads do not pay: the search is many short steps, and they would wait for each other.
+"""
+
+import signal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Protocol, TypeVar
+
+T = TypeVar("T")
+
+_CHUNKS = 4  # tasks for each process: few enough to spare messages, enough to share the work
+
+
+class Run(Protocol):
+    """How a search is carried out for all rows; results come in the order of the rows."""
+
+    def __call__(self, search: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+        """Return the results."""
+
+
+def in_turn(search: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+    """Search one row after the other, in this process."""
+    return map(search, rows)
+
+
+@contextmanager
+def worker_pool(workers: int) -> Iterator[Run]:
+    """Give a way to search in that many processes; one means in this process.
+
+    Processes are started when they are first needed, anew and not as copies: a program that
+    uses them must be safe to import (``if __name__ == "__main__":``).
+
+    Parameters
+    ----------
+    workers : int
+        Number of processes.
+    """
+    if workers <= 1:
+        yield in_turn
+        return
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_deaf)
+
+    def run(search: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+        chunk = max(1, len(rows) // (_CHUNKS * workers))
+        return pool.map(search, rows, chunksize=chunk)
+
+    try:
+        yield run
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _deaf() -> None:
+    """Leave the answer to Ctrl-C to the process that started this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
