@@ -49,7 +49,7 @@ def test_eq09_has_21_products_of_6_pairs_for_four_legs_seen() -> None:
     session = exact_session()
     joints = locate_joints_in_cameras(session.machine, session.axes, session.measurements)
     problem = build_scalar_products(session.machine, joints)
-    assert problem.residuals.shape == (3 * 21, 1)
+    assert problem.n_residuals == 3 * 21
     assert len(problem.start) == 12
 
 
@@ -89,3 +89,12 @@ def test_three_pairs_are_refused_although_together_they_might_be_enough() -> Non
     session = exact_session(legs=((0, 1), (2, 3), (4, 5)))
     with pytest.raises(NotIdentifiable, match="could not be tied together"):
         _locate(session, session.machine)
+
+
+def test_joints_that_were_never_seen_together_are_refused() -> None:
+    session = exact_session()
+    joints = locate_joints_in_cameras(session.machine, session.axes, session.measurements)
+    alone = np.zeros_like(joints.located)
+    alone[0, 0] = True
+    with pytest.raises(NotIdentifiable, match=r"by view: 1, 0, 0"):
+        locate_joints_in_base(session.machine, replace(joints, located=alone))

@@ -14,12 +14,21 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.mechanism.parameters import free_coordinates
+from legcal.geometry.types import Array, IntArray
+from legcal.stages.free_joints import (
+    free_values,
+    joint_positions,
+    joints_from,
+    loose_joints,
+    n_free_coordinates,
+)
 from legcal.stages.joints_in_camera import JointsInCamera
-from legcal.stages.motion import moved, moved_points, register_points, whitener
+from legcal.stages.least_squares import LeastSquares, Term, term_of_all
+from legcal.stages.motion import moved, register_points, whitener
 from legcal.stages.nominal import Criteria, NominalMechanism
-from legcal.stages.solve import LeastSquares, Solution, solve_least_squares
+from legcal.stages.residuals import centre_in_camera, distance_of_joints
+from legcal.stages.solution import Solution
+from legcal.stages.solve import solve_least_squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +86,14 @@ def locate_joints_in_base(
     """
     if criteria == "literal":
         solution = solve_least_squares(build_scalar_products(mechanism, joints))
-        A_Rb = _joints(mechanism, solution.x)
+        A_Rb = joints_from(mechanism, solution.x)
         return JointsInBase(A_Rb, register_views(A_Rb, joints), solution)
     start = register_views(mechanism.parameters.base_joints, joints)
     problem = build_rigid(mechanism, joints, start)
     solution = solve_least_squares(problem)
     _check_identifiable(mechanism, joints, solution)
-    A_Rb = _joints(mechanism, solution.x)
-    steps = iter(solution.x[_n_free(mechanism) :].reshape(-1, 6))
+    A_Rb = joints_from(mechanism, solution.x)
+    steps = iter(solution.x[n_free_coordinates(mechanism) :].reshape(-1, 6))
     cameras = tuple(None if T is None else moved(next(steps), T).inv() for T in _inverses(start))
     return JointsInBase(A_Rb, cameras, solution)
 
@@ -119,31 +128,37 @@ def build_rigid(
     LeastSquares
         Residuals in standard deviations of the centres of step 1.
     """
-    x, A = _unknown_joints(mechanism)
-    unknowns, residuals = [x], []
-    for v, T_camera_Rb in enumerate(_inverses(start)):
-        legs = np.flatnonzero(joints.located[v])
-        if T_camera_Rb is None:
-            residuals += [_distance_residual(A, joints, v, legs)] if len(legs) == 2 else []
-            continue
-        step = ca.SX.sym(f"view{v}", 6)
-        predicted = moved_points(step, T_camera_Rb, A[:, legs.tolist()])
-        for column, j in enumerate(legs):
-            W = ca.DM(whitener(joints.covariance[v, j]))
-            residuals.append(W @ (predicted[:, column] - ca.DM(joints.A_camera[v, j])))
-        unknowns.append(step)
-    n_cameras = len(unknowns) - 1
+    positions, n_free = joint_positions(mechanism), n_free_coordinates(mechanism)
+    cameras = [T for T in _inverses(start) if T is not None]
+    known = np.array([T is not None for T in start])
+    which = np.cumsum(known) - 1
+    view, leg = np.nonzero(joints.located & known[:, None])
+    steps = n_free + 6 * which[view, None] + np.arange(6)
+    centres = Term(
+        centre_in_camera(),
+        np.hstack([positions[leg], steps]),
+        (
+            np.array([T.rotation.as_matrix() for T in cameras]).reshape(-1, 3, 3)[which[view]],
+            np.array([T.translation for T in cameras]).reshape(-1, 3)[which[view]],
+            joints.A_camera[view, leg],
+            whitener(joints.covariance[view, leg]),
+        ),
+    )
+    two = ~known & (joints.located.sum(axis=1) == 2)
+    base = free_values(mechanism, mechanism.parameters.base_joints)
     return LeastSquares(
         "The base joints in the base frame (step 2)",
-        ca.vertcat(*unknowns),
-        ca.vertcat(*residuals),
-        np.concatenate([_start(mechanism), np.zeros(6 * n_cameras)]),
+        (centres, _distances(mechanism, joints, np.flatnonzero(two))),
+        np.concatenate([base, np.zeros(6 * len(cameras))]),
+        n_shared=n_free,
     )
 
 
 def build_scalar_products(mechanism: NominalMechanism, joints: JointsInCamera) -> LeastSquares:
     """Build the criterion C_1 of (9): scalar products do not depend on the frame."""
-    x, A = _unknown_joints(mechanism)
+    x = ca.SX.sym("A", n_free_coordinates(mechanism))
+    A = ca.vertcat(x, 0.0)[joint_positions(mechanism).ravel().tolist()]
+    A = ca.reshape(A, 3, mechanism.n_legs)
     residuals = []
     for A_camera, located in zip(joints.A_camera, joints.located, strict=True):
         pairs = list(combinations(np.flatnonzero(located).tolist(), 2))  # the set V of (8)
@@ -152,50 +167,22 @@ def build_scalar_products(mechanism: NominalMechanism, joints: JointsInCamera) -
             residuals.append(ca.dot(A[:, g] - A[:, j], A[:, n] - A[:, m]) - in_camera)
     return LeastSquares(
         "The base joints in the base frame (eq 9)",
-        x,
-        ca.vertcat(*residuals),
-        _start(mechanism),
+        (term_of_all(x, ca.vertcat(*residuals)),),
+        free_values(mechanism, mechanism.parameters.base_joints),
         exact_hessian=True,
     )
 
 
-def _distance_residual(A: ca.SX, joints: JointsInCamera, view: int, legs: IntArray) -> ca.SX:
-    """Return the weighted distance residual of a view that locates two joints."""
-    j, g = (int(leg) for leg in legs)
-    apart = joints.A_camera[view, g] - joints.A_camera[view, j]
-    distance = float(np.linalg.norm(apart))
-    n = apart / distance
-    sigma = float(np.sqrt(n @ (joints.covariance[view, j] + joints.covariance[view, g]) @ n))
-    return (ca.norm_2(A[:, g] - A[:, j]) - distance) / sigma
-
-
-def _unknown_joints(mechanism: NominalMechanism) -> tuple[ca.SX, ca.SX]:
-    """Return the free coordinates of A as unknowns, and A (3, n_legs) built of them."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    x = ca.SX.sym("A", int(free.sum()))
-    A = ca.SX.zeros(3, mechanism.n_legs)
-    for k, (leg, axis) in enumerate(np.argwhere(free)):
-        A[int(axis), int(leg)] = x[k]
-    return x, A
-
-
-def _joints(mechanism: NominalMechanism, x: Array) -> Array:
-    """Return A_Rb from the free coordinates at the head of x."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    A_Rb = np.zeros((mechanism.n_legs, 3))
-    A_Rb[free] = x[: _n_free(mechanism)]
-    return A_Rb
-
-
-def _start(mechanism: NominalMechanism) -> Array:
-    """Return the free coordinates of the nominal base joints."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    return mechanism.parameters.base_joints[free]
-
-
-def _n_free(mechanism: NominalMechanism) -> int:
-    """Return the number of free coordinates."""
-    return int(free_coordinates(mechanism.n_legs, mechanism.frame_legs).sum())
+def _distances(mechanism: NominalMechanism, joints: JointsInCamera, views: IntArray) -> Term:
+    """Return the weighted distance residuals of views that locate two joints."""
+    legs = np.array([np.flatnonzero(joints.located[v]) for v in views], dtype=np.intp)
+    j, g = legs.reshape(-1, 2).T
+    apart = joints.A_camera[views, g] - joints.A_camera[views, j]
+    distance = np.linalg.norm(apart, axis=1)
+    covariance = joints.covariance[views, j] + joints.covariance[views, g]
+    sigma = np.sqrt(np.einsum("ni,nij,nj->n", apart, covariance, apart)) / distance
+    positions = joint_positions(mechanism)
+    return Term(distance_of_joints(), np.hstack([positions[j], positions[g]]), (distance, sigma))
 
 
 def _inverses(poses: tuple[RigidTransform | None, ...]) -> list[RigidTransform | None]:
@@ -207,10 +194,7 @@ def _check_identifiable(
     mechanism: NominalMechanism, joints: JointsInCamera, solution: Solution
 ) -> None:
     """Refuse when base joints can move without any camera noticing."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    unseen: BoolArray = np.zeros_like(free)
-    unseen[free] = solution.unseen(_n_free(mechanism))
-    loose = [mechanism.leg_names[int(j)] for j in np.flatnonzero(unseen.any(axis=1))]
+    loose = loose_joints(mechanism, solution)
     if loose:
         counts = ", ".join(str(int(n)) for n in joints.located.sum(axis=1))
         raise NotIdentifiable(

@@ -60,7 +60,8 @@ class LegDirections:
 
     def groups(self) -> list[IntArray]:
         """Return the indices of the legs of each group."""
-        return [np.flatnonzero(self.group == g) for g in np.unique(self.group)]
+        order = np.argsort(self.group, kind="stable")
+        return np.split(order, np.flatnonzero(np.diff(self.group[order])) + 1)
 
 
 def find_misses(

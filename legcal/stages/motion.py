@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, IntArray
 
 
 def register_points(P_from: Array, P_to: Array) -> RigidTransform:
@@ -24,14 +24,41 @@ def register_points(P_from: Array, P_to: Array) -> RigidTransform:
     RigidTransform
         T_to_from.
     """
-    centre_from, centre_to = P_from.mean(axis=0), P_to.mean(axis=0)
-    U, _, Vt = np.linalg.svd((P_to - centre_to).T @ (P_from - centre_from))
-    handed = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    rotation = Rotation.from_matrix(U * handed @ Vt)
-    return RigidTransform.from_components(centre_to - rotation.apply(centre_from), rotation)
+    R, t = register_groups(P_from, P_to, np.zeros(len(P_from), dtype=np.intp))
+    return RigidTransform.from_components(t[0], Rotation.from_matrix(R[0]))
 
 
-def moved_points(step: ca.SX, start: RigidTransform, points: ca.SX) -> ca.SX:
+def register_groups(P_from: Array, P_to: Array, group: IntArray) -> tuple[Array, Array]:
+    """Return the motion of :func:`register_points` for each group of points.
+
+    Parameters
+    ----------
+    P_from, P_to : (n, 3) array
+        The same points in two frames [m].
+    group : (n,) array of int
+        The group of each point: 0, 1 and so on.
+
+    Returns
+    -------
+    (n_groups, 3, 3) array, (n_groups, 3) array
+        Rotation matrix and translation [m] of T_to_from.
+    """
+    n_points = np.bincount(group)[:, None]
+
+    def total(values: Array) -> Array:
+        found = np.zeros((len(n_points), *values.shape[1:]))
+        np.add.at(found, group, values)
+        return found
+
+    centre_from, centre_to = total(P_from) / n_points, total(P_to) / n_points
+    arm_from, arm_to = P_from - centre_from[group], P_to - centre_to[group]
+    U, _, Vt = np.linalg.svd(total(arm_to[:, :, None] * arm_from[:, None, :]))
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    R = U @ Vt
+    return R, centre_to - np.einsum("gij,gj->gi", R, centre_from)
+
+
+def moved_points(step: ca.SX, R: ca.SX, t: ca.SX, points: ca.SX) -> ca.SX:
     """Return points moved by an unknown rigid motion, counted from a start.
 
     Parameters
@@ -39,8 +66,8 @@ def moved_points(step: ca.SX, start: RigidTransform, points: ca.SX) -> ca.SX:
     step : (6, 1) SX
         Translation [m], and Gibbs vector w of the turn that follows the start's rotation:
         tan(angle / 2) along the axis. It has no branches and no square root.
-    start : RigidTransform
-        The motion at step = 0.
+    R, t : (3, 3) SX, (3, 1) SX
+        Rotation matrix and translation [m] of the motion at step = 0.
     points : (3, n) SX
         Points, one a column.
 
@@ -48,12 +75,10 @@ def moved_points(step: ca.SX, start: RigidTransform, points: ca.SX) -> ca.SX:
     -------
     (3, n) SX
     """
-    turned = ca.mtimes(ca.DM(start.rotation.as_matrix()), points)
     w = step[3:]
     cross = ca.skew(w)
-    matrix = ca.SX.eye(3) + 2.0 / (1.0 + ca.dot(w, w)) * (cross + ca.mtimes(cross, cross))
-    shift = ca.DM(start.translation) + step[:3]
-    return ca.mtimes(matrix, turned) + ca.repmat(shift, 1, points.shape[1])
+    turn = ca.SX.eye(3) + 2.0 / (1.0 + ca.dot(w, w)) * (cross + ca.mtimes(cross, cross))
+    return turn @ (R @ points) + ca.repmat(t + step[:3], 1, points.shape[1])
 
 
 def moved(step: Array, start: RigidTransform) -> RigidTransform:

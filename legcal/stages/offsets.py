@@ -10,14 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-import casadi as ca
 import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
+from legcal.stages.least_squares import LeastSquares, Term
 from legcal.stages.leg_directions import LegDirections
 from legcal.stages.nominal import Criteria, NominalMechanism
-from legcal.stages.solve import LeastSquares, Solution, solve_least_squares
+from legcal.stages.residuals import change_of_distance, constant_distance
+from legcal.stages.solution import Solution
+from legcal.stages.solve import solve_least_squares
 
 _REWEIGHTINGS = 2
 
@@ -91,17 +93,23 @@ def identify_offsets(
 
 def build_consecutive(mechanism: NominalMechanism, directions: LegDirections) -> LeastSquares:
     """Build the criterion C_2 of (14): distances equal those of the next position of the view."""
-    x, B = _leg_ends(mechanism, directions)
-    residuals = []
-    last: dict[tuple[int, int, int], ca.SX] = {}
-    for group in directions.groups():
-        for a, b in _pairs(mechanism, directions, group):
-            distance = ca.norm_2(B[:, a] - B[:, b])
-            key = (int(directions.view[a]), int(directions.leg[a]), int(directions.leg[b]))
-            if key in last:
-                residuals.append(distance - last[key])
-            last[key] = distance
-    return LeastSquares("The offsets (eq 14)", x, _stacked(residuals), _start(mechanism))
+    nominal = mechanism.parameters.offsets
+    pairs = pairs_of_legs(directions, nominal)
+    last: dict[tuple[int, ...], int] = {}
+    found = []
+    for k, (a, b) in enumerate(pairs):
+        key = (int(directions.view[a]), int(directions.leg[a]), int(directions.leg[b]))
+        if key in last:
+            found.append((last[key], k))
+        last[key] = k
+    _check_any(found)
+    before, after = np.array(found, dtype=np.intp).T
+    term = Term(
+        change_of_distance(),
+        offset_positions(nominal)[directions.leg[pairs[after]]],
+        (observed_legs(directions, pairs[before]), observed_legs(directions, pairs[after])),
+    )
+    return LeastSquares("The offsets (eq 14)", (term,), _start(mechanism))
 
 
 def build_constant_distances(
@@ -125,30 +133,23 @@ def build_constant_distances(
     LeastSquares
         Residuals in standard deviations of the distances.
     """
-    x, B = _leg_ends(mechanism, directions)
+    pairs = pairs_of_legs(directions, q0)
     ends = leg_ends(directions, q0)
     covariance = leg_end_covariance(directions, q0, sigma_q)
-    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for group in directions.groups():
-        for a, b in _pairs(mechanism, directions, group):
-            found.setdefault((int(directions.leg[a]), int(directions.leg[b])), []).append((a, b))
-    unknowns, residuals, start = [x], [], [_start(mechanism)]
-    for (j, g), members in sorted(found.items()):
-        d = ca.SX.sym(f"d_{j}_{g}")
-        values = []
-        for a, b in members:
-            sigma = distance_sigma(ends, covariance, (a, b))
-            residuals.append((ca.norm_2(B[:, a] - B[:, b]) - d) / sigma)
-            values.append(float(np.linalg.norm(ends[a] - ends[b])))
-        unknowns.append(d)
-        start.append(np.array([np.mean(values)]))
-    return LeastSquares(
-        "The offsets (step 3)",
-        ca.vertcat(*unknowns),
-        _stacked(residuals),
-        np.concatenate(start),
-        block=np.arange(len(residuals)),
+    legs = directions.leg[pairs]
+    _, which = np.unique(legs, axis=0, return_inverse=True)
+    which = which.ravel()
+    n_offsets = len(_start(mechanism))
+    term = Term(
+        constant_distance(),
+        np.column_stack([offset_positions(q0)[legs], n_offsets + which]),
+        (observed_legs(directions, pairs), distance_sigma(ends, covariance, pairs)),
+        robust=True,
     )
+    distance = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
+    mean = np.bincount(which, weights=distance) / np.bincount(which)
+    start = np.concatenate([_start(mechanism), mean])
+    return LeastSquares("The offsets (step 3)", (term,), start)
 
 
 def leg_ends(directions: LegDirections, q0: Array) -> Array:
@@ -165,32 +166,42 @@ def leg_end_covariance(directions: LegDirections, q0: Array, sigma_q: float) -> 
     return np.asarray(length[:, None, None] ** 2 * across + sigma_q**2 * along)
 
 
-def distance_sigma(ends: Array, covariance: Array, pair: Sequence[int] | IntArray) -> float:
-    """Return the standard deviation of the distance between two leg ends [m]."""
-    a, b = pair
+def distance_sigma(ends: Array, covariance: Array, pairs: IntArray) -> Array:
+    """Return the standard deviation of the distance between two leg ends, (n_pairs,) [m]."""
+    a, b = pairs.T
     apart = ends[a] - ends[b]
-    n = apart / np.linalg.norm(apart)
-    return float(np.sqrt(n @ (covariance[a] + covariance[b]) @ n))
+    n = apart / np.linalg.norm(apart, axis=1, keepdims=True)
+    return np.asarray(np.sqrt(np.einsum("pi,pij,pj->p", n, covariance[a] + covariance[b], n)))
 
 
-def _leg_ends(mechanism: NominalMechanism, directions: LegDirections) -> tuple[ca.SX, ca.SX]:
-    """Return the unknown offsets, and B (3, n) of (13) built of them; zero for passive legs."""
-    with_offset = np.flatnonzero(np.isfinite(mechanism.parameters.offsets))
-    x = ca.SX.sym("q0", len(with_offset))
-    B = ca.SX.zeros(3, len(directions))
-    for k, leg in enumerate(with_offset):
-        for i in np.flatnonzero(directions.leg == leg):
-            length = float(directions.reading[i]) + x[k]
-            B[:, int(i)] = ca.DM(directions.A[i]) + length * ca.DM(directions.u[i])
-    return x, B
+def pairs_of_legs(directions: LegDirections, q0: Array) -> IntArray:
+    """Return the pairs of legs of each group, g > j, that have offsets: the set AC of (14).
+
+    Raises
+    ------
+    NotIdentifiable
+        If there is no such pair.
+    """
+    finite = np.isfinite(q0[directions.leg])
+    pairs = [
+        pair
+        for group in directions.groups()
+        for pair in combinations(group[finite[group]].tolist(), 2)
+    ]
+    _check_any(pairs)
+    return np.array(pairs, dtype=np.intp)
 
 
-def _pairs(
-    mechanism: NominalMechanism, directions: LegDirections, group: IntArray
-) -> list[tuple[int, int]]:
-    """Return the pairs of legs of a group, g > j, that have offsets: the set AC of (14)."""
-    finite = np.isfinite(mechanism.parameters.offsets[directions.leg[group]])
-    return list(combinations(group[finite].tolist(), 2))
+def observed_legs(directions: LegDirections, pairs: IntArray) -> Array:
+    """Return A, u and reading of both legs of each pair, one leg a column, (n_pairs, 7, 2)."""
+    seen = np.column_stack([directions.A, directions.u, directions.reading])
+    return np.swapaxes(seen[pairs], 1, 2)
+
+
+def offset_positions(q0: Array) -> IntArray:
+    """Return the place of each leg among the legs with an offset, (n_legs,); -1 for passive."""
+    with_offset = np.isfinite(q0)
+    return np.where(with_offset, np.cumsum(with_offset) - 1, -1)
 
 
 def _start(mechanism: NominalMechanism) -> Array:
@@ -207,14 +218,13 @@ def _all_offsets(mechanism: NominalMechanism, x: Array) -> Array:
     return q0
 
 
-def _stacked(residuals: list[ca.SX]) -> ca.SX:
-    """Return residuals as one column, refusing an empty criterion."""
-    if not residuals:
+def _check_any(found: Sequence[object]) -> None:
+    """Refuse an empty criterion."""
+    if not found:
         raise NotIdentifiable(
             "The offsets could not be identified: no image shows two legs whose base joints are "
             "located; needed images that show several legs at once; add such images."
         )
-    return ca.vertcat(*residuals)
 
 
 def _check_identifiable(mechanism: NominalMechanism, solution: Solution) -> None:

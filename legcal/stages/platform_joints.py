@@ -7,19 +7,39 @@ platform: laying the poses on each other gives the joint centres in R_e.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
-import casadi as ca
 import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.parameters import free_coordinates
+from legcal.stages.free_joints import (
+    free_values,
+    joint_positions,
+    joints_from,
+    loose_joints,
+    n_free_coordinates,
+)
+from legcal.stages.least_squares import LeastSquares, Term
 from legcal.stages.leg_directions import LegDirections
-from legcal.stages.motion import moved_points, register_points, whitener
+from legcal.stages.motion import register_groups, whitener
 from legcal.stages.nominal import Criteria, NominalMechanism
-from legcal.stages.offsets import Offsets, distance_sigma, leg_end_covariance, leg_ends
-from legcal.stages.solve import LeastSquares, Solution, solve_least_squares
+from legcal.stages.offsets import (
+    Offsets,
+    distance_sigma,
+    leg_end_covariance,
+    leg_ends,
+    observed_legs,
+    offset_positions,
+    pairs_of_legs,
+)
+from legcal.stages.residuals import (
+    direction_of_leg,
+    distance_of_ends_and_joints,
+    distance_of_joints,
+    length_of_leg,
+)
+from legcal.stages.solution import Solution
+from legcal.stages.solve import solve_least_squares
 
 _RELATIVE_LENGTH = 1e-5  # floor of the sigma of a length: keeps exact readings well conditioned
 
@@ -89,37 +109,30 @@ def locate_platform_joints(
     """
     if criteria == "literal":
         solution = solve_least_squares(build_mean_distances(mechanism, directions, offsets.q0))
-        return PlatformJoints(_joints(mechanism, solution.x), offsets.q0, solution)
+        return PlatformJoints(joints_from(mechanism, solution.x), offsets.q0, solution)
     solution = solve_least_squares(build_rigid(mechanism, directions, offsets.q0, sigma_q))
     _check_identifiable(mechanism, solution)
     q0 = offsets.q0.copy()
-    with_offset = np.isfinite(q0)
-    n_free = _n_free(mechanism)
-    q0[with_offset] = solution.x[n_free : n_free + int(with_offset.sum())]
-    return PlatformJoints(_joints(mechanism, solution.x), q0, solution)
+    q0[np.isfinite(q0)] = solution.x[n_free_coordinates(mechanism) : solution.n_shared]
+    return PlatformJoints(joints_from(mechanism, solution.x), q0, solution)
 
 
 def build_mean_distances(
     mechanism: NominalMechanism, directions: LegDirections, q0: Array
 ) -> LeastSquares:
     """Build the criterion C_3 of (16): mean distances of a view equal those in R_e."""
-    x, B = _unknown_joints(mechanism)
     ends = leg_ends(directions, q0)
-    found: dict[tuple[int, int, int], list[float]] = {}
-    for group in directions.groups():
-        with_end = group[np.isfinite(q0[directions.leg[group]])]
-        for a, b in combinations(with_end.tolist(), 2):
-            key = (int(directions.view[a]), int(directions.leg[a]), int(directions.leg[b]))
-            found.setdefault(key, []).append(float(np.linalg.norm(ends[a] - ends[b])))
-    residuals = [
-        float(np.mean(distances)) - ca.norm_2(B[:, j] - B[:, g])
-        for (_, j, g), distances in sorted(found.items())
-    ]
+    pairs = pairs_of_legs(directions, q0)
+    distance = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
+    key = np.column_stack([directions.view[pairs[:, 0]], directions.leg[pairs]])
+    distinct, which = np.unique(key, axis=0, return_inverse=True)
+    which = which.ravel()
+    mean = np.bincount(which, weights=distance) / np.bincount(which)
+    index = joint_positions(mechanism)[distinct[:, 1:]].reshape(-1, 6)
     return LeastSquares(
         "The platform joints (eq 16)",
-        x,
-        ca.vertcat(*residuals),
-        _start(mechanism),
+        (Term(distance_of_joints(), index, (mean, np.ones(len(mean)))),),
+        free_values(mechanism, mechanism.parameters.platform_joints),
         exact_hessian=True,
     )
 
@@ -144,111 +157,91 @@ def build_rigid(
     -------
     LeastSquares
         Residuals in standard deviations.
+
+    Raises
+    ------
+    NotIdentifiable
+        If no pose shows two legs at once.
     """
-    x, B = _unknown_joints(mechanism)
-    with_offset = np.flatnonzero(np.isfinite(q0))
-    offsets = ca.SX.sym("q0", len(with_offset))
-    offset_of = {int(j): offsets[k] for k, j in enumerate(with_offset)}
-    ends = leg_ends(directions, q0)
-    covariance = leg_end_covariance(directions, q0, sigma_q)
-    sigma_length = float(np.hypot(sigma_q, _RELATIVE_LENGTH * np.mean(q0[with_offset])))
-    poses: list[ca.SX] = []
-    residuals: list[ca.SX] = []
-    block: list[int] = []
-    for group in directions.groups():
-        legs = directions.leg[group]
-        with_end = group[np.isin(legs, with_offset)]
-        if len(with_end) == 2:
-            seen = _distance(directions, with_end, offset_of)
-            a, b = (int(j) for j in directions.leg[with_end])
-            sigma = distance_sigma(ends, covariance, with_end)
-            residuals.append((seen - ca.norm_2(B[:, a] - B[:, b])) / sigma)
-            block.append(len(residuals))
-        if len(with_end) < 3:
-            continue
-        nominal = mechanism.parameters.platform_joints[directions.leg[with_end]]
-        step = ca.SX.sym(f"pose{len(poses)}", 6)
-        poses.append(step)
-        start = register_points(nominal, ends[with_end])
-        predicted = moved_points(step, start, B[:, legs.tolist()])
-        for column, i in enumerate(group.tolist()):
-            leg = predicted[:, column] - ca.DM(directions.A[i])
-            residuals.append(_direction_residual(leg, directions, i))
-            block += 2 * [len(residuals)]
-            if i in with_end:
-                length = float(directions.reading[i]) + offset_of[int(directions.leg[i])]
-                residuals.append((ca.norm_2(leg) - length) / sigma_length)
-                block.append(-1)
-    _check_enough(residuals)
-    return LeastSquares(
-        "The platform joints (step 4)",
-        ca.vertcat(x, offsets, *poses),
-        ca.vertcat(*residuals),
-        np.concatenate([_start(mechanism), q0[with_offset], np.zeros(6 * len(poses))]),
-        block=np.array(block, dtype=np.intp),
-    )
-
-
-def _direction_residual(leg: ca.SX, directions: LegDirections, i: int) -> ca.SX:
-    """Return the direction of a leg vector A B against the observed one, in deviations, (2,)."""
-    along = ca.dot(ca.DM(directions.u[i]), leg)
-    across = ca.mtimes(ca.DM(directions.basis[i]), leg) / along
-    return ca.mtimes(ca.DM(whitener(directions.covariance[i])), across)
-
-
-def _distance(directions: LegDirections, pair: IntArray, offset_of: dict[int, ca.SX]) -> ca.SX:
-    """Return the distance between the ends (13) of two legs, for unknown offsets."""
-    ends = []
-    for i in pair.tolist():
-        length = float(directions.reading[i]) + offset_of[int(directions.leg[i])]
-        ends.append(ca.DM(directions.A[i]) + length * ca.DM(directions.u[i]))
-    return ca.norm_2(ends[0] - ends[1])
-
-
-def _check_enough(residuals: list[ca.SX]) -> None:
-    """Refuse an empty criterion."""
-    if not residuals:
+    has_end = np.isfinite(q0[directions.leg])
+    _, group = np.unique(directions.group, return_inverse=True)
+    n_ends = np.bincount(group, weights=has_end).astype(np.intp)[group]
+    if not np.any(n_ends >= 2):
         raise NotIdentifiable(
             "The platform joints could not be located: no pose shows two legs at once; needed "
             "images of three or more; add images that show several legs at once."
         )
+    by_group = np.argsort(group, kind="stable")
+    pairs = by_group[(has_end & (n_ends == 2))[by_group]].reshape(-1, 2)
+    rows = np.flatnonzero(n_ends >= 3)
+    _, pose = np.unique(group[rows], return_inverse=True)
+    start = [free_values(mechanism, mechanism.parameters.platform_joints), q0[np.isfinite(q0)]]
+    n_shared = sum(len(values) for values in start)
+    start.append(np.zeros(6 * (int(pose.max(initial=-1)) + 1)))
+    return LeastSquares(
+        "The platform joints (step 4)",
+        (
+            _pairs_term(mechanism, directions, pairs, q0, sigma_q),
+            *_pose_terms(mechanism, directions, rows, pose, q0, sigma_q),
+        ),
+        np.concatenate(start),
+        n_shared=n_shared,
+    )
 
 
-def _unknown_joints(mechanism: NominalMechanism) -> tuple[ca.SX, ca.SX]:
-    """Return the free coordinates of B as unknowns, and B (3, n_legs) built of them."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    x = ca.SX.sym("B", int(free.sum()))
-    B = ca.SX.zeros(3, mechanism.n_legs)
-    for k, (leg, axis) in enumerate(np.argwhere(free)):
-        B[int(axis), int(leg)] = x[k]
-    return x, B
+def _pairs_term(
+    mechanism: NominalMechanism,
+    directions: LegDirections,
+    pairs: IntArray,
+    q0: Array,
+    sigma_q: float,
+) -> Term:
+    """Return the residuals of pairs of legs (n_pairs, 2), whose distance is all they tell."""
+    ends, covariance = leg_ends(directions, q0), leg_end_covariance(directions, q0, sigma_q)
+    legs = directions.leg[pairs]
+    offsets = n_free_coordinates(mechanism) + offset_positions(q0)[legs]
+    joints = joint_positions(mechanism)[legs].reshape(-1, 6)
+    observed = (observed_legs(directions, pairs), distance_sigma(ends, covariance, pairs))
+    return Term(distance_of_ends_and_joints(), np.hstack([offsets, joints]), observed, robust=True)
 
 
-def _joints(mechanism: NominalMechanism, x: Array) -> Array:
-    """Return B_Re from the free coordinates at the head of x."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    B_Re = np.zeros((mechanism.n_legs, 3))
-    B_Re[free] = x[: _n_free(mechanism)]
-    return B_Re
+def _pose_terms(
+    mechanism: NominalMechanism,
+    directions: LegDirections,
+    rows: IntArray,
+    pose: IntArray,
+    q0: Array,
+    sigma_q: float,
+) -> tuple[Term, Term]:
+    """Return the residuals of directions and of lengths of legs whose platform poses are free.
 
-
-def _start(mechanism: NominalMechanism) -> Array:
-    """Return the free coordinates of the nominal platform joints."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    return mechanism.parameters.platform_joints[free]
-
-
-def _n_free(mechanism: NominalMechanism) -> int:
-    """Return the number of free coordinates."""
-    return int(free_coordinates(mechanism.n_legs, mechanism.frame_legs).sum())
+    The legs are rows of the directions; *pose* numbers the pose of each.
+    """
+    leg = directions.leg[rows]
+    place, n_free = offset_positions(q0), n_free_coordinates(mechanism)
+    end = place[leg] >= 0
+    nominal = mechanism.parameters.platform_joints
+    ends = leg_ends(directions, q0)
+    R, t = register_groups(nominal[leg[end]], ends[rows[end]], pose[end])
+    steps = n_free + int(place.max()) + 1 + 6 * pose[:, None] + np.arange(6)
+    index = np.hstack([joint_positions(mechanism)[leg], steps])
+    start = (R[pose], t[pose], directions.A[rows])
+    direction = (directions.u[rows], directions.basis[rows], whitener(directions.covariance[rows]))
+    sigma = float(np.hypot(sigma_q, _RELATIVE_LENGTH * np.mean(q0[np.isfinite(q0)])))
+    length = (directions.reading[rows[end]], np.full(len(rows[end]), sigma))
+    return (
+        Term(direction_of_leg(), index, start + direction, robust=True),
+        Term(
+            length_of_leg(),
+            np.hstack([index, n_free + place[leg, None]])[end],
+            tuple(values[end] for values in start) + length,
+        ),
+    )
 
 
 def _check_identifiable(mechanism: NominalMechanism, solution: Solution) -> None:
     """Refuse when platform joints can move without any image noticing."""
-    free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-    unseen = np.zeros_like(free)
-    unseen[free] = solution.unseen(_n_free(mechanism))
-    loose = [mechanism.leg_names[int(j)] for j in np.flatnonzero(unseen.any(axis=1))]
+    loose = loose_joints(mechanism, solution)
     if loose:
         raise NotIdentifiable(
             f"The platform joints could not be tied together: those of {', '.join(loose)} can "

@@ -1,7 +1,7 @@
-"""Least-squares problems in CasADi, solved with IPOPT: the one place of steps 2, 3 and 4.
+"""Least squares with IPOPT: the one place of steps 2, 3 and 4.
 
-A step builds its residuals and a start; this module scales the unknowns, hands IPOPT the
-Gauss-Newton Hessian J'J (or leaves it the exact one) and refuses an answer that did not converge.
+A step builds its problem; this module scales the unknowns, hands IPOPT the sparse Gauss-Newton
+Hessian J'J (or leaves it the exact one) and refuses an answer that did not converge.
 """
 
 from __future__ import annotations
@@ -11,17 +11,21 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.sparse import csc_array, diags_array
 
 from legcal.errors import DidNotConverge
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, IntArray
+from legcal.stages.least_squares import LeastSquares, jacobian_of, residuals_of
+from legcal.stages.solution import Solution, column_scale
 
-_RANK = 1e-7  # singular values of the scaled Jacobian below this are directions that nothing shows
 _REWEIGHTINGS = 4
 _OUTLIER = 4.0  # an observation this many times the median has half its weight
 _SETTLED = 0.01  # change of a weight that no longer matters
 _NO_NOISE = 1e-3  # standard deviations: smaller residuals are rounding, and nobody's fault
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
+    "calc_lam_p": False,
+    "no_nlp_grad": True,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.tol": 1e-8,
@@ -33,97 +37,12 @@ _OPTIONS: dict[str, bool | int | float | str] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class LeastSquares:
-    """Half the sum of squared residuals, to be minimised from a start.
-
-    Attributes
-    ----------
-    name : str
-        What is looked for, for messages: "the base joints (eq 9)".
-    x : casadi.SX
-        Unknowns, one column.
-    residuals : casadi.SX
-        Residuals, one column, in units of their standard deviations or of eqs (9), (14), (16).
-    start : (n,) array
-        Values of the unknowns to start from.
-    exact_hessian : bool
-        Use second derivatives of the residuals instead of J'J. Criteria that do not decide some
-        unknown, as (9) and (16) with z, need it: J'J vanishes in that direction.
-    block : (m,) array of int, optional
-        Residuals of one observation share a number and lose weight together where they are
-        outliers; -1 for residuals that keep theirs. Without it all do.
-    """
-
-    name: str
-    x: ca.SX
-    residuals: ca.SX
-    start: Array
-    exact_hessian: bool = False
-    block: IntArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """A converged least-squares problem.
-
-    Attributes
-    ----------
-    x : (n,) array
-        The unknowns.
-    residuals : (m,) array
-        The residuals there, times the square root of their weights.
-    jacobian : (m, n) array
-        Their derivative there.
-    n_iterations : int
-        Iterations that IPOPT took, over all weights.
-    status : str
-        What IPOPT says about the end.
-    """
-
-    x: Array
-    residuals: Array
-    jacobian: Array
-    n_iterations: int
-    status: str
-
-    @property
-    def cost(self) -> float:
-        """Half the sum of squared residuals."""
-        return 0.5 * float(self.residuals @ self.residuals)
-
-    def covariance(self) -> Array:
-        """Return the covariance of the unknowns when residuals have unit variance, (n, n).
-
-        Directions that no residual shows are given none: see :meth:`unseen`.
-        """
-        scale = _column_scale(self.jacobian)
-        inverse = np.linalg.pinv(self.jacobian * scale, rcond=_RANK)
-        scaled = inverse * scale[:, None]
-        return np.asarray(scaled @ scaled.T)
-
-    def unseen(self, n_first: int) -> BoolArray:
-        """Return which of the first unknowns can move without changing any residual, (n_first,)."""
-        scaled = self.jacobian * _column_scale(self.jacobian)
-        n = scaled.shape[1]
-        n_rest = n - n_first
-        # QR eliminates the unknowns that come later: what is left is about the first ones.
-        triangle = np.zeros((n, n))
-        reduced = np.asarray(np.linalg.qr(np.roll(scaled, -n_first, axis=1), mode="r"))
-        triangle[: len(reduced)] = reduced
-        if np.linalg.svd(triangle[n_rest:, n_rest:], compute_uv=False)[-1] >= _RANK:
-            return np.zeros(n_first, dtype=np.bool_)
-        _, singular, rows = np.linalg.svd(triangle)
-        null = rows[singular < _RANK, n_rest:]
-        return np.asarray(np.abs(null).max(axis=0, initial=0.0) > 1e-3)
-
-
 def solve_least_squares(problem: LeastSquares) -> Solution:
     """Minimise half the sum of squared residuals with IPOPT and a Gauss-Newton Hessian.
 
-    With blocks the problem is solved again with Cauchy weights until these have settled: an
-    observation far beyond the median loses its say. The unknowns are counted from the start in
-    units of what one residual unit shows, so that tolerances do not depend on the units of
+    With robust terms the problem is solved again with Cauchy weights until these have settled:
+    an observation far beyond the median loses its say. The unknowns are counted from the start
+    in units of what one residual unit shows, so that tolerances do not depend on the units of
     length or on the noise.
 
     Parameters
@@ -141,13 +60,14 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
         If IPOPT does not report success.
     """
     built = _build(problem)
-    root_weight = np.ones(problem.residuals.shape[0])
+    root_weight = np.ones(problem.n_residuals)
     solution = _solve(problem, built, np.zeros(len(problem.start)), root_weight)
-    if problem.block is None:
+    block = problem.block
+    if np.all(block < 0):
         return solution
     n_iterations = solution.n_iterations
     for _ in range(_REWEIGHTINGS):
-        new = _cauchy_root_weights(solution.residuals / root_weight, problem.block)
+        new = _cauchy_root_weights(solution.residuals / root_weight, block)
         if np.max(np.abs(new - root_weight)) < _SETTLED:
             break
         root_weight = new
@@ -161,27 +81,31 @@ class _Built:
     """A problem in scaled unknowns, ready to be solved with different weights."""
 
     solver: ca.Function
-    value: ca.Function
-    slope: ca.Function
+    residuals: ca.Function
+    jacobian: ca.Function
     scale: Array
 
 
 def _build(problem: LeastSquares) -> _Built:
-    """Return the problem as IPOPT takes it; the weights are its parameters."""
-    w = ca.SX.sym("w", problem.residuals.shape[0])
-    weighted = w * problem.residuals
-    value = ca.Function("value", [problem.x, w], [weighted])
-    slope = ca.Function("slope", [problem.x, w], [ca.jacobian(weighted, problem.x)])
-    scale = _column_scale(np.asarray(slope(problem.start, 1.0).full()))
+    """Return the problem as IPOPT takes it; the square roots of the weights are its parameters."""
+    residuals, jacobian = residuals_of(problem), jacobian_of(problem)
+    scale = column_scale(_sparse(jacobian(problem.start)))
     if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
         scale = np.full_like(scale, scale.min())
-    z, p = ca.MX.sym("z", len(problem.start)), ca.MX.sym("p", w.shape[0])
+    z, p = ca.MX.sym("z", len(problem.start)), ca.MX.sym("p", problem.n_residuals)
     x = problem.start + scale * z
+    weighted = p * residuals(x)
+    slope = ca.diag(p) @ jacobian(x) @ ca.MX(ca.diag(ca.DM(scale)))
+    cost = 0.5 * ca.sumsqr(weighted)
+    gradient = ca.densify(ca.mtimes(slope.T, weighted))  # IPOPT reads it as full
     options: dict[str, Any] = dict(_OPTIONS)
+    options["grad_f"] = ca.Function(
+        "nlp_grad_f", [z, p], [cost, gradient], ["x", "p"], ["f", "grad_f_x"]
+    )
     if not problem.exact_hessian:
-        options["hess_lag"] = _gauss_newton(z, p, slope(x, p) @ ca.MX(ca.diag(ca.DM(scale))))
-    nlp: dict[str, Any] = {"x": z, "p": p, "f": 0.5 * ca.sumsqr(value(x, p))}
-    return _Built(ca.nlpsol("solver", "ipopt", nlp, options), value, slope, scale)
+        options["hess_lag"] = _gauss_newton(z, p, slope)
+    nlp: dict[str, Any] = {"x": z, "p": p, "f": cost}
+    return _Built(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian, scale)
 
 
 def _solve(problem: LeastSquares, built: _Built, z: Array, root_weight: Array) -> Solution:
@@ -197,8 +121,9 @@ def _solve(problem: LeastSquares, built: _Built, z: Array, root_weight: Array) -
     x = problem.start + built.scale * found
     return Solution(
         x=x,
-        residuals=np.asarray(built.value(x, root_weight).full()).ravel(),
-        jacobian=np.asarray(built.slope(x, root_weight).full()),
+        residuals=root_weight * np.asarray(built.residuals(x).full()).ravel(),
+        jacobian=csc_array(diags_array(root_weight) @ _sparse(built.jacobian(x))),
+        n_shared=len(x) if problem.n_shared is None else problem.n_shared,
         n_iterations=int(stats["iter_count"]),
         status=str(stats["return_status"]),
     )
@@ -228,8 +153,7 @@ def _gauss_newton(z: ca.MX, p: ca.MX, jacobian: ca.MX) -> ca.Function:
     )
 
 
-def _column_scale(jacobian: Array) -> Array:
-    """Return the change of each unknown that moves the residuals by one unit."""
-    norms = np.linalg.norm(jacobian, axis=0)
-    floor = 1e-6 * float(norms.max(initial=0.0)) or 1.0
-    return np.asarray(1.0 / np.maximum(norms, floor))
+def _sparse(matrix: ca.DM) -> csc_array[np.float64]:
+    """Return a CasADi matrix as a sparse array."""
+    first, row = matrix.sparsity().get_ccs()
+    return csc_array((np.array(matrix.nonzeros()), row, first), shape=matrix.shape)
