@@ -1,0 +1,71 @@
+"""How good the calibration of the example hexapod is, against its true model.
+
+    python benchmarks/example.py
+
+Platform errors of eq (20) at the 45 poses: of the nominal model, of what the four steps give
+alone (default criteria, and the criteria as printed), and of the fit of everything; beside the
+error that the fit predicts, and the normalised squared error of its parameters.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from legcal import calibrate, load_dataset, load_mechanism
+from legcal.calibration import Calibration
+from legcal.mechanism.parameters import KinematicParameters, to_vector
+from legcal.mechanism.platform import pose_differences
+from legcal.observations.leg_axes import axes_from_outlines
+from legcal.refinement.start import platform_poses
+from legcal.stages.run import run_steps
+
+ROOT = Path(__file__).parents[1]
+TRUTH = ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"
+
+
+def platform_error(
+    calibration: Calibration, parameters: KinematicParameters, truth: KinematicParameters
+) -> tuple[float, float]:
+    """Return the mean displacement [m] and rotation [rad] between two sets of parameters."""
+    measurements, mechanism = calibration.dataset.measurements, calibration.dataset.mechanism
+    first_row = np.unique(measurements.pose, return_index=True)[1]
+    driven = mechanism.sign * measurements.q[first_row]
+    near = calibration.solution.T_Rb_Re
+    poses, true_poses = (platform_poses(p, driven + p.offsets, near) for p in (parameters, truth))
+    displacement, rotation = pose_differences(poses, true_poses)
+    return float(displacement.mean()), float(rotation.mean())
+
+
+def main() -> None:
+    """Print a line an estimate."""
+    dataset = load_dataset(ROOT / "examples/hexapod")
+    mechanism, truth = dataset.mechanism, load_mechanism(TRUTH).parameters
+    calibration = calibrate(dataset, use_cache=False)
+    solution = calibration.solution
+    radii = {cylinder.link: cylinder.radius for leg in mechanism.legs for cylinder in leg.cylinders}
+    axes = axes_from_outlines(solution.outlines, dataset.measurements, radii)
+    steps = {
+        criteria: run_steps(mechanism, axes, dataset.measurements, criteria=criteria).parameters
+        for criteria in ("literal", "default")
+    }
+    rows = {
+        "nominal model": mechanism.parameters,
+        "four steps, criteria as printed": steps["literal"],
+        "four steps, default criteria": steps["default"],
+        "fit of everything": solution.parameters,
+    }
+    for name, parameters in rows.items():
+        dX, dE = platform_error(calibration, parameters, truth)
+        print(f"{name:32s} {1e3 * dX:8.3f} mm {np.degrees(dE):8.4f} deg")
+    sigma = calibration.sigma
+    dX, dE = 1e3 * sigma.mean_displacement, np.degrees(sigma.mean_rotation)
+    print(f"{'predicted for the fit, 1 sigma':32s} {dX:8.3f} mm {dE:8.4f} deg")
+    error = to_vector(solution.parameters, mechanism.frame_legs) - to_vector(
+        truth, mechanism.frame_legs
+    )
+    pull = error / solution.sigma[: len(error)]
+    print(f"normalised squared error of the parameters: {np.mean(pull**2):.2f}")
+
+
+if __name__ == "__main__":
+    main()
