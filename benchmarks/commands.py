@@ -1,6 +1,6 @@
 """How long the commands take as whole processes, and how much memory: medians of some runs.
 
-    python benchmarks/commands.py [RUNS]
+python benchmarks/commands.py [RUNS]
 """
 
 import os
