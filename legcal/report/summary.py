@@ -31,7 +31,7 @@ def summary(calibration: Calibration, output: Path) -> RenderableType:
             row["name"], f"{nominal:.4f}", f"{value:.4f}", f"{value - nominal:+.4f}", shown
         )
     lines = [
-        *(f"Note: {note}" for note in calibration.dataset.notes),
+        *(f"Note: {note}" for note in calibration.notes),
         _outline_line(calibration),
         _steps_line(calibration),
         _fit_line(calibration),
