@@ -121,6 +121,18 @@ def test_an_unknown_that_no_residual_contains_stays_where_it_is() -> None:
     assert np.abs(solution.x[:3] - [1.0, 0.3, 1.1]).max() < 1e-9
 
 
+def test_few_unknowns_beside_many_shared_ones_are_eliminated() -> None:
+    x = ca.SX.sym("x", 7)
+    shown = [2.0 * x[k] - k for k in range(6)]
+    residuals = ca.vertcat(*shown, x[6] + x[0], x[6] - x[5])
+    problem = replace(_problem("One pose", x, residuals, [0.5] * 7), n_shared=6)
+    apart, together = (
+        solve_least_squares(replace(problem, n_shared=n_shared)) for n_shared in (6, None)
+    )
+    assert np.allclose(apart.covariance(), together.covariance()[:6, :6], atol=1e-9)
+    assert not apart.unseen(6).any()
+
+
 def test_the_number_of_nonzeros_grows_with_the_number_of_poses_and_no_faster() -> None:
     few, many = (solve_least_squares(_poses_of_a_plane(n, 4)) for n in (10, 40))
     assert many.jacobian.nnz == 4 * few.jacobian.nnz

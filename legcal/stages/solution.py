@@ -96,7 +96,8 @@ def _shared_triangle(jacobian: csc_array[np.float64], scale: Array, n_shared: in
         slot = _rank_in_group(group_of_row)
         n_slots, n_own = int(slot.max()) + 1, int(place_of_column.max()) + 1
         filled = np.zeros((n_groups, n_slots, n_own + n_shared))
-        place = np.where(own, place_of_column[column - n_shared], n_own + column)
+        place = n_own + column
+        place[own] = place_of_column[column[own] - n_shared]
         filled[group_of_row[row[~here]], slot[row[~here]], place[~here]] = values[~here]
         rest = _eliminated(filled[:, :, :n_own], filled[:, :, n_own:])
         shared_rows = np.concatenate([shared_rows, rest])
