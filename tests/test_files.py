@@ -98,6 +98,36 @@ def test_earlier_result_is_replaced_and_other_files_are_kept(out: Path) -> None:
     assert list(out.parent.iterdir()) == [out]
 
 
+def test_folder_on_another_file_system_is_filled(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace, stat = os.replace, os.stat
+
+    def refuses_to_cross(source: Path, target: Path) -> None:
+        if not Path(source).is_relative_to(out) and Path(target).is_relative_to(out):
+            raise OSError(18, "Invalid cross-device link")
+        replace(source, target)
+
+    def mounted(path: Any, **options: Any) -> Any:
+        found = stat(path, **options)
+        if Path(path) != out:
+            return found
+        values = list(found)
+        values[2] += 1  # st_dev
+        return os.stat_result(values)
+
+    monkeypatch.setattr(os, "replace", refuses_to_cross)
+    monkeypatch.setattr(os, "stat", mounted)
+    with result_folder(out) as folder:
+        fill(folder, "new")
+    assert contents(out) == {"calibrated.urdf": "new", "notes.txt": "mine", "result.json": RESULT}
+
+
+def test_what_a_killed_run_left_behind_does_not_make_a_folder_foreign(tmp_path: Path) -> None:
+    (tmp_path / ".out.x.legcal-part").mkdir()
+    check_destination(tmp_path)
+
+
 @pytest.mark.parametrize("name", [".", "out"])
 def test_empty_and_current_folders_are_filled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

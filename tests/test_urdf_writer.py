@@ -167,14 +167,17 @@ def test_a_closure_frame_that_carries_other_things_cannot_be_written(tmp_path: P
         ("", ""),
     ],
 )
-def test_the_yaml_changes_in_one_value_only(tmp_path: Path, text: str, expected: str) -> None:
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_the_yaml_changes_in_one_value_only(
+    tmp_path: Path, mark: str, text: str, expected: str
+) -> None:
     shipped = SHIPPED_YAML.read_text()
     line = "  urdf: ../urdf/hexapod.urdf\n"
     for name in ("models", "urdf"):
         (tmp_path / name).mkdir()
     (tmp_path / "urdf" / "hexapod.urdf").write_bytes(SHIPPED_URDF.read_bytes())
     path = tmp_path / "models" / "hexapod.yaml"
-    comment = "# ünïcode\r\n"
+    comment = f"{mark}# ünïcode\r\n"
     path.write_bytes((comment + shipped.replace(line, text)).encode())
     write_calibrated_yaml(load_mechanism(path), tmp_path / "calibrated.yaml", "calibrated.urdf")
     written = (tmp_path / "calibrated.yaml").read_bytes().decode()

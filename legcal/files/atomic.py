@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+TEMPORARY_SUFFIX = ".legcal-part"
+
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that any other program sees its old or its new content, never a part.
@@ -31,7 +33,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 @contextmanager
 def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
     """Give a folder of a name that nobody else uses, and remove it when the block ends."""
-    folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=".legcal-part", dir=parent))
+    folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=TEMPORARY_SUFFIX, dir=parent))
     try:
         yield folder
     finally:

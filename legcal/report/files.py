@@ -1,8 +1,9 @@
 """The output folder: a set of files that appears complete or not at all.
 
-A set of files is first written into a temporary folder beside its destination and moved
-there when it is complete. A run that stops before that leaves the destination as it was; what
-the temporary folder of a killed run leaves behind is never looked at again.
+A set of files is first written into a temporary folder beside its destination (in it, where it
+is a file system of its own) and moved there when it is complete. A run that stops before that
+leaves the destination as it was; what the temporary folder of a killed run leaves behind is never
+looked at again.
 """
 
 import json
@@ -13,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from legcal.errors import UsageError
-from legcal.files.atomic import temporary_folder
+from legcal.files.atomic import TEMPORARY_SUFFIX, temporary_folder
 
 RESULT_NAME = "result.json"
 RESULT_KEY = "legcal_result"
@@ -39,19 +40,17 @@ def check_destination(destination: Path) -> None:
         raise UsageError(
             f"{start} a file of that name, needed a folder; give another output folder."
         )
-    if destination.is_dir() and any(destination.iterdir()) and not _is_result(destination):
+    if destination.is_dir() and _holds_files(destination) and not _is_result(destination):
         raise UsageError(
             f"{start} a folder with other files and no {RESULT_NAME} of legcal, needed a new or "
             "empty folder or that of an earlier result; give another output folder."
         )
-    parent = _existing_parent(destination)
-    targets = [parent] + [destination] * destination.is_dir()
-    for target in targets:
-        if not (target.is_dir() and os.access(target, os.W_OK | os.X_OK)):
-            raise UsageError(
-                f"{start} that {target} cannot be written to, needed permission to create files "
-                "in it; give another output folder."
-            )
+    target = destination if destination.is_dir() else _existing_parent(destination)
+    if not _is_writable(target):
+        raise UsageError(
+            f"{start} that {target} cannot be written to, needed permission to create files "
+            "in it; give another output folder."
+        )
 
 
 @contextmanager
@@ -77,7 +76,7 @@ def result_folder(destination: Path) -> Iterator[Path]:
         As :func:`check_destination`, before the block runs.
     """
     check_destination(destination)
-    with temporary_folder(_existing_parent(destination), destination.name) as temporary:
+    with temporary_folder(_workshop(destination), destination.name) as temporary:
         new = temporary / "new"
         new.mkdir()
         yield new
@@ -86,6 +85,29 @@ def result_folder(destination: Path) -> Iterator[Path]:
             _replace_files(new, destination, temporary / "old")
         else:
             os.rename(new, destination)
+
+
+def _workshop(destination: Path) -> Path:
+    """Return the folder for temporary files: beside the destination if they can move from there.
+
+    Files do not move from one file system to another, and a folder that is one of its own (a
+    mount) may stand where nothing else may be written: then it is the destination itself.
+    """
+    parent = _existing_parent(destination)
+    if not destination.is_dir():
+        return parent
+    is_near = parent.stat().st_dev == destination.stat().st_dev
+    return parent if is_near and _is_writable(parent) else destination
+
+
+def _is_writable(folder: Path) -> bool:
+    """Say whether files can be created in a folder."""
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+
+def _holds_files(folder: Path) -> bool:
+    """Say whether a folder holds more than what killed runs left behind."""
+    return any(not path.name.endswith(TEMPORARY_SUFFIX) for path in folder.iterdir())
 
 
 def _existing_parent(destination: Path) -> Path:

@@ -158,16 +158,12 @@ def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: st
     value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
     block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
     written = None if block is None else _entry(block, "urdf")
-    # Marks count characters after a byte order mark.
-    shift = 1 if text.startswith("\ufeff") else 0
     if written is not None:
-        start, end = written.start_mark.index + shift, written.end_mark.index + shift
-        text = text[:start] + value + text[end:]
+        text = text[: written.start_mark.index] + value + text[written.end_mark.index :]
     elif isinstance(block, yaml.MappingNode) and block.value:
         first = block.value[0][0].start_mark
         separator = ", " if block.flow_style else "\n" + " " * first.column
-        at = first.index + shift
-        text = f"{text[:at]}urdf: {value}{separator}{text[at:]}"
+        text = f"{text[: first.index]}urdf: {value}{separator}{text[first.index :]}"
     destination.write_bytes(text.encode("utf-8"))
 
 
