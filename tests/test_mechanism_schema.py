@@ -143,6 +143,14 @@ def test_a_urdf_alone_closes_no_loop(tmp_path: Path) -> None:
         load_mechanism(path)
 
 
+def test_a_folder_of_the_same_name_does_not_hide_a_shipped_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "hexapod").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_mechanism("hexapod").name == "hexapod"
+
+
 def test_an_unknown_name_lists_the_shipped_models(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="or one of hexapod"):
         load_mechanism("octopod")

@@ -228,7 +228,7 @@ def _read_cameras(paths: tuple[Path, ...], problems: list[str]) -> dict[Path, Ca
 def _mechanism_path(folder: Path, named: str) -> Path:
     """Return the model's path relative to the dataset if there is one, else a shipped one."""
     path = folder / named
-    if not path.exists() and named in shipped_names():
+    if not path.is_file() and named in shipped_names():
         return shipped_folders()[0] / f"{named}.yaml"
     return path
 

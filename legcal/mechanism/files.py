@@ -37,17 +37,18 @@ def find_yaml(model: str | Path) -> Path:
         If it is a URDF without a YAML: a tree alone closes no loop.
     """
     path = Path(model)
-    if path.is_dir():
+    names = shipped_names()
+    is_shipped = str(model) in names
+    if path.is_dir() and not is_shipped:
         raise ModelError(
             f"{path}: the mechanism could not be read: found a folder, needed a YAML or a URDF "
             "file; give the file."
         )
     if path.suffix.lower() in (".urdf", ".xml") and path.exists():
         return _yaml_of_urdf(path)
-    if path.exists():
+    if path.exists() and not path.is_dir():
         return path
-    names = shipped_names()
-    if str(model) in names:
+    if is_shipped:
         return shipped_folders()[0] / f"{model}.yaml"
     raise ModelError(
         f"{path}: the mechanism could not be read: found no such file and no shipped model of that "

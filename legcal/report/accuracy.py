@@ -97,7 +97,7 @@ def evaluate(
     if dataset is None:
         poses, reference_poses = _random_poses(mechanism, truth)
     else:
-        q = _readings_of(load_dataset(dataset), mechanism)
+        q = _readings_of(load_dataset(dataset, check_images=False), mechanism)
         poses = forward_kinematics_many(mechanism, q)
         reference_poses = forward_kinematics_many(truth, q)
     displacement, rotation = pose_differences(
