@@ -224,7 +224,7 @@ def _steps_and_fit(
 
 def _four_steps(work: _Workpiece, outlines: Outlines) -> Steps:
     """Return what the four steps give, or why they give nothing: the fit may do without."""
-    radii = {c.link: c.radius for leg in work.mechanism.legs for c in leg.cylinders}
+    radii = {part: r for leg in work.mechanism.legs for part, r in leg.radius_of_part.items()}
     try:
         axes = axes_from_outlines(outlines, work.measurements, radii)
         found = run_steps(work.mechanism, axes, work.measurements)

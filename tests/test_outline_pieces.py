@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from legcal.detection.pieces import END_COVER, Piece, visible_pieces
@@ -40,6 +41,19 @@ def test_the_longest_stretch_of_a_rod_with_a_collar_is_used() -> None:
     pieces = visible_pieces([Cylinder("rod", 0.008, "base", 0.0, 0.4), collar], 0.4)
     (piece,) = [piece for piece in pieces if piece.link == "rod"]
     assert piece.start == pytest.approx(0.12 + END_COVER * 0.02)
+
+
+def test_of_two_cylinders_of_one_link_the_longest_is_the_part_and_the_other_hides_it() -> None:
+    collar = Cylinder("rod", 0.02, "base", 0.1, 0.16)
+    (piece,) = visible_pieces([Cylinder("rod", 0.008, "base", 0.0, 0.4), collar], 0.4)
+    assert (piece.link, piece.radius) == ("rod", 0.008)
+    assert piece.start == pytest.approx(0.16 + END_COVER * 0.02)
+
+
+def test_equally_long_cylinders_have_one_name_at_every_length() -> None:
+    halves = [Cylinder("a", 0.01, "platform", -0.3, 0.0), Cylinder("b", 0.01, "base", 0.0, 0.3)]
+    lengths = np.linspace(0.35, 0.608, 500)
+    assert {piece.link for x in lengths for piece in visible_pieces(halves, float(x))} == {"b"}
 
 
 def test_a_leg_without_cylinders_shows_nothing() -> None:

@@ -8,7 +8,7 @@ sockets that no model gives the size of, so the outlines are looked for away fro
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from legcal.mechanism.leg import Cylinder
+from legcal.mechanism.leg import Cylinder, main_cylinders
 
 EQUAL_RADII = 0.01  # relative difference below which two cylinders look like one
 END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cylinder, in radii
@@ -49,9 +49,11 @@ def visible_pieces(cylinders: Sequence[Cylinder], length: float) -> tuple[Piece,
     tuple of Piece
         One for each part with something left to see: its longest stretch that no thicker
         cylinder covers, shortened at the joints and beside thicker cylinders. Cylinders of
-        equal radius that touch or overlap are one part, named by the longest of them.
+        equal radius that touch or overlap are one part, named by the longest of them. Of
+        several cylinders of one link the longest is the part; the others only hide.
     """
-    parts = _merge_equal([(c.link, c.radius, *c.span(length)) for c in cylinders])
+    main = main_cylinders(cylinders)
+    parts = _merge_equal(cylinders, length)
     pieces = []
     for link, radius, start, end in parts:
         cover = END_COVER * radius
@@ -65,26 +67,28 @@ def visible_pieces(cylinders: Sequence[Cylinder], length: float) -> tuple[Piece,
                     for stretch in ((low, min(high, first - gap)), (max(low, last + gap), high))
                 ]
         low, high = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
-        if high > low:
+        if high > low and _look_alike(radius, main[link].radius):
             pieces.append(Piece(link, radius, low, high))
     return tuple(sorted(pieces, key=lambda piece: (piece.start, piece.link)))
 
 
 def _merge_equal(
-    spans: list[tuple[str, float, float, float]],
+    cylinders: Sequence[Cylinder], length: float
 ) -> list[tuple[str, float, float, float]]:
-    """Join spans (link, radius, start, end) of equal radius that touch."""
-    merged: list[tuple[str, float, float, float]] = []
-    longest: list[float] = []
-    for link, radius, start, end in sorted(spans, key=lambda span: (span[2], span[3], span[0])):
-        for i, (name, other, low, high) in enumerate(merged):
-            equal = abs(radius - other) <= EQUAL_RADII * max(radius, other)
-            if equal and start <= high + radius:
-                name = link if end - start > longest[i] else name
-                longest[i] = max(longest[i], end - start)
-                merged[i] = (name, max(radius, other), low, max(high, end))
+    """Return spans (link, radius, start, end) of cylinders, those of equal radius joined."""
+    spans = [((c.end - c.start, c.link), c.radius, *c.span(length)) for c in cylinders]
+    merged: list[tuple[tuple[float, str], float, float, float]] = []
+    for name, radius, start, end in sorted(spans, key=lambda span: (span[2], span[3], span[0])):
+        for i, (other_name, other, low, high) in enumerate(merged):
+            if _look_alike(radius, other) and start <= high + radius:
+                longest = max(name, other_name)  # of equal lengths the later name, in any pose
+                merged[i] = (longest, max(radius, other), low, max(high, end))
                 break
         else:
-            merged.append((link, radius, start, end))
-            longest.append(end - start)
-    return merged
+            merged.append((name, radius, start, end))
+    return [(link, radius, start, end) for (_, link), radius, start, end in merged]
+
+
+def _look_alike(one: float, two: float) -> bool:
+    """Say whether two radii are too near to show a step."""
+    return abs(one - two) <= EQUAL_RADII * max(one, two)

@@ -1,5 +1,6 @@
 """One leg of an n-leg parallel mechanism (section 2)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
@@ -46,6 +47,14 @@ class Cylinder:
         return self.start + shift, self.end + shift
 
 
+def main_cylinders(cylinders: Sequence[Cylinder]) -> dict[str, Cylinder]:
+    """Return the cylinder that each link names as a part: its longest; the others hide pieces."""
+    found: dict[str, Cylinder] = {}
+    for cylinder in sorted(cylinders, key=lambda c: (c.end - c.start, c.radius)):
+        found[cylinder.link] = cylinder
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Leg:
     """A leg from its base joint centre A to its platform joint centre B.
@@ -89,6 +98,11 @@ class Leg:
     cylinders: tuple[Cylinder, ...]
     base_axis: Array | None = None
     platform_axis: Array | None = None
+
+    @property
+    def radius_of_part(self) -> dict[str, float]:
+        """Radius [m] of each part that outlines are found of, by its URDF link."""
+        return {link: c.radius for link, c in main_cylinders(self.cylinders).items()}
 
     @property
     def type(self) -> str:

@@ -60,5 +60,5 @@ def fitted_legs(legs: Sequence[Leg], frame_legs: Sequence[int]) -> FittedLegs:
         tuple(leg.name for leg in legs),
         np.array([leg.sign for leg in legs], dtype=np.intp),
         tuple(frame_legs),
-        {(i, c.link): c.radius for i, leg in enumerate(legs) for c in leg.cylinders},
+        {(i, part): r for i, leg in enumerate(legs) for part, r in leg.radius_of_part.items()},
     )

@@ -115,9 +115,9 @@ def _steps(calibration: Calibration) -> dict[str, Any]:
 def _parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
     mechanism, solution = calibration.dataset.mechanism, calibration.solution
     nominal_radii = {
-        (j, cylinder.link): cylinder.radius
+        (j, part): radius
         for j, leg in enumerate(mechanism.legs)
-        for cylinder in leg.cylinders
+        for part, radius in leg.radius_of_part.items()
     }
     names = (
         *parameter_names(mechanism.leg_names, mechanism.frame_legs),
