@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from legcal.errors import LegcalError
+from legcal.signals import stopped_by_signals
 from legcal.version import __version__
 
 if TYPE_CHECKING:
@@ -165,7 +166,8 @@ def main() -> None:
     usage_error: type[Exception] = typer.BadParameter.__bases__[0]
     as_json = "--json" in sys.argv
     try:
-        code = app(standalone_mode=False)
+        with stopped_by_signals():
+            code = app(standalone_mode=False)
     except LegcalError as error:
         _fail(type(error).__name__, str(error), as_json=as_json)
         code = error.exit_code

@@ -61,3 +61,7 @@ class NotIdentifiable(LegcalError):
 
 class DidNotConverge(LegcalError):
     """An iterative method stopped before it reached its tolerance."""
+
+
+class OutOfResources(LegcalError):
+    """The machine did not give what the work needs, such as memory."""

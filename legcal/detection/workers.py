@@ -3,12 +3,17 @@
 Threads do not pay: the search is many short steps, and they would wait for each other.
 """
 
+import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from threading import Thread
 from typing import Protocol, TypeVar
+
+from legcal.errors import OutOfResources
 
 T = TypeVar("T")
 
@@ -38,11 +43,16 @@ def worker_pool(workers: int) -> Iterator[Run]:
     ----------
     workers : int
         Number of processes.
+
+    Raises
+    ------
+    OutOfResources
+        If one of the processes is ended from outside.
     """
     if workers <= 1:
         yield in_turn
         return
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_deaf)
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_follow_parent)
 
     def run(search: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
         chunk = max(1, len(rows) // (_CHUNKS * workers))
@@ -50,10 +60,27 @@ def worker_pool(workers: int) -> Iterator[Run]:
 
     try:
         yield run
+    except BrokenProcessPool as error:
+        raise OutOfResources(
+            f"The images could not be searched: found that one of {workers} processes was ended "
+            "from outside, needed all of them to the end; see that there is enough memory and try "
+            "again."
+        ) from error
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _deaf() -> None:
-    """Leave the answer to Ctrl-C to the process that started this one."""
+def _follow_parent() -> None:
+    """Leave the answer to Ctrl-C to the process that started this one, and end when it does.
+
+    A pool's processes wait for work for ever when their parent is killed.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -148,7 +148,10 @@ def refine_from_best(
         return dataclasses.replace(found, notes=(*found.notes, *notes))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
         raise failures[0]
-    raise DidNotConverge(notes or ["The fit was given no starting values; it needs at least one."])
+    problems = dict.fromkeys(problem for failure in failures for problem in failure.problems)
+    raise DidNotConverge(
+        list(problems) or "The fit was given no starting values; it needs at least one."
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,10 +172,7 @@ def _candidate(
     try:
         state, iterations = first_minimum(problem, begin, settings)
     except DidNotConverge:
-        # A fit that nothing determines has no minimum to converge to: say so if that is why.
-        linear = linearize(problem, begin, NoiseModel().whitening(problem.outlines.covariance))
-        normal = information(problem, linear, 1.0)
-        uncertainty(problem, normal, estimated_names(problem, legs), machine_size(begin))
+        _refuse_undetermined(problem, legs, begin)
         raise
     cost = comparable_cost(problem, state, settings)
     return _Candidate(start.label, state, cost, iterations)
@@ -186,9 +186,20 @@ def _refined(
     settings: RefinementSettings,
 ) -> Solution:
     """Work out a first minimum with a problem that is already built."""
-    fit = fit_in_rounds(problem, candidate.state, candidate.iterations, settings)
+    try:
+        fit = fit_in_rounds(problem, candidate.state, candidate.iterations, settings)
+    except DidNotConverge:
+        _refuse_undetermined(problem, legs, candidate.state)
+        raise
     _refuse_other_radii(problem, fit.state, legs)
     return assemble_solution(problem, fit, legs, outlines, candidate.label, settings)
+
+
+def _refuse_undetermined(problem: FitProblem, legs: FittedLegs, state: State) -> None:
+    """Raise NotIdentifiable if that is why there is no minimum to converge to."""
+    linear = linearize(problem, state, NoiseModel().whitening(problem.outlines.covariance))
+    normal = information(problem, linear, 1.0)
+    uncertainty(problem, normal, estimated_names(problem, legs), machine_size(state))
 
 
 def _refuse_other_radii(problem: FitProblem, state: State, legs: FittedLegs) -> None:
