@@ -167,6 +167,13 @@ def test_millimetres_are_recognised(folder: Folder) -> None:
     assert message.count("these look like millimetres: divide the column by 1000") == 6
 
 
+def test_one_reading_far_outside_does_not_make_its_column_millimetres(folder: Folder) -> None:
+    folder.rows[1]["leg1_prismatic"] = 0.5
+    message = refused(folder)
+    assert "found 0.5 m in row 2 (line 3)" in message
+    assert "correct the readings or the limits" in message
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -125,6 +125,8 @@ def test_rows_without_image_are_named_by_label_or_else_by_number() -> None:
     assert row_names(recorded()) == ("i/2.png", "i/1.png", "3", "4")
     twice = recorded(["", "", "", ""], ["x", "y", "x", "z"])
     assert row_names(twice) == ("1", "y", "3", "z")
+    shared = replace(recorded(["", "", "", ""], ["x", "y"]), pose=np.array([0, 0, 1, 1]))
+    assert row_names(shared) == ("x", "x", "y", "y")
     clash = recorded(["x", "", "", ""], ["", "y", "x", "z"])
     assert row_names(clash) == ("x", "y", "3", "z")
 

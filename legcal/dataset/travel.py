@@ -49,7 +49,8 @@ def check_travel(
         if np.any(far):
             remedy = (
                 "these look like millimetres: divide the column by 1000"
-                if _look_like_millimetres(column[far], lower, upper)
+                if 2 * np.sum(far) >= len(column)
+                and _look_like_millimetres(column[far], lower, upper)
                 else "correct the readings or the limits"
             )
             problems.append(

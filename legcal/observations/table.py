@@ -43,12 +43,14 @@ def row_names(measurements: Measurements) -> tuple[str, ...]:
     """
     names = list(measurements.image)
     for v in range(len(measurements.views)):
-        blank = [i for i in np.flatnonzero(measurements.view == v) if not names[i]]
+        rows = np.flatnonzero(measurements.view == v).tolist()
+        blank = [i for i in rows if not names[i]]
+        taken = {names[i] for i in rows}
         labels = [
             measurements.pose_labels[measurements.pose[i]] if measurements.pose_labels else ""
             for i in blank
         ]
-        if not all(labels) or len(set(labels)) < len(labels) or set(labels) & set(names):
+        if not all(labels) or len(set(labels)) < len(labels) or set(labels) & taken:
             labels = [str(i + 1) for i in blank]
         for i, label in zip(blank, labels, strict=True):
             names[i] = label
