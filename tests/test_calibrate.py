@@ -209,6 +209,17 @@ def test_an_interrupted_run_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_view_without_images_is_noted_and_gets_no_pose(example_run: Run, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(example_run.folder, tmp_path / "spare"))
+    entry = _entry(folder)
+    entry["views"]["spare"] = {"camera": "camera_info.yaml"}
+    _write_entry(folder, entry)
+    calibration = calibrate(folder, output=tmp_path / "out")
+    assert any("view spare has no row" in note for note in calibration.notes)
+    document = json.loads((tmp_path / "out/result.json").read_text())
+    assert set(document["views"]) == {"c1", "c2", "c3"}
+
+
 def test_a_dataset_can_be_loaded_first(example_run: Run) -> None:
     dataset = load_dataset(example_run.folder)
     assert calibrate(dataset).solution.start == example_run.calibration.solution.start

@@ -23,8 +23,8 @@ _RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m
 def result_document(calibration: Calibration) -> dict[str, Any]:
     """Return the document of ``result.json``."""
     solution, mechanism = calibration.solution, calibration.dataset.mechanism
-    views = calibration.dataset.measurements.views
-    cameras = [mechanism.T_base_Rb * T.inv() for T in solution.T_camera_Rb]
+    measurements, outlines = calibration.dataset.measurements, solution.outlines
+    placed = np.unique(measurements.view[outlines.row[outlines.used]]).tolist()
     return {
         "legcal_result": 1,
         "status": "converged",
@@ -37,8 +37,12 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
         "parameters": _parameter_rows(calibration),
         "covariance": solution.covariance.tolist(),
         "views": {
-            view.name: {"T_base_camera": motion_to_xyz_quat(T)}
-            for view, T in zip(views, cameras, strict=True)
+            measurements.views[v].name: {
+                "T_base_camera": motion_to_xyz_quat(
+                    mechanism.T_base_Rb * solution.T_camera_Rb[v].inv()
+                )
+            }
+            for v in placed
         },
         "stages": {"staged": _steps(calibration)},
         "residuals": {"chi2": solution.chi2, "dof": solution.dof, "rms_px": solution.rms_px},
