@@ -37,7 +37,7 @@ class Evaluation:
     rotation : (n_poses,) array
         Delta E of eq (20), the angle of the rotation between both platforms [rad].
     names : tuple of str
-        Parameter names.
+        Names of the parameters that both models have.
     values, references : (n_parameters,) array
         The parameters of the model and of the reference [m].
     """
@@ -105,12 +105,15 @@ def evaluate(
         [platform_in_base(truth, T) for T in reference_poses],
     )
     names = parameter_names(mechanism.leg_names, mechanism.frame_legs)
+    values = to_vector(mechanism.parameters, mechanism.frame_legs)
+    references = to_vector(truth.parameters, truth.frame_legs)
+    both = np.isfinite(values) & np.isfinite(references)  # passive legs have no offset
     return Evaluation(
         displacement,
         rotation,
-        names,
-        to_vector(mechanism.parameters, mechanism.frame_legs),
-        to_vector(truth.parameters, truth.frame_legs),
+        tuple(name for name, is_known in zip(names, both, strict=True) if is_known),
+        values[both],
+        references[both],
     )
 
 
