@@ -9,12 +9,14 @@ import json
 import os
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from legcal.errors import LegcalError
+from legcal.errors import LegcalError, OutOfResources
 from legcal.signals import stopped_by_signals
 from legcal.version import __version__
 
@@ -145,17 +147,48 @@ def evaluate(
 def _print(renderable: RenderableType) -> None:
     from rich.console import Console
 
-    Console(highlight=False).print(renderable)
+    with _writing_to_stdout():
+        Console(highlight=False).print(renderable)
+        sys.stdout.flush()
 
 
 def _print_json(document: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
+    with _writing_to_stdout():
+        sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
+        sys.stdout.flush()
+
+
+@contextmanager
+def _writing_to_stdout() -> Iterator[None]:
+    """Say what keeps the output from being written; a reader that has left is none of that."""
+    found = "that it is closed"
+    if sys.stdout is not None:
+        try:
+            yield
+            return
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            found = f"'{error.strerror}'"
+            _leave_stdout()
+    raise OutOfResources(
+        f"The output could not be printed: found {found}, needed a stdout that takes it; send it "
+        "elsewhere."
+    )
+
+
+def _leave_stdout() -> None:
+    """Let what is left in the buffer of stdout go nowhere, so that nothing fails there again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.stdout = None
 
 
 def _fail(kind: str, message: str, *, as_json: bool) -> None:
     if as_json:
-        _print_json({"error": {"kind": kind, "message": message}})
-    else:
+        with suppress(OutOfResources):
+            _print_json({"error": {"kind": kind, "message": message}})
+            return
+    if sys.stderr is not None:
         sys.stderr.write(f"legcal: {message}\n")
 
 

@@ -7,6 +7,7 @@ file was given by the user: its images are not detected. Rows marked ``edited`` 
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,7 +111,9 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     """
     entry = _read_entry(dataset.folder / CACHE_NAME)
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
-    has_image = np.array([path is not None and path.exists() for path in paths], dtype=np.bool_)
+    has_image = np.array(
+        [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
+    )
     given_names = set(entry.given) if entry else set()
     given = np.array([name in given_names for name in _places(dataset)], dtype=np.bool_)
     recorded = entry.fingerprint if entry else None  # the format is part of the fingerprint

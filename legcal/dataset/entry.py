@@ -6,13 +6,14 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 from scipy.spatial.transform import RigidTransform
 
-from legcal.files.schema import FileSchema
+from legcal.files.schema import FileSchema, Metres, Name, Number
 from legcal.geometry.frames import motion_from_xyz_quat
 
 QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
+ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+Vector = tuple[Metres, Metres, Metres]
+Quaternion = tuple[Number, Number, Number, Number]
 
 
 class MotionEntry(FileSchema):
@@ -60,5 +61,16 @@ class DatasetEntry(FileSchema):
     legcal_dataset: Literal[1]
     mechanism: str
     measurements: str
-    encoder_sigma: Annotated[float, Field(gt=0.0)]
-    views: Annotated[dict[str, ViewEntry], Field(min_length=1)]
+    encoder_sigma: Annotated[Number, Field(gt=0.0)]
+    views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
+
+    @field_validator("encoder_sigma")
+    @classmethod
+    def _is_that_of_an_encoder(cls, sigma: float) -> float:
+        least, most = ENCODER_SIGMAS
+        if not least <= sigma <= most:
+            raise ValueError(
+                f"found {sigma:g} m, needed {least:g} to {most:g} m; give one standard deviation "
+                "of a reading in metres."
+            )
+        return sigma

@@ -1,5 +1,6 @@
 """A dataset: the folder of section 4.1, read and validated before any work."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -188,13 +189,17 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
 
 def _dataset_file(given: Path) -> Path:
     """Return the path of dataset.yaml."""
-    path = given if given.suffix in (".yaml", ".yml") and not given.is_dir() else given / FILE_NAME
-    if not path.parent.is_dir():
+    path = (
+        given
+        if given.suffix in (".yaml", ".yml") and not os.path.isdir(given)
+        else given / FILE_NAME
+    )
+    if not os.path.isdir(path.parent):
         raise DatasetError(
             f"{given}: the dataset could not be read: found no such folder, needed a folder with a "
             f"{FILE_NAME}; check the path."
         )
-    if not path.exists():
+    if not os.path.exists(path):
         raise DatasetError(
             f"{given}: the dataset could not be read: found no {path.name} in the folder, needed "
             "one; give the folder of a dataset."
@@ -228,7 +233,7 @@ def _read_cameras(paths: tuple[Path, ...], problems: list[str]) -> dict[Path, Ca
 def _mechanism_path(folder: Path, named: str) -> Path:
     """Return the model's path relative to the dataset if there is one, else a shipped one."""
     path = folder / named
-    if not path.is_file() and named in shipped_names():
+    if not os.path.isfile(path) and named in shipped_names():
         return shipped_folders()[0] / f"{named}.yaml"
     return path
 
@@ -261,7 +266,7 @@ def _read_outlines(
 ) -> Outlines | None:
     """Return the outlines beside the dataset, if there are any."""
     path = folder / OBSERVATIONS_NAME
-    if not path.exists():
+    if not os.path.exists(path):
         return None
     is_own = (folder / CACHE_NAME).exists()
     return read_observations(path, mechanism.legs, measurements, skip_stale=is_own)
@@ -289,7 +294,7 @@ def _row_problems(dataset: Dataset) -> list[str]:
                 f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
                 "them; name an image or remove the row."
             )
-        elif path is not None and (path.exists() or row not in given):
+        elif path is not None and (os.path.exists(path) or row not in given):
             found = dataset.image_problem(row)
             problems += [found] if found else []
     return problems

@@ -142,10 +142,12 @@ def _rows(
         if len(cells) == len(header):
             rows.append(_Row(where, dict(zip(header, cells, strict=True))))
         else:
-            kind = "short" if len(cells) < len(header) else "long"
+            kind, remedy = "short", "complete the row"
+            if len(cells) > len(header):
+                kind, remedy = "long", "remove what is too much, and write decimals with points"
             problems.append(
                 f"{where}: the row is too {kind}: found {len(cells)} cells, needed {len(header)} "
-                "as in the header; complete the row."
+                f"as in the header; {remedy}."
             )
     return rows
 

@@ -1,15 +1,16 @@
 """Files that people write: YAML read safely, and what a schema finds wrong, in sentences."""
 
 import difflib
+import os
 import re
 import reprlib
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
 from pydantic_core import ErrorDetails
 
 from legcal.errors import DatasetError
@@ -31,6 +32,21 @@ _NEEDED = {
     "model_type": "a mapping of names to values",
     "model_attributes_type": "a mapping of names to values",
 }
+
+
+def _one_plain_line(name: str) -> str:
+    """Refuse a name that a table or a message could not show as it is."""
+    if not name or name != name.strip() or not name.isprintable():
+        raise ValueError(
+            f"found the name {name!r}, needed printable characters without spaces at the ends; "
+            "rename it."
+        )
+    return name
+
+
+Name = Annotated[str, AfterValidator(_one_plain_line)]
+Number = Annotated[float, Strict()]  # true is not one, nor is text
+Metres = Annotated[Number, Field(gt=-1e6, lt=1e6)]  # squares of far larger ones overflow
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
 
@@ -59,6 +75,13 @@ class _Loader(yaml.SafeLoader):
                 key.tag = "tag:yaml.org,2002:str"
         return node
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, LookupError, AttributeError, TypeError) as error:
+            kind = node.tag.rsplit(":", 1)[-1]
+            raise _at(node, f"{describe(node.value)}, which is no {kind}") from error
+
 
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
@@ -86,7 +109,7 @@ def read_text(path: Path, what: str) -> bytes:
         If there is no such regular file, it cannot be read, or it is far too large.
     """
     remedy = f"check the path of the {what}"
-    if not path.exists():
+    if not os.path.exists(path):  # unlike that of a Path, False where a name is too long
         raise DatasetError(
             f"{path}: the {what} could not be read: found no such file, needed one; {remedy}."
         )
@@ -216,6 +239,8 @@ def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: 
             return f"{path}: {place} could not be used: {context['error']}"
         case "greater_than":
             needed = f"a number greater than {context['gt']:g}"
+        case "less_than":
+            needed = f"a number less than {context['lt']:g}"
         case "literal_error":
             needed = context["expected"]
         case "too_short":

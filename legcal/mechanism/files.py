@@ -1,5 +1,6 @@
 """Finding and reading the files of a mechanism: a path, a URDF, or a shipped name."""
 
+import os
 from pathlib import Path
 
 from legcal.errors import DatasetError, ModelError, OutOfClass
@@ -39,14 +40,14 @@ def find_yaml(model: str | Path) -> Path:
     path = Path(model)
     names = shipped_names()
     is_shipped = str(model) in names
-    if path.is_dir() and not is_shipped:
+    if os.path.isdir(path) and not is_shipped:
         raise ModelError(
             f"{path}: the mechanism could not be read: found a folder, needed a YAML or a URDF "
             "file; give the file."
         )
-    if path.suffix.lower() in (".urdf", ".xml") and path.exists():
+    if path.suffix.lower() in (".urdf", ".xml") and os.path.exists(path):
         return _yaml_of_urdf(path)
-    if path.exists() and not path.is_dir():
+    if os.path.exists(path) and not os.path.isdir(path):
         return path
     if is_shipped:
         return shipped_folders()[0] / f"{model}.yaml"

@@ -12,8 +12,8 @@ from legcal.files import schema
 from legcal.mechanism.files import read_file
 
 WHAT = "mechanism file"
-Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
-Vector4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+Vector3 = Annotated[list[schema.Metres], Field(min_length=3, max_length=3)]
+Vector4 = Annotated[list[schema.Number], Field(min_length=4, max_length=4)]
 
 
 class PoseEntry(schema.FileSchema):
@@ -43,7 +43,7 @@ class LegcalBlock(schema.FileSchema):
     platform_joint: str | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)]
     home: PoseEntry | None = None
-    legs: Annotated[dict[str, str], Field(min_length=1)]
+    legs: Annotated[dict[schema.Name, str], Field(min_length=1)]
 
     @field_validator("base_frame")
     @classmethod

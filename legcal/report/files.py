@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from legcal.errors import UsageError
+from legcal.errors import OutOfResources, UsageError
 from legcal.files.atomic import TEMPORARY_SUFFIX, temporary_folder
 
 RESULT_NAME = "result.json"
@@ -34,6 +34,15 @@ def check_destination(destination: Path) -> None:
         If it is a file, holds files but no result of legcal, or cannot be written to.
     """
     start = f"{destination}: the result could not be written: found"
+    try:
+        os.lstat(destination)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise UsageError(
+            f"{start} '{error.strerror}', needed a path that can be created; give another "
+            "output folder."
+        ) from error
     if destination.is_symlink() and not destination.exists():
         raise UsageError(f"{start} a broken link, needed a folder; give another output folder.")
     if destination.exists() and not destination.is_dir():
@@ -74,17 +83,26 @@ def result_folder(destination: Path) -> Iterator[Path]:
     ------
     UsageError
         As :func:`check_destination`, before the block runs.
+    OutOfResources
+        If the files cannot be written, as on a full disk.
     """
     check_destination(destination)
-    with temporary_folder(_workshop(destination), destination.name) as temporary:
-        new = temporary / "new"
-        new.mkdir()
-        yield new
-        destination.parent.mkdir(parents=True, exist_ok=True)
-        if destination.exists():
-            _replace_files(new, destination, temporary / "old")
-        else:
-            os.rename(new, destination)
+    try:
+        with temporary_folder(_workshop(destination), destination.name) as temporary:
+            new = temporary / "new"
+            new.mkdir()
+            yield new
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            if destination.exists():
+                _replace_files(new, destination, temporary / "old")
+            else:
+                os.rename(new, destination)
+    except OSError as error:
+        raise OutOfResources(
+            f"{destination}: the result could not be written: found '{error.strerror}', needed a "
+            "folder that takes its files; free some space or give another output folder; nothing "
+            "was written."
+        ) from error
 
 
 def _workshop(destination: Path) -> Path:

@@ -7,6 +7,7 @@ directory lists. Damage inside the compressed data of a JPEG that leaves its mar
 is not seen.
 """
 
+import os
 import re
 import struct
 import zlib
@@ -118,8 +119,8 @@ def image_size(content: bytes) -> ImageSize:
 def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
     """Return the bytes of an image file, and what is wrong with them if anything."""
     needed = "a complete PNG, JPEG or TIFF file"
-    if not path.is_file():
-        found = "something that is not a file" if path.exists() else "no such file"
+    if not os.path.isfile(path):
+        found = "something that is not a file" if os.path.exists(path) else "no such file"
         return b"", _problem(path, where, found, needed, "correct the path or remove the row")
     try:
         content = path.read_bytes()
