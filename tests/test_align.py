@@ -78,6 +78,23 @@ def test_all_images_together_find_the_camera_among_clutter(
     assert apart(T, legs) < (7.0 if n_images == 1 else 2.5)
 
 
+def test_one_edge_of_each_leg_does_not_pass_for_the_other() -> None:
+    legs = predicted(8, ROUGH)
+    right = strips(legs, 0.0, 0)
+    width = 30.0  # the same edges, taken for those of the other side, lie this far away
+    either = [
+        Strips(
+            np.concatenate([s.shift, s.shift - width]),
+            np.array([0.25, 0.27]),
+            np.array([0.25, 0.13]),
+            np.array([0.13, 0.24]),
+        )
+        for s in right
+    ]
+    T = align_camera("c1", ROUGH, legs, either, np.full(len(legs), 7.0))
+    assert apart(T, legs) < 2.5
+
+
 def test_alignment_is_deterministic() -> None:
     legs = predicted(5, ROUGH)
     found = strips(legs, 0.2, 3)

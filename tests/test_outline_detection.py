@@ -112,6 +112,17 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 2.0
 
 
+def test_an_edge_stands_alone_where_the_other_side_is_as_dark_as_the_background() -> None:
+    cam = camera()
+    light = Light(direction=(1.0, 0.0, -0.3), ambient=0.1, diffuse=0.9)
+    bars = [bar(-0.09, 0.03, 170.0, 0.015), bar(0.08, -0.05, 170.0, 0.015)]
+    image = render(cam, bars, 17.0, light, blur=0.6, noise=2.0, supersample=4)
+    found = detect(cam, bars, np.rint(image).astype(np.uint8))
+    np.testing.assert_array_equal(found.used, [True, False, True, False])
+    assert np.abs(errors(cam, bars, found)).max() < 0.2
+    assert all(found.reason[i] for i in (1, 3))
+
+
 @pytest.mark.parametrize("kind", ["uint16", "colour"])
 def test_outlines_are_straight_in_space_and_not_in_the_picture(kind: str) -> None:
     cam = camera(np.array([-0.3, 0.1, 0.001, -0.002, 0.0]))

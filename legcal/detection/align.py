@@ -3,7 +3,9 @@
 One pose serves all images of a view. Three legs and a candidate strip of each give a pose near
 the rough one (two numbers a strip, six unknowns); the pose on which most legs of all
 images agree is kept and refined by robust Gauss-Newton steps. Wrong candidates, be they
-neighbouring legs or clutter, agree on nothing.
+neighbouring legs or clutter, agree on nothing. All legs of a view are tried as brighter than what
+is behind them and as darker: one edge of a leg, lit from one side, may be all that is seen of it,
+and must not pass for the other edge.
 """
 
 from collections.abc import Sequence
@@ -98,14 +100,16 @@ def align_camera(
             f"inside its images, needed {LEAST_LEGS}; check T_base_camera of the view."
         )
     ends = _Ends.of(legs)
-    votes = _collect(ends, strips, tolerance)
-    best, best_gain = np.zeros(6), -np.inf
-    for start in _trials(votes):
-        xi = _refine(ends, votes, start)
-        gain = _gain(votes, _shifts(ends, xi)) - _prior(xi)
-        if gain > best_gain + 1e-9:
-            best, best_gain = xi, gain
-    agreeing = int(np.count_nonzero(_agreeing(votes, _shifts(ends, best)) > 0.0))
+    best, best_gain, agreeing = np.zeros(6), -np.inf, 0
+    for score in ([s.if_brighter for s in strips], [s.if_darker for s in strips]):
+        votes = _collect(ends, strips, score, tolerance)
+        for start in _trials(votes):
+            xi = _refine(ends, votes, start)
+            agreement = _agreeing(votes, _shifts(ends, xi))
+            gain = float(agreement.sum()) - _prior(xi)
+            if gain > best_gain + 1e-9:
+                best, best_gain = xi, gain
+                agreeing = int(np.count_nonzero(agreement > 0.0))
     needed = max(LEAST_LEGS, int(np.ceil(LEAST_AGREEMENT * len(legs))))
     if agreeing < needed:
         raise NotVisible(
@@ -140,13 +144,15 @@ def _jacobian(legs: _Ends, xi: Array) -> Array:
     )
 
 
-def _collect(legs: _Ends, strips: Sequence[Strips], tolerance: Array) -> _Votes:
+def _collect(
+    legs: _Ends, strips: Sequence[Strips], scores: Sequence[Array], tolerance: Array
+) -> _Votes:
     """Pad the candidates to one array."""
     n_kept = max(1, max(len(s.score) for s in strips))
     shift, score = np.zeros((len(strips), n_kept, 2)), np.zeros((len(strips), n_kept))
     for i, candidates in enumerate(strips):
         n = len(candidates.score)
-        shift[i, :n], score[i, :n] = candidates.shift, candidates.score
+        shift[i, :n], score[i, :n] = candidates.shift, scores[i]
     return _Votes(shift, score, _jacobian(legs, np.zeros(6)), tolerance)
 
 
@@ -181,11 +187,6 @@ def _agreeing(votes: _Votes, predicted: Array) -> Array:
     gap = np.abs(votes.shift - predicted[..., None, :]).max(axis=-1)
     closeness = np.maximum(1.0 - (gap / votes.tolerance[:, None]) ** 2, 0.0)
     return np.asarray((votes.score * closeness).max(axis=-1))
-
-
-def _gain(votes: _Votes, predicted: Array) -> float:
-    """Return the agreement of all legs with one pose."""
-    return float(_agreeing(votes, predicted).sum())
 
 
 def _prior(xi: Array) -> float:

@@ -231,7 +231,7 @@ def _outside(leg: int, cylinders: Sequence[Cylinder]) -> PartOutlines:
     """Return the verdict on a leg that is not in the image."""
     h, square = np.full((2, 3), np.nan), np.full((2, 2, 2), np.nan)
     longest = max(cylinders, key=lambda cylinder: (cylinder.end - cylinder.start, cylinder.link))
-    return PartOutlines(leg, longest.link, h, square, square, OUTSIDE)
+    return PartOutlines(leg, longest.link, h, square, square, (OUTSIDE, OUTSIDE))
 
 
 def _table(rows: Sequence[int], found: Sequence[Sequence[PartOutlines]]) -> Outlines:
@@ -246,7 +246,7 @@ def _table(rows: Sequence[int], found: Sequence[Sequence[PartOutlines]]) -> Outl
         h=np.array([part.h[edge] for _, part, edge in pairs]).reshape(-1, 3),
         ends=np.array([part.ends[edge] for _, part, edge in pairs]).reshape(-1, 2, 2),
         covariance=np.array([part.covariance[edge] for _, part, edge in pairs]).reshape(-1, 2, 2),
-        used=np.array([part.reason == "" for _, part, _ in pairs], dtype=np.bool_),
-        reason=tuple(part.reason for _, part, _ in pairs),
+        used=np.array([part.reasons[edge] == "" for _, part, edge in pairs], dtype=np.bool_),
+        reason=tuple(part.reasons[edge] for _, part, edge in pairs),
         source=("detected",) * len(pairs),
     )

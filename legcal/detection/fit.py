@@ -6,6 +6,7 @@ variance from the noise of the block. All blocks of all outlines of an image are
 The line through the blocks of one outline is fitted robustly; two or three rounds suffice.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ BLUR_ROUNDS = 3
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 # Prior precision of the amplitudes, in units of the contrast of a block.
 RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
+BACKGROUND, BEND = (0, 1), (0, 1, 4)  # functions of the limb model without an edge
 STEP = 0.8  # largest step of a block [px]
 
 
@@ -38,6 +40,8 @@ class BlockFit:
         Step from the background to the leg, a pixel and a half inside [grey levels].
     gain : (n,) array
         How much chi^2 falls by there being an edge at all.
+    sharp : (n,) array
+        How much it falls by there being a step or a limb, and not only a bend of the shading.
     """
 
     shift: Array
@@ -45,6 +49,7 @@ class BlockFit:
     noise: Array
     contrast: Array
     gain: Array
+    sharp: Array
 
 
 def fit_blocks(
@@ -90,14 +95,18 @@ def fit_blocks(
     reference = np.broadcast_to(np.asarray(1.5 + blur, dtype=np.float32), (len(d), 1))
     at, _ = basis(reference, half_width, blur)
     contrast = np.sum(at[:, 2:, 0] * amplitude[:, 2:, 0], axis=1)
-    gain = _without_edge(normal, right, y) / np.maximum(noise, 1e-9) - freedom
-    return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast, gain)
+    gain, sharp = (
+        _without(normal, right, y, kept) / np.maximum(noise, 1e-9) - freedom
+        for kept in (BACKGROUND, BEND)
+    )
+    return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast, gain, sharp)
 
 
-def _without_edge(normal: Array, right: Array, y: Samples) -> Array:
-    """Return the sum of squares that a background with a slope leaves unexplained."""
-    background = normal[:, :2, :2] + 1e-3 * np.eye(2)
-    explained = np.sum(right[:, :2] * np.linalg.solve(background, right[:, :2]), axis=(1, 2))
+def _without(normal: Array, right: Array, y: Samples, kept: Sequence[int]) -> Array:
+    """Return the sum of squares that some of the functions of the model leave unexplained."""
+    some = list(kept)
+    part = normal[:, some][:, :, some] + 1e-3 * np.eye(len(some))
+    explained = np.sum(right[:, some] * np.linalg.solve(part, right[:, some]), axis=(1, 2))
     return np.asarray(np.einsum("nm,nm->n", y, y).astype(np.float64) - explained)
 
 

@@ -68,6 +68,8 @@ class MeasuredEdge:
         How the blocks lie about it.
     contrast : float
         Median step from the background to the leg, without sign [grey levels].
+    is_step : bool
+        Whether most blocks show a step or a limb, and not only a bend of the shading.
     blur : float
         Standard deviation of the blur of the image [px].
     covariance : (2, 2) array
@@ -78,6 +80,7 @@ class MeasuredEdge:
     v: Array
     line: StraightFit
     contrast: float
+    is_step: bool
     blur: float
     covariance: Array
 
@@ -115,16 +118,21 @@ def measure_edges(
         return [None] * len(edges), blur
     blocks.settle(blur, LAST_ROUNDS, least_gain=LEAST_GAIN)
     return [
-        None if line is None else _measured(_moved(edge, at, line), line, step, blur)
-        for edge, at, line, step in zip(edges, v, blocks.lines, blocks.contrasts(), strict=True)
+        None if line is None else _measured(_moved(edge, at, line), line, step, sharp, blur)
+        for edge, at, line, step, sharp in zip(
+            edges, v, blocks.lines, blocks.contrasts(), blocks.sharpness(), strict=True
+        )
     ], blur
 
 
-def _measured(v: Array, line: StraightFit, contrasts: Array, blur: float) -> MeasuredEdge:
+def _measured(
+    v: Array, line: StraightFit, contrasts: Array, sharp: Array, blur: float
+) -> MeasuredEdge:
     """Return a measured edge; shading moves it by its grey levels over the slope of the step."""
     contrast = float(np.median(contrasts[line.kept]))
+    is_step = float(np.median(sharp[line.kept])) > LEAST_GAIN
     bias = SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3)
-    return MeasuredEdge(v, line, contrast, blur, line.covariance + bias**2)
+    return MeasuredEdge(v, line, contrast, is_step, blur, line.covariance + bias**2)
 
 
 def _moved(edge: Edge, v: Array, line: StraightFit | None) -> Array:
@@ -145,6 +153,7 @@ class _Blocks:
     half_width: Samples  # (n, 1)
     moved: Array  # (n,) [px]
     contrast: Array  # (n,) [grey levels]
+    sharp: Array  # (n,) chi^2
     lines: list[StraightFit | None]
 
     @classmethod
@@ -185,6 +194,7 @@ class _Blocks:
             half_width.astype(np.float32)[:, None],
             np.zeros(sum(counts)),
             np.zeros(sum(counts)),
+            np.zeros(sum(counts)),
             [None] * len(edges),
         )
 
@@ -197,6 +207,10 @@ class _Blocks:
         """Return the contrasts of the blocks of each edge, without sign."""
         return np.split(np.abs(self.contrast), self.bounds[1:-1])
 
+    def sharpness(self) -> list[Array]:
+        """Return how clearly the blocks of each edge show a step and not a bend [chi^2]."""
+        return np.split(self.sharp, self.bounds[1:-1])
+
     def settle(self, blur: float, n_rounds: int, least_gain: float) -> None:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""
         active = np.ones(len(self.lines), dtype=np.bool_)
@@ -205,7 +219,7 @@ class _Blocks:
             least = least_gain if turn > 1 else -np.inf  # a line that is off shows bad fits
             chosen = np.repeat(active, counts)
             fit = fit_blocks(*self.samples(chosen), blur)
-            self.contrast[chosen] = fit.contrast
+            self.contrast[chosen], self.sharp[chosen] = fit.contrast, fit.sharp
             shift, variance = np.zeros(len(chosen)), np.full(len(chosen), np.inf)
             shift[chosen] = fit.shift
             variance[chosen] = np.where(fit.gain > least, fit.variance, np.inf)

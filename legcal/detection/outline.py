@@ -5,30 +5,24 @@ fitted to all outlines of the image together; the verdict on each part, with the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from legcal.detection.band import Band, band_of_leg
 from legcal.detection.measure import Edge, MeasuredEdge, measure_edges
-from legcal.detection.pairs import block_positions, find_pair
+from legcal.detection.pairs import Pair, block_positions, find_pair
 from legcal.detection.picture import Grey
 from legcal.detection.pieces import Piece
 from legcal.detection.prediction import PredictedLeg, hidden_by
+from legcal.detection.verdict import LEAST_LENGTH, verdicts
 from legcal.geometry.types import Array, BoolArray
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 
 OUTSIDE = "outside the image"  # a reason
 MARGIN = 4.0  # beside a leg in front [px]
-LEAST_LENGTH = (30.0, 1.0)  # of an outline: [px] and in widths of the leg
 NARROWEST = 5.0  # [px]
-LEAST_CONTRAST = 4.0  # [grey levels]
-LEAST_AGREEMENT = 0.6  # share of the blocks with an edge that must lie on the line
-LEAST_KEPT = 0.25  # share of all unhidden blocks that must
-LARGEST_SCATTER = (0.6, 1.2)  # of the blocks of an edge: [px] and in blurs
-LARGEST_SIGMA = 0.5  # [px]
-WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +41,8 @@ class PartOutlines:
         Both ends of both used pieces [px], the first nearer to the base joint.
     covariance : (2, 2, 2) array
         Of the normal offsets at these ends [px^2].
-    reason : str
-        Why the part was rejected, "" if it is to be used.
+    reasons : tuple of two str
+        Why each outline was rejected, "" if it is to be used.
     """
 
     leg: int
@@ -56,7 +50,7 @@ class PartOutlines:
     h: Array
     ends: Array
     covariance: Array
-    reason: str
+    reasons: tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +62,16 @@ class _Part:
     band: Band
     predicted: Array  # (2, 2) offsets of edge 1 and 2 at both ends of the band
     hidden: BoolArray  # of the block positions
-    v: Array  # (2, 2) found offsets
+    pair: Pair
+
+    @property
+    def width(self) -> Array:
+        """Predicted width at both ends of the band [px], (2,)."""
+        return np.asarray(self.predicted[1] - self.predicted[0])
 
     @property
     def half_width(self) -> float:
-        return float(0.5 * np.mean(self.v[1] - self.v[0]))
+        return float(0.5 * np.mean(self.pair.v[1] - self.pair.v[0]))
 
 
 def outline_parts(
@@ -151,7 +150,7 @@ def _find(
     pair = find_pair(grey, camera, band, predicted, ~free, window)
     if pair is None:
         return "no convincing pair of edges"
-    return _Part(leg, piece, band, predicted, ~free, pair.v)
+    return _Part(leg, piece, band, predicted, ~free, pair)
 
 
 def _in_front(
@@ -173,7 +172,7 @@ def _measure(grey: Grey, camera: Camera, parts: Sequence[_Part]) -> list[PartOut
     edges = [
         Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
         for part in parts
-        for v, epsilon in zip(part.v, EPSILON, strict=True)
+        for v, epsilon in zip(part.pair.v, EPSILON, strict=True)
     ]
     measured, _ = measure_edges(grey, camera, edges)
     return [
@@ -185,52 +184,21 @@ def _measure(grey: Grey, camera: Camera, parts: Sequence[_Part]) -> list[PartOut
 def _judge(
     camera: Camera, part: _Part, one: MeasuredEdge | None, two: MeasuredEdge | None
 ) -> PartOutlines:
-    """Turn the measured edges of a part into outlines with a verdict."""
-    if one is None or two is None:
-        return _rejected(part.leg, part.piece, "edge hardly visible")
-    h = np.stack([part.band.line(*edge.v) for edge in (one, two)])
-    ends = np.empty((2, 2, 2))
+    """Turn the measured edges of a part into outlines with verdicts."""
+    result = _rejected(part.leg, part.piece, "")
     for i, edge in enumerate((one, two)):
+        if edge is None:
+            continue
         place = np.array([edge.line.first, edge.line.last])
         offset = edge.v[0] + (edge.v[1] - edge.v[0]) * place
-        ends[i] = camera.distort(part.band.points(place * part.band.length, offset))
-    covariance = np.stack([one.covariance, two.covariance])
-    reason = _reason(part, one, two)
-    return PartOutlines(part.leg.leg, part.piece.link, h, ends, covariance, reason)
-
-
-def _reason(part: _Part, one: MeasuredEdge, two: MeasuredEdge) -> str:
-    """Return why a part cannot be trusted, "" if it can."""
-    fits = (one.line, two.line)
-    width, expected = two.v - one.v, part.predicted[1] - part.predicted[0]
-    mismatch = np.abs(width - expected) / (WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected)
-    if mismatch.max() > 1.0:
-        i = int(np.argmax(mismatch))
-        return f"width inconsistent with the radius, {width[i]:.1f} px for {expected[i]:.1f} px"
-    least = max(LEAST_LENGTH[0], LEAST_LENGTH[1] * float(width.mean()))
-    length = min((f.last - f.first) * part.band.length for f in fits)
-    if length < least:
-        return f"too short, {length:.0f} px visible"
-    agreement = min(f.agreement for f in fits)
-    if agreement < LEAST_AGREEMENT:
-        return f"edge not straight, {100 * agreement:.0f} % of it on one line"
-    kept = min(float(np.mean(f.kept)) for f in fits)
-    if kept < LEAST_KEPT:
-        return f"edge hardly visible, found on {100 * kept:.0f} % of it"
-    contrast = min(one.contrast, two.contrast)
-    if contrast < LEAST_CONTRAST:
-        return f"low contrast, {contrast:.1f} grey levels"
-    scatter = max(f.scatter for f in fits)
-    if scatter > max(LARGEST_SCATTER[0], LARGEST_SCATTER[1] * one.blur):
-        return f"edge too rough, scatter {scatter:.2f} px"
-    sigma = max(float(np.sqrt(np.diag(edge.covariance).max())) for edge in (one, two))
-    if sigma > LARGEST_SIGMA:
-        return f"edge too uncertain, sigma {sigma:.2f} px"
-    return ""
+        result.h[i] = part.band.line(*edge.v)
+        result.ends[i] = camera.distort(part.band.points(place * part.band.length, offset))
+        result.covariance[i] = edge.covariance
+    return replace(result, reasons=verdicts(part.pair, part.width, part.band.length, (one, two)))
 
 
 def _rejected(leg: PredictedLeg, piece: Piece, reason: str) -> PartOutlines:
     """Return a part of which nothing was found."""
     nothing = np.full((2, 3), np.nan)
     square = np.full((2, 2, 2), np.nan)
-    return PartOutlines(leg.leg, piece.link, nothing, square, square.copy(), reason)
+    return PartOutlines(leg.leg, piece.link, nothing, square, square.copy(), (reason, reason))

@@ -1,8 +1,10 @@
 """The pair of edges that are the two outlines of a part, near an aligned prediction.
 
-Both edges are looked for apart, as straight lines near their predictions on which many blocks of
-the picture have an edge; then the pair is chosen whose distance suits the radius at both ends.
-Shading inside the leg and clutter beside it make lines as well, seldom at that distance.
+Both edges are looked for apart, as straight lines near their predictions on which many blocks
+of the picture have an edge; then the pair is chosen whose distance suits the radius at
+both ends. Shading inside the leg and clutter beside it make lines as well, seldom at that
+distance. Where one side of a leg is as bright as what is behind it there is no pair: an edge
+that no other line near its prediction rivals may stand alone.
 """
 
 from dataclasses import dataclass
@@ -23,6 +25,9 @@ MARGIN = 6  # columns beyond the search window, to judge what an edge is
 KEPT = 8
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
 LEAST_SCORE = 0.15
+LONE_SCORE = 0.5  # of an edge that may stand alone
+RIVAL = 0.6  # of its score, which no other line may reach
+RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +38,15 @@ class Pair:
     ----------
     v : (2, 2) array
         Offsets of edge 1 and edge 2 at both ends of the band [px], good to about a pixel.
-    score : (2,) array
-        Share of the unhidden length on which the picture has these edges.
+    found : (2,) array of bool
+        False for an edge that was not found and is put where the width of the part demands.
+    alone : (2,) array of bool
+        Whether each edge is convincing without the other.
     """
 
     v: Array
-    score: Array
+    found: BoolArray
+    alone: BoolArray
 
 
 def find_pair(
@@ -64,13 +72,32 @@ def find_pair(
     Returns
     -------
     Pair or None
-        None where no two edges are convincing.
+        None where no two edges are convincing, nor one alone.
     """
-    found = [_edge_lines(grey, camera, band, v, hidden, window) for v in predicted]
-    (shift1, score1), (shift2, score2) = found
+    lines = [_edge_lines(grey, camera, band, v, hidden, window) for v in predicted]
+    width = predicted[1] - predicted[0]
+    together = _best_pair(lines[0], lines[1], width, window)
+    lone = [_alone(*candidates) for candidates in lines]
+    if together is not None:
+        shifts = np.stack([lines[edge][0][i] for edge, i in enumerate(together)])
+        alone = np.array([i == k for i, k in zip(together, lone, strict=True)])
+        return Pair(predicted + shifts, np.ones(2, dtype=np.bool_), alone)
+    scores = [0.0 if i is None else lines[edge][1][i] for edge, i in enumerate(lone)]
+    edge = int(np.argmax(scores))
+    i = lone[edge]
+    if i is None or max(lines[1 - edge][1], default=0.0) >= LONE_SCORE:
+        return None  # two clear edges at another distance are not those of this part
+    found = np.arange(2) == edge
+    return Pair(predicted + lines[edge][0][i], found, found)
+
+
+def _best_pair(
+    one: tuple[Array, Array], two: tuple[Array, Array], width: Array, window: float
+) -> tuple[int, int] | None:
+    """Return which of the lines near both edges are a pair, None if no two are convincing."""
+    (shift1, score1), (shift2, score2) = one, two
     if not len(score1) or not len(score2):
         return None
-    width = predicted[1] - predicted[0]
     mismatch = (shift2[None, :, :] - shift1[:, None, :]) / (
         WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
     )
@@ -79,10 +106,18 @@ def find_pair(
     value = value - 0.1 * np.mean(mismatch**2, axis=-1) - 0.1 * np.mean(drift**2, axis=-1)
     value[np.abs(mismatch).max(axis=-1) > 3.0] = -np.inf
     i, j = np.unravel_index(int(np.argmax(value)), value.shape)
-    score = np.array([score1[i], score2[j]])
-    if not np.isfinite(value[i, j]) or score.min() < LEAST_SCORE:
+    if not np.isfinite(value[i, j]) or min(score1[i], score2[j]) < LEAST_SCORE:
         return None
-    return Pair(predicted + np.stack([shift1[i], shift2[j]]), score)
+    return int(i), int(j)
+
+
+def _alone(shift: Array, score: Array) -> int | None:
+    """Return the best line near an edge if it has no rival."""
+    if not len(score) or score[0] < LONE_SCORE:
+        return None
+    middle = shift.mean(axis=1)
+    other = np.abs(middle - middle[0]) > RIVAL_DISTANCE
+    return None if np.any(score[other] > RIVAL * score[0]) else 0
 
 
 def block_positions(band: Band) -> Array:
@@ -104,7 +139,7 @@ def _edge_lines(
     values, inside = sample(grey, 1, camera, xy)
     shape = (n_blocks, ROWS, v.shape[1])
     seen = inside.reshape(shape).all(axis=1) & ~hidden[:, None]
-    votes = edge_sharpness(values.reshape(shape).mean(axis=1), seen)
+    votes = np.maximum(*edge_sharpness(values.reshape(shape).mean(axis=1), seen))
     votes = votes[:, MARGIN:-MARGIN] * seen[:, MARGIN:-MARGIN]
     return _lines(votes / max(1, int(seen.any(axis=1).sum())), half)
 
