@@ -43,11 +43,6 @@ class Band:
         along = self.origin + t[..., None] * (self.along / self.scale)
         return np.asarray(along + v[..., None] * (self.normal / self.scale))
 
-    def coordinates(self, xy: Array) -> Array:
-        """Return (t, v) [px] of points of the sensor plane, both (..., 2)."""
-        basis = np.column_stack([self.along, self.normal])
-        return np.asarray((xy - self.origin) @ basis * self.scale)
-
     def offsets(self, h: Array, t: Array) -> Array:
         """Return the coordinate v of lines h (..., 3) of eq (2) at t (...) [px]."""
         on_axis = self.points(t, np.zeros(()))

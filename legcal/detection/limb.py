@@ -1,4 +1,4 @@
-"""The shape of the picture across an outline: a background, a blurred step, a lit limb (hazard 9).
+"""The shape of the picture across an outline: a background, a blurred step, a lit limb.
 
 At depth D inside the outline of a cylinder of half-width R the surface normal leans towards the
 camera by sqrt(rho (2 - rho)) with rho = D / R, which grows like the square root of the depth;

@@ -113,7 +113,7 @@ def refine_from_best(
     starts: Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
 ) -> Solution:
-    """Fit everything from several starts and keep the lowest cost (hazard 10 of the method).
+    """Fit everything from several starts and keep the lowest cost.
 
     The first minima are compared; only the lowest is worked out, the others stand in for it if
     that fails. A start that fails is skipped with a note; between equal costs the earlier
