@@ -37,11 +37,14 @@ class Steps:
         The cameras that step 2 places; None as a whole if the steps failed.
     failure : str
         Why they failed; "" if they did not.
+    diagnostics : tuple of str
+        What they left out, and why.
     """
 
     parameters: KinematicParameters | None
     T_Rb_camera: tuple[RigidTransform | None, ...] | None
     failure: str
+    diagnostics: tuple[str, ...] = ()
 
     def in_file_order(self, order: Order) -> Steps:
         """Return the same with legs and views in the order of the files."""
@@ -149,11 +152,8 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
     standard deviations.
     """
     mechanism = dataset.mechanism
-    first_row = np.unique(dataset.measurements.pose, return_index=True)[1]
-    nominal = [
-        platform_in_base(mechanism, T)
-        for T in forward_kinematics_many(mechanism, dataset.measurements.q[first_row])
-    ]
+    q = dataset.measurements.q[dataset.measurements.first_rows]
+    nominal = [platform_in_base(mechanism, T) for T in forward_kinematics_many(mechanism, q)]
     displacement, rotation = pose_differences(solution.T_Rb_Re, nominal)
     change = PlatformError(displacement, rotation)
     sigma = predict_platform_error(

@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +27,14 @@ if TYPE_CHECKING:
 ISSUES = "the issue tracker of legcal"
 INTERRUPTED = 130
 MOST_WORKERS = 8  # processes that search images; each takes about 150 MB
+
+
+class Criteria(StrEnum):
+    """What the four steps minimise."""
+
+    DEFAULT = "default"
+    LITERAL = "literal"
+
 
 app = typer.Typer(
     name="legcal",
@@ -89,6 +98,10 @@ def calibrate(
         Path, typer.Option("--output", "-o", metavar="OUT", help="The result folder to write.")
     ],
     as_json: JsonOption = False,
+    criteria: Annotated[
+        Criteria,
+        typer.Option(help="What the four steps minimise: legcal's criteria, or the paper's."),
+    ] = Criteria.DEFAULT,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Detect again, even where a cached detection fits.")
     ] = False,
@@ -103,6 +116,7 @@ def calibrate(
             dataset,
             output=output,
             progress=progress,
+            criteria=criteria.value,
             use_cache=not fresh,
             workers=min(os.cpu_count() or 1, MOST_WORKERS),
         )
@@ -214,11 +228,11 @@ def main() -> None:
         _fail(
             "InternalError",
             f"This is a mistake in legcal {__version__}, not in your data: "
-            f"{type(error).__name__}: {error}; nothing was written; please report it with the "
+            f"{type(error).__name__}: {error}; please report it with the "
             f"lines above to {ISSUES}.",
             as_json=as_json,
         )
         code = 3
     if code == INTERRUPTED:  # typer turns the interrupt of a command into this code
-        _fail("Interrupted", "Stopped; nothing was written.", as_json=as_json)
+        _fail("Interrupted", "Stopped before the end.", as_json=as_json)
     sys.exit(code if isinstance(code, int) else 0)

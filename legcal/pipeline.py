@@ -25,17 +25,18 @@ from legcal.calibration import Calibration, Steps, in_file_order, judge
 from legcal.dataset.cache import DetectionPlan, fingerprint, plan_dataset, store_outlines
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.detection.observe import (
-    SETTINGS,
     Photographs,
     Scene,
     align,
     detect,
+    detection_settings,
     doubtful_rows,
     given_outlines,
 )
 from legcal.detection.workers import Run, worker_pool
-from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible, OutOfClass
 from legcal.mechanism.kinematics import forward_kinematics_many
+from legcal.mechanism.leg import LegKind
 from legcal.mechanism.model import Mechanism
 from legcal.observations.canonical_order import (
     Order,
@@ -56,6 +57,7 @@ from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, start_from
 from legcal.report.files import check_destination
 from legcal.report.result import write_result
+from legcal.stages.nominal import Criteria
 from legcal.stages.run import run_steps
 
 
@@ -64,6 +66,7 @@ def calibrate(
     *,
     output: str | Path | None = None,
     progress: Report = no_progress,
+    criteria: Criteria = "default",
     use_cache: bool = True,
     workers: int = 1,
 ) -> Calibration:
@@ -77,6 +80,8 @@ def calibrate(
         Write the result folder there: calibrated model, parameters, observations.
     progress : callable
         Called as ``progress(stage, done, total)``.
+    criteria : {"default", "literal"}
+        What the four steps minimise: legcal's criteria, or the paper's as printed.
     use_cache : bool
         Use the outlines that an earlier run left beside the dataset, if they still fit.
     workers : int
@@ -105,7 +110,7 @@ def calibrate(
         check_destination(Path(output))
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     with worker_pool(workers) as run:
-        work = _workpiece(dataset, run, use_cache=use_cache)
+        work = _workpiece(dataset, run, criteria, use_cache=use_cache)
         outlines, steps, solution = _observe_and_fit(work, progress)
     notes = [*dataset.notes, *_keep_outlines(work, outlines)]
     calibration = judge(
@@ -148,6 +153,7 @@ class _Workpiece:
     mechanism: Mechanism
     measurements: Measurements
     run: Run
+    criteria: Criteria
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -164,15 +170,16 @@ class _Workpiece:
     @cached_property
     def nominal_poses(self) -> list[RigidTransform]:
         """T_base_platform of every pose by the nominal model."""
-        first_row = np.unique(self.measurements.pose, return_index=True)[1]
-        return forward_kinematics_many(self.mechanism, self.measurements.q[first_row])
+        q = self.measurements.q[self.measurements.first_rows]
+        return forward_kinematics_many(self.mechanism, q)
 
 
-def _workpiece(dataset: Dataset, run: Run, *, use_cache: bool) -> _Workpiece:
+def _workpiece(dataset: Dataset, run: Run, criteria: Criteria, *, use_cache: bool) -> _Workpiece:
     """Put a dataset into the order of work, and see which images are still to be searched."""
+    _refuse_rods(dataset.mechanism)
     names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, names)
-    current = fingerprint(dataset, SETTINGS)
+    current = fingerprint(dataset, detection_settings())
     plan = plan_dataset(dataset, current if use_cache else "")
     return _Workpiece(
         dataset=dataset,
@@ -182,7 +189,19 @@ def _workpiece(dataset: Dataset, run: Run, *, use_cache: bool) -> _Workpiece:
         mechanism=dataset.mechanism.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
         run=run,
+        criteria=criteria,
     )
+
+
+def _refuse_rods(mechanism: Mechanism) -> None:
+    """Raise OutOfClass if a leg has a constant length."""
+    rods = [leg.name for leg in mechanism.legs if leg.kind is LegKind.CONSTANT]
+    if rods:
+        raise OutOfClass(
+            f"{mechanism.yaml_path}: the mechanism could not be calibrated: found legs of constant "
+            f"length ({', '.join(rods)}), needed legs with a slider; leave such machines to a "
+            "later version, which can write a calibrated length."
+        )
 
 
 def _nominal_scene(work: _Workpiece) -> Scene:
@@ -227,10 +246,10 @@ def _four_steps(work: _Workpiece, outlines: Outlines) -> Steps:
     radii = {part: r for leg in work.mechanism.legs for part, r in leg.radius_of_part.items()}
     try:
         axes = axes_from_outlines(outlines, work.measurements, radii)
-        found = run_steps(work.mechanism, axes, work.measurements)
+        found = run_steps(work.mechanism, axes, work.measurements, criteria=work.criteria)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
-    return Steps(found.parameters, found.T_Rb_camera, "")
+    return Steps(found.parameters, found.T_Rb_camera, "", found.diagnostics)
 
 
 def _starts(work: _Workpiece, outlines: Outlines, scene: Scene, steps: Steps) -> list[Start]:

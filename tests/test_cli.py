@@ -206,4 +206,4 @@ def test_stopping_by_hand_is_no_mistake(
 
     monkeypatch.setattr("legcal.mechanism.load.load_mechanism", stopped)
     assert run(monkeypatch, "inspect", "hexapod") == 130
-    assert "nothing was written" in capsys.readouterr().err
+    assert "Stopped before the end" in capsys.readouterr().err

@@ -60,6 +60,11 @@ def _unit(module: str) -> str:
     return module.split(".")[1] if "." in module else module
 
 
+def test_every_part_of_the_package_has_its_place() -> None:
+    outside = {"legcal", "__main__", "errors", "progress", "signals", "simulation", "version"}
+    assert {_unit(module) for module in _modules()} == outside | set(LAYERS)
+
+
 def test_no_module_imports_itself_in_a_circle() -> None:
     circles = [module for module in _modules() if module in _reachable(module)]
     assert circles == []

@@ -1,12 +1,15 @@
 """A machine with a leg that nobody drives or reads: a telescope beside the six motors."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import yaml
 from mechanisms import SHIPPED_URDF, SHIPPED_YAML
+from rich.console import Console
 
 from legcal import evaluate, load_mechanism
+from legcal.report.accuracy_table import accuracy_table
 
 
 def _with_a_telescope(folder: Path) -> Path:
@@ -37,3 +40,18 @@ def test_an_evaluation_leaves_out_the_offset_that_a_passive_leg_does_not_have(
     assert "leg7.offset" not in evaluation.names
     assert np.all(evaluation.values == evaluation.references)
     assert all(np.isfinite(row["difference"]) for row in evaluation.document()["parameters"])
+
+
+def test_without_enough_motors_parameters_alone_are_compared(tmp_path: Path) -> None:
+    path = _with_a_telescope(tmp_path)
+    entry = yaml.safe_load(path.read_text())
+    entry["name_mot"] = [name for name in entry["name_mot"] if name != "leg6_prismatic"]
+    path.write_text(yaml.safe_dump(entry))
+    evaluation = evaluate(path, path)
+    document = evaluation.document()
+    assert document["dX_m"] is document["dE_rad"] is document["dX_max_m"] is None
+    assert document["poses"] == 0
+    assert len(document["parameters"]) > 30
+    printed = io.StringIO()
+    Console(file=printed, width=80).print(accuracy_table(evaluation))
+    assert "the motors do not determine" in printed.getvalue()

@@ -1,4 +1,4 @@
-"""The pose of the camera of a view, from candidate strips of all its images together (hazard 14).
+"""The pose of the camera of a view, from candidate strips of all its images together.
 
 One pose serves all images of a view. Three legs and a candidate strip of each give a pose near
 the rough one (two numbers a strip, six unknowns); the pose on which most legs of all

@@ -1,4 +1,4 @@
-"""Guided detection: photographs, readings and rough camera poses to outlines (3.1, hazard 14).
+"""Guided detection: photographs, readings and rough camera poses to outlines (3.1).
 
 Two verbs. ``align_views`` finds one camera pose for each view from all of its images;
 ``detect_outlines`` finds and measures the outlines near the predictions of those poses. After a

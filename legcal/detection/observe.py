@@ -7,9 +7,11 @@ has told where everything is, images that left doubts are searched again close t
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.resources import files
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -40,8 +42,15 @@ from legcal.progress import Report
 
 NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 
-SETTINGS: dict[str, object] = {"passes": 2, "near_fit_px": NEAR_FIT_PX}
-"""What detection depends on besides the dataset and the version."""
+
+def detection_settings() -> dict[str, object]:
+    """Return what detected outlines depend on besides the dataset: windows, and the code itself."""
+    digest = hashlib.sha256()
+    for package in ("detection", "vision", "geometry"):
+        for source in sorted(files(f"legcal.{package}").iterdir(), key=lambda source: source.name):
+            if source.name.endswith(".py"):
+                digest.update(source.read_bytes())
+    return {"near_fit_px": NEAR_FIT_PX, "code": digest.hexdigest()}
 
 
 @dataclass(frozen=True, eq=False)

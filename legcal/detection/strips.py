@@ -1,4 +1,4 @@
-"""Candidate strips: where a leg may be, near its prediction but tens of pixels off (hazard 14).
+"""Candidate strips: where a leg may be, near its prediction but tens of pixels off.
 
 A patch of the image is straightened along the predicted leg and cut into short blocks. Every
 block votes for the sideways shifts at which both outlines of the leg, a known distance apart,

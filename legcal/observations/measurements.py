@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, IntArray
@@ -68,6 +69,11 @@ class Measurements:
     def n_rows(self) -> int:
         """Number of images."""
         return len(self.image)
+
+    @property
+    def first_rows(self) -> IntArray:
+        """The first row of every pose, (n_poses,): its reading is that of the pose."""
+        return np.asarray(np.unique(self.pose, return_index=True)[1])
 
     @property
     def n_poses(self) -> int:

@@ -153,8 +153,7 @@ def readings(measurements: Measurements, legs: FittedLegs) -> Readings:
 
     Images of one pose share one reading: that of the first row. Passive legs have none.
     """
-    _, first_row = np.unique(measurements.pose, return_index=True)
-    length = legs.sign * measurements.q[first_row]
+    length = legs.sign * measurements.q[measurements.first_rows]
     pose, leg = np.nonzero(np.isfinite(length))
     return Readings(leg, pose, length[pose, leg], measurements.sigma_q)
 

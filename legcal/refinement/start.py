@@ -79,8 +79,7 @@ def start_from(
     -------
     Start
     """
-    _, first_row = np.unique(measurements.pose, return_index=True)
-    lengths = legs.sign * measurements.q[first_row] + parameters.offsets
+    lengths = legs.sign * measurements.q[measurements.first_rows] + parameters.offsets
     poses = platform_poses(parameters, lengths, T_Rb_Re)
     return Start(parameters, tuple(T_camera_Rb), poses, label)
 

@@ -50,10 +50,11 @@ class Evaluation:
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal evaluate --json`` prints."""
+        compared = len(self.displacement) > 0
         return {
-            "dX_m": float(self.displacement.mean()),
-            "dE_rad": float(self.rotation.mean()),
-            "dX_max_m": float(self.displacement.max()),
+            "dX_m": float(self.displacement.mean()) if compared else None,
+            "dE_rad": float(self.rotation.mean()) if compared else None,
+            "dX_max_m": float(self.displacement.max()) if compared else None,
             "poses": len(self.displacement),
             "parameters": [
                 {"name": name, "value": v, "reference": r, "difference": v - r}
@@ -90,11 +91,20 @@ def evaluate(
         If the two models are not of the same machine.
     DidNotConverge
         If a model cannot reach a reading.
+
+    Notes
+    -----
+    Where the motors do not determine the pose only parameters are compared: both arrays of
+    platform errors are empty then.
     """
     mechanism = model if isinstance(model, Mechanism) else load_mechanism(model)
     truth = reference if isinstance(reference, Mechanism) else load_mechanism(reference)
     truth = _in_the_order_of(truth, mechanism)
-    if dataset is None:
+    poses: list[RigidTransform] = []
+    reference_poses: list[RigidTransform] = []
+    if any(m.mobility != len(m.motors) for m in (mechanism, truth)):
+        pass  # no reading says where the platform is
+    elif dataset is None:
         poses, reference_poses = _random_poses(mechanism, truth)
     else:
         q = _readings_of(load_dataset(dataset, check_images=False), mechanism)
@@ -147,8 +157,8 @@ def _readings_of(dataset: Dataset, mechanism: Mechanism) -> Array:
             f"The models could not be compared at the readings of {dataset.folder}: its mechanism "
             f"has no {', '.join(missing)}; the dataset must belong to the same machine."
         )
-    _, first_row = np.unique(dataset.measurements.pose, return_index=True)
-    return dataset.measurements.q[first_row][:, [names.index(n) for n in mechanism.leg_names]]
+    legs = [names.index(name) for name in mechanism.leg_names]
+    return dataset.measurements.q[dataset.measurements.first_rows][:, legs]
 
 
 def _random_poses(

@@ -10,7 +10,6 @@ from legcal.report.accuracy import Evaluation
 
 def accuracy_table(evaluation: Evaluation) -> RenderableType:
     """Return the platform errors and the parameters of an evaluation, in mm and degrees."""
-    dX, dE = 1e3 * evaluation.displacement, np.degrees(evaluation.rotation)
     table = Table(title="Parameters [mm]", title_justify="left", box=None, pad_edge=False)
     table.add_column("parameter")
     for column in ("model", "reference", "difference"):
@@ -19,8 +18,14 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
         evaluation.names, 1e3 * evaluation.values, 1e3 * evaluation.references, strict=True
     ):
         table.add_row(name, f"{value:.4f}", f"{reference:.4f}", f"{value - reference:+.4f}")
-    headline = Text(
+    return Group(Text(_headline(evaluation)), Text(), table)
+
+
+def _headline(evaluation: Evaluation) -> str:
+    dX, dE = 1e3 * evaluation.displacement, np.degrees(evaluation.rotation)
+    if len(dX) == 0:
+        return "Parameters only: the motors do not determine the pose of the platform."
+    return (
         f"Platform error over {len(dX)} poses: displacement {dX.mean():.4f} mm "
         f"(max {dX.max():.4f}), orientation {dE.mean():.4f} deg (max {dE.max():.4f})"
     )
-    return Group(headline, Text(), table)

@@ -115,7 +115,7 @@ def _steps(calibration: Calibration) -> dict[str, Any]:
     steps = calibration.steps
     if steps.parameters is None:
         return {"failure": steps.failure}
-    return _joints(steps.parameters)
+    return {**_joints(steps.parameters), "diagnostics": list(steps.diagnostics)}
 
 
 def _parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:

@@ -9,9 +9,9 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
-from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import Calibration
+from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.platform import pose_differences
 from legcal.refinement.start import platform_poses
 from legcal.report.result import result_document
@@ -63,22 +63,20 @@ def _steps_line(calibration: Calibration) -> str:
     steps = calibration.steps
     if steps.parameters is None:
         return f"The four steps alone gave no result: {steps.failure}"
-    displacement, rotation = _apart(calibration)
+    displacement, rotation = _apart(calibration, steps.parameters)
+    left_out = f" They left out {len(steps.diagnostics)} axes or joints." * bool(steps.diagnostics)
     return (
         f"The four steps alone end {1e3 * displacement:.3f} mm / {np.degrees(rotation):.3f} deg "
-        "from the fit at the platform."
+        f"from the fit at the platform.{left_out}"
     )
 
 
-def _apart(calibration: Calibration) -> tuple[float, float]:
-    """Return how far the platform of the four steps is from that of the fit [m, rad]."""
-    solution, mechanism = calibration.solution, calibration.dataset.mechanism
-    measurements, parameters = calibration.dataset.measurements, calibration.steps.parameters
-    assert parameters is not None
-    first_row = np.unique(measurements.pose, return_index=True)[1]
-    lengths = mechanism.sign * measurements.q[first_row] + parameters.offsets
-    poses: tuple[RigidTransform, ...] = platform_poses(parameters, lengths, solution.T_Rb_Re)
-    displacement, rotation = pose_differences(poses, solution.T_Rb_Re)
+def _apart(calibration: Calibration, parameters: KinematicParameters) -> tuple[float, float]:
+    """Return how far the platform with these parameters is from that of the fit [m, rad]."""
+    near, mechanism = calibration.solution.T_Rb_Re, calibration.dataset.mechanism
+    measurements = calibration.dataset.measurements
+    lengths = mechanism.sign * measurements.q[measurements.first_rows] + parameters.offsets
+    displacement, rotation = pose_differences(platform_poses(parameters, lengths, near), near)
     return float(displacement.mean()), float(rotation.mean())
 
 
