@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 ISSUES = "the issue tracker of legcal"
 INTERRUPTED = 130
-MOST_WORKERS = 8  # processes that search images; each takes about 150 MB
+MOST_WORKERS = 4  # processes that search images; each takes about 150 MB
 
 
 class Criteria(StrEnum):
@@ -118,7 +118,7 @@ def calibrate(
             progress=progress,
             criteria=criteria.value,
             use_cache=not fresh,
-            workers=min(os.cpu_count() or 1, MOST_WORKERS),
+            workers=min(_processors(), MOST_WORKERS),
         )
     if as_json:
         _print_json(result_document(calibration))
@@ -156,6 +156,13 @@ def evaluate(
         from legcal.report.accuracy_table import accuracy_table
 
         _print(accuracy_table(evaluation))
+
+
+def _processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _print(renderable: RenderableType) -> None:

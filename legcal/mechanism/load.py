@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
-from legcal.geometry.frames import motion_from_xyz_quat
 from legcal.mechanism import agreement
 from legcal.mechanism.bodies import Bodies, rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
@@ -69,9 +68,7 @@ def _assemble(file: MechanismFile, urdf: Urdf, yaml_path: Path) -> Mechanism:
         chain = ClosedChain(urdf.text, closures)
     except ModelError as error:
         raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
-    home = None
-    if block.home is not None:
-        home = motion_from_xyz_quat(block.home.xyz, block.home.quat_xyzw)
+    home = None if block.home is None else block.home.motion()
     legs = tuple(
         _leg(name, leg_chain, urdf, file, bodies, home)
         for j, (name, leg_chain) in enumerate(zip(block.legs, chains, strict=True))

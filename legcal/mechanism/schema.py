@@ -1,36 +1,16 @@
 """The mechanism YAML: five keys that Gepetto's ``robot.yaml`` shares, and the ``legcal`` block."""
 
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from legcal.errors import DatasetError, ModelError
 from legcal.files import schema
+from legcal.files.motion import MotionEntry
 from legcal.mechanism.files import read_file
 
 WHAT = "mechanism file"
-Vector3 = Annotated[list[schema.Metres], Field(min_length=3, max_length=3)]
-Vector4 = Annotated[list[schema.Number], Field(min_length=4, max_length=4)]
-
-
-class PoseEntry(schema.FileSchema):
-    """``{xyz: [m], quat_xyzw: [-]}``: a pose of the platform link in the base link."""
-
-    xyz: Vector3
-    quat_xyzw: Vector4
-
-    @field_validator("quat_xyzw")
-    @classmethod
-    def _unit(cls, value: list[float]) -> list[float]:
-        norm = math.sqrt(float(np.dot(value, value)))
-        if abs(norm - 1.0) > 1e-3:
-            raise ValueError(
-                f"found a quaternion of norm {norm:.6g}, needed 1 within 0.001; normalise it."
-            )
-        return [x / norm for x in value]
 
 
 class LegcalBlock(schema.FileSchema):
@@ -42,7 +22,7 @@ class LegcalBlock(schema.FileSchema):
     platform: str
     platform_joint: str | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)]
-    home: PoseEntry | None = None
+    home: MotionEntry | None = None
     legs: Annotated[dict[schema.Name, str], Field(min_length=1)]
 
     @field_validator("base_frame")

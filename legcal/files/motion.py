@@ -1,0 +1,37 @@
+"""How files write a rigid motion."""
+
+import math
+
+from pydantic import field_validator
+from scipy.spatial.transform import RigidTransform
+
+from legcal.files.schema import FileSchema, Metres, Number
+from legcal.geometry.frames import motion_from_xyz_quat
+
+QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
+
+Vector = tuple[Metres, Metres, Metres]
+Quaternion = tuple[Number, Number, Number, Number]
+
+
+class MotionEntry(FileSchema):
+    """A rigid motion: ``{xyz: [m], quat_xyzw: [-]}``."""
+
+    xyz: Vector
+    quat_xyzw: Quaternion
+
+    @field_validator("quat_xyzw")
+    @classmethod
+    def _has_unit_norm(cls, quat: Quaternion) -> Quaternion:
+        norm = math.hypot(*quat)
+        if abs(norm - 1.0) > QUATERNION_TOLERANCE:
+            raise ValueError(
+                f"found a quaternion of norm {norm:.6g}, needed 1 within {QUATERNION_TOLERANCE:g}; "
+                "check its four numbers, x y z w."
+            )
+        x, y, z, w = (c / norm for c in quat)
+        return x, y, z, w
+
+    def motion(self) -> RigidTransform:
+        """Return the motion, its quaternion made exactly unit."""
+        return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
