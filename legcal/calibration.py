@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.dataset.folder import Dataset
 from legcal.geometry.types import IntArray
 from legcal.mechanism.kinematics import forward_kinematics_many
-from legcal.mechanism.parameters import KinematicParameters, parameter_names
+from legcal.mechanism.parameters import KinematicParameters, parameter_names, radius_name
 from legcal.mechanism.platform import platform_in_base, pose_differences
 from legcal.observations.canonical_order import (
     Order,
@@ -125,7 +125,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         name
         for name in (
             *parameter_names(mechanism.leg_names, mechanism.frame_legs),
-            *(f"{mechanism.leg_names[leg]}.radius.{part}" for leg, part in radii),
+            *(radius_name(mechanism.leg_names[leg], part) for leg, part in radii),
         )
         if name in estimated
     )

@@ -51,7 +51,7 @@ from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import reject_unused_legs
 from legcal.progress import Report, no_progress
-from legcal.refinement.legs import fitted_legs
+from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, start_from
@@ -168,6 +168,11 @@ class _Workpiece:
         )
 
     @cached_property
+    def fitted_legs(self) -> FittedLegs:
+        """The legs as the fit sees them."""
+        return fitted_legs(self.mechanism.legs, self.mechanism.frame_legs)
+
+    @cached_property
     def nominal_poses(self) -> list[RigidTransform]:
         """T_base_platform of every pose by the nominal model."""
         q = self.measurements.q[self.measurements.first_rows]
@@ -234,9 +239,8 @@ def _steps_and_fit(
     steps = _four_steps(work, outlines)
     progress("Four steps", 1, 1)
     progress("Fit of everything", 0, 1)
-    legs = fitted_legs(work.mechanism.legs, work.mechanism.frame_legs)
     starts = _starts(work, outlines, scene, steps)
-    solution = refine_from_best(legs, work.measurements, outlines, starts)
+    solution = refine_from_best(work.fitted_legs, work.measurements, outlines, starts)
     progress("Fit of everything", 1, 1)
     return steps, solution
 
@@ -255,7 +259,6 @@ def _four_steps(work: _Workpiece, outlines: Outlines) -> Steps:
 def _starts(work: _Workpiece, outlines: Outlines, scene: Scene, steps: Steps) -> list[Start]:
     """Return the starts of the fit: the nominal model, and the steps where they gave a result."""
     T_base_Rb, T_platform_Re = work.mechanism.T_base_Rb, work.mechanism.T_platform_Re
-    legs = fitted_legs(work.mechanism.legs, work.mechanism.frame_legs)
     platform = [T_base_Rb.inv() * T * T_platform_Re for T in work.nominal_poses]
     rough = [None if T is None else T.inv() * T_base_Rb for T in scene.T_base_camera]
     staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
@@ -264,7 +267,7 @@ def _starts(work: _Workpiece, outlines: Outlines, scene: Scene, steps: Steps) ->
     if steps.parameters is not None:
         starts.append((steps.parameters, _cameras(work, outlines, staged, rough, steps), "staged"))
     return [
-        start_from(parameters, work.measurements, legs, cameras, platform, label)
+        start_from(parameters, work.measurements, work.fitted_legs, cameras, platform, label)
         for parameters, cameras, label in starts
     ]
 

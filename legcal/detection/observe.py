@@ -1,8 +1,8 @@
 """The images of a dataset as one table of outlines: detected, cached, given or edited.
 
-The two passes of detection: first the camera of every view is
-aligned on all of its images and the legs are searched in wide windows; once a fit
-has told where everything is, images that left doubts are searched again close to it.
+Detection has two passes: first the camera of every view is aligned on all of its images and
+the legs are searched in wide windows; once a fit has told where everything is, images that
+left doubts are searched again close to it.
 """
 
 from __future__ import annotations

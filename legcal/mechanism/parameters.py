@@ -65,6 +65,11 @@ def parameter_names(leg_names: Sequence[str], frame_legs: Sequence[int]) -> tupl
     return (*joints, *(f"{name}.offset" for name in leg_names))
 
 
+def radius_name(leg_name: str, part: str) -> str:
+    """Return the name of the radius of a cylinder of a leg."""
+    return f"{leg_name}.radius.{part}"
+
+
 def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Array:
     """Return the free parameters as one vector [m]: base joints, platform joints, offsets."""
     free = free_coordinates(len(parameters.offsets), frame_legs)

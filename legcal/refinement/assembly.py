@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 
 from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.parameters import radius_name
 from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import uncertainty
 from legcal.refinement.inputs import inputs_of
@@ -46,7 +47,7 @@ def assemble_solution(
         T_camera_Rb=fit.state.T_camera_Rb,
         T_Rb_Re=fit.state.T_Rb_Re,
         radii=dict(zip(parts, fit.state.radii.tolist(), strict=True)),
-        names=(*names, *(f"{legs.names[leg]}.radius.{part}" for leg, part in parts)),
+        names=(*names, *(radius_name(legs.names[leg], part) for leg, part in parts)),
         covariance=known.covariance,
         sigma=np.sqrt(np.diagonal(known.covariance)),
         weak=known.weak,

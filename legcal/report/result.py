@@ -11,11 +11,10 @@ import numpy as np
 from legcal.calibration import Calibration
 from legcal.errors import DidNotConverge
 from legcal.geometry.frames import motion_to_xyz_quat
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parameters import KinematicParameters, parameter_names, to_vector
+from legcal.mechanism.parameters import KinematicParameters, parameter_names, radius_name, to_vector
 from legcal.observations.table import write_observations
 from legcal.report.files import result_folder
-from legcal.report.urdf import check_closes, write_calibrated_urdf, write_calibrated_yaml
+from legcal.report.urdf import reload_and_check, write_calibrated_urdf, write_calibrated_yaml
 
 _RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m]
 
@@ -89,7 +88,7 @@ def write_result(calibration: Calibration, destination: Path) -> None:
 
 def _check_written(yaml: Path, calibration: Calibration) -> None:
     """Load what was written; it must be the model that was computed, and close."""
-    written = load_mechanism(yaml)
+    written = reload_and_check(yaml)
     expected = to_vector(calibration.solution.parameters, written.frame_legs)
     found = to_vector(written.parameters, written.frame_legs)
     known = ~(np.isnan(found) & np.isnan(expected))  # passive legs have no offset
@@ -100,7 +99,6 @@ def _check_written(yaml: Path, calibration: Calibration) -> None:
             f"{off:.1e} m from the computed ones; at most {_RELOADED:.0e} m is allowed; nothing "
             "was written; please report this."
         )
-    check_closes(written)
 
 
 def _joints(parameters: KinematicParameters) -> dict[str, Any]:
@@ -127,7 +125,7 @@ def _parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
     }
     names = (
         *parameter_names(mechanism.leg_names, mechanism.frame_legs),
-        *(f"{mechanism.leg_names[leg]}.radius.{part}" for leg, part in solution.radii),
+        *(radius_name(mechanism.leg_names[leg], part) for leg, part in solution.radii),
     )
     values = to_vector(solution.parameters, mechanism.frame_legs).tolist()
     nominal = to_vector(mechanism.parameters, mechanism.frame_legs).tolist()
