@@ -8,6 +8,7 @@ from typing import Literal
 from legcal.geometry.types import Array
 
 JointLetter = Literal["R", "U", "S"]
+PlatformLetter = Literal["R", "U", "S", ""]
 
 
 class LegKind(StrEnum):
@@ -63,8 +64,12 @@ class Leg:
     ----------
     name : str
         The name in the mechanism file.
-    base_joint, platform_joint : {"R", "U", "S"}
-        Joint types, found from the model.
+    base_joint : {"R", "U", "S"}
+        Type of the joint at the base, found from the model.
+    platform_joint : {"R", "U", "S", ""}
+        Type of the joint at the platform; empty for a leg that is fixed to the platform (the
+        centre leg of a Tricept). B of such a leg is the foot of the platform link's origin on
+        the leg's axis.
     kind : LegKind
         Actuated, passive or constant length.
     prismatic : str or None
@@ -82,12 +87,19 @@ class Leg:
     cylinders : tuple of Cylinder
         What a camera can see of the leg.
     base_axis, platform_axis : (3,) array or None
-        Unit axis in the base or platform link, only for joints whose axis is a parameter.
+        Unit axis in the base or platform link, only for joints whose axis is a parameter: R,
+        and the outer axis of U in a leg without an S joint; none in planar mechanisms. The last
+        component that is not zero is positive: an axis is a line. The platform axis of a leg
+        that is fixed to the platform is its direction from A to B.
+    twist : float or None
+        Angle about u from the inner axis at the base to the inner one at the platform [rad],
+        in (-pi/2, pi/2], which the leg keeps constant; only for legs without an S joint in
+        space. See :mod:`legcal.mechanism.equations`.
     """
 
     name: str
     base_joint: JointLetter
-    platform_joint: JointLetter
+    platform_joint: PlatformLetter
     kind: LegKind
     prismatic: str | None
     A_base: Array
@@ -98,6 +110,7 @@ class Leg:
     cylinders: tuple[Cylinder, ...]
     base_axis: Array | None = None
     platform_axis: Array | None = None
+    twist: float | None = None
 
     @property
     def radius_of_part(self) -> dict[str, float]:
@@ -106,6 +119,6 @@ class Leg:
 
     @property
     def type(self) -> str:
-        """The leg's joints from base to platform, such as ``SPU``."""
+        """The leg's joints from base to platform, such as ``SPU``; ``UP`` if fixed there."""
         slider = "" if self.kind is LegKind.CONSTANT else "P"
         return f"{self.base_joint}{slider}{self.platform_joint}"
