@@ -12,15 +12,15 @@ from legcal.mechanism.bodies import Bodies, rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
 from legcal.mechanism.closing import close_at
 from legcal.mechanism.cylinders import with_cylinders
-from legcal.mechanism.files import find_urdf, find_yaml
 from legcal.mechanism.home import find_home, settle_home
 from legcal.mechanism.leg import Leg, LegKind
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.notes import diagnose
-from legcal.mechanism.schema import MechanismFile, read_mechanism_file
+from legcal.mechanism.schema import MechanismFile
+from legcal.mechanism.sources.read import read_source
 from legcal.mechanism.topology import LegChain, find_chains
-from legcal.mechanism.urdf import Urdf, read_urdf
+from legcal.mechanism.urdf import Urdf
 
 
 def load_mechanism(model: str | Path) -> Mechanism:
@@ -39,9 +39,8 @@ def load_mechanism(model: str | Path) -> Mechanism:
     OutOfClass
         If the mechanism is not one that the method covers.
     """
-    yaml_path = find_yaml(model)
-    file = read_mechanism_file(yaml_path)
-    urdf = read_urdf(find_urdf(yaml_path, file.legcal.urdf))
+    source = read_source(model)
+    yaml_path, file, urdf = source.path, source.file, source.urdf
     agreement.check_names(file, urdf, yaml_path)
     agreement.check_class(file, urdf, yaml_path)
     mechanism = _assemble(file, urdf, yaml_path)
