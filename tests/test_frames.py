@@ -57,6 +57,20 @@ def test_frame_keeps_its_axes_when_lengths_are_scaled(seed: int, scale: float) -
     )
 
 
+@FAST
+@given(SEEDS)
+def test_two_points_and_a_normal_move_together_whatever_their_heights(seed: int) -> None:
+    T, P = motion(seed), points(seed)[:2]
+    here = frame_on_points(P)
+    np.testing.assert_allclose(here.rotation.as_matrix()[:, 2], [0.0, 0.0, 1.0], atol=1e-12)
+    local = here.inv().apply(P)
+    assert local[1, 0] > 0.0
+    assert local[1, 1] == pytest.approx(0.0, abs=1e-12)
+    assert local[1, 2] == pytest.approx(P[1, 2] - P[0, 2], abs=1e-12)
+    moved = frame_on_points(T.apply(P), T.rotation.apply([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(moved.as_matrix(), (T * here).as_matrix(), atol=1e-12)
+
+
 def test_two_points_keep_the_z_axis() -> None:
     T = frame_on_points(np.array([[1.0, 1.0, 0.0], [1.0, 3.0, 0.0]]))
     np.testing.assert_allclose(T.rotation.apply([0.0, 0.0, 1.0]), [0.0, 0.0, 1.0], atol=1e-15)

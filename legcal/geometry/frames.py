@@ -14,20 +14,24 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array
 
 
-def frame_on_points(points: Array) -> RigidTransform:
+def frame_on_points(points: Array, normal: Array | None = None) -> RigidTransform:
     """Return the frame that three points define: origin, x axis, xy plane (z completes).
 
-    With two points (a planar mechanism) the z axis is kept.
+    Two points define the frame of a planar mechanism: its z axis is the normal of the plane, its
+    x axis the direction of the second point in that plane.
 
     Parameters
     ----------
     points : (3, 3) or (2, 3) array
         Joint centres in some frame L [m].
+    normal : (3,) array, optional
+        Unit normal of the plane of motion in L, for two points; z without it.
 
     Returns
     -------
     RigidTransform
-        T_L_frame. The points have coordinates (0, 0, 0), (x > 0, 0, 0), (., y > 0, 0) in it.
+        T_L_frame. The points have coordinates (0, 0, 0), (x > 0, 0, 0), (., y > 0, 0) in it;
+        of two points the second one has (x > 0, 0, .).
 
     Raises
     ------
@@ -36,8 +40,12 @@ def frame_on_points(points: Array) -> RigidTransform:
     """
     x = points[1] - points[0]
     spread = float(np.linalg.norm(points - points[0], axis=1).max())
-    toward_y = points[2] - points[0] if len(points) == 3 else np.cross([0.0, 0.0, 1.0], x)
-    z = np.cross(x, toward_y)
+    if len(points) == 3:
+        z = np.cross(x, points[2] - points[0])
+    else:
+        z = np.array([0.0, 0.0, 1.0]) if normal is None else normal
+        x = x - (x @ z) * z
+        z = z * float(x @ x)
     if spread == 0.0 or np.linalg.norm(z) < 1e-9 * spread**2:
         raise ValueError("the points that should define a frame coincide or are collinear")
     x = x / np.linalg.norm(x)

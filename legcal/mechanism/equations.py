@@ -1,0 +1,294 @@
+"""What a leg demands of the platform's pose, in closed form (sections 2 and 3.5).
+
+A leg from A to B with direction u says how long it is, |AB| = s q + q0, and its joints say more:
+
+- a revolute axis is perpendicular to the leg, v . u = 0, eq (7), at the base and at the platform;
+- a leg that is fixed to the platform keeps its direction in it;
+- a leg without an S joint cannot twist: the angle about u from its inner axis p at the base to
+  its inner axis w at the platform is constant. p is the revolute axis, or a x u for a
+  universal joint whose outer axis is a; the same for w. Axes are lines: sin(angle - twist) = 0.
+
+All legs are free of frames: A is given in any frame of the base, B in any frame of the platform,
+and a pose is that of the second frame in the first. Planar mechanisms keep their equations of
+length only.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.mechanism.leg import JointLetter, Leg, LegKind, PlatformLetter
+
+N_LOCAL = 12  # A, B, length, base axis 1 and 2, platform axis 1 and 2, twist
+
+
+class Demand(StrEnum):
+    """What an equation of a leg is about."""
+
+    LENGTH = "length"
+    BASE_AXIS = "base axis"
+    PLATFORM_AXIS = "platform axis"
+    ALONG_1 = "direction in the platform, first angle"
+    ALONG_2 = "direction in the platform, second angle"
+    TWIST = "twist"
+
+
+@dataclass(frozen=True, eq=False)
+class LegGeometry:
+    """The numbers that a leg's equations contain.
+
+    Attributes
+    ----------
+    base_joint, platform_joint : str
+        The letters of :class:`legcal.mechanism.leg.Leg`.
+    kind : LegKind
+        Whether the length is measured, free or constant.
+    A, B : (3,) array
+        Joint centres in the frames of base and platform [m].
+    q0 : float
+        Length at reading zero [m]; that of a constant leg.
+    base_axis, platform_axis : (3,) array or None
+        Unit axes in the frames of base and platform.
+    twist : float or None
+        Angle that the leg keeps [rad].
+    """
+
+    base_joint: JointLetter
+    platform_joint: PlatformLetter
+    kind: LegKind
+    A: Array
+    B: Array
+    q0: float
+    base_axis: Array | None
+    platform_axis: Array | None
+    twist: float | None
+
+    @property
+    def demands(self) -> tuple[Demand, ...]:
+        """The equations of this leg, in the order of :func:`linearize`."""
+        found = [Demand.LENGTH]
+        if self.base_joint == "R" and self.base_axis is not None:
+            found.append(Demand.BASE_AXIS)
+        if self.platform_joint == "R" and self.platform_axis is not None:
+            found.append(Demand.PLATFORM_AXIS)
+        if self.platform_joint == "":
+            found += [Demand.ALONG_1, Demand.ALONG_2]
+        if self.twist is not None:
+            found.append(Demand.TWIST)
+        return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """The equations of one leg at poses.
+
+    Attributes
+    ----------
+    demands : tuple of Demand
+        What each row is about.
+    values : (k, m) array
+        |AB| - q0 [m] for the length, which the leg's s q is to equal; zero where a demand is met
+        for the other rows, which have no unit.
+    by_pose : (k, m, 6) array
+        Derivative by a small rotation of the platform about its origin [rad] and by its
+        displacement [m], both in the frame of the base.
+    by_local : (k, m, 12) array
+        Derivative by A, B, q0 [m], turns of the base axis and of the platform axis about the
+        first and second vector of :func:`legcal.geometry.lines.normal_basis`, and the twist [rad].
+        Exact where the demands are met.
+    """
+
+    demands: tuple[Demand, ...]
+    values: Array
+    by_pose: Array
+    by_local: Array
+
+
+def geometry_of(leg: Leg) -> LegGeometry:
+    """Return the geometry of a leg in the links of base and platform."""
+    return LegGeometry(
+        leg.base_joint,
+        leg.platform_joint,
+        leg.kind,
+        leg.A_base,
+        leg.B_platform,
+        leg.q0,
+        leg.base_axis,
+        leg.platform_axis,
+        leg.twist,
+    )
+
+
+def linearize(leg: LegGeometry, R: Array, t: Array) -> Linearization:
+    """Return a leg's equations and their derivatives at poses of the platform.
+
+    Parameters
+    ----------
+    leg : LegGeometry
+        The leg.
+    R, t : (k, 3, 3) and (k, 3) array
+        Rotation and position [m] of the platform's frame in that of the base.
+
+    Returns
+    -------
+    Linearization
+    """
+    state = _State(leg, R, t)
+    rows = [_ROWS[demand](state) for demand in leg.demands]
+    return Linearization(
+        leg.demands,
+        np.stack([row.value for row in rows], axis=1),
+        np.stack([row.by_pose for row in rows], axis=1),
+        np.stack([row.by_local for row in rows], axis=1),
+    )
+
+
+class _State:
+    """A leg at poses: its direction, and its axes turned into the frame of the base."""
+
+    def __init__(self, leg: LegGeometry, R: Array, t: Array) -> None:
+        self.leg, self.R = leg, R
+        self.arm = R @ leg.B
+        vector = self.arm + t - leg.A
+        self.length = np.linalg.norm(vector, axis=1)
+        self.u = vector / self.length[:, None]
+
+    def turned(self, vector: Array) -> Array:
+        """Return a direction of the platform in the frame of the base, (k, 3)."""
+        return np.asarray(self.R @ vector)
+
+
+class _Row:
+    """One equation at poses, its derivative collected from what it depends on."""
+
+    def __init__(self, state: _State, value: Array) -> None:
+        self.state, self.value = state, value
+        self.by_pose = np.zeros((len(value), 6))
+        self.by_local = np.zeros((len(value), N_LOCAL))
+
+    def depends_on_leg(self, gradient: Array) -> None:
+        """Add the dependence on the vector from A to B."""
+        self.by_pose[:, :3] += np.cross(self.state.arm, gradient)
+        self.by_pose[:, 3:] += gradient
+        self.by_local[:, :3] -= gradient
+        self.by_local[:, 3:6] += _back(self.state.R, gradient)
+
+    def depends_on_u(self, gradient: Array) -> None:
+        """Add the dependence on the leg's direction."""
+        u = self.state.u
+        across = gradient - u * _dot(u, gradient)[:, None]
+        self.depends_on_leg(across / self.state.length[:, None])
+
+    def depends_on_base_axis(self, gradient: Array) -> None:
+        """Add the dependence on the axis at the base."""
+        e1, e2 = normal_basis(_given(self.state.leg.base_axis))
+        self.by_local[:, 7] -= gradient @ e2
+        self.by_local[:, 8] += gradient @ e1
+
+    def depends_on_platform_vector(self, vector: Array, gradient: Array) -> None:
+        """Add the dependence on a direction that is tied to the platform and to its axis."""
+        axis = _given(self.state.leg.platform_axis)
+        self.by_pose[:, :3] += np.cross(self.state.turned(vector), gradient)
+        inside = _back(self.state.R, gradient)
+        for column, e in zip((9, 10), normal_basis(axis), strict=True):
+            self.by_local[:, column] += inside @ np.cross(e, vector)
+
+
+def _length(state: _State) -> _Row:
+    """Return |AB| - q0."""
+    row = _Row(state, state.length - state.leg.q0)
+    row.depends_on_leg(state.u)
+    row.by_local[:, 6] = -1.0
+    return row
+
+
+def _base_axis(state: _State) -> _Row:
+    """Return v . u of eq (7) at the base."""
+    v = np.broadcast_to(_given(state.leg.base_axis), state.u.shape)
+    row = _Row(state, _dot(v, state.u))
+    row.depends_on_u(v)
+    row.depends_on_base_axis(state.u)
+    return row
+
+
+def _platform_axis(state: _State) -> _Row:
+    """Return v . u of eq (7) at the platform."""
+    return _component(state, _given(state.leg.platform_axis))
+
+
+def _along(which: int, state: _State) -> _Row:
+    """Return a component of u across the direction that the platform gives the leg."""
+    return _component(state, normal_basis(_given(state.leg.platform_axis))[which])
+
+
+def _component(state: _State, vector: Array) -> _Row:
+    """Return the component of u along a direction of the platform."""
+    v = state.turned(vector)
+    row = _Row(state, _dot(v, state.u))
+    row.depends_on_u(v)
+    row.depends_on_platform_vector(vector, state.u)
+    return row
+
+
+def _twist(state: _State) -> _Row:
+    """Return sin(angle - twist) of the inner axes p and w about u."""
+    leg, u = state.leg, state.u
+    a, tau = _given(leg.base_axis), float(leg.twist or 0.0)
+    across = np.cross(a, u)
+    reach = np.linalg.norm(across, axis=1)[:, None]
+    p = np.broadcast_to(a, u.shape) if leg.base_joint == "R" else across / reach
+    b = _given(leg.platform_axis)
+    outer = normal_basis(b)[0] if leg.platform_joint == "" else b
+    far = np.cross(state.turned(outer), u)
+    far_reach = np.linalg.norm(far, axis=1)[:, None]
+    w = far / far_reach if leg.platform_joint == "U" else state.turned(outer)
+    c, s = np.cos(tau), np.sin(tau)
+    row = _Row(state, c * _dot(u, np.cross(p, w)) - s * _dot(p, w))
+    by_p, by_w = c * np.cross(w, u) - s * w, c * np.cross(u, p) - s * p
+    row.depends_on_u(c * np.cross(p, w))
+    if leg.base_joint == "U":
+        row.depends_on_u(np.cross(by_p, a) / reach)
+        by_p = np.cross(u, by_p) / reach
+    row.depends_on_base_axis(by_p)
+    if leg.platform_joint == "U":
+        row.depends_on_u(np.cross(by_w, state.turned(outer)) / far_reach)
+        by_w = np.cross(u, by_w) / far_reach
+    row.depends_on_platform_vector(outer, by_w)
+    row.by_local[:, 11] = -(s * _dot(u, np.cross(p, w)) + c * _dot(p, w))
+    return row
+
+
+_ROWS = {
+    Demand.LENGTH: _length,
+    Demand.BASE_AXIS: _base_axis,
+    Demand.PLATFORM_AXIS: _platform_axis,
+    Demand.ALONG_1: lambda state: _along(0, state),
+    Demand.ALONG_2: lambda state: _along(1, state),
+    Demand.TWIST: _twist,
+}
+
+
+def stack(legs: Sequence[LegGeometry], R: Array, t: Array) -> list[Linearization]:
+    """Return the equations of all legs at poses, one entry a leg; see :func:`linearize`."""
+    return [linearize(leg, R, t) for leg in legs]
+
+
+def _given(vector: Array | None) -> Array:
+    """Return an axis that a leg with this demand has."""
+    if vector is None:
+        raise ValueError("a leg whose joints need an axis was described without one")
+    return vector
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Return the scalar products of rows."""
+    return np.asarray(np.einsum("ki,ki->k", a, b))
+
+
+def _back(R: Array, vectors: Array) -> Array:
+    """Return directions of the base's frame in that of the platform, (k, 3)."""
+    return np.asarray(np.einsum("kji,kj->ki", R, vectors))
