@@ -13,8 +13,8 @@ and a pose is that of the second frame in the first. Planar mechanisms keep thei
 length only.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -272,9 +272,27 @@ _ROWS = {
 }
 
 
-def stack(legs: Sequence[LegGeometry], R: Array, t: Array) -> list[Linearization]:
-    """Return the equations of all legs at poses, one entry a leg; see :func:`linearize`."""
-    return [linearize(leg, R, t) for leg in legs]
+def twist_of(leg: LegGeometry, R: Array, t: Array) -> float:
+    """Return the twist with which a leg without an S joint closes at a pose.
+
+    Parameters
+    ----------
+    leg : LegGeometry
+        The leg; its own twist does not matter.
+    R, t : (3, 3) and (3,) array
+        Rotation and position [m] of the platform's frame in that of the base.
+
+    Returns
+    -------
+    float
+        In (-pi/2, pi/2] [rad].
+    """
+    sine, cosine = (
+        float(linearize(replace(leg, twist=twist), R[None], t[None]).values[0, -1])
+        for twist in (0.0, -0.5 * np.pi)
+    )
+    angle = math.atan2(sine, cosine)
+    return angle - math.pi * math.ceil(angle / math.pi - 0.5)
 
 
 def _given(vector: Array | None) -> Array:
