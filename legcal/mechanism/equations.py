@@ -63,9 +63,9 @@ class LegGeometry:
     A: Array
     B: Array
     q0: float
-    base_axis: Array | None
-    platform_axis: Array | None
-    twist: float | None
+    base_axis: Array | None = None
+    platform_axis: Array | None = None
+    twist: float | None = None
 
     @property
     def demands(self) -> tuple[Demand, ...]:

@@ -35,11 +35,13 @@ class KinematicParameters:
 def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     """Return which joint coordinates are parameters and not zero by the frame's definition.
 
+    Two frame legs belong to a planar mechanism, whose heights z are no parameters.
+
     Parameters
     ----------
     n_legs : int
         Number of legs.
-    frame_legs : sequence of 3 int
+    frame_legs : sequence of 3 or 2 int
         The legs whose joint centres are origin, x axis and xy plane of the frame.
 
     Returns
@@ -47,6 +49,7 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     (n_legs, 3) array of bool
     """
     free = np.ones((n_legs, 3), dtype=np.bool_)
+    free[:, 2] = len(frame_legs) == 3
     for rank, leg in enumerate(frame_legs):
         free[leg, rank:] = False
     return free

@@ -1,8 +1,4 @@
-"""What the covariance of the parameters means at the platform.
-
-Legs keep their lengths, so an error d xi of the parameters moves the platform by
-delta = -J_pose^-1 J_xi d xi: implicit differentiation of |R B + t - A| = sign q + q0.
-"""
+"""What the covariance of the parameters means at the platform."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,9 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.mechanism.parameters import KinematicParameters, free_coordinates
+from legcal.mechanism.equations import LegGeometry
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.parametrization import parametrize
+from legcal.mechanism.sensitivity import pose_sensitivity
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,59 +38,6 @@ class PlatformError:
     def mean_rotation(self) -> float:
         """Root mean square over all poses [rad]."""
         return float(np.sqrt(np.mean(self.rotation**2)))
-
-
-def pose_sensitivity(
-    parameters: KinematicParameters, frame_legs: Sequence[int], T_Rb_Re: Sequence[RigidTransform]
-) -> Array:
-    """Return the derivative of platform poses with respect to the parameters, readings given.
-
-    Parameters
-    ----------
-    parameters : KinematicParameters
-        Joints in R_b and R_e, offsets [m]; legs without an offset are left out.
-    frame_legs : sequence of 3 int
-        The legs that define R_b and R_e.
-    T_Rb_Re : sequence of RigidTransform
-        Platform poses.
-
-    Returns
-    -------
-    (n_poses, 6, n_parameters) array
-        Rotation vector in R_b [rad/m] and displacement of the origin of R_e, by the free
-        parameters.
-
-    Raises
-    ------
-    NotIdentifiable
-        If the readings do not determine a pose.
-    """
-    measured = np.isfinite(parameters.offsets)
-    R = np.array([T.rotation.as_matrix() for T in T_Rb_Re]).reshape(-1, 3, 3)
-    t = np.array([T.translation for T in T_Rb_Re]).reshape(-1, 1, 3)
-    arm = np.einsum("kij,lj->kli", R, parameters.platform_joints)
-    leg = arm + t - parameters.base_joints
-    u = leg / np.linalg.norm(leg, axis=-1, keepdims=True)
-    n_legs = len(measured)
-    by_joint = np.zeros((2, len(R), n_legs, n_legs, 3))
-    each = np.arange(n_legs)
-    by_joint[0][:, each, each] = -u
-    by_joint[1][:, each, each] = np.einsum("kji,klj->kli", R, u)
-    free = free_coordinates(n_legs, frame_legs)
-    by_offset = np.broadcast_to(-np.eye(n_legs), (len(R), n_legs, n_legs))
-    J_xi = np.concatenate(
-        [by_joint[0][:, :, free], by_joint[1][:, :, free], by_offset[:, :, measured]], axis=-1
-    )[:, measured]
-    J_pose = np.concatenate([np.cross(arm, u), u], axis=-1)[:, measured]
-    singular = np.linalg.svd(J_pose, compute_uv=False)
-    bad = np.flatnonzero((singular[:, -1] < 1e-9 * singular[:, 0]) | (singular.shape[1] < 6))
-    if len(bad):
-        raise NotIdentifiable(
-            f"The platform error could not be predicted: the {int(measured.sum())} readings do "
-            f"not determine platform pose {bad[0] + 1}, where the machine is singular; six "
-            "independent ones are needed; leave this pose out."
-        )
-    return np.asarray(-np.linalg.pinv(J_pose) @ J_xi)
 
 
 def predict_platform_error(
@@ -122,6 +68,24 @@ def predict_platform_error(
     NotIdentifiable
         If the readings do not determine a pose.
     """
-    J = pose_sensitivity(parameters, frame_legs, T_Rb_Re)
+    legs = _legs(parameters)
+    names = [f"leg{j + 1}" for j in range(len(legs))]
+    J = pose_sensitivity(
+        legs,
+        parametrize(names, legs, frame_legs),
+        frame_legs,
+        np.array([T.rotation.as_matrix() for T in T_Rb_Re]).reshape(-1, 3, 3),
+        np.array([T.translation for T in T_Rb_Re]).reshape(-1, 3),
+    )
     variance = np.einsum("kia,ab,kib->ki", J, covariance, J, optimize=True)
     return PlatformError(np.sqrt(variance[:, 3:].sum(axis=1)), np.sqrt(variance[:, :3].sum(axis=1)))
+
+
+def _legs(parameters: KinematicParameters) -> list[LegGeometry]:
+    """Return legs with point-like joints; those without an offset are passive."""
+    kinds = np.where(np.isfinite(parameters.offsets), LegKind.ACTUATED, LegKind.PASSIVE)
+    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
+    return [
+        LegGeometry("S", "S", LegKind(kind), A, B, float(q0))
+        for (A, B), kind, q0 in zip(joints, kinds, parameters.offsets, strict=True)
+    ]

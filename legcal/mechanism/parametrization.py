@@ -1,0 +1,196 @@
+"""The parameters of any mechanism of the class: which there are, their names and their gauge.
+
+R_b and R_e are built on the joint centres of N_d legs, and the coordinates that this makes zero
+are not parameters. Neither are the heights of the joints of a planar mechanism, nor the place along
+its axis of a leg that is fixed to the platform: nothing depends on them. A parameter vector holds
+base joints, platform joints, offsets and constant lengths, then axes at the base, axes
+at the platform and twists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.mechanism.equations import N_LOCAL, LegGeometry, geometry_of
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parameters import free_coordinates
+
+_LENGTH, _TWIST = 6, 11
+
+
+@dataclass(frozen=True, eq=False)
+class Parametrization:
+    """Where the numbers of each leg stand in a parameter vector.
+
+    Attributes
+    ----------
+    names : tuple of str
+        ``leg2.base.x``, ``leg1.offset``, ``leg1.length``, ``leg1.base_axis.1``, ``leg1.twist``.
+    units : tuple of str
+        ``m`` or ``rad``.
+    place : (n_legs, 12) array of int
+        Position of A, B, length, turns of both axes, twist of each leg; -1 for what is
+        no parameter. The order is that of :class:`legcal.mechanism.equations.Linearization`.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    place: IntArray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def scatter(self, by_local: Array, leg: int) -> Array:
+        """Return derivatives (..., 12) by a leg's numbers as derivatives by all parameters."""
+        place = self.place[leg]
+        wide = np.zeros((*by_local.shape[:-1], len(self)))
+        wide[..., place[place >= 0]] = by_local[..., place >= 0]
+        return wide
+
+
+def geometries(mechanism: Mechanism) -> tuple[LegGeometry, ...]:
+    """Return the legs of a mechanism in its joint frames: A and axes in R_b, B and axes in R_e."""
+    T_Rb, T_Re = mechanism.T_base_Rb.inv(), mechanism.T_platform_Re.inv()
+    parameters = mechanism.parameters
+    return tuple(
+        replace(
+            geometry_of(leg),
+            A=parameters.base_joints[j],
+            B=parameters.platform_joints[j],
+            base_axis=_turned(T_Rb, leg.base_axis),
+            platform_axis=_turned(T_Re, leg.platform_axis),
+        )
+        for j, leg in enumerate(mechanism.legs)
+    )
+
+
+def parametrize(
+    names: Sequence[str],
+    legs: Sequence[LegGeometry],
+    frame_legs: Sequence[int],
+    *,
+    twists: bool = False,
+) -> Parametrization:
+    """Return the parameters of legs.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Leg names.
+    legs : sequence of LegGeometry
+        The legs in R_b and R_e.
+    frame_legs : sequence of int
+        The legs that define R_b and R_e: three in space, two in a plane.
+    twists : bool
+        Count the twists of legs without an S joint; they are held at nominal otherwise.
+
+    Returns
+    -------
+    Parametrization
+    """
+    free = _free(legs, frame_legs, twists=twists)
+    found: list[tuple[str, str]] = []
+    place = np.full(free.shape, -1, dtype=np.intp)
+    for columns in (range(3), range(3, 6), (_LENGTH,), (7, 8), (9, 10), (_TWIST,)):
+        for j, leg in enumerate(legs):
+            for column in columns:
+                if free[j, column]:
+                    place[j, column] = len(found)
+                    unit = "m" if column <= _LENGTH else "rad"
+                    found.append((f"{names[j]}.{_local_name(column, leg.kind)}", unit))
+    return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
+
+
+def parametrization_of(mechanism: Mechanism, *, twists: bool = False) -> Parametrization:
+    """Return the parameters of a mechanism; see :func:`parametrize`."""
+    return parametrize(
+        mechanism.leg_names, geometries(mechanism), mechanism.frame_legs, twists=twists
+    )
+
+
+def vector_of(
+    parametrization: Parametrization, legs: Sequence[LegGeometry], nominal: Sequence[LegGeometry]
+) -> Array:
+    """Return the parameters of legs as a vector [m, rad].
+
+    Axes are rotations of the nominal ones: v = exp([w]_x) v_nominal with w = w_1 e_1 + w_2 e_2 and
+    e_1, e_2 the :func:`legcal.geometry.lines.normal_basis` of v_nominal.
+
+    Parameters
+    ----------
+    parametrization : Parametrization
+        Which parameters.
+    legs, nominal : sequence of LegGeometry
+        The legs, and those whose axes count as zero.
+    """
+    vector = np.zeros(len(parametrization))
+    for leg, start, place in zip(legs, nominal, parametrization.place, strict=True):
+        local = np.concatenate(
+            [
+                leg.A,
+                leg.B,
+                [leg.q0],
+                _turn(leg.base_axis, start.base_axis),
+                _turn(leg.platform_axis, start.platform_axis),
+                [_near(leg.twist, start.twist)],
+            ]
+        )
+        vector[place[place >= 0]] = local[place >= 0]
+    return vector
+
+
+def _free(legs: Sequence[LegGeometry], frame_legs: Sequence[int], *, twists: bool) -> BoolArray:
+    """Return which numbers of each leg are parameters, (n_legs, 12)."""
+    free = np.zeros((len(legs), N_LOCAL), dtype=np.bool_)
+    joints = free_coordinates(len(legs), frame_legs)
+    free[:, :3], free[:, 3:6] = joints, joints
+    for j, leg in enumerate(legs):
+        free[j, _LENGTH] = leg.kind is not LegKind.PASSIVE
+        free[j, 7:9] = leg.base_axis is not None
+        free[j, 9:11] = leg.platform_axis is not None
+        free[j, _TWIST] = twists and leg.twist is not None
+        if leg.platform_joint == "" and leg.platform_axis is not None:
+            free[j, 3 + int(np.argmax(np.abs(leg.platform_axis)))] = False
+    return free
+
+
+def _local_name(column: int, kind: LegKind) -> str:
+    """Return the name of one number of a leg."""
+    if column < 6:
+        return f"{'base' if column < 3 else 'platform'}.{'xyz'[column % 3]}"
+    if column == _LENGTH:
+        return "length" if kind is LegKind.CONSTANT else "offset"
+    if column == _TWIST:
+        return "twist"
+    return f"{'base' if column < 9 else 'platform'}_axis.{2 - column % 2}"
+
+
+def _turned(T: RigidTransform, axis: Array | None) -> Array | None:
+    """Return an axis in another frame."""
+    return None if axis is None else np.asarray(T.rotation.apply(axis))
+
+
+def _turn(axis: Array | None, nominal: Array | None) -> Array:
+    """Return the two angles by which an axis, a line, is turned from the nominal one [rad]."""
+    if axis is None or nominal is None:
+        return np.zeros(2)
+    if axis @ nominal < 0.0:
+        axis = -axis
+    turn = np.cross(nominal, axis)
+    sine = float(np.linalg.norm(turn))
+    scale = 1.0 if sine == 0.0 else float(np.arctan2(sine, axis @ nominal)) / sine
+    return np.asarray(normal_basis(nominal) @ (scale * turn))
+
+
+def _near(twist: float | None, nominal: float | None) -> float:
+    """Return the twist, an angle between lines, nearest to the nominal one [rad]."""
+    if twist is None or nominal is None:
+        return 0.0
+    return float(twist - np.pi * np.round((twist - nominal) / np.pi))
