@@ -34,9 +34,9 @@ class Closure:
 class ClosedChain:
     """A tree of joints with loop closures.
 
-    Configurations are Pinocchio's (quaternions for floating joints), velocities its tangent
-    vectors. The object holds Pinocchio's work space, so that one object serves one thread; it
-    pickles by being built again.
+    Configurations are Pinocchio's (quaternions for floating joints, cosine and sine for planar
+    and continuous ones), velocities its tangent vectors. The object holds Pinocchio's work space,
+    so that one object serves one thread; it pickles by being built again.
 
     Parameters
     ----------
@@ -147,14 +147,25 @@ class ClosedChain:
             Its derivative.
         """
         M = self._placement(base).actInv(self._placement(frame))
-        target = pin.SE3(T_base_frame.rotation.as_matrix(), np.array(T_base_frame.translation))
-        error = target.actInv(M)
+        matrix = T_base_frame.as_matrix()
+        error = pin.SE3(matrix[:3, :3], matrix[:3, 3]).actInv(M)
+        jacobian = pin.Jlog6(error) @ self.twist(base, frame)
+        return np.array(pin.log6(error).vector), np.asarray(jacobian)
+
+    def twist(self, base: str, frame: str) -> Array:
+        """Return how a tangent step moves one frame in another, at the last linearisation.
+
+        Returns
+        -------
+        (6, nv) array
+            Displacement and rotation of ``frame`` relative to ``base``, in ``frame``.
+        """
+        M = self._placement(base).actInv(self._placement(frame))
         J_frame, J_base = (
             pin.getFrameJacobian(self._model, self._data, self._frame(name), pin.LOCAL)
             for name in (frame, base)
         )
-        relative = J_frame - M.inverse().action @ J_base
-        return np.array(pin.log6(error).vector), np.asarray(pin.Jlog6(error) @ relative)
+        return np.asarray(J_frame - M.inverse().action @ J_base)
 
     def q_index(self, joint: str) -> int:
         """Return where the value of a joint stands in a configuration."""
@@ -185,16 +196,28 @@ class ClosedChain:
         platform: str,
         T_base_platform: RigidTransform,
     ) -> Array:
-        """Return the configuration with the floating joint that carries the platform set."""
+        """Return the configuration with the virtual joint that carries the platform set.
+
+        A planar joint takes the part of the motion that lies in its plane.
+        """
         pin.forwardKinematics(self._model, self._data, configuration)
         index = self._model.getJointId(joint)
         before = self._data.oMi[self._model.parents[index]] * self._model.jointPlacements[index]
         after = self._data.oMi[index].actInv(self._placement(platform))
         matrix = T_base_platform.as_matrix()
         wanted = self._placement(base) * pin.SE3(matrix[:3, :3], matrix[:3, 3]) * after.inverse()
+        motion = before.actInv(wanted)
         placed = configuration.copy()
         start = self.q_index(joint)
-        placed[start : start + 7] = pin.SE3ToXYZQUAT(before.actInv(wanted))
+        if self._model.joints[index].nv == 3:
+            angle = np.arctan2(
+                motion.rotation[1, 0] - motion.rotation[0, 1],
+                motion.rotation[0, 0] + motion.rotation[1, 1],
+            )
+            x, y = motion.translation[:2]
+            placed[start : start + 4] = (x, y, np.cos(angle), np.sin(angle))
+        else:
+            placed[start : start + 7] = pin.SE3ToXYZQUAT(motion)
         return placed
 
     def _frame(self, name: str) -> int:

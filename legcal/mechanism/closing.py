@@ -1,5 +1,8 @@
 """Closing the chain with the platform held at a pose: every branch finds its own joint angles."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
@@ -8,7 +11,11 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.model import Mechanism
 
 CLOSED = 1e-12  # [m], and [rad] for frames
+NEAR = 2e-3  # [m, rad]: no other posture of a leg is as near as what axes may be off
 RESTARTS = 60
+RANK = 1e-10  # of the largest singular value
+
+Equations = Callable[[Array], tuple[Array, Array]]
 
 
 def leg_vectors(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
@@ -36,7 +43,7 @@ def close_at(
     mechanism : Mechanism
         The machine.
     T_base_platform : RigidTransform
-        Pose of the platform link.
+        Pose of the platform link; it must meet what the legs demand.
     start : (nq,) array, optional
         Where the joint angles start; zero without it.
 
@@ -50,25 +57,32 @@ def close_at(
     DidNotConverge
         If a leg does not close, naming its closure and the distance left.
     """
-    configuration = _placed(mechanism, T_base_platform, start)
-    free = _angles(mechanism)
-    rng = np.random.default_rng(20020701)
-    for _ in range(RESTARTS):
+    configuration, residual = _posture(mechanism, T_base_platform, start)
+    if np.abs(residual).max(initial=0.0) >= CLOSED:
+        held = partial(_equations, mechanism, T_base_platform)
         configuration, residual = _levenberg_marquardt(
-            mechanism, T_base_platform, configuration, free
+            mechanism, held, configuration, _angles(mechanism) | _sliders(mechanism)
         )
-        if np.abs(residual).max() < CLOSED:
-            return configuration
-        stuck = np.abs(residual) > CLOSED
-        jacobian = _equations(mechanism, T_base_platform, configuration)[1]
-        columns = free & (np.abs(jacobian[stuck]).max(axis=0) > 1e-9)
-        step = np.where(columns, rng.uniform(-np.pi, np.pi, len(columns)), 0.0)
-        configuration = mechanism.chain.integrate(configuration, step)
-    raise DidNotConverge(
-        f"{mechanism.yaml_path}: the legs could not be closed with the platform at "
-        f"{_millimetres(T_base_platform)} mm: {worst_closure(mechanism, residual)}, needed less "
-        "than 1e-12 m; check that the legs reach this pose (legcal.home)."
-    )
+    _check(mechanism, T_base_platform, configuration, residual, CLOSED)
+    return configuration
+
+
+def close_near(
+    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None = None
+) -> Array:
+    """Return the closed configuration nearest to a pose that meets the demands but for rounding.
+
+    Parameters, exceptions and result are those of :func:`close_at`, but the platform is let go
+    at the end: it moves by what the axes of the model are off, or not at all.
+    """
+    configuration, residual = _posture(mechanism, T_base_platform, start)
+    if np.abs(residual).max(initial=0.0) >= CLOSED:
+        everything = np.ones(mechanism.chain.nv, dtype=np.bool_)
+        configuration, residual = _levenberg_marquardt(
+            mechanism, mechanism.chain.linearize, configuration, everything
+        )
+    _check(mechanism, T_base_platform, configuration, residual, NEAR)
+    return configuration
 
 
 def worst_closure(mechanism: Mechanism, residual: Array) -> str:
@@ -93,6 +107,55 @@ def slider_columns(mechanism: Mechanism, legs: tuple[int, ...]) -> tuple[list[in
     joints = [name for name in names if name is not None]
     chain = mechanism.chain
     return [chain.q_index(j) for j in joints], [chain.v_index(j) for j in joints]
+
+
+def _posture(
+    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None
+) -> tuple[Array, Array]:
+    """Return joint angles of all legs with the platform held and sliders set, and what is open."""
+    configuration = _placed(mechanism, T_base_platform, start)
+    free = _angles(mechanism)
+    held = partial(_equations, mechanism, T_base_platform)
+    rng = np.random.default_rng(20020701)
+    residual = np.zeros(0)
+    for _ in range(RESTARTS):
+        configuration, residual = _levenberg_marquardt(mechanism, held, configuration, free)
+        if np.abs(residual).max(initial=0.0) < NEAR:
+            break
+        stuck = np.abs(residual) > NEAR
+        jacobian = held(configuration)[1]
+        columns = free & (np.abs(jacobian[stuck]).max(axis=0) > 1e-9)
+        step = np.where(columns, rng.uniform(-np.pi, np.pi, len(columns)), 0.0)
+        configuration = mechanism.chain.integrate(configuration, step)
+    return configuration, residual
+
+
+def _check(
+    mechanism: Mechanism,
+    T_base_platform: RigidTransform,
+    configuration: Array,
+    residual: Array,
+    astray: float,
+) -> None:
+    """Refuse a chain that is not closed, or whose platform is not where it should be."""
+    problem = None
+    if np.abs(residual).max(initial=0.0) >= CLOSED:
+        problem = f"{worst_closure(mechanism, residual)}, needed less than 1e-12 m"
+    else:
+        R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
+        matrix = T_base_platform.as_matrix()
+        off = float(max(np.abs(R - matrix[:3, :3]).max(), np.abs(t - matrix[:3, 3]).max()))
+        if off > max(astray, 1e-11):
+            problem = (
+                f"the platform stays {off:.3g} (m or rad) away, needed a pose that its "
+                "joint and its legs allow"
+            )
+    if problem is not None:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: the legs could not be closed with the platform at "
+            f"{_millimetres(T_base_platform)} mm: {problem}; check that the legs reach this pose "
+            "(legcal.home)."
+        )
 
 
 def _placed(mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None) -> Array:
@@ -123,6 +186,14 @@ def _angles(mechanism: Mechanism) -> BoolArray:
     return free
 
 
+def _sliders(mechanism: Mechanism) -> BoolArray:
+    """Return the tangent coordinates that are sliders of legs."""
+    free = np.zeros(mechanism.chain.nv, dtype=np.bool_)
+    every = tuple(range(mechanism.n_legs))
+    free[slider_columns(mechanism, every)[1]] = True
+    return free
+
+
 def _equations(
     mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array
 ) -> tuple[Array, Array]:
@@ -138,24 +209,24 @@ def _equations(
 
 
 def _levenberg_marquardt(
-    mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array, free: BoolArray
+    mechanism: Mechanism, equations: Equations, configuration: Array, free: BoolArray
 ) -> tuple[Array, Array]:
-    """Return where the angles end, and the residual there."""
-    residual, jacobian = _equations(mechanism, T_base_platform, configuration)
+    """Return where the free coordinates end, and the residual there."""
+    residual, jacobian = equations(configuration)
     damping, cost = 1e-3, float(residual @ residual)
     for _ in range(60):
-        if np.abs(residual).max() < 0.01 * CLOSED:
+        if np.abs(residual).max(initial=0.0) < 0.01 * CLOSED:
             break
         J = jacobian[:, free]
         normal = J.T @ J
         scale = damping * max(float(np.trace(normal)) / max(len(normal), 1), 1e-12)
         step = np.zeros(len(free))
         if damping < 1e-9:
-            step[free] = -np.linalg.lstsq(J, residual, rcond=1e-12)[0]
+            step[free] = -np.linalg.lstsq(J, residual, rcond=RANK)[0]
         else:
             step[free] = -np.linalg.solve(normal + scale * np.eye(len(normal)), J.T @ residual)
         moved = mechanism.chain.integrate(configuration, step)
-        new_residual, new_jacobian = _equations(mechanism, T_base_platform, moved)
+        new_residual, new_jacobian = equations(moved)
         new_cost = float(new_residual @ new_residual)
         if new_cost < cost:
             configuration, residual, jacobian, cost = moved, new_residual, new_jacobian, new_cost

@@ -1,16 +1,27 @@
-"""The home pose: found where a file gives none, and settled on the lengths of rods."""
+"""The home pose: found where a file gives none, and settled on what the legs demand."""
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array
-from legcal.mechanism.closing import leg_vectors
+from legcal.mechanism.closing import close_near, platform_pose, readings_at
+from legcal.mechanism.demands import (
+    Demands,
+    constraints_at,
+    demands_at,
+    is_constrained,
+    leg_scale,
+    moved,
+)
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.model import Mechanism
 
 TRIALS = 200
+ENOUGH = 20  # trials, where one of them found a pose above the base
+SETTLED = 1e-15  # of a leg length
+FURTHEST = 0.01  # of a leg length
+_RANK = 1e-9
 
 
 def find_home(mechanism: Mechanism) -> RigidTransform:
@@ -18,6 +29,7 @@ def find_home(mechanism: Mechanism) -> RigidTransform:
 
     Of all that seeded starts find, the one that turns the platform least is taken, and of the
     mirror images in the plane of the base joints the one on the positive side of the base's z.
+    Legs without a motor take the length that is left to them, inside their travel if possible.
 
     Raises
     ------
@@ -25,29 +37,22 @@ def find_home(mechanism: Mechanism) -> RigidTransform:
         If none is found.
     """
     middle = np.array([0.5 * sum(leg.travel) for leg in mechanism.legs])
-    wanted = mechanism.sign * middle + mechanism.q0
-    held = np.array([leg.kind is not LegKind.PASSIVE for leg in mechanism.legs])
+    wanted = mechanism.sign * middle
+    held = np.array([leg.kind is LegKind.ACTUATED for leg in mechanism.legs])
     rng = np.random.default_rng(1965)
     centre = mechanism.A_base.mean(axis=0)
-    reach = float(np.abs(wanted).mean())
-
-    def misfit(x: Array) -> Array:
-        return np.asarray((_lengths(mechanism, x) - wanted)[held])
-
+    reach = float(np.abs(wanted + mechanism.q0).mean())
     best: tuple[float, RigidTransform] | None = None
     for trial in range(TRIALS):
-        start = np.concatenate(
-            [centre + rng.normal(0.0, reach, 3), rng.normal(0.0, 0.1 + trial / TRIALS, 3)]
-        )
-        fit = least_squares(misfit, start, xtol=1e-15)
-        if np.abs(fit.fun).max() > 1e-9:
+        place = centre + rng.normal(0.0, reach, 3)
+        turn = Rotation.from_rotvec(rng.normal(0.0, 0.1 + trial / TRIALS, 3))
+        T = _solve(mechanism, RigidTransform.from_components(place, turn), wanted[held])
+        if T is None:
             continue
-        T = _pose(fit.x)
-        below = float(T.apply(mechanism.B_platform).mean(axis=0)[2] < centre[2])
-        rank = 10.0 * below + float(T.rotation.magnitude())
+        rank = _unlikely(mechanism, T) + float(T.rotation.magnitude())
         if best is None or rank < best[0] - 1e-6:
             best = rank, T
-        if trial >= 20 and best[0] < 10.0:
+        if trial >= ENOUGH and best[0] < 5.0:
             break
     if best is None:
         raise DidNotConverge(
@@ -58,47 +63,115 @@ def find_home(mechanism: Mechanism) -> RigidTransform:
 
 
 def settle_home(mechanism: Mechanism, home: RigidTransform) -> RigidTransform:
-    """Return the pose nearest to home that keeps the length of every leg of constant length.
+    """Return the pose nearest to home that meets every demand of legs and plane.
 
-    Files give home with few digits; legs with sliders absorb that, rods cannot.
+    Files give home with few digits; sliders absorb that, but rods, revolute axes and universal
+    joints in a row cannot.
 
     Raises
     ------
     ModelError
         If home is more than 1 % of a leg length away from any such pose.
     """
-    rods = [j for j, leg in enumerate(mechanism.legs) if leg.kind is LegKind.CONSTANT]
-    if not rods:
-        return home
-    T = home
+    settled, problem = settle(mechanism, home)
+    if problem is not None:
+        raise ModelError(
+            f"{mechanism.yaml_path}: legcal.home could not be used: found {problem} there, needed "
+            "a closed pose; correct legcal.home."
+        )
+    return settled
+
+
+def closed_home(mechanism: Mechanism, home: RigidTransform | None) -> tuple[RigidTransform, Array]:
+    """Return the home pose and the closed configuration there, from a given pose or from none.
+
+    Raises
+    ------
+    ModelError, DidNotConverge
+        As :func:`settle_home`, :func:`find_home` and :func:`legcal.mechanism.closing.close_at`.
+    """
+    start = find_home(mechanism) if home is None else home
+    settled = settle_home(mechanism, start)
+    configuration = close_near(mechanism, settled)
+    constrained = is_constrained(mechanism)
+    return platform_pose(mechanism, configuration) if constrained else settled, configuration
+
+
+def settle(mechanism: Mechanism, T: RigidTransform) -> tuple[RigidTransform, str | None]:
+    """Return the nearest pose that meets every constraint, and what is in the way if none is near.
+
+    Gauss-Newton steps of least norm on the constraints, angles counted at a mean leg's length.
+    """
+    if not is_constrained(mechanism):
+        return T, None
+    first = constraints_at(mechanism, T)
+    scale = leg_scale(mechanism, T)
+    if np.abs(first.values).max() > FURTHEST * scale:
+        return T, first.worst()
+    demands, best = first, np.abs(first.values).max()
     for _ in range(20):
-        vectors = leg_vectors(mechanism, T)[rods]
-        lengths = np.linalg.norm(vectors, axis=1)
-        miss = lengths - mechanism.q0[rods]
-        if np.abs(miss).max() < 1e-15:
+        if best <= SETTLED * scale:
             break
-        if np.abs(miss).max() > 0.01 * lengths.mean():
-            leg = mechanism.legs[rods[int(np.argmax(np.abs(miss)))]]
-            raise ModelError(
-                f"{mechanism.yaml_path}: legcal.home could not be used: found leg '{leg.name}' "
-                f"{1e3 * np.abs(miss).max():.3g} mm off its constant length there, needed a closed "
-                "pose; correct legcal.home."
-            )
-        u = vectors / lengths[:, None]
-        arms = T.rotation.apply(mechanism.B_platform[rods])
-        scale = float(lengths.mean())
-        jacobian = np.hstack([u, np.cross(arms, u) / scale])
-        step = -np.linalg.lstsq(jacobian, miss, rcond=None)[0]
-        turn = Rotation.from_rotvec(step[3:] / scale)
-        T = RigidTransform.from_components(T.translation + step[:3], turn * T.rotation)
-    return T
+        trial = moved(T, _step(demands.jacobian, demands.values, scale))
+        demands = constraints_at(mechanism, trial)
+        worst = np.abs(demands.values).max()
+        if worst >= best and best < 1e-12 * scale:
+            break  # rounding
+        T, best = trial, worst
+    return T, (demands.worst() if best > 1e-9 * scale else None)
 
 
-def _pose(x: Array) -> RigidTransform:
-    """Return the pose of three coordinates [m] and a rotation vector [rad]."""
-    return RigidTransform.from_components(x[:3], Rotation.from_rotvec(x[3:]))
+def _step(jacobian: Array, values: Array, scale: float, damping: float = 0.0) -> Array:
+    """Return the step that removes values, rotations counted as displacements at a scale."""
+    weights = np.array([1.0 / scale] * 3 + [1.0] * 3)
+    scaled = jacobian * weights
+    if damping > 0.0:
+        normal = scaled.T @ scaled + damping * np.eye(6)
+        return np.asarray(-weights * np.linalg.solve(normal, scaled.T @ values))
+    return np.asarray(-weights * np.linalg.lstsq(scaled, values, rcond=_RANK)[0])
 
 
-def _lengths(mechanism: Mechanism, x: Array) -> Array:
-    """Return the leg lengths at a pose [m]."""
-    return np.asarray(np.linalg.norm(leg_vectors(mechanism, _pose(x)), axis=1))
+def _solve(
+    mechanism: Mechanism, T: RigidTransform, lengths: Array, steps: int = 60
+) -> RigidTransform | None:
+    """Return the pose near T with those lengths of the actuated legs, None if none is reached."""
+    scale = leg_scale(mechanism, T)
+
+    def misfit(pose: RigidTransform) -> tuple[Demands, Array, float]:
+        demands = demands_at(mechanism, pose)
+        values = demands.values.copy()
+        values[demands.measured] -= lengths
+        return demands, values, float(values @ values)
+
+    demands, values, cost = misfit(T)
+    damping = 1e-3
+    for _ in range(steps):
+        if np.abs(values).max() < 1e-14 * scale:
+            break
+        step = _step(demands.jacobian, values, scale, damping if damping > 1e-9 else 0.0)
+        size = float(np.abs(step[:3]).max())
+        trial = moved(T, step / max(1.0, size))  # at most a radian
+        ahead = misfit(trial)
+        if ahead[2] < cost:
+            T, (demands, values, cost), damping = trial, ahead, damping / 10.0
+        elif damping > 1e3 or cost < (1e-13 * scale) ** 2:
+            break
+        else:
+            damping = max(10.0 * damping, 1e-8)
+    return T if np.abs(values).max() < 1e-9 else None
+
+
+def _unlikely(mechanism: Mechanism, T: RigidTransform) -> float:
+    """Return a penalty: below the base, a fixed leg backwards, a passive one outside its travel."""
+    centre = mechanism.A_base.mean(axis=0)
+    B = np.asarray(T.apply(mechanism.B_platform))
+    size = float(np.abs(B - mechanism.A_base).max())
+    penalty = 10.0 * float(B.mean(axis=0)[2] < centre[2] - 1e-6 * size)
+    for j, (leg, q) in enumerate(zip(mechanism.legs, readings_at(mechanism, T), strict=True)):
+        lower, upper = leg.travel
+        if leg.kind is LegKind.PASSIVE and not lower <= q <= upper:
+            penalty += 5.0
+        if leg.platform_joint == "" and leg.platform_axis is not None:
+            along = T.rotation.apply(leg.platform_axis) @ (B[j] - mechanism.A_base[j])
+            penalty += 100.0 * float(along < 0.0)
+    return penalty

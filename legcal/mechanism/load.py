@@ -7,19 +7,21 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
+from legcal.geometry.types import Array
 from legcal.mechanism import agreement
 from legcal.mechanism.bodies import Bodies, rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
-from legcal.mechanism.closing import close_at
 from legcal.mechanism.cylinders import with_cylinders
-from legcal.mechanism.home import find_home, settle_home
-from legcal.mechanism.leg import Leg, LegKind
+from legcal.mechanism.home import closed_home
+from legcal.mechanism.leg_chain import LegChain
+from legcal.mechanism.leg_of_chain import leg_of
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.notes import diagnose
+from legcal.mechanism.plane import check_virtual_joint, plane_of_motion
 from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.sources.read import read_source
-from legcal.mechanism.topology import LegChain, find_chains
+from legcal.mechanism.topology import find_chains
 from legcal.mechanism.urdf import Urdf
 
 
@@ -44,9 +46,9 @@ def load_mechanism(model: str | Path) -> Mechanism:
     agreement.check_names(file, urdf, yaml_path)
     agreement.check_class(file, urdf, yaml_path)
     mechanism = _assemble(file, urdf, yaml_path)
-    home = mechanism.home if file.legcal.home is not None else find_home(mechanism)
-    mechanism = replace(mechanism, home=settle_home(mechanism, home))
-    mechanism = replace(mechanism, home_configuration=close_at(mechanism, mechanism.home))
+    given = mechanism.home if file.legcal.home is not None else None
+    home, configuration = closed_home(mechanism, given)
+    mechanism = replace(mechanism, home=home, home_configuration=configuration)
     mechanism = replace(mechanism, mobility=mobility(mechanism))
     agreement.check_length_law(mechanism)
     return replace(
@@ -63,18 +65,32 @@ def _assemble(file: MechanismFile, urdf: Urdf, yaml_path: Path) -> Mechanism:
     chains = agreement.legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform), bodies, urdf, file, yaml_path
     )
+    ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
+    normals = plane_of_motion(chains)
+    agreement.check_count(chains, spatial=normals is None, path=yaml_path)
+    if block.platform_joint is not None:
+        virtual = urdf.joints[block.platform_joint]
+        turn = bodies.T_body_link[virtual.parent].rotation.inv()
+        normal = None if normals is None else np.asarray(turn.apply(normals[0]))
+        check_virtual_joint(virtual, normal, yaml_path)
     try:
         chain = ClosedChain(urdf.text, closures)
     except ModelError as error:
         raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
     home = None if block.home is None else block.home.motion()
     legs = tuple(
-        _leg(name, leg_chain, urdf, file, bodies, home)
-        for j, (name, leg_chain) in enumerate(zip(block.legs, chains, strict=True))
+        leg_of(
+            name,
+            leg_chain,
+            ends,
+            travel=_travel(leg_chain, urdf),
+            actuated=leg_chain.motor in file.name_mot,
+            spatial=normals is None,
+            home=home,
+        )
+        for name, leg_chain in zip(block.legs, chains, strict=True)
     )
-    frame_legs = tuple(list(block.legs).index(name) for name in block.base_frame)
-    agreement.check_frames(legs, frame_legs, yaml_path)
-    return Mechanism(
+    mechanism = Mechanism(
         name=urdf.name,
         yaml_path=yaml_path,
         urdf_path=urdf.path,
@@ -82,61 +98,26 @@ def _assemble(file: MechanismFile, urdf: Urdf, yaml_path: Path) -> Mechanism:
         platform=block.platform,
         platform_joint=block.platform_joint,
         legs=with_cylinders(legs, urdf, bodies, chains),
-        frame_legs=frame_legs,
-        spatial=True,
+        frame_legs=tuple(list(block.legs).index(name) for name in block.base_frame),
+        spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
         home_configuration=chain.neutral(),
         chain=chain,
         urdf=urdf,
         leg_chains=tuple(chains),
+        base_normal=None if normals is None else _in_link(ends[0], normals[0]),
+        platform_normal=None if normals is None else _in_link(ends[1], normals[1]),
     )
+    agreement.check_frames(mechanism)
+    return mechanism
 
 
-def _leg(
-    name: str,
-    chain: LegChain,
-    urdf: Urdf,
-    file: MechanismFile,
-    bodies: Bodies,
-    home: RigidTransform | None,
-) -> Leg:
-    """Return a leg in the links of base and platform."""
-    T_base, T_platform = (
-        bodies.T_body_link[link] for link in (file.legcal.base, file.legcal.platform)
-    )
-    A_base = np.asarray(T_base.inv().apply(chain.base.centre_near))
-    B_platform = np.asarray(T_platform.inv().apply(chain.platform.centre_far))
-    slider = None if chain.slider is None else chain.slider.connection.joint
-    sign, travel = 1, (0.0, 0.0)
-    kind = LegKind.CONSTANT
-    if slider is not None:
-        travel = urdf.joints[slider].limits or travel
-        length = None if home is None else float(np.linalg.norm(home.apply(B_platform) - A_base))
-        sign = _sign(chain.reach, travel, length)
-        kind = LegKind.ACTUATED if slider in file.name_mot else LegKind.PASSIVE
-    return Leg(
-        name=name,
-        base_joint=chain.base.letter,
-        platform_joint=chain.platform.letter,
-        kind=kind,
-        prismatic=slider,
-        A_base=A_base,
-        B_platform=B_platform,
-        q0=sign * chain.reach,
-        sign=sign,
-        travel=travel,
-        cylinders=(),
-    )
+def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
+    """Return the limits of a leg's slider [m], zero for a rod."""
+    limits = None if chain.motor is None else urdf.joints[chain.motor].limits
+    return (0.0, 0.0) if limits is None else limits
 
 
-def _sign(reach: float, travel: tuple[float, float], length: float | None) -> int:
-    """Return whether a leg grows (+1) or shrinks (-1) with its joint value.
-
-    B stands at reach + q along the slider. Its length at home tells on which side of A, where
-    only one of the two is within the travel; else the middle of the travel does.
-    """
-    if length is not None:
-        inside = [travel[0] <= s * length - reach <= travel[1] for s in (1, -1)]
-        if inside[0] != inside[1]:
-            return 1 if inside[0] else -1
-    return 1 if reach + 0.5 * (travel[0] + travel[1]) > 0.0 else -1
+def _in_link(T_body_link: RigidTransform, direction: Array) -> Array:
+    """Return a direction of a body in one of its links."""
+    return np.asarray(T_body_link.rotation.inv().apply(direction))

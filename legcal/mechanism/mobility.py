@@ -1,21 +1,30 @@
-"""How many freedoms the closed mechanism has, idle spins of legs not counted."""
+"""How many freedoms the platform of the closed mechanism has, idle spins of legs not counted.
+
+The closures leave a null space of joint rates; the mobility is the rank of the twist that it
+gives the platform. What is left of the null space moves no platform: legs with an S joint at
+both ends spin about themselves. Overconstrained closures (a planar mechanism welded in space)
+need no care: dependent rows do not change a null space.
+"""
 
 from collections.abc import Iterator
 
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.mechanism.demands import leg_scale
 from legcal.mechanism.model import Mechanism
 
 RANK_TOLERANCE = 1e-7  # of the largest singular value, lengths and angles made comparable
 STEP = 0.05  # [rad], and of a leg length
+CLOSED = 1e-10
+CONFIGURATIONS = 3
 
 
 def mobility(mechanism: Mechanism) -> int:
-    """Return the freedoms of the platform: joint freedoms less the rank of the closures.
+    """Return the rank of the platform's twist over the null space of the closures.
 
-    The rank is taken at closed configurations near home too, because a symmetric pose may be
-    singular. Legs with a sphere at both ends spin about themselves: that is no freedom.
+    It is taken where the closures have their largest rank, at closed configurations near home
+    too, because a symmetric pose may be singular.
 
     Parameters
     ----------
@@ -27,8 +36,18 @@ def mobility(mechanism: Mechanism) -> int:
     int
         The mobility; the motors determine the pose where it equals their number.
     """
-    rank = max(_rank(mechanism, c) for c in generic_configurations(mechanism, 3))
-    return mechanism.chain.nv - rank - idle_spins(mechanism)
+    found = [freedoms(mechanism, c) for c in generic_configurations(mechanism, CONFIGURATIONS)]
+    return min(found)[1]
+
+
+def freedoms(mechanism: Mechanism, configuration: Array) -> tuple[int, int]:
+    """Return the freedoms of all joints and of the platform alone at a closed configuration."""
+    scale = leg_scale(mechanism, mechanism.home)
+    null_space = _null_space(mechanism, configuration, scale)
+    twist = mechanism.chain.twist(mechanism.base, mechanism.platform) @ null_space
+    twist[:3] /= scale
+    values = np.linalg.svd(twist, compute_uv=False)
+    return null_space.shape[1], int(np.sum(values > RANK_TOLERANCE))
 
 
 def idle_spins(mechanism: Mechanism) -> int:
@@ -37,50 +56,61 @@ def idle_spins(mechanism: Mechanism) -> int:
 
 
 def generic_configurations(mechanism: Mechanism, count: int) -> Iterator[Array]:
-    """Yield home, then closed configurations a little way off in seeded directions."""
+    """Yield home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
     chain = mechanism.chain
     yield mechanism.home_configuration
     rng = np.random.default_rng(1965)
-    scale = _column_scale(mechanism)
+    scale = _column_scale(mechanism, leg_scale(mechanism, mechanism.home))
+    jacobian = chain.linearize(mechanism.home_configuration)[1] * scale
+    inverse = np.linalg.pinv(jacobian, rcond=RANK_TOLERANCE)
     for _ in range(count - 1):
-        configuration = mechanism.home_configuration
-        _, jacobian = chain.linearize(configuration)
         direction = rng.normal(size=chain.nv)
-        direction -= np.linalg.pinv(jacobian * scale, rcond=RANK_TOLERANCE) @ (
-            jacobian @ (scale * direction)
-        )
-        step = STEP * scale * direction / np.abs(direction).max()
-        configuration = chain.integrate(configuration, step)
-        for _ in range(12):
-            residual, jacobian = chain.linearize(configuration)
-            if np.abs(residual).max() < 1e-12:
-                break
-            change = np.linalg.lstsq(jacobian * scale, residual, rcond=RANK_TOLERANCE)[0]
-            configuration = chain.integrate(configuration, -scale * change)
-        yield configuration
+        direction -= inverse @ (jacobian @ direction)
+        size = float(np.abs(direction).max())
+        if size < RANK_TOLERANCE:
+            return  # nothing moves
+        step = STEP * scale * direction / size
+        configuration = project(mechanism, chain.integrate(mechanism.home_configuration, step))
+        if configuration is not None:
+            yield configuration
 
 
-def _rank(mechanism: Mechanism, configuration: Array) -> int:
-    """Return the rank of the closures, with lengths in leg lengths."""
-    _, jacobian = mechanism.chain.linearize(configuration)
-    scaled = jacobian * _column_scale(mechanism)
+def project(mechanism: Mechanism, configuration: Array) -> Array | None:
+    """Return the closed configuration nearest to one that is almost closed, None if none is.
+
+    Gauss-Newton steps of least norm, lengths counted in leg lengths.
+    """
+    chain = mechanism.chain
+    scale = _column_scale(mechanism, leg_scale(mechanism, mechanism.home))
+    worst = np.inf
+    for _ in range(15):
+        residual, jacobian = chain.linearize(configuration)
+        if np.abs(residual).max(initial=0.0) < 1e-14 or np.abs(residual).max() > 2.0 * worst:
+            break
+        worst = float(np.abs(residual).max())
+        change = np.linalg.lstsq(jacobian * scale, residual, rcond=RANK_TOLERANCE)[0]
+        configuration = chain.integrate(configuration, -scale * change)
+        if worst < 1e-12:
+            break
+    residual = chain.residual(configuration)
+    return configuration if np.abs(residual).max(initial=0.0) < CLOSED else None
+
+
+def _null_space(mechanism: Mechanism, configuration: Array, scale: float) -> Array:
+    """Return what tangent steps keep all loops closed, orthonormal with lengths in leg lengths."""
+    columns = _column_scale(mechanism, scale)
+    jacobian = mechanism.chain.linearize(configuration)[1] * columns
     row = 0
     for closure in mechanism.chain.closures:
-        if closure.kind == "6d":
-            scaled[row + 3 : row + 6] *= leg_scale(mechanism)
+        jacobian[row : row + 3] /= scale
         row += closure.rows
-    values = np.linalg.svd(scaled, compute_uv=False)
-    return int(np.sum(values > RANK_TOLERANCE * values[0]))
+    _, values, right = np.linalg.svd(jacobian)
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0])) if len(values) else 0
+    return np.asarray(columns[:, None] * right[rank:].T)
 
 
-def _column_scale(mechanism: Mechanism) -> Array:
+def _column_scale(mechanism: Mechanism, scale: float) -> Array:
     """Return what turns tangent steps without a unit into [m] and [rad]."""
-    scale = np.full(mechanism.chain.nv, leg_scale(mechanism))
-    scale[mechanism.chain.rotation_columns()] = 1.0
-    return scale
-
-
-def leg_scale(mechanism: Mechanism) -> float:
-    """Return the mean length of the legs at home [m]."""
-    B = mechanism.home.apply(mechanism.B_platform)
-    return float(np.linalg.norm(B - mechanism.A_base, axis=1).mean())
+    columns = np.full(mechanism.chain.nv, scale)
+    columns[mechanism.chain.rotation_columns()] = 1.0
+    return columns
