@@ -203,7 +203,7 @@ def test_a_slider_that_misses_the_joint_centre_is_refused_with_the_distance(
 def test_axes_that_do_not_meet_are_no_universal_joint(tmp_path: Path) -> None:
     change = {r'(child link="leg3_a2_link"/><origin xyz=")0.0 0.0 0.0': r"\g<1>0.0 0.0 0.002"}
     message = _refused(tmp_path, OutOfClass, change)
-    assert "'leg3_a2' and 'leg3_a1' miss each other by 2 mm" in message
+    assert "'leg3_a1' and 'leg3_a2' miss each other by 2 mm" in message
 
 
 def test_axes_that_are_not_perpendicular_are_no_universal_joint(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def normal_basis(u: Array) -> Array:
     (..., 2, 3) array
         e1 and e2, with e1 x e2 = u.
     """
-    axis = np.eye(3)[np.argmin(np.abs(u), axis=-1)]
+    axis = np.eye(3)[np.argmin(np.round(np.abs(u), 9), axis=-1)]  # ties are not left to rounding
     e1 = axis - u * np.sum(u * axis, axis=-1, keepdims=True)
     e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
     return np.stack([e1, np.cross(u, e1)], axis=-2)

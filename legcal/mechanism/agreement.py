@@ -1,20 +1,19 @@
 """Whether a mechanism YAML and its URDF agree: names, the class covered, legs, length law."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
-from legcal.geometry.frames import frame_on_points
 from legcal.mechanism.bodies import Bodies
 from legcal.mechanism.closing import leg_vectors, platform_pose, slider_columns
-from legcal.mechanism.leg import Leg, LegKind
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.mobility import generic_configurations
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.schema import MechanismFile
-from legcal.mechanism.topology import LegChain
 from legcal.mechanism.urdf import Urdf
 
 LENGTH_LAW = 1e-9  # [m]
@@ -64,40 +63,61 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
 
 
 def check_class(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    """Check that motors are sliders and that the virtual joint is one that is covered.
+    """Check that the virtual joint is one that is covered.
 
     Raises
     ------
     OutOfClass
         With one sentence for each joint that is not.
     """
-    problems = [
-        f"{path}: the motor '{name}' is outside the method: found a {urdf.joints[name].type} joint "
-        "in name_mot, needed prismatic joints, whose readings are leg lengths; this machine "
-        "cannot be calibrated this way."
-        for name in file.name_mot
-        if urdf.joints[name].type != "prismatic"
-    ]
+    problems = []
     virtual = file.legcal.platform_joint
-    if virtual is not None and urdf.joints[virtual].type != "floating":
-        problems.append(
-            f"{path}: legcal.platform_joint '{virtual}' is not covered: found a "
-            f"{urdf.joints[virtual].type} joint, needed a floating one (planar mechanisms are not "
-            "covered yet); correct it, or write null if a leg carries the platform."
-        )
+    if virtual is not None:
+        joint = urdf.joints[virtual]
+        if joint.type not in ("floating", "planar"):
+            problems.append(
+                f"{path}: legcal.platform_joint '{virtual}' is not covered: found a {joint.type} "
+                "joint, needed a floating or planar one, which only says where the platform is; "
+                "correct it, or write null if a leg carries the platform."
+            )
+        elif joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
+            axis = ", ".join(f"{x:g}" for x in joint.axis)
+            problems.append(
+                f"{path}: legcal.platform_joint '{virtual}' is not covered: found a planar joint "
+                f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
+                "plane of its frame; turn its origin rpy instead."
+            )
     if file.joint_name or file.joint_type:
         problems.append(
             f"{path}: joint_name and joint_type are not covered: found {len(file.joint_name)} "
             "joints that stand for others, needed none; write these joints as revolutes, or cut "
             "the loop there."
         )
-    if len(file.legcal.base_frame) != 3:
-        problems.append(
-            f"{path}: legcal.base_frame is not covered: found {len(file.legcal.base_frame)} legs, "
-            "needed 3 for a mechanism in space; name three legs."
-        )
     if problems:
         raise OutOfClass(problems)
+
+
+def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
+    """Check that there are as many legs as define a frame.
+
+    Raises
+    ------
+    OutOfClass
+        If there are fewer.
+    """
+    n_d = n_frame_legs(spatial=spatial)
+    if len(chains) < n_d:
+        where = "in space" if spatial else "in a plane"
+        raise OutOfClass(
+            f"{path}: this mechanism is outside the method: found {len(chains)} "
+            f"{'leg' if len(chains) == 1 else 'legs'} {where}, needed at least {n_d}, whose joints "
+            "define the frames of base and platform; this machine cannot be calibrated this way."
+        )
+
+
+def n_frame_legs(*, spatial: bool) -> int:
+    """Return N_d, the number of legs whose joints define a frame."""
+    return 3 if spatial else 2
 
 
 def legs_in_order(
@@ -110,7 +130,7 @@ def legs_in_order(
     ModelError
         If a name means no leg, or two mean the same, or a leg has none.
     OutOfClass
-        If a leg has other joints than S or U with an S, or a motor is on no leg.
+        If a motor is not the slider of a leg.
     """
     problems, ordered = [], list[LegChain]()
     owner: dict[int, str] = {}
@@ -138,29 +158,36 @@ def legs_in_order(
     ]
     if problems:
         raise ModelError(problems)
-    _check_types(file, ordered, path)
+    _check_motors(file, ordered, urdf, path)
     return ordered
 
 
-def check_frames(legs: Sequence[Leg], frame_legs: Iterable[int], path: Path) -> None:
+def check_frames(mechanism: Mechanism) -> None:
     """Check that the joint centres of the frame legs span a frame on base and platform.
 
     Raises
     ------
     ModelError
-        If they coincide or are collinear.
+        If they are too few or too many, coincide, or are collinear.
     """
+    path, n_d = mechanism.yaml_path, n_frame_legs(spatial=mechanism.spatial)
+    chosen = [mechanism.leg_names[j] for j in mechanism.frame_legs]
+    if len(chosen) != n_d:
+        where = "in space" if mechanism.spatial else "in a plane"
+        raise ModelError(
+            f"{path}: legcal.base_frame could not be used: found {len(chosen)} legs, needed {n_d} "
+            f"for a mechanism {where}; name {n_d} legs."
+        )
     problems = []
     for side in ("base", "platform"):
-        points = [leg.A_base if side == "base" else leg.B_platform for leg in legs]
-        chosen = [legs[j].name for j in frame_legs]
         try:
-            frame_on_points(np.array([points[j] for j in frame_legs]))
+            _ = mechanism.T_base_Rb if side == "base" else mechanism.T_platform_Re
         except ValueError:
+            needed = "three that span a plane" if n_d == 3 else "two that lie apart in the plane"
             problems.append(
                 f"{path}: legcal.base_frame could not be used: found {side} joints of "
-                f"{', '.join(chosen)} in one point or on one line, needed three that span a plane; "
-                "choose other legs."
+                f"{', '.join(chosen)} in one point or on one line, needed {needed}; choose other "
+                "legs."
             )
     if problems:
         raise ModelError(problems)
@@ -192,25 +219,23 @@ def check_length_law(mechanism: Mechanism) -> None:
                 )
 
 
-def _check_types(file: MechanismFile, chains: Sequence[LegChain], path: Path) -> None:
-    """Refuse legs whose joints are not covered, and motors that are not on them."""
-    problems = []
-    for name, chain in zip(file.legcal.legs, chains, strict=True):
-        letters = chain.base.letter + chain.platform.letter
-        if "S" not in letters or "R" in letters:
-            slider = "P" if chain.slider is not None else ""
-            problems.append(
-                f"{path}: leg '{name}' is not covered: found the type "
-                f"{letters[0]}{slider}{letters[1]}, needed an S joint at one end and an S or a U "
-                "at the other (SPU, UPS, SPS); legs with R joints or without S are not covered yet."
-            )
+def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
+    """Refuse motors that are not the slider of a leg."""
     sliders = {c.slider.connection.joint for c in chains if c.slider is not None}
-    problems += [
-        f"{path}: the motor '{motor}' is outside the method: found it on no leg, needed the slider "
-        "of a leg; remove it from name_mot."
-        for motor in file.name_mot
-        if motor not in sliders
-    ]
+    problems = []
+    for motor in file.name_mot:
+        kind = urdf.joints[motor].type
+        if kind != "prismatic":
+            problems.append(
+                f"{path}: the motor '{motor}' is outside the method: found a {kind} joint in "
+                "name_mot, needed prismatic joints, whose readings are leg lengths; this machine "
+                "cannot be calibrated this way."
+            )
+        elif motor not in sliders:
+            problems.append(
+                f"{path}: the motor '{motor}' is outside the method: found it on no leg, needed "
+                "the slider of a leg; remove it from name_mot."
+            )
     if problems:
         raise OutOfClass(problems)
 

@@ -13,8 +13,8 @@ from legcal.geometry.types import Array
 from legcal.mechanism.axes import Step
 from legcal.mechanism.bodies import Bodies
 from legcal.mechanism.leg import Cylinder, Leg
+from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.robot_xml import parse_robot
-from legcal.mechanism.topology import LegChain
 from legcal.mechanism.urdf import Urdf
 
 PARALLEL = 1e-6

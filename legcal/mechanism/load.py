@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import ModelError
 from legcal.geometry.types import Array
 from legcal.mechanism import agreement
-from legcal.mechanism.bodies import Bodies, rigid_bodies
+from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
 from legcal.mechanism.cylinders import with_cylinders
 from legcal.mechanism.home import closed_home

@@ -13,8 +13,8 @@ from legcal.geometry.frames import frame_on_points
 from legcal.geometry.types import Array
 from legcal.mechanism.chain import ClosedChain
 from legcal.mechanism.leg import Leg, LegKind
+from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.parameters import KinematicParameters
-from legcal.mechanism.topology import LegChain
 from legcal.mechanism.urdf import Urdf
 
 
@@ -52,6 +52,9 @@ class Mechanism:
         Freedoms of the platform; the motors determine its pose where it equals their number.
     diagnostics : tuple of str
         What the reader should know, one sentence each.
+    base_normal, platform_normal : (3,) array or None
+        The normal of the plane of motion in the links of base and platform, the same way up;
+        None in space.
     """
 
     name: str
@@ -70,6 +73,8 @@ class Mechanism:
     leg_chains: tuple[LegChain, ...]
     mobility: int = 0
     diagnostics: tuple[str, ...] = ()
+    base_normal: Array | None = None
+    platform_normal: Array | None = None
 
     @property
     def n_legs(self) -> int:
@@ -109,21 +114,22 @@ class Mechanism:
     @cached_property
     def T_base_Rb(self) -> RigidTransform:
         """The frame on the base joint centres of the frame legs, in the base link."""
-        return frame_on_points(self.A_base[list(self.frame_legs)])
+        return frame_on_points(self.A_base[list(self.frame_legs)], self.base_normal)
 
     @cached_property
     def T_platform_Re(self) -> RigidTransform:
         """The frame on the platform joint centres of the frame legs, in the platform link."""
-        return frame_on_points(self.B_platform[list(self.frame_legs)])
+        return frame_on_points(self.B_platform[list(self.frame_legs)], self.platform_normal)
 
     @cached_property
     def parameters(self) -> KinematicParameters:
         """The kinematic parameters xi, in R_b and R_e [m]."""
         base = self.T_base_Rb.inv().apply(self.A_base)
         platform = self.T_platform_Re.inv().apply(self.B_platform)
+        n_d = len(self.frame_legs)
         for rank, leg in enumerate(self.frame_legs):  # zero by definition, not by rounding
-            base[leg, rank:] = 0.0
-            platform[leg, rank:] = 0.0
+            base[leg, rank:n_d] = 0.0
+            platform[leg, rank:n_d] = 0.0
         passive = [leg.kind is LegKind.PASSIVE for leg in self.legs]
         return KinematicParameters(base, platform, np.where(passive, np.nan, self.q0))
 
