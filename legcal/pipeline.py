@@ -181,7 +181,7 @@ class _Workpiece:
 
 def _workpiece(dataset: Dataset, run: Run, criteria: Criteria, *, use_cache: bool) -> _Workpiece:
     """Put a dataset into the order of work, and see which images are still to be searched."""
-    _refuse_rods(dataset.mechanism)
+    _refuse_other_legs(dataset.mechanism)
     names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, names)
     current = fingerprint(dataset, detection_settings())
@@ -198,14 +198,19 @@ def _workpiece(dataset: Dataset, run: Run, criteria: Criteria, *, use_cache: boo
     )
 
 
-def _refuse_rods(mechanism: Mechanism) -> None:
-    """Raise OutOfClass if a leg has a constant length."""
-    rods = [leg.name for leg in mechanism.legs if leg.kind is LegKind.CONSTANT]
-    if rods:
+def _refuse_other_legs(mechanism: Mechanism) -> None:
+    """Raise OutOfClass if a leg is not of the kind that the fit has equations for."""
+    others = [
+        f"{leg.name} ({leg.kind}, {leg.type})"
+        for leg in mechanism.legs
+        if leg.kind is LegKind.CONSTANT or "S" not in leg.type or "R" in leg.type
+    ]
+    if others:
         raise OutOfClass(
-            f"{mechanism.yaml_path}: the mechanism could not be calibrated: found legs of constant "
-            f"length ({', '.join(rods)}), needed legs with a slider; leave such machines to a "
-            "later version, which can write a calibrated length."
+            f"{mechanism.yaml_path}: the mechanism could not be calibrated: found the legs "
+            f"{', '.join(others)}, needed legs with a slider, an S joint at one end and an S or "
+            "a U at the other (SPU, UPS, SPS); this version identifies and moves such machines "
+            "and does not calibrate them yet."
         )
 
 

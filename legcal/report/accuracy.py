@@ -18,7 +18,7 @@ from legcal.geometry.types import Array
 from legcal.mechanism.kinematics import forward_kinematics, forward_kinematics_many
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parameters import parameter_names, to_vector
+from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 from legcal.mechanism.platform import platform_in_base, pose_differences
 
 N_RANDOM_POSES = 100
@@ -36,15 +36,17 @@ class Evaluation:
         Delta X of eq (20) at every pose [m].
     rotation : (n_poses,) array
         Delta E of eq (20), the angle of the rotation between both platforms [rad].
-    names : tuple of str
-        Names of the parameters that both models have.
+    names, units : tuple of str
+        Names of the parameters, and ``m`` or ``rad``.
     values, references : (n_parameters,) array
-        The parameters of the model and of the reference [m].
+        The parameters of the model and of the reference. Axes are turns of the reference's axis,
+        so that the reference has zero there.
     """
 
     displacement: Array
     rotation: Array
     names: tuple[str, ...]
+    units: tuple[str, ...]
     values: Array
     references: Array
 
@@ -114,16 +116,15 @@ def evaluate(
         [platform_in_base(mechanism, T) for T in poses],
         [platform_in_base(truth, T) for T in reference_poses],
     )
-    names = parameter_names(mechanism.leg_names, mechanism.frame_legs)
-    values = to_vector(mechanism.parameters, mechanism.frame_legs)
-    references = to_vector(truth.parameters, truth.frame_legs)
-    both = np.isfinite(values) & np.isfinite(references)  # passive legs have no offset
+    parametrization = parametrization_of(truth, twists=True)
+    origin = geometries(truth)
     return Evaluation(
         displacement,
         rotation,
-        tuple(name for name, is_known in zip(names, both, strict=True) if is_known),
-        values[both],
-        references[both],
+        parametrization.names,
+        parametrization.units,
+        vector_of(parametrization, geometries(mechanism), origin),
+        vector_of(parametrization, origin, origin),
     )
 
 
@@ -144,6 +145,17 @@ def _in_the_order_of(reference: Mechanism, model: Mechanism) -> Mechanism:
         raise ModelError(
             f"The models could not be compared: their base_frame legs differ ({found}); "
             "coordinates mean the same only in the same frame; give both the same base_frame."
+        )
+    different = [
+        f"{one.name} is {one.kind} {one.type} and {other.kind} {other.type}"
+        for one, other in zip(model.legs, reference.legs, strict=True)
+        if (one.type, one.kind) != (other.type, other.kind)
+    ]
+    if different or model.spatial != reference.spatial:
+        found = "; ".join(different) or "one is spatial and the other planar"
+        raise ModelError(
+            f"The models could not be compared: {found}; both must describe the same machine; "
+            "check the two paths."
         )
     return reference
 

@@ -10,12 +10,19 @@ from legcal.report.accuracy import Evaluation
 
 def accuracy_table(evaluation: Evaluation) -> RenderableType:
     """Return the platform errors and the parameters of an evaluation, in mm and degrees."""
-    table = Table(title="Parameters [mm]", title_justify="left", box=None, pad_edge=False)
+    title = "Parameters [mm; axes and twists in deg]"
+    if "rad" not in evaluation.units:
+        title = "Parameters [mm]"
+    table = Table(title=Text(title), title_justify="left", box=None, pad_edge=False)
     table.add_column("parameter")
     for column in ("model", "reference", "difference"):
         table.add_column(column, justify="right")
+    scale = np.where([unit == "rad" for unit in evaluation.units], np.degrees(1.0), 1e3)
     for name, value, reference in zip(
-        evaluation.names, 1e3 * evaluation.values, 1e3 * evaluation.references, strict=True
+        evaluation.names,
+        scale * evaluation.values,
+        scale * evaluation.references,
+        strict=True,
     ):
         table.add_row(name, f"{value:.4f}", f"{reference:.4f}", f"{value - reference:+.4f}")
     return Group(Text(_headline(evaluation)), Text(), table)
