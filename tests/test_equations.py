@@ -7,68 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_legs import changed, leg_and_pose
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
-from legcal.geometry.types import Array
-from legcal.mechanism.equations import Demand, LegGeometry, linearize, twist_of
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.equations import Demand, linearize, twist_of
 
 FAST = settings(deadline=None, max_examples=20)
 SEEDS = st.integers(0, 2**32 - 1)
 TYPES = [f"{base}{platform}" for base, platform in product("RUS", ["R", "U", "S", ""])]
 STEP = 1e-6
-
-
-def leg_and_pose(joints: str, seed: int) -> tuple[LegGeometry, Array, Array]:
-    """Return a random leg that closes at a random pose."""
-    rng = np.random.default_rng(seed)
-    base, platform = joints[0], joints[1:]
-    R = Rotation.random(rng=rng).as_matrix()
-    t = rng.normal(size=3)
-    A, B = rng.normal(size=3), rng.normal(size=3)
-    u = R @ B + t - A
-    u /= np.linalg.norm(u)
-    a, b = Rotation.random(2, rng=rng).apply([0.0, 0.0, 1.0])
-    if base == "R":
-        a = np.cross(a, u) / np.linalg.norm(np.cross(a, u))
-    if platform == "R":
-        b = R.T @ (np.cross(b, u) / np.linalg.norm(np.cross(b, u)))
-    if platform == "":
-        b = R.T @ u
-    leg = LegGeometry(
-        base_joint=base,  # type: ignore[arg-type]
-        platform_joint=platform,  # type: ignore[arg-type]
-        kind=LegKind.ACTUATED,
-        A=A,
-        B=B,
-        q0=0.4,
-        base_axis=None if base == "S" else a,
-        platform_axis=None if platform == "S" else b,
-        twist=None if "S" in joints else 0.0,
-    )
-    if leg.twist is not None:
-        leg = replace(leg, twist=twist_of(leg, R, t))
-    return leg, R, t
-
-
-def turned(vector: Array | None, axis: Array | None, angles: Array) -> Array | None:
-    """Return an axis, or what is tied to it, turned about the basis normal to the axis."""
-    if vector is None or axis is None:
-        return None
-    return Rotation.from_rotvec(angles @ normal_basis(axis)).apply(vector)
-
-
-def changed(leg: LegGeometry, local: Array) -> LegGeometry:
-    return replace(
-        leg,
-        A=leg.A + local[:3],
-        B=leg.B + local[3:6],
-        q0=leg.q0 + local[6],
-        base_axis=turned(leg.base_axis, leg.base_axis, local[7:9]),
-        platform_axis=turned(leg.platform_axis, leg.platform_axis, local[9:11]),
-        twist=None if leg.twist is None else leg.twist + local[11],
-    )
 
 
 @pytest.mark.parametrize("joints", TYPES)
