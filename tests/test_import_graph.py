@@ -11,6 +11,7 @@ LAYERS = (
     "geometry",
     "files",
     "mechanism",
+    "authoring",
     "vision",
     "observations",
     "detection",

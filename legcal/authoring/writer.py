@@ -1,0 +1,258 @@
+"""The files of a mechanism in the recommended layout: a URDF tree, and a YAML that closes it.
+
+The platform hangs from the base by a virtual joint. A leg with an S is cut there (``3d``) and hangs
+from its other end; a leg without S hangs from the base and is welded to the platform (``6d``). All
+joints except the slider are at zero at home, with the z axis of every frame along the leg.
+"""
+
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import RigidTransform
+
+from legcal.authoring.assembled import Assembled, AssembledLeg
+from legcal.geometry.frames import motion_to_xyz_quat
+from legcal.geometry.types import Array
+from legcal.mechanism.leg import LegKind
+
+TURN = (-3.15, 3.15)  # [rad]
+VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
+_AXES = {"x": "1.0 0.0 0.0", "y": "0.0 1.0 0.0", "z": "0.0 0.0 1.0"}
+
+
+def urdf_text(machine: Assembled) -> str:
+    """Return the URDF of a machine: all its geometry."""
+    tree = _Tree()
+    tree.link("base")
+    tree.link("platform")
+    if machine.planar:
+        height = np.array([0.0, 0.0, machine.T_base_platform.translation[2]])
+        tree.joint("platform_free", "planar", "base", "platform", height, None, axis="z")
+    else:
+        tree.joint("platform_free", "floating", "base", "platform")
+    for leg in machine.legs:
+        _Branch(tree, machine, leg).write()
+    return tree.text(machine.name)
+
+
+def yaml_text(machine: Assembled) -> str:
+    """Return the mechanism YAML of a machine: closures, motors, legs and home."""
+    home = {"xyz": list(machine.home.xyz), "quat_xyzw": list(machine.home.quat_xyzw)}
+    document = {
+        "closed_loop": [[f"{leg.name}_end", f"{leg.name}_seat"] for leg in machine.legs],
+        "type": ["3d" if leg.type.has_sphere else "6d" for leg in machine.legs],
+        "name_mot": [
+            f"{leg.name}_prismatic" for leg in machine.legs if leg.kind is LegKind.ACTUATED
+        ],
+        "joint_name": [],
+        "joint_type": [],
+        "legcal": {
+            "version": 1,
+            "urdf": f"../urdf/{machine.name}.urdf",
+            "base": "base",
+            "platform": "platform",
+            "platform_joint": "platform_free",
+            "base_frame": list(machine.base_frame),
+            "home": home,
+            "legs": {leg.name: _joint_of(leg) for leg in machine.legs},
+        },
+    }
+    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=False))
+
+
+def _hangs_from_base(leg: AssembledLeg) -> bool:
+    """Say whether a leg hangs from the base, and not from the platform with its S at the base."""
+    return leg.type.base != "S" or leg.type.platform == "S"
+
+
+def _joint_of(leg: AssembledLeg) -> str:
+    """Return the joint that names a leg in the YAML."""
+    if leg.kind is LegKind.CONSTANT:
+        return f"{leg.name}_a1" if _hangs_from_base(leg) else f"{leg.name}_b1"
+    return f"{leg.name}_prismatic"
+
+
+class _Tree:
+    """Links and joints in the order in which they are told."""
+
+    def __init__(self) -> None:
+        self._links: dict[str, list[str]] = {}
+        self._joints: list[str] = []
+
+    def link(self, name: str) -> None:
+        self._links[name] = []
+
+    def cylinder(self, link: str, radius: float, start: float, end: float) -> None:
+        """Show a cylinder along the z axis of a link."""
+        self._links[link].append(
+            f'<visual><origin xyz="0 0 {0.5 * (start + end)!r}" rpy="0 0 0"/><geometry>'
+            f'<cylinder radius="{radius!r}" length="{abs(end - start)!r}"/></geometry></visual>'
+        )
+
+    def joint(
+        self,
+        name: str,
+        kind: str,
+        parent: str,
+        child: str,
+        xyz: Array | None = None,
+        rotation: Array | None = None,
+        axis: str | None = None,
+        limits: tuple[float, float] | None = None,
+    ) -> None:
+        """Connect two links; without numbers their frames coincide."""
+        place = _numbers(np.zeros(3) if xyz is None else xyz)
+        angles = _numbers(np.zeros(3) if rotation is None else roll_pitch_yaw(rotation))
+        text = (
+            f'  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{place}" rpy="{angles}"/>'
+        )
+        if axis is not None:
+            text += f'<axis xyz="{_AXES[axis]}"/>'
+        if limits is not None:
+            lower, upper = (float(x) for x in limits)
+            text += f'<limit lower="{lower!r}" upper="{upper!r}" effort="1000" velocity="1"/>'
+        self._joints.append(text + "</joint>")
+
+    def text(self, name: str) -> str:
+        """Return the file."""
+        lines = ['<?xml version="1.0" encoding="utf-8"?>', f'<robot name="{name}">']
+        for link, shown in self._links.items():
+            inside = "".join(shown)
+            end = f">{inside}</link>" if shown else "/>"
+            lines.append(f'  <link name="{link}"{end}')
+        return "\n".join([*lines, *self._joints, "</robot>", ""])
+
+
+class _Branch:
+    """One leg, from the link that it hangs from to the frames that close its loop."""
+
+    def __init__(self, tree: _Tree, machine: Assembled, leg: AssembledLeg) -> None:
+        self._tree, self._leg = tree, leg
+        self._from_base = _hangs_from_base(leg)
+        self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
+        self._T = machine.T_base_platform
+        self._link = "base" if self._from_base else "platform"
+        self._along = np.zeros(3)  # where the next joint stands in the link before it
+
+    def write(self) -> None:
+        """Add the leg to the tree."""
+        leg = self._leg
+        if self._from_base:
+            R = self._near("a", leg.type.base, leg.u, leg.base_axis, leg.A_base)
+        else:
+            inverse = self._R_base_platform.T
+            axis = inverse @ leg.platform_axis
+            R = self._near("b", leg.type.platform, -inverse @ leg.u, axis, leg.B_platform)
+        self._half(near=True)
+        if leg.kind is LegKind.CONSTANT:
+            self._along = np.array([0.0, 0.0, leg.q0])
+        else:
+            far = f"{leg.name}_{'rod' if self._from_base else 'tube'}"
+            offset = np.array([0.0, 0.0, leg.q0])
+            self._to(f"{leg.name}_prismatic", "prismatic", far, offset, None, "z", leg.travel)
+            self._half(near=False)
+        if self._from_base and not leg.type.has_sphere:
+            R = self._far(R)
+        self._close(R)
+
+    def _near(self, side: str, letter: str, u: Array, axis: Array, at: Array) -> Array:
+        """Add the joint that a leg hangs from, and return the frame of the leg there."""
+        y = _unit(np.cross(u, axis))
+        along = np.column_stack([np.cross(y, u), y, u])
+        first = np.column_stack([axis, y, np.cross(axis, y)]) if letter == "U" else along
+        self._turn(f"{side}1", at, first, "x")
+        if letter == "U":
+            self._turn(f"{side}2", None, first.T @ along, "y")
+        if letter == "S":
+            self._turn(f"{side}2", None, None, "y")
+            self._turn(f"{side}3", None, None, "z")
+        return along
+
+    def _far(self, R: Array) -> Array:
+        """Add the joint at the platform of a leg without S, and return the frame after it."""
+        leg = self._leg
+        if leg.type.platform == "":
+            return R
+        y = _unit(np.cross(leg.u, leg.platform_axis))
+        along = np.column_stack([np.cross(y, leg.u), y, leg.u])
+        if leg.type.platform == "R":
+            self._turn("b1", self._along, R.T @ along, "x")
+            return along
+        last = np.column_stack([leg.platform_axis, y, np.cross(leg.platform_axis, y)])
+        self._turn("b2", self._along, R.T @ along, "y")
+        self._turn("b1", None, along.T @ last, "x")
+        return last
+
+    def _close(self, R: Array) -> None:
+        """Add the frames that coincide where the loop closes."""
+        leg, tree = self._leg, self._tree
+        end, seat = f"{leg.name}_end", f"{leg.name}_seat"
+        tree.link(end)
+        tree.link(seat)
+        tree.joint(f"{end}_frame", "fixed", self._link, end, self._along)
+        if not self._from_base:
+            tree.joint(f"{seat}_frame", "fixed", "base", seat, leg.A_base)
+        elif leg.type.has_sphere:
+            tree.joint(f"{seat}_frame", "fixed", "platform", seat, leg.B_platform)
+        else:
+            turned = self._R_base_platform.T @ R
+            tree.joint(f"{seat}_frame", "fixed", "platform", seat, leg.B_platform, turned)
+
+    def _turn(self, joint: str, at: Array | None, rotation: Array | None, axis: str) -> None:
+        """Add a revolute."""
+        name = f"{self._leg.name}_{joint}"
+        self._to(name, "revolute", f"{name}_link", at, rotation, axis, TURN)
+
+    def _to(
+        self,
+        joint: str,
+        kind: str,
+        child: str,
+        at: Array | None,
+        rotation: Array | None,
+        axis: str,
+        limits: tuple[float, float],
+    ) -> None:
+        """Add a joint and go on from its child."""
+        self._tree.link(child)
+        self._tree.joint(joint, kind, self._link, child, at, rotation, axis, limits)
+        self._link, self._along = child, np.zeros(3)
+
+    def _half(self, *, near: bool) -> None:
+        """Show the half of the leg that the present link carries."""
+        leg = self._leg
+        radius = leg.tube if near == self._from_base else leg.rod
+        if radius is None:
+            return
+        if leg.kind is LegKind.CONSTANT:
+            self._tree.cylinder(self._link, radius, 0.0, leg.q0)
+            return
+        length = VISIBLE * leg.shortest_shown
+        self._tree.cylinder(self._link, radius, 0.0, length if near else -length)
+
+
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """Return the angles of ``rpy``, (3,) [rad], exact also near a pitch of 90 deg."""
+    r = rotation
+    yaw = np.arctan2(r[1, 0], r[0, 0])
+    s, c = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+def home_entry(T: RigidTransform) -> dict[str, Any]:
+    """Return a pose as files write it, without negative zeros."""
+    return {key: [x + 0.0 for x in value] for key, value in motion_to_xyz_quat(T).items()}
+
+
+def _unit(vector: Array) -> Array:
+    """Return a vector of length one."""
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _numbers(values: Array) -> str:
+    """Return numbers so that they are read back exactly, rounding noise of zero as zero."""
+    return " ".join(repr(float(x) + 0.0 if abs(x) > 1e-15 else 0.0) for x in values)
