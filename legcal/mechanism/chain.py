@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
 from legcal.geometry.types import Array, IntArray
@@ -133,8 +133,9 @@ class ClosedChain:
 
     def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
         """Return T_base_frame between two frames at a configuration."""
-        R, t = self.placement(configuration, base, frame)
-        return RigidTransform.from_components(t, Rotation.from_quat(pin.Quaternion(R).coeffs()))
+        pin.forwardKinematics(self._model, self._data, configuration)
+        M = self._placement(base).actInv(self._placement(frame))
+        return RigidTransform.from_matrix(M.homogeneous)
 
     def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
         """Return residual and Jacobian of holding a frame at a pose, at the last linearisation.

@@ -56,13 +56,13 @@ class Demands:
         chosen = tuple(f for f, is_in in zip(self.found, rows, strict=True) if is_in)
         return Demands(chosen, self.values[rows], self.jacobian[rows], self.measured[rows])
 
-    def worst(self) -> str:
-        """Return the row that is furthest from met, with the amount."""
+    def worst(self, verb: str = "") -> str:
+        """Return the row that is furthest from met, with the amount: who (verb) how far how."""
         if not len(self.values):
             return "nothing is demanded"
         row = int(np.argmax(np.abs(self.values)))
         who, how = self.found[row]
-        return f"{who} {1e3 * abs(self.values[row]):.3g} mm {how}"
+        return " ".join(f"{who} {verb} {1e3 * abs(self.values[row]):.3g} mm {how}".split())
 
 
 def is_constrained(mechanism: Mechanism) -> bool:
@@ -140,7 +140,7 @@ def unmet(mechanism: Mechanism, T_base_platform: RigidTransform) -> str | None:
     if np.abs(here.values).max() <= _EXACT:
         return None
     home = np.abs(constraints_at(mechanism, mechanism.home).values).max()
-    return here.worst() if np.abs(here.values).max() > _EXACT + 10.0 * home else None
+    return here.worst("would be") if np.abs(here.values).max() > _EXACT + 10.0 * home else None
 
 
 def leg_scale(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:

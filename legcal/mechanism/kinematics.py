@@ -1,7 +1,9 @@
 """Forward and inverse kinematics of the closed chain, and its mobility (section 2).
 
 Forward kinematics holds the motors at their readings and closes all loops on Pinocchio's
-constraints, followed from home or from a given pose so that it stays in one assembly mode.
+constraints, followed from home or from a given pose so that it stays in one assembly mode. A
+:class:`Follower` keeps the closed configuration from one row of readings to the next: the
+cheapest way along a path.
 """
 
 import numpy as np
@@ -9,13 +11,16 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.closing import close_at, platform_pose, readings_at, slider_columns
+from legcal.mechanism.closing import close_near, platform_pose, readings_at, slider_columns
+from legcal.mechanism.demands import unmet
 from legcal.mechanism.following import follow
+from legcal.mechanism.home import settle
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
 
 __all__ = [
+    "Follower",
     "forward_kinematics",
     "forward_kinematics_many",
     "inverse_kinematics",
@@ -52,11 +57,71 @@ def forward_kinematics(
     UsageError
         If the readings are too few or not finite.
     """
-    readings = _readings(mechanism, np.asarray(q, dtype=np.float64)[None])[0]
-    configuration = mechanism.home_configuration
-    if start is not None:
-        configuration = close_at(mechanism, start, configuration)
-    return platform_pose(mechanism, follow(mechanism, configuration, readings))
+    return Follower(mechanism, start).move_to(q)
+
+
+class Follower:
+    """A closed configuration that is moved from readings to readings, each step from the last.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+    start : RigidTransform, optional
+        T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it.
+
+    Attributes
+    ----------
+    configuration : (nq,) array
+        The closed chain at the last readings.
+
+    Raises
+    ------
+    NotIdentifiable
+        If the motors do not determine the pose.
+    UsageError
+        If the legs do not allow the start, by more than 1 % of a leg length.
+    DidNotConverge
+        If the legs do not reach the start.
+    """
+
+    def __init__(self, mechanism: Mechanism, start: RigidTransform | None = None) -> None:
+        _check_determined(mechanism)
+        self._mechanism = mechanism
+        self.configuration = mechanism.home_configuration
+        if start is not None:
+            settled, problem = settle(mechanism, start)
+            if problem is not None:
+                raise UsageError(
+                    f"The pose could not be followed from its start: found {problem} there, needed "
+                    "a pose that the legs allow; correct the start."
+                )
+            self.configuration = close_near(mechanism, settled, self.configuration)
+
+    @property
+    def pose(self) -> RigidTransform:
+        """T_base_platform at the last readings."""
+        return platform_pose(self._mechanism, self.configuration)
+
+    def move_to(self, q: Array) -> RigidTransform:
+        """Return the platform pose at readings, followed from the last ones.
+
+        Parameters
+        ----------
+        q : (n_legs,) array
+            Readings [m]; those of legs without a motor are ignored and may be NaN.
+
+        Raises
+        ------
+        DidNotConverge
+            If no closed pose is reached without crossing a singularity; the configuration stays
+            where it was.
+        UsageError
+            If the readings are too few or not finite.
+        """
+        readings = _readings(self._mechanism, np.asarray(q, dtype=np.float64)[None])[0]
+        self.configuration = follow(self._mechanism, self.configuration, readings)
+        return self.pose
 
 
 def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransform]:
@@ -113,17 +178,17 @@ def inverse_kinematics(mechanism: Mechanism, T_base_platform: RigidTransform) ->
     Raises
     ------
     UsageError
-        If a leg of constant length does not reach the pose.
+        If the legs or the plane of motion do not allow the pose: a rod that is too short or too
+        long, a revolute axis that is not perpendicular to its leg, a leg that would be twisted.
     """
+    problem = unmet(mechanism, T_base_platform)
+    if problem is not None:
+        raise UsageError(
+            f"The platform cannot stand there: {problem}, needed a pose that every leg "
+            "allows; choose one that keeps it."
+        )
     q = readings_at(mechanism, T_base_platform)
-    for j, leg in enumerate(mechanism.legs):
-        if leg.kind is LegKind.CONSTANT:
-            if abs(q[j]) > 1e-9:
-                raise UsageError(
-                    f"The platform cannot stand there: leg '{leg.name}' would be {1e3 * q[j]:.4g} "
-                    "mm longer than it is, needed its constant length; choose a pose that keeps it."
-                )
-            q[j] = 0.0
+    q[[leg.kind is LegKind.CONSTANT for leg in mechanism.legs]] = 0.0
     return q
 
 
@@ -157,20 +222,26 @@ def _readings(mechanism: Mechanism, q: Array) -> Array:
             f"The pose could not be computed: found readings of shape {q.shape[1:]}, needed "
             f"({mechanism.n_legs},), one for each leg; pass them in the order of the legs."
         )
+    _check_determined(mechanism)
+    readings = q[:, list(mechanism.motors)]
+    legs = list(mechanism.motors)
+    lengths = mechanism.sign[legs] * readings + mechanism.q0[legs]
+    wrong = np.argwhere(~((lengths > 0.0) & np.isfinite(lengths)))
+    if len(wrong):
+        row, column = wrong[0]
+        raise UsageError(
+            f"The pose of row {row + 1} could not be computed: found the reading "
+            f"{readings[row, column]:g} of leg '{mechanism.legs[legs[column]].name}', needed a "
+            "finite number above a leg length of zero; correct the reading."
+        )
+    return readings
+
+
+def _check_determined(mechanism: Mechanism) -> None:
+    """Refuse a mechanism whose motors do not determine the pose."""
     if mechanism.mobility != len(mechanism.motors):
         raise NotIdentifiable(
             f"{mechanism.yaml_path}: the pose cannot be computed from readings: found mobility "
             f"{mechanism.mobility} and {len(mechanism.motors)} motors, needed as many motors as "
             "mobility; correct name_mot, or do not ask for poses of this mechanism."
         )
-    readings = q[:, list(mechanism.motors)]
-    for row, values in enumerate(readings):
-        for j, value in zip(mechanism.motors, values, strict=True):
-            leg = mechanism.legs[j]
-            if not np.isfinite(value) or leg.sign * value + leg.q0 <= 0.0:
-                raise UsageError(
-                    f"The pose of row {row + 1} could not be computed: found the reading {value:g} "
-                    f"of leg '{leg.name}', needed a finite number above a leg length of zero; "
-                    "correct the reading."
-                )
-    return readings
