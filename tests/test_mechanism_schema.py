@@ -90,11 +90,9 @@ def test_two_frame_legs_are_not_covered_yet(tmp_path: Path) -> None:
     assert "needed 3 for a mechanism in space" in _problems(tmp_path, text, OutOfClass)[0]
 
 
-def test_joints_that_stand_for_others_are_not_covered(tmp_path: Path) -> None:
+def test_joints_that_stand_for_others_need_a_type_each(tmp_path: Path) -> None:
     text = _with("joint_name: []", "joint_name: [leg1_b1]")
     assert "1 names and 0 entries" in _problems(tmp_path / "unequal", text)[0]
-    text = text.replace("joint_type: []", "joint_type: [SPHERICAL]")
-    assert "joint_name and joint_type" in _problems(tmp_path, text, OutOfClass)[0]
 
 
 def test_an_almost_unit_quaternion_is_normalised(tmp_path: Path) -> None:

@@ -1,12 +1,14 @@
-"""Finding and reading the files of a mechanism: a path, a URDF, or a shipped name."""
+"""Finding and reading the files of a mechanism: a path, a folder, or a shipped name."""
 
 import os
 from pathlib import Path
 
-from legcal.errors import DatasetError, ModelError, OutOfClass
+from legcal.errors import DatasetError, ModelError
 from legcal.files import schema
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+
+FOLDER_YAML = "robot.yaml"  # as Gepetto names it
 
 
 def shipped_folders() -> tuple[Path, Path]:
@@ -22,31 +24,34 @@ def shipped_names() -> list[str]:
     return sorted(path.stem for path in shipped_folders()[0].glob("*.yaml"))
 
 
-def find_yaml(model: str | Path) -> Path:
-    """Return the mechanism YAML of a path or of the name of a shipped model.
+def find_model(model: str | Path) -> Path:
+    """Return the file that describes a mechanism, of a path or of the name of a shipped model.
 
     Parameters
     ----------
     model : str or Path
-        A mechanism YAML, a URDF with its YAML beside it or in ``../models``, or a shipped name.
+        A mechanism YAML, a URDF, an MJCF file, a folder with ``robot.yaml``, or a shipped name.
+
+    Returns
+    -------
+    Path
+        A YAML, or another file whose format its content tells.
 
     Raises
     ------
     ModelError
         If there is no such file and no such shipped model.
-    OutOfClass
-        If it is a URDF without a YAML: a tree alone closes no loop.
     """
     path = Path(model)
     names = shipped_names()
     is_shipped = str(model) in names
     if os.path.isdir(path) and not is_shipped:
+        if (path / FOLDER_YAML).is_file():
+            return path / FOLDER_YAML
         raise ModelError(
-            f"{path}: the mechanism could not be read: found a folder, needed a YAML or a URDF "
-            "file; give the file."
+            f"{path}: the mechanism could not be read: found a folder without {FOLDER_YAML}, "
+            "needed a folder with it, or a YAML, URDF or MJCF file; give the file."
         )
-    if path.suffix.lower() in (".urdf", ".xml") and os.path.exists(path):
-        return _yaml_of_urdf(path)
     if os.path.exists(path) and not os.path.isdir(path):
         return path
     if is_shipped:
@@ -92,17 +97,10 @@ def read_file(path: Path, what: str) -> bytes:
         raise ModelError(error.problems) from error
 
 
-def _yaml_of_urdf(path: Path) -> Path:
-    """Return the YAML that closes the loops of a URDF."""
+def yaml_of_urdf(path: Path) -> Path | None:
+    """Return the YAML that closes the loops of a URDF, or None."""
     near = [path.with_suffix(".yaml"), _sibling(path, "models").with_suffix(".yaml")]
-    for candidate in near:
-        if candidate.is_file():
-            return candidate
-    raise OutOfClass(
-        f"{path}: this is not a parallel mechanism: found a URDF, which is a tree without closed "
-        f"loops, and no YAML that closes them; write {near[0]} with closed_loop, type, name_mot "
-        "and a legcal block."
-    )
+    return next((candidate for candidate in near if candidate.is_file()), None)
 
 
 def _sibling(path: Path, folder: str) -> Path:

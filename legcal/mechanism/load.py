@@ -43,6 +43,11 @@ def load_mechanism(model: str | Path) -> Mechanism:
     """
     source = read_source(model)
     yaml_path, file, urdf = source.path, source.file, source.urdf
+    if file.legcal is None:
+        raise ModelError(
+            f"{yaml_path}: legcal could not be read: found no such key, needed it; add "
+            "'legcal: ...' to the file."
+        )
     agreement.check_names(file, urdf, yaml_path)
     agreement.check_class(file, urdf, yaml_path)
     mechanism = _assemble(file, urdf, yaml_path)

@@ -47,7 +47,7 @@ class MechanismFile(BaseModel):
     name_mot: list[str]
     joint_name: list[str] = []
     joint_type: list[str] = []
-    legcal: LegcalBlock
+    legcal: LegcalBlock | None = None
 
 
 def read_mechanism_file(path: Path) -> MechanismFile:
@@ -110,6 +110,8 @@ def _contradictions(file: MechanismFile, path: Path) -> list[str]:
         for name in repeated
     ]
     block = file.legcal
+    if block is None:
+        return problems
     problems += [
         f"{path}: legcal.base_frame could not be used: found '{name}', which is not a leg; "
         f"{schema.closest(name, block.legs)}"

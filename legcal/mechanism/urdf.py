@@ -19,7 +19,7 @@ from legcal.mechanism.urdf_checks import Problems, check_numbers, check_tree, nu
 
 JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating", "planar")
-_IGNORED_LOOPS = ("loop_joint", "constraint")
+LOOP_TAGS = ("loop_joint", "constraint")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Urdf:
     path : Path
         The file.
     content : bytes
-        The file as it stands on disk.
+        The file as it stands on disk, or the URDF that was made of another format.
     name : str
         The robot's name.
     links : tuple of str
@@ -91,13 +91,15 @@ class Urdf:
         return self.content.decode("utf-8-sig")
 
 
-def read_urdf(path: Path) -> Urdf:
+def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
     """Return the tree of a URDF file.
 
     Parameters
     ----------
     path : Path
         The file.
+    travel_needed : bool
+        Whether a prismatic joint without limits is refused; else its limits are None.
 
     Raises
     ------
@@ -105,22 +107,53 @@ def read_urdf(path: Path) -> Urdf:
         If the file is missing or not XML, has a document type or entities, or if its links,
         joints or numbers do not describe one tree; one sentence a problem, with line numbers.
     """
-    content = read_file(path, "URDF")
+    return parse_urdf(path, read_file(path, "URDF"), travel_needed=travel_needed)
+
+
+def parse_urdf(path: Path, content: bytes, *, travel_needed: bool = True) -> Urdf:
+    """Return the tree of a URDF that was read before.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    content : bytes
+        What it holds.
+    travel_needed : bool
+        Whether a prismatic joint without limits is refused; else its limits are None.
+
+    Raises
+    ------
+    ModelError
+        As :func:`read_urdf`, of whose tests this has all but those of the file itself.
+    """
     robot = parse_robot(path, content)
     problems = Problems(path)
-    links = [e for e in robot if e.tag == "link"]
-    joints = [e for e in robot if e.tag == "joint"]
     for element in robot:
-        if element.tag in _IGNORED_LOOPS:
+        if element.tag in LOOP_TAGS:
             problems.add(
                 element,
-                f"closes a loop with <{element.tag}>, which is not read",
+                f"closes a loop with <{element.tag}>, which is not read beside a mechanism YAML",
                 "write the pair of frames in closed_loop of the mechanism YAML",
             )
+    return checked_tree(robot, path, content, problems, travel_needed=travel_needed)
+
+
+def checked_tree(
+    robot: etree._Element,
+    path: Path,
+    content: bytes,
+    problems: Problems,
+    *,
+    travel_needed: bool = True,
+) -> Urdf:
+    """Return the tree of a ``<robot>``, whatever else it holds; see :func:`parse_urdf`."""
+    links = [e for e in robot if e.tag == "link"]
+    joints = [e for e in robot if e.tag == "joint"]
     for element in (*links, *joints):
         check_numbers(element, problems)
     root = check_tree(links, joints, problems)
-    found = {j.name: j for e in joints if (j := _joint(e, problems)) is not None}
+    found = {j.name: j for e in joints if (j := _joint(e, problems, travel_needed)) is not None}
     problems.raise_if_any()
     return Urdf(
         path=path,
@@ -133,7 +166,7 @@ def read_urdf(path: Path) -> Urdf:
     )
 
 
-def _joint(element: etree._Element, problems: Problems) -> UrdfJoint | None:
+def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> UrdfJoint | None:
     """Return a joint, or None with its problems noted."""
     n_before = len(problems)
     for tag in ("parent", "child", "origin", "axis", "limit"):
@@ -151,7 +184,7 @@ def _joint(element: etree._Element, problems: Problems) -> UrdfJoint | None:
             element, "has <mimic>, which is not followed", "close the loop in the mechanism YAML"
         )
     axis = _axis(element, kind, problems)
-    limits = _limits(element, kind, problems)
+    limits = _limits(element, kind, problems, travel_needed)
     if len(problems) > n_before:
         return None
     origin = element.find("origin")
@@ -197,11 +230,16 @@ def _axis(element: etree._Element, kind: str, problems: Problems) -> Array:
     return axis / max(norm, 1e-9)
 
 
-def _limits(element: etree._Element, kind: str, problems: Problems) -> tuple[float, float] | None:
+def _limits(
+    element: etree._Element, kind: str, problems: Problems, travel_needed: bool
+) -> tuple[float, float] | None:
     """Return the limits of a revolute or prismatic joint."""
     if kind not in ("revolute", "prismatic"):
         return None
     limit = element.find("limit")
+    bounds_written = limit is not None and not {"lower", "upper"}.isdisjoint(limit.keys())
+    if kind == "prismatic" and not travel_needed and not bounds_written:
+        return None
     needed = ("lower", "upper", "effort", "velocity") if kind == "prismatic" else (
         "effort", "velocity")  # fmt: skip
     missing = [key for key in needed if limit is None or limit.get(key) is None]

@@ -1,0 +1,113 @@
+"""A URDF written from links and joints, for formats that are not URDF."""
+
+from dataclasses import dataclass, field
+from math import pi
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry.types import Array
+
+FULL_TURN = 2.0 * pi
+EYE = RigidTransform.identity()
+
+
+@dataclass(frozen=True, eq=False)
+class TextCylinder:
+    """A visual cylinder on a link: its pose there, radius and length [m]."""
+
+    T_link_cylinder: RigidTransform
+    radius: float
+    length: float
+
+
+@dataclass
+class TreeText:
+    """The lines of a URDF while it is put together.
+
+    Attributes
+    ----------
+    links, joints : dict of str to str
+        The line of every link and joint, by name.
+    """
+
+    links: dict[str, str] = field(default_factory=dict)
+    joints: dict[str, str] = field(default_factory=dict)
+
+    def unused(self, name: str) -> str:
+        """Return a name that no link and no joint has yet: the given one, or it with a number."""
+        taken = self.links.keys() | self.joints.keys()
+        number, found = 1, name
+        while found in taken:
+            number += 1
+            found = f"{name}_{number}"
+        return found
+
+    def link(self, name: str, cylinders: tuple[TextCylinder, ...] = ()) -> None:
+        """Add a link with its visible cylinders."""
+        visuals = "".join(
+            f"<visual>{origin(c.T_link_cylinder)}<geometry>"
+            f'<cylinder radius="{c.radius!r}" length="{c.length!r}"/></geometry></visual>'
+            for c in cylinders
+        )
+        inside = f">{visuals}</link>" if visuals else "/>"
+        self.links[name] = f"  <link name={quoteattr(name)}{inside}"
+
+    def joint(
+        self,
+        name: str,
+        kind: str,
+        parent: str,
+        child: str,
+        T_parent_origin: RigidTransform = EYE,
+        axis: Array | None = None,
+        limits: tuple[float, float] = (-FULL_TURN, FULL_TURN),
+    ) -> None:
+        """Add a joint; ``axis`` and ``limits`` [rad] or [m] are those of a moving one."""
+        moving = ""
+        if axis is not None:
+            moving = f'<axis xyz="{_numbers(axis)}"/>' + limit(*limits)
+        self.joints[name] = (
+            f'  <joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
+            f"<child link={quoteattr(child)}/>{origin(T_parent_origin)}{moving}</joint>"
+        )
+
+    def body(self) -> str:
+        """Return the lines of all links and joints."""
+        return "\n".join([*self.links.values(), *self.joints.values()])
+
+    def robot(self, name: str) -> bytes:
+        """Return the whole URDF."""
+        head = f'<?xml version="1.0" encoding="utf-8"?>\n<robot name={quoteattr(name)}>\n'
+        return f"{head}{self.body()}\n</robot>\n".encode()
+
+
+def origin(T_parent_origin: RigidTransform) -> str:
+    """Return the ``<origin>`` of a rigid motion [m, rad]."""
+    rpy = roll_pitch_yaw(T_parent_origin.rotation.as_matrix())
+    return f'<origin xyz="{_numbers(T_parent_origin.translation)}" rpy="{_numbers(rpy)}"/>'
+
+
+def limit(lower: float, upper: float) -> str:
+    """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
+    return f'<limit lower="{lower!r}" upper="{upper!r}" effort="1000" velocity="1"/>'
+
+
+def roll_pitch_yaw(matrix: Array) -> Array:
+    """Return the angles of a rotation about fixed x, y, z, (3,) [rad], to rounding everywhere.
+
+    Near a pitch of 90 degrees the yaw is badly determined: whatever it comes out as, the roll
+    makes up for it.
+    """
+    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
+    y_column = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    z_column = np.array([np.sin(pitch) * np.cos(yaw), np.sin(pitch) * np.sin(yaw), np.cos(pitch)])
+    roll = np.arctan2(matrix[:, 1] @ z_column, matrix[:, 1] @ y_column)
+    return np.array([roll, pitch, yaw])
+
+
+def _numbers(values: Array) -> str:
+    """Return numbers with all their digits."""
+    return " ".join(repr(float(x) + 0.0) for x in values)
