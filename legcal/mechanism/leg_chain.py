@@ -239,25 +239,35 @@ def _crossing(axis: Axis, u: Array, point: Array) -> Array:
 def _rod(zero: _Zero) -> tuple[int, _Ends]:
     """Return how many joints of a leg without slider are at the base, and its ends.
 
-    A revolute along the rod passes through both centres: the first split that makes sense counts.
+    A revolute along the rod passes through both centres, and may belong to either joint: the one
+    that its origin is nearer to.
     """
+    found: list[tuple[float, int, _Ends]] = []
     problems: dict[int, OutOfClass] = {}
-    for n_lower in range(len(zero.steps) - 1, 0, -1):
+    for n_lower in range(1, len(zero.steps)):
         try:
-            return n_lower, _rod_ends(zero, n_lower)
+            ends = _rod_ends(zero, n_lower)
         except OutOfClass as error:
             problems[n_lower] = error
+            continue
+        lower, upper = zero.axes[:n_lower], zero.axes[n_lower:]
+        away = [np.linalg.norm(axis.point - ends.A) for axis in lower]
+        away += [np.linalg.norm(axis.point - ends.B) for axis in upper]
+        found.append((float(sum(away)), n_lower, ends))
+    if found:
+        _, n_lower, ends = min(found, key=lambda split: split[:2])
+        return n_lower, ends
     places = _places(zero.axes)
     if len(places) == 2:
         raise problems[len(places[0])]
-    found = (
+    what = (
         f"no slider and {len(places)} joints in different places, so that the rod hangs on a "
         "moving arm and the joint at A moves"
         if len(places) > 2
         else "no slider and all joints in one place"
     )
     raise OutOfClass(
-        f"the leg of joint '{zero.leg}' is outside the method: found {found}, needed a joint whose "
+        f"the leg of joint '{zero.leg}' is outside the method: found {what}, needed a joint whose "
         "centre is fixed in the base, then a slider or a rod of constant length, and a joint whose "
         "centre is fixed in the platform; this machine cannot be calibrated this way."
     )

@@ -1,0 +1,345 @@
+"""Any machine of the class, written as URDF and YAML in any spanning tree, for tests."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+
+EYE = RigidTransform.identity()
+PASSED = 0.05  # [m] by which every slider is out at home
+
+
+@dataclass(frozen=True, eq=False)
+class LegSpec:
+    """A leg as drawn at home: joints, centres in the base link, and the axes there.
+
+    ``base_axis`` and ``platform_axis`` are the axis of R and the outer one of U; a U beside an S
+    need not have one.
+    """
+
+    type: str  # base joint and platform joint, "U" alone if fixed to the platform
+    A: Array
+    B_home: Array
+    kind: str = "actuated"
+    base_axis: Array | None = None
+    platform_axis: Array | None = None
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        return self.type[0], self.type[1:]
+
+    @property
+    def u(self) -> Array:
+        between = self.B_home - self.A
+        return np.asarray(between / np.linalg.norm(between))
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """A machine at home."""
+
+    legs: tuple[LegSpec, ...]
+    home: RigidTransform
+    frame_legs: tuple[int, ...] = (0, 1, 2)
+    normal: Array | None = None
+
+
+@dataclass(frozen=True)
+class LegLayout:
+    """How one leg is written.
+
+    ``cut``: ``far`` (3d where the far joint is an S and ``sphere``), ``mid`` or ``slider``
+    (welded behind or before the slider), ``carry`` (the leg carries the platform, uncut).
+    """
+
+    hung: str = "base"
+    cut: str = "far"
+    sphere: bool = True
+    flip_slider: bool = False
+    flip_axes: bool = False
+    slid: float = 0.0
+    mount: bool = False
+    spin: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a machine is written: one entry for all legs, or one for each."""
+
+    legs: tuple[LegLayout, ...] = (LegLayout(),)
+    virtual: str | None = "floating"
+    home: bool = True
+
+    def of(self, j: int) -> LegLayout:
+        return self.legs[j % len(self.legs)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """A joint of a leg at zero: type, a point of its axis, and the axis, in the base link."""
+
+    name: str
+    type: str
+    point: Array
+    axis: Array
+
+
+@dataclass
+class _Text:
+    links: list[str] = field(default_factory=list)
+    joints: list[str] = field(default_factory=list)
+
+    def link(self, name: str, visual: str = "") -> None:
+        self.links.append(f'  <link name="{name}">{visual}</link>')
+
+    def joint(
+        self, name: str, kind: str, parent: str, child: str, T: RigidTransform, moving: str = ""
+    ) -> None:
+        self.joints.append(
+            f'  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f"{_origin(T)}{moving}</joint>"
+        )
+
+
+def _numbers(values: Sequence[float] | Array) -> str:
+    return " ".join(repr(float(x)) for x in values)
+
+
+def _origin(T: RigidTransform) -> str:
+    rpy = T.rotation.as_euler("xyz")
+    return f'<origin xyz="{_numbers(T.translation)}" rpy="{_numbers(rpy)}"/>'
+
+
+def write_machine(folder: Path, machine: Machine, layout: Layout, name: str = "machine") -> Path:
+    """Write a machine in a layout and return its YAML."""
+    text = _Text()
+    text.link("base")
+    text.link("platform")
+    carried = any(layout.of(j).cut == "carry" for j in range(len(machine.legs)))
+    virtual = None if carried else layout.virtual
+    if virtual is not None:
+        T = EYE
+        if virtual == "planar" and machine.normal is not None:
+            T = RigidTransform.from_rotation(_toward(machine.normal))
+        text.joint("platform_free", virtual, "base", "platform", T, '<axis xyz="0 0 1"/>')
+    loops: list[list[str]] = []
+    kinds: list[str] = []
+    for j, leg in enumerate(machine.legs):
+        written = _Leg(text, f"leg{j + 1}", leg, layout.of(j), machine.home).write()
+        if written is not None:
+            loops.append(written[1:])
+            kinds.append(written[0])
+    names = [f"leg{j + 1}" for j in range(len(machine.legs))]
+    has_slider = [leg.kind != "constant" for leg in machine.legs]
+    block = {
+        "version": 1,
+        "base": "base",
+        "platform": "platform",
+        "platform_joint": None if virtual is None else "platform_free",
+        "base_frame": [names[j] for j in machine.frame_legs],
+        "legs": {
+            n: f"{n}_{'slider' if s else 'a1'}" for n, s in zip(names, has_slider, strict=True)
+        },
+    }
+    if layout.home:
+        block["home"] = {
+            "xyz": [float(x) for x in machine.home.translation],
+            "quat_xyzw": [float(x) for x in machine.home.rotation.as_quat()],
+        }
+    document = {
+        "closed_loop": loops,
+        "type": kinds,
+        "name_mot": [f"{n}_slider" for n, leg in zip(names, machine.legs, strict=True)
+                     if leg.kind == "actuated"],
+        "legcal": block,
+    }  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ['<?xml version="1.0"?>', f'<robot name="{name}">', *text.links, *text.joints]
+    (folder / f"{name}.urdf").write_text("\n".join([*lines, "</robot>", ""]))
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    return path
+
+
+class _Leg:
+    """One leg on its way into the text."""
+
+    def __init__(
+        self, text: _Text, name: str, leg: LegSpec, layout: LegLayout, home: RigidTransform
+    ) -> None:
+        self.text, self.name, self.leg, self.layout = text, name, leg, layout
+        self.rng = np.random.default_rng(1000 + layout.seed)
+        u = leg.u
+        out = 0.0 if leg.kind == "constant" else PASSED
+        self.B = leg.B_home - out * u
+        back = RigidTransform.from_translation(-out * u)
+        self.roots = {"base": EYE, "platform": back * home}
+        base, platform = leg.ends
+        lower = self._group("a", base, leg.A, leg.base_axis)
+        upper = self._group("b", platform, self.B, leg.platform_axis)[::-1]
+        if layout.spin and "S" in leg.type:
+            place = self.B - 0.1 * u if platform == "S" else leg.A + 0.1 * u
+            spin = _Joint(f"{name}_spin", "revolute", place, u)
+            lower, upper = (lower, [spin, *upper]) if platform == "S" else ([*lower, spin], upper)
+        slider = [] if leg.kind == "constant" else [_Joint(f"{name}_slider", "prismatic", leg.A, u)]
+        self.joints = [*lower, *slider, *upper]
+        self.n_lower, self.n_upper = len(lower), len(upper)
+        self.far_axes = 3 if leg.ends[layout.hung == "base"] == "S" else 0
+
+    def _group(self, end: str, letter: str, centre: Array, outer: Array | None) -> list[_Joint]:
+        """Return the revolutes of a joint, from the one fixed in base or platform inwards."""
+        if outer is None:
+            outer = self.rng.normal(size=3)
+        outer = outer / np.linalg.norm(outer)
+        inner = np.cross(outer, self.leg.u if "S" not in self.leg.type else self.rng.normal(size=3))
+        inner = inner / np.linalg.norm(inner)
+        axes = {"": [], "R": [outer], "U": [outer, inner], "S": [outer, inner, self.leg.u]}[letter]
+        if letter == "S" and self.layout.flip_axes:
+            axes = [outer, inner, np.cross(outer, inner)]
+        return [
+            _Joint(f"{self.name}_{end}{i}", "revolute", centre, axis)
+            for i, axis in enumerate(axes, start=1)
+        ]
+
+    def write(self) -> list[str] | None:
+        """Write the leg and return type and frames of its closure, None if it carries."""
+        layout, n = self.layout, len(self.joints)
+        near, far = ("base", "platform") if layout.hung == "base" else ("platform", "base")
+        if layout.cut in ("mid", "slider"):
+            at = self.n_lower + (layout.cut == "mid" and self.leg.kind != "constant")
+            tips = [
+                self._piece("base", range(at)),
+                self._piece("platform", range(n - 1, at - 1, -1)),
+            ]
+            T_weld = RigidTransform.from_components(self.leg.A, Rotation.random(rng=self.rng))
+            frames = [
+                self._frame(tip, pose, side, T_weld)
+                for (tip, pose), side in zip(tips, ("low", "high"), strict=True)
+            ]
+            return ["6d", *frames]
+        walk = list(range(n)) if near == "base" else list(range(n - 1, -1, -1))
+        cut_sphere = self.far_axes and layout.sphere and layout.cut == "far"
+        if cut_sphere:
+            walk = walk[: -self.far_axes]
+        tip, pose = self._piece(near, walk)
+        if layout.cut == "carry":
+            T = pose.inv() * self.roots["platform"]
+            self.text.joint("platform_carried", "fixed", tip, "platform", T)
+            return None
+        centre = self.B if far == "platform" else self.leg.A
+        T_end = RigidTransform.from_components(centre, Rotation.random(rng=self.rng))
+        root, T_root = self._root(far)
+        frames = [self._frame(tip, pose, "end", T_end), self._frame(root, T_root, "seat", T_end)]
+        return ["3d" if cut_sphere else "6d", *frames]
+
+    def _root(self, link: str) -> tuple[str, RigidTransform]:
+        """Return base or platform, or a link mounted on it."""
+        pose = self.roots[link]
+        if not self.layout.mount:
+            return link, pose
+        T = RigidTransform.from_components([0.01, 0.02, -0.03], Rotation.from_rotvec([1, 2, 3]))
+        mount = f"{self.name}_{link}_mount"
+        self.text.link(mount)
+        self.text.joint(f"{mount}ed", "fixed", link, mount, T)
+        return mount, pose * T
+
+    def _piece(self, root: str, walk: Sequence[int]) -> tuple[str, RigidTransform]:
+        """Hang joints from base or platform; return the last link and its pose."""
+        link, pose = self._root(root)
+        outward = root == "base"
+        for i in walk:
+            joint = self.joints[i]
+            point = joint.point + self.layout.slid * self.rng.uniform(-1.0, 1.0) * joint.axis
+            T = RigidTransform.from_components(point, Rotation.random(rng=self.rng))
+            flip = self.layout.flip_slider if joint.type == "prismatic" else self.layout.flip_axes
+            axis = joint.axis * (-1.0 if flip else 1.0)
+            if joint.type == "prismatic":
+                axis = axis if outward else -axis
+            child = f"{joint.name}_link"
+            self.text.link(child, self._visual(i + 1 if outward else i, T))
+            lower, upper = (-6.3, 6.3) if joint.type == "revolute" else (-0.2, 0.5)
+            if joint.type == "prismatic" and self.layout.flip_slider:
+                lower, upper = -upper, -lower
+            self.text.joint(
+                joint.name, joint.type, link, child, pose.inv() * T,
+                f'<axis xyz="{_numbers(T.rotation.inv().apply(axis))}"/>'
+                f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>',
+            )  # fmt: skip
+            link, pose = child, T
+        return link, pose
+
+    def _visual(self, region: int, T: RigidTransform) -> str:
+        """Return the cylinder of the tube or the rod, where a link is one of them."""
+        ends = {self.n_lower: (self.leg.A, self.leg.A + 0.2 * self.leg.u)}
+        if self.leg.kind != "constant" and self.n_upper:
+            ends[self.n_lower + 1] = self.B - 0.15 * self.leg.u, self.B
+        if region not in ends:
+            return ""
+        start, end = ends[region]
+        shown = RigidTransform.from_components(0.5 * (start + end), _toward(self.leg.u))
+        length = float(np.linalg.norm(end - start))
+        return (
+            f"<visual>{_origin(T.inv() * shown)}<geometry>"
+            f'<cylinder radius="0.01" length="{length!r}"/></geometry></visual>'
+        )
+
+    def _frame(self, link: str, pose: RigidTransform, end: str, T: RigidTransform) -> str:
+        """Write a frame on a link and return its name."""
+        name = f"{self.name}_{end}"
+        self.text.link(name)
+        self.text.joint(f"{name}_frame", "fixed", link, name, pose.inv() * T)
+        return name
+
+
+def _toward(direction: Array) -> Rotation:
+    """Return a rotation whose z axis points along a direction."""
+    e1, e2 = normal_basis(direction)
+    return Rotation.from_matrix(np.column_stack([e1, e2, direction]))
+
+
+def expected_axes(machine: Machine, j: int) -> tuple[Array | None, Array | None, float | None]:
+    """Return base axis, platform axis and twist of a leg, from how it is drawn at home."""
+    leg = machine.legs[j]
+    base, platform = leg.ends
+    if machine.normal is not None:
+        return None, None, None
+    without_s = "S" not in leg.type
+    a = leg.base_axis if base == "R" or (base == "U" and without_s) else None
+    b = leg.platform_axis if platform == "R" or (platform == "U" and without_s) else None
+    back = machine.home.rotation.inv()
+    b_platform = back.apply(leg.u) if platform == "" else None
+    if b is not None:
+        b_platform = _line(np.asarray(back.apply(b)))
+    if not without_s:
+        return (None if a is None else _line(a)), b_platform, None
+    assert a is not None and b_platform is not None
+    p = a if base == "R" else np.cross(a, leg.u)
+    if platform == "":
+        w = machine.home.rotation.apply(normal_basis(np.asarray(b_platform))[0])
+    else:
+        assert b is not None
+        w = b if platform == "R" else np.cross(b, leg.u)
+    angle = float(np.arctan2(leg.u @ np.cross(p, w), p @ w))
+    return _line(a), b_platform, angle - np.pi * np.ceil(angle / np.pi - 0.5 - 1e-10)
+
+
+def _line(axis: Array) -> Array:
+    """Return a unit vector whose last component that is not zero is positive."""
+    axis = axis / np.linalg.norm(axis)
+    return np.asarray(axis * np.sign(axis[np.abs(axis) > 1e-9][-1]))
+
+
+def expected_B(machine: Machine, j: int) -> Array:
+    """Return the platform joint centre of a leg in the platform link."""
+    leg = machine.legs[j]
+    B = leg.B_home
+    if leg.ends[1] == "":
+        B = leg.A + ((np.asarray(machine.home.translation) - leg.A) @ leg.u) * leg.u
+    return np.asarray(machine.home.inv().apply(B))

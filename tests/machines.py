@@ -1,0 +1,77 @@
+"""Machines of the class, one function each, for tests that write them in many layouts."""
+
+import numpy as np
+from layouts import LegSpec, Machine
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.types import Array
+
+HOME = RigidTransform.from_components([0.03, -0.02, 0.6], Rotation.from_rotvec([0.1, -0.15, 0.3]))
+
+
+def ring(angles: list[float], radius: float, height: float = 0.0) -> Array:
+    """Return points on a circle about z, angles in degrees."""
+    a = np.deg2rad(angles)
+    return np.stack([radius * np.cos(a), radius * np.sin(a), 0.0 * a + height], axis=1)
+
+
+def _seven(seed: int = 1) -> tuple[Array, Array]:
+    """Return seven pairs of joint centres, not coplanar, in the base link at home."""
+    rng = np.random.default_rng(seed)
+    A = ring([10, 50, 130, 170, 250, 290, 0], 0.3) + rng.uniform(-0.02, 0.02, (7, 3))
+    B = ring([-10, 70, 110, 190, 230, 310, 45], 0.2) + rng.uniform(-0.02, 0.02, (7, 3))
+    B[6] *= 0.3
+    return A, np.asarray(HOME.apply(B))
+
+
+def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) -> Machine:
+    """Return a machine with legs of these types between general points, general axes."""
+    rng = np.random.default_rng(seed)
+    A, B = _seven(seed)
+    kinds = kinds or ["actuated"] * len(types)
+    order = [0, 2, 4, 1, 3, 5, 6]
+    legs = []
+    for j, kind, leg_type in zip(order, kinds, types, strict=False):
+        u = B[j] - A[j]
+        axes = []
+        for letter in (leg_type + " ")[:2]:
+            axis = rng.normal(size=3)
+            if letter == "R":
+                axis = np.cross(u, axis)
+            axes.append(axis / np.linalg.norm(axis))
+        legs.append(LegSpec(leg_type, A[j], B[j], kind, axes[0], axes[1]))
+    return Machine(tuple(legs), HOME)
+
+
+def planar(normal: tuple[float, float, float] = (0.0, 0.0, 1.0), n_legs: int = 3) -> Machine:
+    """Return a planar n-RPR whose legs stand at different heights."""
+    n = np.array(normal) / np.linalg.norm(normal)
+    turn = Rotation.align_vectors([n], [[0.0, 0.0, 1.0]])[0]
+    angles = [200.0, 330.0, 95.0, 20.0][:n_legs]
+    A = ring(angles, 0.4)
+    B = ring([a + 12.0 for a in angles], 0.12)
+    heights = np.array([0.0, 0.02, -0.015, 0.03])[:n_legs]
+    A[:, 2] = B[:, 2] = heights
+    B += [0.03, 0.02, 0.0]
+    home = RigidTransform.from_components(
+        turn.apply([0.03, 0.02, 0.0]), Rotation.from_rotvec(0.2 * n)
+    )
+    legs = tuple(
+        LegSpec("RR", turn.apply(a), turn.apply(b), "actuated", n, n)
+        for a, b in zip(A, B, strict=True)
+    )
+    return Machine(legs, home, frame_legs=(0, 1), normal=n)
+
+
+MACHINES = {
+    "6-UPS": lambda: of_types(["US"] * 6),
+    "6-SPS": lambda: of_types(["SS"] * 6),
+    "3-RPR": planar,
+    "3-RPR, tilted plane": lambda: planar((0.3, -0.5, 0.8)),
+    "3-UPU": lambda: of_types(["UU"] * 3),
+    "3-RPS": lambda: of_types(["RS"] * 3),
+    "3-SPR": lambda: of_types(["SR"] * 3),
+    "Tricept": lambda: of_types(["SS", "SS", "SS", "U"], ["actuated"] * 3 + ["passive"]),
+    "hexapod with a rod": lambda: of_types(["US"] * 6, ["actuated"] * 5 + ["constant"]),
+    "hexapod with a strut": lambda: of_types(["US"] * 6 + ["SS"], ["actuated"] * 6 + ["passive"]),
+}

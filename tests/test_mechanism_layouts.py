@@ -1,0 +1,133 @@
+"""Equal mechanisms give equal analyses, whatever tree they are written in."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from layouts import (
+    PASSED,
+    LegLayout,
+    LegSpec,
+    Layout,
+    Machine,
+    expected_axes,
+    expected_B,
+    write_machine,
+)
+from machines import MACHINES, of_types
+
+from legcal.mechanism.leg import Leg
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+
+LAYOUTS = {
+    "hung from the base": Layout(),
+    "hung from the platform": Layout((LegLayout(hung="platform"),)),
+    "S as revolutes": Layout((LegLayout(sphere=False),)),
+    "S as revolutes, hung from the platform": Layout(
+        (LegLayout(hung="platform", sphere=False, flip_axes=True),)
+    ),
+    "cut behind the slider": Layout((LegLayout(cut="mid", slid=0.02),)),
+    "cut before the slider": Layout((LegLayout(cut="slider", mount=True),)),
+    "flipped sliders and axes": Layout((LegLayout(flip_slider=True, flip_axes=True, slid=0.03),)),
+    "mounts and idle spins": Layout((LegLayout(hung="platform", mount=True, spin=True),)),
+    "carried by leg 1": Layout(
+        (LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0, seed=k) for k in range(1, 7)])
+    ),
+    "every leg otherwise": Layout(
+        (
+            LegLayout(hung="platform", slid=0.01, seed=4),
+            LegLayout(cut="mid", flip_slider=True, seed=5),
+            LegLayout(sphere=False, spin=True, mount=True, seed=6),
+            LegLayout(cut="slider", flip_axes=True, slid=0.04, seed=7),
+        )
+    ),
+}
+
+
+def _check(mechanism: Mechanism, machine: Machine, layout: Layout) -> None:
+    """Check that a mechanism is the machine that was drawn, to 1e-9."""
+    assert mechanism.spatial == (machine.normal is None)
+    assert mechanism.frame_legs == machine.frame_legs
+    for j, (leg, spec) in enumerate(zip(mechanism.legs, machine.legs, strict=True)):
+        _check_leg(leg, spec, layout.of(j))
+        base_axis, platform_axis, twist = expected_axes(machine, j)
+        A, B = spec.A, expected_B(machine, j)
+        _close(leg.A_base, A)
+        _close(leg.B_platform, B)
+        _close(leg.base_axis, base_axis)
+        _close(leg.platform_axis, platform_axis)
+        _close(leg.twist, twist)
+        length = np.linalg.norm(machine.home.apply(B) - A)
+        out = 0.0 if spec.kind == "constant" else PASSED
+        _close(leg.q0, length - out)
+        spins = mechanism.leg_chains[j].idle_spins
+        added = layout.of(j).spin and "S" in spec.type
+        assert spins == (spec.type == "SS") + added
+
+
+def _check_leg(leg: Leg, spec: LegSpec, layout: LegLayout) -> None:
+    assert (leg.base_joint, leg.platform_joint, leg.kind) == (*spec.ends, spec.kind)
+    assert leg.sign == (-1 if layout.flip_slider and spec.kind != "constant" else 1)
+    assert {c.side for c in leg.cylinders} == (
+        {"base"} if spec.kind == "constant" or spec.ends[1] == "" else {"base", "platform"}
+    )
+    ends = {c.side: (c.start, c.end) for c in leg.cylinders}
+    np.testing.assert_allclose(ends["base"], (0.0, 0.2), atol=1e-9)
+    if "platform" in ends:
+        np.testing.assert_allclose(ends["platform"], (-0.15, 0.0), atol=1e-9)
+
+
+def _close(found: object, wanted: object) -> None:
+    if wanted is None:
+        assert found is None
+    else:
+        assert found is not None
+        np.testing.assert_allclose(
+            np.asarray(found, dtype=float), np.asarray(wanted, dtype=float), atol=1e-9
+        )
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("machine", MACHINES)
+def test_every_layout_of_a_machine_gives_the_same_analysis(
+    machine: str, name: str, tmp_path: Path
+) -> None:
+    drawn, layout = MACHINES[machine](), LAYOUTS[name]
+    mechanism = load_mechanism(write_machine(tmp_path, drawn, layout))
+    _check(mechanism, drawn, layout)
+    freedoms = {"6": 6, "3": 3, "T": 3, "h": 5 if "rod" in machine else 6}
+    assert mechanism.mobility == freedoms[machine[0]]
+
+
+LEG_LAYOUTS = st.builds(
+    LegLayout,
+    hung=st.sampled_from(["base", "platform"]),
+    cut=st.sampled_from(["far", "mid", "slider"]),
+    sphere=st.booleans(),
+    flip_slider=st.booleans(),
+    flip_axes=st.booleans(),
+    slid=st.sampled_from([0.0, 0.01, 0.05]),
+    mount=st.booleans(),
+    spin=st.booleans(),
+    seed=st.integers(0, 9),
+)
+LEG_TYPES = st.sampled_from(["US", "SU", "SS", "RS", "SR", "UU", "RU", "UR", "RR", "U", "S"])
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    types=st.lists(LEG_TYPES, min_size=3, max_size=6),
+    layouts=st.lists(LEG_LAYOUTS, min_size=1, max_size=6),
+    seed=st.integers(0, 99),
+)
+def test_any_legs_in_any_layout_are_found_as_drawn(
+    types: list[str], layouts: list[LegLayout], seed: int, tmp_path: Path
+) -> None:
+    machine, layout = of_types(types, seed=seed), Layout(tuple(layouts))
+    mechanism = load_mechanism(write_machine(tmp_path, machine, layout))
+    _check(mechanism, machine, layout)
