@@ -48,7 +48,7 @@ ModelArgument = Annotated[
     str,
     typer.Argument(
         metavar="MODEL",
-        help="A mechanism YAML, a URDF with its YAML beside it, or the name of a shipped model.",
+        help="A mechanism YAML, a URDF, an MJCF file, a robot.yaml folder or a shipped name.",
     ),
 ]
 JsonOption = Annotated[
@@ -75,12 +75,29 @@ def _root(
 
 
 @app.command()
-def inspect(model: ModelArgument, as_json: JsonOption = False) -> None:
+def inspect(
+    model: ModelArgument,
+    as_json: JsonOption = False,
+    write: Annotated[
+        Path | None,
+        typer.Option(
+            "--write",
+            metavar="DIR",
+            help="Write the model down as DIR/models/NAME.yaml and DIR/urdf/NAME.urdf.",
+        ),
+    ] = None,
+) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
     from legcal.mechanism.inspect import describe
     from legcal.mechanism.load import load_mechanism
 
-    description = describe(load_mechanism(model))
+    mechanism = load_mechanism(model)
+    description = describe(mechanism)
+    if write is not None:
+        from legcal.report.model_files import write_model
+
+        for path in write_model(mechanism, write):
+            typer.echo(f"Wrote {path}.", err=True)
     if as_json:
         _print_json(description)
     else:
@@ -156,6 +173,82 @@ def evaluate(
         from legcal.report.accuracy_table import accuracy_table
 
         _print(accuracy_table(evaluation))
+
+
+@app.command()
+def new(
+    table: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[TABLE]", help="A YAML or CSV table of the legs.", show_default=False
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="DIR", help="The folder of models/ and urdf/."),
+    ] = ...,  # type: ignore[assignment]
+    family: Annotated[
+        str | None, typer.Option(help="Instead of a table: number and type of legs, 6-UPS.")
+    ] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of all lengths: mm or m.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the model and its files.")] = None,
+    base_radius: Annotated[float | None, typer.Option(help="Circle of the base joints.")] = None,
+    platform_radius: Annotated[
+        float | None, typer.Option(help="Circle of the platform joints.")
+    ] = None,
+    height: Annotated[float | None, typer.Option(help="Of the platform over the base.")] = None,
+    base_spread: Annotated[
+        float | None, typer.Option(help="Angle in a pair of base joints (6 legs), in degrees: 30.")
+    ] = None,
+    platform_spread: Annotated[
+        float | None, typer.Option(help="Angle in a pair of platform joints: 30.")
+    ] = None,
+    turn: Annotated[
+        float | None,
+        typer.Option(help="Of the platform about z at home, in degrees: 0; planar 30."),
+    ] = None,
+    offset: Annotated[float | None, typer.Option(help="Leg length at reading zero.")] = None,
+    travel: Annotated[
+        tuple[float, float] | None, typer.Option(help="Lowest and highest reading.")
+    ] = None,
+    leg_radius: Annotated[float | None, typer.Option(help="Radius of tube and rod.")] = None,
+    tilt: Annotated[
+        float | None,
+        typer.Option(help="Of the axes of R and U out of their default, in degrees: 0."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a model, YAML and URDF, from a table of joints or a few dimensions."""
+    from legcal.authoring.create import create_model
+    from legcal.authoring.request import described
+    from legcal.mechanism.inspect import describe
+
+    dimensions = {
+        "base_radius": base_radius,
+        "platform_radius": platform_radius,
+        "height": height,
+        "base_spread": base_spread,
+        "platform_spread": platform_spread,
+        "turn": turn,
+        "offset": offset,
+        "travel": travel,
+        "leg_radius": leg_radius,
+        "tilt": tilt,
+    }
+    asked = described(table, family=family, unit=unit, name=name, dimensions=dimensions)
+    created = create_model(asked, output, force=force)
+    description = describe(created.mechanism)
+    if as_json:
+        paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
+        _print_json(description | {"paths": paths})
+    else:
+        from rich.text import Text
+
+        from legcal.report.inspect_table import inspect_table
+
+        _print(inspect_table(description))
+        _print(Text(f"\nwritten: {created.yaml_path} {created.urdf_path}", overflow="ignore"))
 
 
 def _processors() -> int:

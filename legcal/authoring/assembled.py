@@ -112,7 +112,7 @@ def assemble(described: Description) -> Assembled:
     lengths = np.linalg.norm(B - A, axis=1)
     _refuse(_lengths(described, lengths))
     u = (B - A) / lengths[:, None]
-    tangents = np.array([_across(u[j], A[j] - A.mean(axis=0)) for j in range(len(A))])
+    tangents = np.array([across_leg(u[j], A[j] - A.mean(axis=0)) for j in range(len(A))])
     if all_revolute(described):
         tangents[:] = [0.0, 0.0, 1.0]
     legs, problems = [], []
@@ -156,7 +156,7 @@ def is_planar(legs: Sequence[AssembledLeg], T: RigidTransform) -> bool:
     return _in_a_plane(legs) and bool(upright) and bool(T.rotation.apply(z)[2] > 1.0 - 1e-15)
 
 
-def _across(u: Array, outward: Array) -> Array:
+def across_leg(u: Array, outward: Array) -> Array:
     """Return the horizontal direction across a leg; across the way outward for upright legs."""
     z = np.array([0.0, 0.0, 1.0])
     for other in (u, outward, np.array([1.0, 0.0, 0.0])):
