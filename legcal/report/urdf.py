@@ -22,7 +22,9 @@ from legcal.mechanism.leg import LegKind
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.sources.read import XML_SUFFIXES
 from legcal.mechanism.urdf import UrdfJoint
+from legcal.report.model_files import mechanism_text
 from legcal.report.urdf_patch import patch_origins, same_point
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
@@ -143,7 +145,8 @@ def _carrier(mechanism: Mechanism, frame: str, leg: str) -> UrdfJoint:
 def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: str) -> None:
     """Write the mechanism's YAML with ``legcal.urdf`` naming the calibrated file.
 
-    Every other character stays as it was; the key is added where the file does not have it.
+    Every other character stays as it was; the key is added where the file does not have it. A
+    mechanism of another format, or without a block ``legcal``, gets a YAML with all it needs.
 
     Parameters
     ----------
@@ -154,6 +157,9 @@ def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: st
     urdf_name : str
         The calibrated URDF, relative to ``destination``.
     """
+    if not _is_written_down(mechanism):
+        destination.write_bytes(mechanism_text(mechanism, urdf_name).encode("utf-8"))
+        return
     text = mechanism.yaml_path.read_bytes().decode("utf-8")
     value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
     block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
@@ -165,6 +171,17 @@ def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: st
         separator = ", " if block.flow_style else "\n" + " " * first.column
         text = f"{text[: first.index]}urdf: {value}{separator}{text[first.index :]}"
     destination.write_bytes(text.encode("utf-8"))
+
+
+def _is_written_down(mechanism: Mechanism) -> bool:
+    """Say whether the YAML of a mechanism is one of ours, and holds of the URDF as it is."""
+    if mechanism.yaml_path.suffix.lower() in XML_SUFFIXES:
+        return False
+    content = mechanism.yaml_path.read_bytes().decode("utf-8")
+    document = yaml.compose(content, Loader=yaml.SafeLoader)
+    stand_ins = _entry(document, "joint_name")
+    has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)
+    return isinstance(_entry(document, "legcal"), yaml.MappingNode) and not has_stand_ins
 
 
 def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
