@@ -205,7 +205,7 @@ def new(
     ] = None,
     turn: Annotated[
         float | None,
-        typer.Option(help="Of the platform about z at home, in degrees: 0; planar 30."),
+        typer.Option(help="Of the platform about z, in degrees: 0; planar 30."),
     ] = None,
     offset: Annotated[float | None, typer.Option(help="Leg length at reading zero.")] = None,
     travel: Annotated[
@@ -214,7 +214,7 @@ def new(
     leg_radius: Annotated[float | None, typer.Option(help="Radius of tube and rod.")] = None,
     tilt: Annotated[
         float | None,
-        typer.Option(help="Of the axes of R and U out of their default, in degrees: 0."),
+        typer.Option(help="Of R and U axes from their default, in degrees: 0."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
     as_json: JsonOption = False,
