@@ -213,7 +213,8 @@ def _levenberg_marquardt(
 ) -> tuple[Array, Array]:
     """Return where the free coordinates end, and the residual there."""
     residual, jacobian = equations(configuration)
-    damping, cost = 1e-3, float(residual @ residual)
+    cost = float(residual @ residual)
+    damping = min(1e-3, cost)  # quadratic where the start is near
     for _ in range(60):
         if np.abs(residual).max(initial=0.0) < 0.01 * CLOSED:
             break
@@ -221,7 +222,7 @@ def _levenberg_marquardt(
         normal = J.T @ J
         scale = damping * max(float(np.trace(normal)) / max(len(normal), 1), 1e-12)
         step = np.zeros(len(free))
-        if damping < 1e-9:
+        if damping < 1e-12:
             step[free] = -np.linalg.lstsq(J, residual, rcond=RANK)[0]
         else:
             step[free] = -np.linalg.solve(normal + scale * np.eye(len(normal)), J.T @ residual)
@@ -234,7 +235,7 @@ def _levenberg_marquardt(
         elif damping > 1e6 or np.abs(residual).max() < CLOSED:
             break
         else:
-            damping = max(10.0 * damping, 1e-6)
+            damping = max(10.0 * damping, 1e-8)
     return configuration, residual
 
 

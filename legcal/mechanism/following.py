@@ -3,8 +3,8 @@
 A hexapod has at least nine assembly modes at its home lengths. Newton on Pinocchio's constraints
 is trusted only where its steps contract from the first on and the legs' equations keep the sign
 of their determinant; else the way is halved, and the next step starts from what was reached.
-Small steps that shrink very fast prove that the Jacobian hardly changes on the way: they need no
-look at the determinant.
+Where the Jacobian of the closures hardly changes on the way there is no room for a singularity, and
+no need to look at the determinant.
 """
 
 from dataclasses import dataclass
@@ -21,18 +21,17 @@ from legcal.mechanism.singularity import side
 NEWTON_STEPS = 12
 SHORTEST = 1.0 / 4096.0  # of the way from known readings to the wanted ones
 CONTRACTION = 0.5  # of the step before; of 1 rad or 1 m for the first
-SURE_STEP = 0.1  # [rad, m]: a first step up to here ...
-SURE_CONTRACTION = 0.1  # ... and a second one up to this part of it leave no room for a singularity
+SURE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity between J0 and J1
 
 
 @dataclass(frozen=True, eq=False)
 class _Reached:
-    """Where Newton ended: the configuration, what is open there, and how the steps went."""
+    """Where Newton ended: the configuration, the linearised closures, and how the steps went."""
 
     configuration: Array
     residual: Array
+    jacobian: Array
     contracts: bool
-    sure: bool
 
 
 def follow(
@@ -70,6 +69,7 @@ def follow(
     q_columns, v_columns = slider_columns(mechanism, mechanism.motors)
     free = np.delete(np.arange(mechanism.chain.nv), v_columns)
     first = configuration[q_columns]
+    known = mechanism.chain.linearize(configuration)[1][:, free]
     here: float | None = None
     done, step = 0.0, 1.0
     while done < 1.0:
@@ -78,12 +78,13 @@ def follow(
         trial[q_columns] = readings if wanted == 1.0 else first + wanted * (readings - first)
         reached = _newton(mechanism, trial, free)
         accepted = reached.contracts and not _flipped(mechanism, reached.configuration)
-        if accepted and not reached.sure:
+        if accepted and not _hardly_changes(known, reached.jacobian):
             if here is None:
                 here = side(mechanism, platform_pose(mechanism, configuration))
-            accepted = side(mechanism, platform_pose(mechanism, reached.configuration)) == here
+            accepted = here == side(mechanism, platform_pose(mechanism, reached.configuration))
         if accepted:
-            configuration, done, step = reached.configuration, wanted, 2.0 * step
+            configuration, known = reached.configuration, reached.jacobian
+            done, step = wanted, 2.0 * step
         else:
             step *= 0.5
             if step < shortest:
@@ -101,23 +102,23 @@ def _newton(mechanism: Mechanism, configuration: Array, free: IntArray) -> _Reac
     """Close the loops by Newton with the motors held, watching how its steps shrink."""
     chain = mechanism.chain
     step = np.zeros(chain.nv)
-    previous, sure = 1.0, True
-    residual = np.zeros(0)
-    for i in range(NEWTON_STEPS):
+    previous = 1.0
+    for _ in range(NEWTON_STEPS):
         residual, jacobian = chain.linearize(configuration)
+        J = jacobian[:, free]
         worst = float(np.abs(residual).max())
         if worst < 0.01 * CLOSED:
-            return _Reached(configuration, residual, True, sure)
-        change = _solve(jacobian[:, free], residual)
+            return _Reached(configuration, residual, J, True)
+        change = _solve(J, residual)
         size = float(np.abs(change).max())
         if size > CONTRACTION * previous:
-            return _Reached(configuration, residual, worst < CLOSED, sure)
-        sure = sure and (size < SURE_STEP if i == 0 else size < SURE_CONTRACTION * previous)
+            return _Reached(configuration, residual, J, worst < CLOSED)
         previous = size
         step[free] = -change
         configuration = chain.integrate(configuration, step)
-    residual = chain.residual(configuration)
-    return _Reached(configuration, residual, float(np.abs(residual).max()) < CLOSED, False)
+    residual, jacobian = chain.linearize(configuration)
+    closed = float(np.abs(residual).max()) < CLOSED
+    return _Reached(configuration, residual, jacobian[:, free], closed)
 
 
 def _solve(jacobian: Array, residual: Array) -> Array:
@@ -130,6 +131,17 @@ def _solve(jacobian: Array, residual: Array) -> Array:
         if np.abs(change).max() < 1.0:
             return np.asarray(change)
     return np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-10)[0])
+
+
+def _hardly_changes(known: Array, jacobian: Array) -> bool:
+    """Say whether two square Jacobians differ too little for a singular one between them."""
+    if known.shape[0] != known.shape[1]:
+        return False
+    try:
+        change = np.linalg.solve(known, jacobian - known)
+    except np.linalg.LinAlgError:
+        return False
+    return float(np.abs(change).sum(axis=1).max()) < SURE
 
 
 def _flipped(mechanism: Mechanism, configuration: Array) -> bool:

@@ -43,7 +43,7 @@ def mobility(mechanism: Mechanism) -> int:
 def freedoms(mechanism: Mechanism, configuration: Array) -> tuple[int, int]:
     """Return the freedoms of all joints and of the platform alone at a closed configuration."""
     scale = leg_scale(mechanism, mechanism.home)
-    null_space = _null_space(mechanism, configuration, scale)
+    null_space = free_motions(mechanism, configuration)
     twist = mechanism.chain.twist(mechanism.base, mechanism.platform) @ null_space
     twist[:3] /= scale
     values = np.linalg.svd(twist, compute_uv=False)
@@ -96,8 +96,15 @@ def project(mechanism: Mechanism, configuration: Array) -> Array | None:
     return configuration if np.abs(residual).max(initial=0.0) < CLOSED else None
 
 
-def _null_space(mechanism: Mechanism, configuration: Array, scale: float) -> Array:
-    """Return what tangent steps keep all loops closed, orthonormal with lengths in leg lengths."""
+def free_motions(mechanism: Mechanism, configuration: Array) -> Array:
+    """Return the tangent steps that keep all loops closed, orthonormal with lengths in leg lengths.
+
+    Returns
+    -------
+    (nv, k) array
+        A basis; idle spins of legs are among them.
+    """
+    scale = leg_scale(mechanism, mechanism.home)
     columns = _column_scale(mechanism, scale)
     jacobian = mechanism.chain.linearize(configuration)[1] * columns
     row = 0

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
-from legcal.mechanism.demands import Demands, demands_at, leg_scale
+from legcal.mechanism.demands import Demands, demands_at, is_constrained, leg_scale
 from legcal.mechanism.model import Mechanism
 
 
@@ -56,7 +56,22 @@ def side(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
 
     Between two poses of different sign lies a singularity.
     """
-    demands = demands_at(mechanism, T_base_platform)
-    if len(demands.values) != 6:
-        return 0.0
-    return float(np.sign(np.linalg.det(dimensionless(mechanism, T_base_platform, demands))))
+    if not is_constrained(mechanism):
+        rows = _lines(mechanism, T_base_platform)
+    else:
+        demands = demands_at(mechanism, T_base_platform)
+        rows = dimensionless(mechanism, T_base_platform, demands)
+    return float(np.sign(np.linalg.det(rows))) if len(rows) == 6 else 0.0
+
+
+def _lines(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the lines of the motors' legs, (n_motors, 6), where nothing else is demanded.
+
+    The moments u x arm are written out: ``np.cross`` is slow on six rows.
+    """
+    motors = list(mechanism.motors)
+    matrix = T_base_platform.as_matrix()
+    arms = mechanism.B_platform[motors] @ matrix[:3, :3].T
+    u = arms + matrix[:3, 3] - mechanism.A_base[motors]
+    (x, y, z), (a, b, c) = arms.T, u.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)

@@ -1,0 +1,149 @@
+"""Random closed configurations inside the travel, in the assembly mode of home.
+
+Where the motors determine the pose their readings are drawn and followed from home. Not all legs
+can be at the ends of a long travel at the same time: what is not reached is drawn again, and
+nearer to home after two draws in vain. Where motors do not determine the pose, home wanders on the
+manifold of closed configurations.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.closing import platform_pose, slider_columns
+from legcal.mechanism.following import follow
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.mobility import free_motions, project
+from legcal.mechanism.model import Mechanism
+
+TRIES = 20  # draws for each configuration
+NEARER = 1.3 * 0.8 ** np.arange(TRIES)  # how far from home draws go, at most all of the way
+SHORTEST = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
+WALK = 6  # steps of a random walk between two configurations
+STRIDE = 0.15  # [rad], and of a leg length
+INSIDE = 1e-12  # [m]
+
+
+class Configurations(NamedTuple):
+    """Closed configurations.
+
+    Attributes
+    ----------
+    configurations : (count, nq) array
+        Of the closed chain.
+    readings : (count, n_legs) array
+        Joint value of every leg [m], passive ones too; zero for legs of constant length.
+    poses : list of RigidTransform
+        T_base_platform.
+    """
+
+    configurations: Array
+    readings: Array
+    poses: list[RigidTransform]
+
+
+def random_configurations(
+    mechanism: Mechanism, count: int, rng: np.random.Generator | int
+) -> Configurations:
+    """Return random closed configurations with every slider inside its travel.
+
+    Readings of motors are uniform in the travel and followed from home without crossing a
+    singularity; those that cannot be reached are drawn again, nearer and nearer to home. Where
+    motors do not determine the pose, the mechanism takes a random walk from home.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+    count : int
+        How many.
+    rng : Generator or int
+        Source of chance, or its seed.
+
+    Returns
+    -------
+    Configurations
+        Arrays of configurations and readings, and a list of poses.
+
+    Raises
+    ------
+    DidNotConverge
+        If too few are reached.
+    """
+    chance = np.random.default_rng(rng)
+    determined = mechanism.mobility == len(mechanism.motors)
+    found = list((_drawn if determined else _wandered)(mechanism, count, chance))
+    if len(found) < count:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: random poses could not be drawn: found {len(found)} of "
+            f"{count} inside the travel in {TRIES} tries for each, needed all; check legcal.home "
+            "and the limits of the sliders."
+        )
+    return Configurations(
+        np.array(found).reshape(count, mechanism.chain.nq),
+        np.array([_joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
+        [platform_pose(mechanism, c) for c in found],
+    )
+
+
+def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Iterator[Array]:
+    """Yield what is reached from home at random readings of the motors."""
+    motors = [mechanism.legs[j] for j in mechanism.motors]
+    lower, upper = np.array([leg.travel for leg in motors]).T
+    home = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
+    for _ in range(count):
+        for nearer in NEARER:
+            q = chance.uniform(lower, upper)
+            if nearer < 1.0:
+                q = np.clip(home + nearer * (q - home), lower, upper)
+            try:
+                reached = follow(mechanism, mechanism.home_configuration, q, shortest=SHORTEST)
+            except DidNotConverge:  # the legs cannot have these lengths at the same time
+                continue
+            if not _outside(mechanism, reached).any():
+                yield reached
+                break
+
+
+def _wandered(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Iterator[Array]:
+    """Yield every few steps of a random walk whose sliders stay inside their travel."""
+    here = mechanism.home_configuration
+    for _ in range(count):
+        for _ in range(TRIES):
+            here = _strolled(mechanism, here, chance)
+            if not _outside(mechanism, here).any():
+                yield here
+                break
+
+
+def _strolled(mechanism: Mechanism, here: Array, chance: np.random.Generator) -> Array:
+    """Return a closed configuration a few steps away, no further outside the travel."""
+    for _ in range(WALK):
+        motions = free_motions(mechanism, here)
+        weights = chance.normal(size=motions.shape[1]) / np.sqrt(max(motions.shape[1], 1))
+        there = project(mechanism, mechanism.chain.integrate(here, STRIDE * motions @ weights))
+        if there is None:
+            continue
+        if not np.any(_outside(mechanism, there) & ~_outside(mechanism, here)):
+            here = there
+    return here
+
+
+def _joint_values(mechanism: Mechanism, configuration: Array) -> Array:
+    """Return the joint value of every leg at a configuration, zero for rods, (n_legs,) [m]."""
+    values = np.zeros(mechanism.n_legs)
+    sliding = [j for j, leg in enumerate(mechanism.legs) if leg.kind is not LegKind.CONSTANT]
+    values[sliding] = configuration[slider_columns(mechanism, tuple(sliding))[0]]
+    return values
+
+
+def _outside(mechanism: Mechanism, configuration: Array) -> BoolArray:
+    """Return which legs are outside their travel, or flipped, (n_legs,)."""
+    values = _joint_values(mechanism, configuration)
+    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    outside = (values < lower - INSIDE) | (values > upper + INSIDE)
+    return np.asarray(outside | (mechanism.sign * values + mechanism.q0 <= 0.0))
