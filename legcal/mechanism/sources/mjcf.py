@@ -149,11 +149,13 @@ def _bodies(element: etree._Element, tree: MjcfTree) -> _Ends | None:
         T_two = RigidTransform.from_translation(T_one_two.inv().apply(at))
         return (names[0], T_one), (names[1], T_two)
     relpose = values.numbers(element, attributes, "relpose", (7,))
-    if relpose is not None and relpose[3:].any():  # else the configuration of the file holds
-        rotation = Rotation.from_quat(np.roll(relpose[3:], -1))
-        T_one_two = RigidTransform.from_components(relpose[:3], rotation)
     T_two = RigidTransform.from_translation(at)  # the anchor of a weld stands in body2
-    return (names[0], T_one_two * T_two), (names[1], T_two)
+    if relpose is not None and relpose[3:].any():  # MuJoCo brings the anchor to this very place
+        rotation = Rotation.from_quat(np.roll(relpose[3:], -1))
+        T_one = RigidTransform.from_components(relpose[:3], rotation)
+    else:  # the configuration of the file holds
+        T_one = T_one_two * T_two
+    return (names[0], T_one), (names[1], T_two)
 
 
 def _motors(root: etree._Element, tree: MjcfTree) -> list[str]:
