@@ -212,7 +212,11 @@ def test_axes_that_are_not_perpendicular_are_no_universal_joint(tmp_path: Path) 
 
 
 def test_parallel_axes_are_no_universal_joint(tmp_path: Path) -> None:
-    change = {r'(child link="leg3_a2_link"/>.*<axis xyz=")0 1 0': r"\g<1>1 0 0"}
+    change = {
+        r'(child link="leg3_a2_link"/><origin xyz=")0.0 0.0 0.0(.*<axis xyz=")0 1 0': (
+            r"\g<1>0.0 0.002 0.0\g<2>1 0 0"
+        )
+    }
     assert "are parallel" in _refused(tmp_path, OutOfClass, change)
 
 
@@ -222,12 +226,15 @@ def test_three_axes_that_meet_in_two_points_are_no_spherical_joint(tmp_path: Pat
     assert "meet in two points 4 mm apart" in message
 
 
-def test_a_leg_without_a_spherical_joint_is_not_covered(tmp_path: Path) -> None:
-    change = {
-        r'name="(leg4_a1)" type="revolute"': r'name="\1" type="fixed"',
-    }
-    message = _refused(tmp_path, OutOfClass, change, Layout(welded=True))
-    assert "found the type SPR" in message
+def test_a_universal_joint_that_is_blocked_on_one_axis_is_a_revolute(tmp_path: Path) -> None:
+    path = write_hexapod(tmp_path, Layout(welded=True))
+    urdf = path.with_suffix(".urdf")
+    old = 'name="leg4_a1" type="revolute"'
+    urdf.write_text(urdf.read_text().replace(old, old.replace("revolute", "fixed")))
+    mechanism = load_mechanism(path)
+    assert mechanism.legs[3].type == "SPR"
+    assert mechanism.legs[3].platform_axis is not None
+    assert mechanism.mobility == 5
 
 
 def test_a_motor_that_turns_is_outside_the_method(tmp_path: Path) -> None:
@@ -270,9 +277,16 @@ def test_a_virtual_joint_that_is_not_named_is_refused(tmp_path: Path) -> None:
     assert "floating joint 'platform_free'" in message
 
 
-def test_a_planar_virtual_joint_is_not_covered_yet(tmp_path: Path) -> None:
-    message = _refused(tmp_path, OutOfClass, {'type="floating"': 'type="planar"'})
-    assert "planar mechanisms are not covered yet" in message
+def test_a_planar_virtual_joint_is_refused_where_the_legs_move_in_space(tmp_path: Path) -> None:
+    change = {'name="platform_free" type="floating">': 'name="platform_free" type="planar">'}
+    assert "axis (1, 0, 0)" in _refused(tmp_path, OutOfClass, change)
+    change = {
+        'name="platform_free" type="floating">(.*?)</joint>': (
+            r'name="platform_free" type="planar">\1<axis xyz="0 0 1"/></joint>'
+        )
+    }
+    message = _refused(tmp_path, OutOfClass, change)
+    assert "found a planar joint, needed a floating one" in message
 
 
 def test_a_platform_fixed_to_the_base_is_refused(tmp_path: Path) -> None:

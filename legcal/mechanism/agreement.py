@@ -13,7 +13,8 @@ from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.mobility import generic_configurations
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.schema import MechanismFile
+from legcal.mechanism.proposal import any_joint
+from legcal.mechanism.schema import LegcalBlock, MechanismFile
 from legcal.mechanism.urdf import Urdf
 
 LENGTH_LAW = 1e-9  # [m]
@@ -30,9 +31,6 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
     block = file.legcal
     links, joints = set(urdf.links), set(urdf.joints)
     named: list[tuple[str, str, str, set[str]]] = [
-        ("legcal.base", block.base, "link", links),
-        ("legcal.platform", block.platform, "link", links),
-        *((f"legcal.legs.{leg}", joint, "joint", joints) for leg, joint in block.legs.items()),
         *((f"name_mot.{i}", joint, "joint", joints) for i, joint in enumerate(file.name_mot)),
         *(
             (f"closed_loop.{i}.{k}", frame, "frame (link or joint)", links | joints)
@@ -40,8 +38,14 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
             for k, frame in enumerate(pair)
         ),
     ]
-    if block.platform_joint is not None:
-        named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
+    if block is not None:
+        named += [
+            ("legcal.base", block.base, "link", links),
+            ("legcal.platform", block.platform, "link", links),
+            *((f"legcal.legs.{leg}", joint, "joint", joints) for leg, joint in block.legs.items()),
+        ]
+        if block.platform_joint is not None:
+            named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
     problems = [
         _unknown(path, place, name, what, urdf, known)
         for place, name, what, known in named
@@ -53,7 +57,7 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         for i, (one, two) in enumerate(file.closed_loop)
         if one == two
     ]
-    if block.base == block.platform:
+    if block is not None and block.base == block.platform:
         problems.append(
             f"{path}: legcal.platform could not be used: found the link '{block.base}' as base and "
             "as platform, needed two links; correct one of them."
@@ -62,16 +66,16 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         raise ModelError(problems)
 
 
-def check_class(file: MechanismFile, urdf: Urdf, path: Path) -> None:
+def check_virtual_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
     """Check that the virtual joint is one that is covered.
 
     Raises
     ------
     OutOfClass
-        With one sentence for each joint that is not.
+        If it is not.
     """
     problems = []
-    virtual = file.legcal.platform_joint
+    virtual = block.platform_joint
     if virtual is not None:
         joint = urdf.joints[virtual]
         if joint.type not in ("floating", "planar"):
@@ -87,12 +91,6 @@ def check_class(file: MechanismFile, urdf: Urdf, path: Path) -> None:
                 f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
                 "plane of its frame; turn its origin rpy instead."
             )
-    if file.joint_name or file.joint_type:
-        problems.append(
-            f"{path}: joint_name and joint_type are not covered: found {len(file.joint_name)} "
-            "joints that stand for others, needed none; write these joints as revolutes, or cut "
-            "the loop there."
-        )
     if problems:
         raise OutOfClass(problems)
 
@@ -121,7 +119,7 @@ def n_frame_legs(*, spatial: bool) -> int:
 
 
 def legs_in_order(
-    chains: Sequence[LegChain], bodies: Bodies, urdf: Urdf, file: MechanismFile, path: Path
+    chains: Sequence[LegChain], bodies: Bodies, urdf: Urdf, block: LegcalBlock, path: Path
 ) -> list[LegChain]:
     """Return the leg chains in the order of the YAML.
 
@@ -129,12 +127,10 @@ def legs_in_order(
     ------
     ModelError
         If a name means no leg, or two mean the same, or a leg has none.
-    OutOfClass
-        If a motor is not the slider of a leg.
     """
     problems, ordered = [], list[LegChain]()
     owner: dict[int, str] = {}
-    for name, joint in file.legcal.legs.items():
+    for name, joint in block.legs.items():
         found = [c for c in chains if _is_on(joint, c, bodies, urdf)]
         if not found:
             problems.append(
@@ -152,13 +148,12 @@ def legs_in_order(
             ordered.append(found[0])
     problems += [
         f"{path}: legcal.legs is incomplete: found no name for the leg with joint "
-        f"'{_any_joint(chain)}', needed every leg; add a line for it."
+        f"'{any_joint(chain)}', needed every leg; add a line for it."
         for chain in chains
         if id(chain) not in owner and not problems
     ]
     if problems:
         raise ModelError(problems)
-    _check_motors(file, ordered, urdf, path)
     return ordered
 
 
@@ -219,8 +214,14 @@ def check_length_law(mechanism: Mechanism) -> None:
                 )
 
 
-def _check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
-    """Refuse motors that are not the slider of a leg."""
+def check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
+    """Check that every motor is the slider of a leg.
+
+    Raises
+    ------
+    OutOfClass
+        With one sentence for each motor that is not.
+    """
     sliders = {c.slider.connection.joint for c in chains if c.slider is not None}
     problems = []
     for motor in file.name_mot:
@@ -246,13 +247,6 @@ def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
         return True
     entry = urdf.joints[joint]
     return not entry.moves and bodies.body_of[entry.child] in chain.bodies
-
-
-def _any_joint(chain: LegChain) -> str:
-    """Return a joint that names a leg for the reader."""
-    if chain.slider is not None:
-        return str(chain.slider.connection.joint)
-    return next((s.connection.joint for s in chain.steps if s.connection.joint), "none")
 
 
 def _unknown(path: Path, place: str, name: str, what: str, urdf: Urdf, known: set[str]) -> str:

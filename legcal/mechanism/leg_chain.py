@@ -279,11 +279,15 @@ def _places(axes: Sequence[Axis]) -> list[list[Axis]]:
     for axis in axes[1:]:
         last = places[-1]
         if axis.direction is None or last[-1].direction is None:
-            meets = last[-1].distance(axis.point) <= CONCURRENT if axis.direction is None else (
-                axis.distance(last[-1].point) <= CONCURRENT)  # fmt: skip
+            line, sphere = (axis, last[-1]) if last[-1].direction is None else (last[-1], axis)
+            meets = line.distance(sphere.point) <= CONCURRENT
         else:
             near, far = nearest(last[-1], axis)
-            meets = near is not None and float(np.linalg.norm(near - far)) <= CONCURRENT
+            meets = (
+                near is not None
+                and far is not None
+                and float(np.linalg.norm(near - far)) <= CONCURRENT
+            )
         if meets:
             last.append(axis)
         else:

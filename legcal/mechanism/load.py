@@ -1,5 +1,6 @@
 """Loading a mechanism: files, tree, closures, legs and home, each checked before the next."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +18,12 @@ from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.leg_of_chain import leg_of
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.notes import diagnose
+from legcal.mechanism.notes import diagnose, proposal_notes
 from legcal.mechanism.plane import check_virtual_joint, plane_of_motion
-from legcal.mechanism.schema import MechanismFile
+from legcal.mechanism.proposal import propose_block, propose_frame
+from legcal.mechanism.schema import LegcalBlock
 from legcal.mechanism.sources.read import read_source
+from legcal.mechanism.sources.source import Source
 from legcal.mechanism.topology import find_chains
 from legcal.mechanism.urdf import Urdf
 
@@ -42,34 +45,31 @@ def load_mechanism(model: str | Path) -> Mechanism:
         If the mechanism is not one that the method covers.
     """
     source = read_source(model)
-    yaml_path, file, urdf = source.path, source.file, source.urdf
-    if file.legcal is None:
-        raise ModelError(
-            f"{yaml_path}: legcal could not be read: found no such key, needed it; add "
-            "'legcal: ...' to the file."
-        )
-    agreement.check_names(file, urdf, yaml_path)
-    agreement.check_class(file, urdf, yaml_path)
-    mechanism = _assemble(file, urdf, yaml_path)
-    given = mechanism.home if file.legcal.home is not None else None
+    file, urdf = source.file, source.urdf
+    agreement.check_names(file, urdf, source.path)
+    pairs = sorted(zip(file.closed_loop, file.type, strict=True))  # sums depend on their order
+    closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
+    block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
+    mechanism = _assemble(source, block, closures)
+    given = mechanism.home if block.home is not None else None
     home, configuration = closed_home(mechanism, given)
     mechanism = replace(mechanism, home=home, home_configuration=configuration)
     mechanism = replace(mechanism, mobility=mobility(mechanism))
     agreement.check_length_law(mechanism)
-    return replace(
-        mechanism, diagnostics=diagnose(mechanism, home_is_given=file.legcal.home is not None)
-    )
+    proposed = proposal_notes(file.legcal, mechanism)
+    found = diagnose(mechanism, home_is_given=block.home is not None)
+    return replace(mechanism, diagnostics=(*source.notes, *proposed, *found))
 
 
-def _assemble(file: MechanismFile, urdf: Urdf, yaml_path: Path) -> Mechanism:
+def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Mechanism:
     """Return the mechanism, its chain not closed yet."""
-    block = file.legcal
-    pairs = sorted(zip(file.closed_loop, file.type, strict=True))  # sums depend on their order
-    closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
+    file, urdf, yaml_path = source.file, source.urdf, source.path
+    agreement.check_virtual_type(block, urdf, yaml_path)
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = agreement.legs_in_order(
-        find_chains(bodies, urdf, block.base, block.platform), bodies, urdf, file, yaml_path
+        find_chains(bodies, urdf, block.base, block.platform), bodies, urdf, block, yaml_path
     )
+    agreement.check_motors(file, chains, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     agreement.check_count(chains, spatial=normals is None, path=yaml_path)
@@ -95,6 +95,8 @@ def _assemble(file: MechanismFile, urdf: Urdf, yaml_path: Path) -> Mechanism:
         )
         for name, leg_chain in zip(block.legs, chains, strict=True)
     )
+    names = list(block.legs)
+    base_frame = block.base_frame or propose_frame(names, chains)
     mechanism = Mechanism(
         name=urdf.name,
         yaml_path=yaml_path,
@@ -103,7 +105,7 @@ def _assemble(file: MechanismFile, urdf: Urdf, yaml_path: Path) -> Mechanism:
         platform=block.platform,
         platform_joint=block.platform_joint,
         legs=with_cylinders(legs, urdf, bodies, chains),
-        frame_legs=tuple(list(block.legs).index(name) for name in block.base_frame),
+        frame_legs=tuple(names.index(name) for name in base_frame),
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
         home_configuration=chain.neutral(),

@@ -2,8 +2,8 @@
 
 from legcal.mechanism.closing import readings_at
 from legcal.mechanism.leg import LegKind
-from legcal.mechanism.mobility import idle_spins
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.schema import LegcalBlock
 
 
 def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
@@ -35,10 +35,43 @@ def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
             f"the motors do not determine the pose: mobility {mechanism.mobility}, motors "
             f"{n_motors}; forward kinematics is refused."
         )
-    spins = idle_spins(mechanism)
-    if spins:
-        notes.append(
-            f"{spins} legs have an S joint at both ends and spin about themselves; this is not "
-            "counted as mobility."
+    return (*notes, *_spin_notes(mechanism))
+
+
+def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[str, ...]:
+    """Return what of the block ``legcal`` was proposed because the file does not have it."""
+    frame = ", ".join(mechanism.leg_names[j] for j in mechanism.frame_legs)
+    if written is None:
+        return (
+            f"the file has no block legcal: base '{mechanism.base}', platform "
+            f"'{mechanism.platform}', legs {', '.join(mechanism.leg_names)} and base_frame "
+            f"[{frame}] were taken from its bodies; write them down to choose others.",
         )
-    return tuple(notes)
+    if written.base_frame is None:
+        return (
+            f"legcal.base_frame is not given: [{frame}] was taken, whose joints span most; write "
+            "it down to choose others.",
+        )
+    return ()
+
+
+def _spin_notes(mechanism: Mechanism) -> list[str]:
+    """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
+    notes = []
+    chains = mechanism.leg_chains
+    both = sum(leg.base_joint == leg.platform_joint == "S" for leg in mechanism.legs)
+    if both:
+        legs, spin = "1 leg has", "spins about itself"
+        if both > 1:
+            legs, spin = f"{both} legs have", "spin about themselves"
+        notes.append(
+            f"{legs} an S joint at both ends and {spin}; this is not counted as mobility."
+        )
+    others = sum(chain.idle_spins for chain in chains) - both
+    if others:
+        joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
+        notes.append(
+            f"{joints} what an S joint of the leg does, or another revolute; this is not counted "
+            "as mobility."
+        )
+    return notes

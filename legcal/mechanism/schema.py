@@ -14,20 +14,25 @@ WHAT = "mechanism file"
 
 
 class LegcalBlock(schema.FileSchema):
-    """The block ``legcal``: what belongs to base, platform and legs."""
+    """The block ``legcal``: what belongs to base, platform and legs.
+
+    What is missing is proposed, see :mod:`legcal.mechanism.proposal`.
+    """
 
     version: Literal[1]
     urdf: str | None = None
     base: str
     platform: str
     platform_joint: str | None = None
-    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)]
+    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
     home: MotionEntry | None = None
     legs: Annotated[dict[schema.Name, str], Field(min_length=1)]
 
     @field_validator("base_frame")
     @classmethod
-    def _different(cls, value: list[str]) -> list[str]:
+    def _different(cls, value: list[str] | None) -> list[str] | None:
+        if value is None:
+            return None
         repeated = sorted({name for name in value if value.count(name) > 1})
         if repeated:
             raise ValueError(
@@ -48,6 +53,11 @@ class MechanismFile(BaseModel):
     joint_name: list[str] = []
     joint_type: list[str] = []
     legcal: LegcalBlock | None = None
+
+    @field_validator("type")
+    @classmethod
+    def _small_letters(cls, value: list[str]) -> list[str]:
+        return [kind.lower() for kind in value]
 
 
 def read_mechanism_file(path: Path) -> MechanismFile:
@@ -115,7 +125,7 @@ def _contradictions(file: MechanismFile, path: Path) -> list[str]:
     problems += [
         f"{path}: legcal.base_frame could not be used: found '{name}', which is not a leg; "
         f"{schema.closest(name, block.legs)}"
-        for name in block.base_frame
+        for name in block.base_frame or ()
         if name not in block.legs
     ]
     return problems

@@ -42,6 +42,7 @@ def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[Le
 
 def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[Step]]:
     """Return the joints of every leg from base to platform."""
+    _refuse_second_mechanism(bodies, urdf, base, platform)
     at: dict[str, list[Connection]] = {}
     for connection in bodies.connections:
         _refuse_unsupported(connection, urdf, base, platform)
@@ -59,7 +60,7 @@ def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[St
                 break
             onward = [c for c in at[body] if c is not connection]
             if body == base or len(onward) != 1 or id(onward[0]) in used:
-                raise OutOfClass(_not_a_chain(urdf, first, body, base, len(onward)))
+                raise OutOfClass(_not_a_chain(urdf, steps, body, base, len(onward)))
             connection = onward[0]
         paths.append(steps)
     stray = [c for c in bodies.connections if id(c) not in used]
@@ -69,6 +70,40 @@ def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[St
             "from base to platform, needed every joint on a leg; fix it or remove it."
         )
     return paths
+
+
+def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
+    """Refuse loops of other bodies than those that hang together with the platform."""
+    group = {body: body for body in bodies.body_of.values()}
+
+    def find(body: str) -> str:
+        while group[body] != body:
+            body = group[body]
+        return body
+
+    for connection in bodies.connections:
+        if base not in connection.bodies:
+            one, two = (find(body) for body in connection.bodies)
+            group[two] = one
+    others = [
+        next(find(body) for body in c.bodies if body != base)
+        for c in bodies.connections
+        if base in c.bodies and set(c.bodies) != {base}
+    ]
+    for other in others:
+        if other != find(platform) and others.count(other) > 1:
+            member = _most_joined(bodies, {body for body in group if find(body) == other})
+            raise OutOfClass(
+                f"{urdf.path}: the mechanism could not be read: found a second mechanism on the "
+                f"base, with link '{member}', that has no moving body in common with the platform "
+                f"'{platform}', needed one; write each to its own file."
+            )
+
+
+def _most_joined(bodies: Bodies, members: set[str]) -> str:
+    """Return the body of some where most joints meet."""
+    ends = [body for c in bodies.connections for body in c.bodies if body in members]
+    return max(sorted(members), key=ends.count)
 
 
 def _step(connection: Connection, near: int, urdf: Urdf) -> Step:
@@ -102,18 +137,22 @@ def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform:
         )
 
 
-def _not_a_chain(urdf: Urdf, first: Connection, body: str, base: str, n_onward: int) -> str:
-    """Return why the leg that starts at a joint is not a chain."""
+def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int) -> str:
+    """Return why the leg that starts with some joints is not a chain."""
+    needed = "needed one unbranched chain from base to platform for each leg"
+    first = steps[0].connection
     if body == base:
         found = "returns to the base"
     elif n_onward == 0:
         found = f"ends at link '{body}' without reaching the platform"
+    elif len(steps) == 1 and first.type != "sphere" and n_onward > 1:
+        found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        needed = "needed joints whose centres are fixed in the base"
     else:
         found = f"shares link '{body}' with another leg or branches there"
     return (
         f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
-        f"{_name(first)} {found}, needed one unbranched chain from base to platform for each leg; "
-        "check closed_loop, legcal.base and legcal.platform."
+        f"{_name(first)} {found}, {needed}; check closed_loop, legcal.base and legcal.platform."
     )
 
 
