@@ -134,14 +134,19 @@ def _solve(jacobian: Array, residual: Array) -> Array:
 
 
 def _hardly_changes(known: Array, jacobian: Array) -> bool:
-    """Say whether two square Jacobians differ too little for a singular one between them."""
-    if known.shape[0] != known.shape[1]:
-        return False
-    try:
-        change = np.linalg.solve(known, jacobian - known)
-    except np.linalg.LinAlgError:
-        return False
-    return float(np.abs(change).sum(axis=1).max()) < SURE
+    """Say whether two Jacobians differ too little for one of smaller rank between them."""
+    difference = jacobian - known
+    if known.shape[0] == known.shape[1]:
+        try:
+            change = np.linalg.solve(known, difference)
+        except np.linalg.LinAlgError:
+            change = np.full_like(known, np.inf)
+        if float(np.abs(change).sum(axis=1).max()) < SURE:
+            return True
+    left, values, right = np.linalg.svd(known, full_matrices=False)
+    rank = int(np.sum(values > 1e-6 * values[0]))
+    change = (left[:, :rank].T @ difference @ right[:rank].T) / values[:rank, None]
+    return float(np.linalg.norm(change, 2)) < SURE
 
 
 def _flipped(mechanism: Mechanism, configuration: Array) -> bool:
