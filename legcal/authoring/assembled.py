@@ -218,7 +218,7 @@ def _sizes(described: Description) -> list[str]:
         if leg.offset is None:
             continue
         ends = leg.travel or (0.0, 0.0)
-        for length in {leg.offset + ends[0], leg.offset + ends[1]}:
+        for length in (leg.offset + ends[0], leg.offset + ends[1]):
             problems += _out_of_proportion(described, leg.name, length)[:1]
             if problems:
                 return problems
