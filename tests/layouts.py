@@ -319,7 +319,8 @@ def expected_axes(machine: Machine, j: int) -> tuple[Array | None, Array | None,
         b_platform = _line(np.asarray(back.apply(b)))
     if not without_s:
         return (None if a is None else _line(a)), b_platform, None
-    assert a is not None and b_platform is not None
+    assert a is not None
+    assert b_platform is not None
     p = a if base == "R" else np.cross(a, leg.u)
     if platform == "":
         w = machine.home.rotation.apply(normal_basis(np.asarray(b_platform))[0])

@@ -1,5 +1,7 @@
 """Machines of the class, one function each, for tests that write them in many layouts."""
 
+from collections.abc import Callable
+
 import numpy as np
 from layouts import LegSpec, Machine
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -63,7 +65,7 @@ def planar(normal: tuple[float, float, float] = (0.0, 0.0, 1.0), n_legs: int = 3
     return Machine(legs, home, frame_legs=(0, 1), normal=n)
 
 
-MACHINES = {
+MACHINES: dict[str, Callable[[], Machine]] = {
     "6-UPS": lambda: of_types(["US"] * 6),
     "6-SPS": lambda: of_types(["SS"] * 6),
     "3-RPR": planar,

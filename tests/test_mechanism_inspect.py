@@ -4,6 +4,7 @@ import io
 import json
 from pathlib import Path
 
+import numpy as np
 from mechanisms import Layout, write_hexapod
 from rich.console import Console
 
@@ -23,8 +24,10 @@ def _table(description: dict[str, object]) -> str:
 def test_the_document_has_every_key_of_the_contract() -> None:
     document = json.loads(json.dumps(describe(load_mechanism("hexapod")), allow_nan=False))
     assert list(document) == [
-        "name", "spatial", "mobility", "motors", "n_d", "legs", "diagnostics",
+        "name", "spatial", "mobility", "motors", "n", "n_d", "r", "n_ac", "idle_spins", "legs",
+        "diagnostics",
     ]  # fmt: skip
+    assert [document[key] for key in ("n", "r", "n_ac", "idle_spins")] == [6, 0, 6, 0]
     assert document["name"] == "hexapod"
     assert document["spatial"] is True
     assert (document["mobility"], document["motors"], document["n_d"]) == (6, 6, 3)
@@ -32,7 +35,7 @@ def test_the_document_has_every_key_of_the_contract() -> None:
     leg = document["legs"][0]
     assert list(leg) == [
         "name", "type", "actuated", "kind", "A", "B", "q0", "sign", "base_axis", "platform_axis",
-        "cylinders",
+        "twist", "cylinders",
     ]  # fmt: skip
     assert (leg["type"], leg["actuated"], leg["kind"]) == ("SPU", True, "actuated")
     assert (leg["base_axis"], leg["platform_axis"], leg["sign"]) == (None, None, 1)
@@ -58,3 +61,18 @@ def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
     assert "344.217 - q" in text
     assert "note: the motors do not determine the pose" in text
     assert max(len(line) for line in text.splitlines()) <= 80
+
+
+def test_the_table_shows_axes_and_twists_where_they_are_parameters() -> None:
+    mechanism = load_mechanism("3-upu-tilted")
+    document = json.loads(json.dumps(describe(mechanism), allow_nan=False))
+    assert (document["r"], document["n_ac"], document["idle_spins"]) == (0, 3, 0)
+    assert document["legs"][0]["twist"] == mechanism.legs[0].twist
+    text = _table(document)
+    assert max(len(line) for line in text.splitlines()) <= 80
+    assert "axis at base" in text
+    assert f"{np.degrees(mechanism.legs[1].twist or 0.0):.3f}" in text
+    assert "axis at base" not in _table(describe(load_mechanism("3-rpr")))
+    assert describe(load_mechanism("3-rps"))["r"] == 3
+    assert describe(load_mechanism("hexapod-strut"))["idle_spins"] == 1
+    assert describe(load_mechanism("hexapod-strut"))["n_ac"] == 6

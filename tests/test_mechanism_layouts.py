@@ -8,9 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from layouts import (
     PASSED,
+    Layout,
     LegLayout,
     LegSpec,
-    Layout,
     Machine,
     expected_axes,
     expected_B,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from layouts import LegLayout, Layout, write_machine
+from layouts import Layout, LegLayout, write_machine
 from machines import MACHINES
 from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 

@@ -145,7 +145,7 @@ def test_a_folder_of_the_same_name_does_not_hide_a_shipped_model(
 
 
 def test_an_unknown_name_lists_the_shipped_models(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="or one of .*hexapod"):
+    with pytest.raises(ModelError, match=r"or one of .*hexapod"):
         load_mechanism("octopod")
     with pytest.raises(ModelError, match="found a folder"):
         load_mechanism(tmp_path)

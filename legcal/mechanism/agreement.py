@@ -1,4 +1,4 @@
-"""Whether a mechanism YAML and its URDF agree: names, the class covered, legs, length law."""
+"""Whether a mechanism YAML and its URDF agree: names, legs, motors, frames."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,16 +8,11 @@ import numpy as np
 from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.mechanism.bodies import Bodies
-from legcal.mechanism.closing import leg_vectors, platform_pose, slider_columns
-from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_chain import LegChain
-from legcal.mechanism.mobility import generic_configurations
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.proposal import any_joint
 from legcal.mechanism.schema import LegcalBlock, MechanismFile
 from legcal.mechanism.urdf import Urdf
-
-LENGTH_LAW = 1e-9  # [m]
 
 
 def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -186,32 +181,6 @@ def check_frames(mechanism: Mechanism) -> None:
             )
     if problems:
         raise ModelError(problems)
-
-
-def check_length_law(mechanism: Mechanism) -> None:
-    """Check L = sign q + q0 against Pinocchio at two closed configurations.
-
-    Raises
-    ------
-    OutOfClass
-        If a leg does not keep it to 1e-9 m.
-    """
-    for configuration in generic_configurations(mechanism, 2):
-        if np.abs(mechanism.chain.residual(configuration)).max() > 1e-11:
-            continue  # the little step did not close: home alone decides
-        T_base_platform = platform_pose(mechanism, configuration)
-        lengths = np.linalg.norm(leg_vectors(mechanism, T_base_platform), axis=1)
-        for j, leg in enumerate(mechanism.legs):
-            q = 0.0
-            if leg.kind is not LegKind.CONSTANT:
-                q = float(configuration[slider_columns(mechanism, (j,))[0][0]])
-            miss = abs(float(lengths[j]) - (leg.sign * q + leg.q0))
-            if miss > LENGTH_LAW:
-                raise OutOfClass(
-                    f"{mechanism.yaml_path}: leg '{leg.name}' is outside the method: found its "
-                    f"length {1e3 * miss:.3g} mm away from reading plus offset, needed at most "
-                    f"{1e3 * LENGTH_LAW:.0e} mm; check the origins along the leg."
-                )
 
 
 def check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:

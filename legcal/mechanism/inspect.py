@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from legcal.mechanism.leg import Leg
+from legcal.mechanism.leg import Leg, LegKind
 from legcal.mechanism.model import Mechanism
 
 
@@ -18,14 +18,21 @@ def describe(mechanism: Mechanism) -> dict[str, Any]:
     -------
     dict
         The document of ``legcal inspect --json``: A in the base link and B in the platform link
-        [m], ``n_d`` the number of legs that define the frames.
+        [m], ``n_d`` the number of legs that define the frames, ``r`` that of R joints on the base,
+        ``n_ac`` that of legs that are actuated or of constant length, ``idle_spins`` the
+        freedoms that turn nothing but a leg about itself; twist in [rad].
     """
+    kinds = [leg.kind for leg in mechanism.legs]
     return {
         "name": mechanism.name,
         "spatial": mechanism.spatial,
         "mobility": mechanism.mobility,
         "motors": len(mechanism.motors),
+        "n": mechanism.n_legs,
         "n_d": len(mechanism.frame_legs),
+        "r": sum(leg.base_joint == "R" for leg in mechanism.legs),
+        "n_ac": len(kinds) - kinds.count(LegKind.PASSIVE),
+        "idle_spins": sum(chain.idle_spins for chain in mechanism.leg_chains),
         "legs": [_leg(leg) for leg in mechanism.legs],
         "diagnostics": list(mechanism.diagnostics),
     }
@@ -46,5 +53,6 @@ def _leg(leg: Leg) -> dict[str, Any]:
         "platform_axis": (
             None if leg.platform_axis is None else [float(x) for x in leg.platform_axis]
         ),
+        "twist": leg.twist,
         "cylinders": [{"link": c.link, "radius": c.radius} for c in leg.cylinders],
     }

@@ -8,10 +8,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
+from legcal.files.motion import MotionEntry
+from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.geometry.types import Array
 from legcal.mechanism import agreement
 from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
+from legcal.mechanism.consistency import check_equations
 from legcal.mechanism.cylinders import with_cylinders
 from legcal.mechanism.home import closed_home
 from legcal.mechanism.leg_chain import LegChain
@@ -50,12 +53,16 @@ def load_mechanism(model: str | Path) -> Mechanism:
     pairs = sorted(zip(file.closed_loop, file.type, strict=True))  # sums depend on their order
     closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
     block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
+    if block.home is None and source.poses is not None:
+        T = source.poses[block.base].inv() * source.poses[block.platform]
+        home = MotionEntry.model_validate(motion_to_xyz_quat(T))
+        block = block.model_copy(update={"home": home})
     mechanism = _assemble(source, block, closures)
     given = mechanism.home if block.home is not None else None
     home, configuration = closed_home(mechanism, given)
     mechanism = replace(mechanism, home=home, home_configuration=configuration)
     mechanism = replace(mechanism, mobility=mobility(mechanism))
-    agreement.check_length_law(mechanism)
+    check_equations(mechanism)
     proposed = proposal_notes(file.legcal, mechanism)
     found = diagnose(mechanism, home_is_given=block.home is not None)
     return replace(mechanism, diagnostics=(*source.notes, *proposed, *found))

@@ -1,5 +1,6 @@
 """The table of ``legcal inspect``: a mechanism as found, on 80 columns."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -38,12 +39,42 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
             leg["name"], f"{leg['type']}{kind}", A_text, B_text, _length(leg),
             ", ".join(radii) or "none",
         )  # fmt: skip
+    axes: list[RenderableType] = []
+    if _has_axes(description["legs"]):
+        axes = [Text(), _axes_table(description["legs"])]
     notes = [Text(f"note: {note}") for note in description["diagnostics"]]
     legend = Text(
         f"R_b and R_e stand on the joints of {description['n_d']} legs; q is the reading.",
         style="dim",
     )
-    return Group(heading, Text(), table, Text(), legend, *notes)
+    return Group(heading, Text(), table, *axes, Text(), legend, *notes)
+
+
+def _has_axes(legs: Sequence[dict[str, Any]]) -> bool:
+    """Say whether the axis of any joint is a parameter."""
+    return any(leg["base_axis"] or leg["platform_axis"] for leg in legs)
+
+
+def _axes_table(legs: Sequence[dict[str, Any]]) -> Table:
+    """Return the axes of the joints, and the twist of legs that cannot turn about themselves."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("leg", overflow="fold")
+    table.add_column("axis at base", justify="right", no_wrap=True)
+    table.add_column("axis at platform", justify="right", no_wrap=True)
+    table.add_column(r"twist \[deg]", justify="right", no_wrap=True)
+    for leg in legs:
+        twist = "" if leg["twist"] is None else f"{math.degrees(leg['twist']) + 0.0:.3f}"
+        table.add_row(
+            leg["name"], _direction(leg["base_axis"]), _direction(leg["platform_axis"]), twist
+        )
+    return table
+
+
+def _direction(axis: Sequence[float] | None) -> str:
+    """Return a unit vector, or nothing where there is no axis."""
+    if axis is None:
+        return ""
+    return " ".join(f"{round(x, 4) + 0.0:7.4f}" for x in axis)
 
 
 def _type_width(legs: Sequence[dict[str, Any]]) -> int:

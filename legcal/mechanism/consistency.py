@@ -1,0 +1,71 @@
+"""Whether the legs that were found keep their equations where Pinocchio closes the loops."""
+
+import numpy as np
+
+from legcal.errors import OutOfClass
+from legcal.mechanism.axes import CONCURRENT, PERPENDICULAR
+from legcal.mechanism.closing import platform_pose, slider_columns
+from legcal.mechanism.equations import Demand, geometry_of, linearize
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.mobility import generic_configurations
+from legcal.mechanism.model import Mechanism
+
+CONFIGURATIONS = 3
+
+_FOUND = {
+    Demand.BASE_AXIS: "its revolute axis at the base {0:.3g} deg from perpendicular to the leg",
+    Demand.PLATFORM_AXIS: "its revolute axis at the platform {0:.3g} deg from perpendicular to it",
+    Demand.ALONG_1: "it turned {0:.3g} deg in the platform to which it is fixed",
+    Demand.ALONG_2: "it turned {0:.3g} deg in the platform to which it is fixed",
+    Demand.TWIST: "it twisted by {0:.3g} deg although it has no S joint",
+}
+
+
+def check_equations(mechanism: Mechanism) -> None:
+    """Check the equations of all legs against Pinocchio at home and at poses near it.
+
+    The closed configurations come from the URDF alone, the equations from the geometry that was
+    found: both must describe one machine. Origins and axes of a file are rounded, so the same
+    tolerances hold as for joints.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The mechanism, with its chain closed at home.
+
+    Raises
+    ------
+    OutOfClass
+        If a length is more than 10 um off, or an axis, a direction or a twist more than 1 mrad.
+    """
+    problems: dict[str, str] = {}
+    for configuration in generic_configurations(mechanism, CONFIGURATIONS):
+        T = platform_pose(mechanism, configuration)
+        R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
+        for j, leg in enumerate(mechanism.legs):
+            equations = linearize(geometry_of(leg), R, t)
+            values = equations.values[0].copy()
+            if leg.kind is not LegKind.CONSTANT:
+                values[0] -= leg.sign * configuration[slider_columns(mechanism, (j,))[0][0]]
+            for demand, value in zip(equations.demands, np.abs(values), strict=True):
+                problem = _problem(demand, float(value))
+                if problem is not None:
+                    problems.setdefault(
+                        leg.name,
+                        f"{mechanism.yaml_path}: leg '{leg.name}' is outside the method: found "
+                        f"{problem} at a closed pose; check the origins and axes along the leg.",
+                    )
+    if problems:
+        raise OutOfClass(list(problems.values()))
+
+
+def _problem(demand: Demand, value: float) -> str | None:
+    """Return how an equation is broken, None if it is kept."""
+    if demand is Demand.LENGTH:
+        if value <= CONCURRENT:
+            return None
+        return f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most 0.01 mm,"
+    if value <= PERPENDICULAR:
+        return None
+    angle = np.degrees(np.arcsin(min(value, 1.0)))
+    return f"{_FOUND[demand].format(angle)}, needed at most {np.degrees(PERPENDICULAR):.2g} deg,"
