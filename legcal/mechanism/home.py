@@ -21,6 +21,7 @@ TRIALS = 200
 ENOUGH = 20  # trials, where one of them found a pose above the base
 SETTLED = 1e-15  # of a leg length
 FURTHEST = 0.01  # of a leg length
+PATIENCE = 5  # steps that change little
 _RANK = 1e-9
 
 
@@ -144,15 +145,16 @@ def _solve(
         return demands, values, float(values @ values)
 
     demands, values, cost = misfit(T)
-    damping = 1e-3
+    damping, stuck = 1e-3, 0
     for _ in range(steps):
-        if np.abs(values).max() < 1e-14 * scale:
+        if np.abs(values).max() < 1e-14 * scale or stuck > PATIENCE:
             break
         step = _step(demands.jacobian, values, scale, damping if damping > 1e-9 else 0.0)
         size = float(np.abs(step[:3]).max())
         trial = moved(T, step / max(1.0, size))  # at most a radian
         ahead = misfit(trial)
         if ahead[2] < cost:
+            stuck = stuck + 1 if ahead[2] > 0.9 * cost else 0
             T, (demands, values, cost), damping = trial, ahead, damping / 10.0
         elif damping > 1e3 or cost < (1e-13 * scale) ** 2:
             break
@@ -166,7 +168,8 @@ def _unlikely(mechanism: Mechanism, T: RigidTransform) -> float:
     centre = mechanism.A_base.mean(axis=0)
     B = np.asarray(T.apply(mechanism.B_platform))
     size = float(np.abs(B - mechanism.A_base).max())
-    penalty = 10.0 * float(B.mean(axis=0)[2] < centre[2] - 1e-6 * size)
+    below = mechanism.spatial and B.mean(axis=0)[2] < centre[2] - 1e-6 * size
+    penalty = 10.0 * float(below)
     for j, (leg, q) in enumerate(zip(mechanism.legs, readings_at(mechanism, T), strict=True)):
         lower, upper = leg.travel
         if leg.kind is LegKind.PASSIVE and not lower <= q <= upper:
