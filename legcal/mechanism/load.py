@@ -55,12 +55,12 @@ def load_mechanism(model: str | Path) -> Mechanism:
     block = file.legcal or propose_block(urdf, closures, file.name_mot, source.path)
     if block.home is None and source.poses is not None:
         T = source.poses[block.base].inv() * source.poses[block.platform]
-        home = MotionEntry.model_validate(motion_to_xyz_quat(T))
-        block = block.model_copy(update={"home": home})
+        drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
+        block = block.model_copy(update={"home": drawn})
     mechanism = _assemble(source, block, closures)
     given = mechanism.home if block.home is not None else None
-    home, configuration = closed_home(mechanism, given)
-    mechanism = replace(mechanism, home=home, home_configuration=configuration)
+    pose, configuration = closed_home(mechanism, given)
+    mechanism = replace(mechanism, home=pose, home_configuration=configuration)
     mechanism = replace(mechanism, mobility=mobility(mechanism))
     check_equations(mechanism)
     proposed = proposal_notes(file.legcal, mechanism)

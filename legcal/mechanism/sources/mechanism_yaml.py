@@ -8,23 +8,15 @@ from legcal.errors import ModelError
 from legcal.mechanism.files import find_urdf
 from legcal.mechanism.robot_xml import parse_robot
 from legcal.mechanism.schema import MechanismFile, read_mechanism_file
-from legcal.mechanism.sources.reference import reference_poses
 from legcal.mechanism.sources.source import Source
 from legcal.mechanism.sources.stand_ins import check_stand_ins, replace_stand_ins
-from legcal.mechanism.sources.travel import (
-    assumed_travel,
-    set_travel,
-    sliders_without_travel,
-    travel_note,
-)
 from legcal.mechanism.urdf import Urdf, parse_urdf, read_urdf
 
 
 def read_yaml_source(path: Path) -> Source:
     """Return a mechanism from its YAML and the URDF that it names.
 
-    A file without the block ``legcal`` may leave the travel of sliders open, as Gepetto's do: one
-    is then assumed, and a note says so.
+    A file without the block ``legcal`` may leave the travel of sliders open, as Gepetto's do.
 
     Raises
     ------
@@ -37,23 +29,18 @@ def read_yaml_source(path: Path) -> Source:
         find_urdf(path, None if block is None else block.urdf), travel_needed=block is not None
     )
     check_stand_ins(file, urdf, path)
-    sliders = sliders_without_travel(urdf)
-    if not sliders and not file.joint_name:
+    if not file.joint_name:
         return Source(path, file, urdf)
-    return _converted(path, file, urdf, sliders)
+    return _converted(path, file, urdf)
 
 
-def _converted(path: Path, file: MechanismFile, urdf: Urdf, sliders: list[str]) -> Source:
-    """Return a mechanism whose URDF had to be completed."""
+def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
+    """Return a mechanism whose URDF has joints that stand for others."""
     robot = parse_robot(urdf.path, urdf.content)
-    notes = []
-    if sliders:
-        travel = assumed_travel(reference_poses(urdf))
-        notes.append(travel_note(sliders, travel))
-        set_travel(robot, sliders, travel)
     frames = replace_stand_ins(robot, file, urdf)
     content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
-    completed = parse_urdf(urdf.path, content)
+    travel_needed = file.legcal is not None
+    completed = parse_urdf(urdf.path, content, travel_needed=travel_needed)
     changes = {
         "closed_loop": [[frames.get(name, name) for name in pair] for pair in file.closed_loop],
         "joint_name": [],
@@ -67,4 +54,4 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf, sliders: list[str]) 
                 "for another joint (joint_name), needed another joint of that leg; name its "
                 "prismatic joint."
             )
-    return Source(path, file.model_copy(update=changes), completed, True, tuple(notes))
+    return Source(path, file.model_copy(update=changes), completed, True)

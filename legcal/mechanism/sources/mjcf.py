@@ -17,11 +17,9 @@ from legcal.mechanism.robot_xml import parse_xml
 from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.sources.components import moving_groups
 from legcal.mechanism.sources.loops import Loop, LoopKind, close_loop
-from legcal.mechanism.sources.mjcf_bodies import NO_RANGE, WORLD, MjcfTree, read_bodies
+from legcal.mechanism.sources.mjcf_bodies import WORLD, MjcfTree, read_bodies
 from legcal.mechanism.sources.mjcf_values import Values, own_attributes
 from legcal.mechanism.sources.source import Source
-from legcal.mechanism.sources.travel import assumed_travel, travel_note
-from legcal.mechanism.sources.tree_text import limit
 from legcal.mechanism.urdf import Urdf, parse_urdf
 from legcal.mechanism.urdf_checks import Problems
 
@@ -52,16 +50,15 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
             "<weld> in <equality>, which is a tree without closed loops, needed the closures of "
             "its loops; add them."
         )
-    notes = _assume_travel(tree)
     pairs = [close_loop(loop, tree.text, tree.poses) for loop in loops]
     name = root.get("model", "").strip() or path.stem
-    urdf = parse_urdf(path, tree.text.robot(name))
+    urdf = parse_urdf(path, tree.text.robot(name), travel_needed=False)
     frames = [ends for ends, _ in pairs]
     urdf, dropped = _without_loose_bodies(urdf, frames, tree, name)
-    if dropped:
-        notes.append(f"Free bodies that touch no loop were left out: {', '.join(dropped)}.")
+    left_out = f"Free bodies that touch no loop were left out: {', '.join(dropped)}."
+    values_there = {name: x for name, x in tree.references.items() if name in urdf.joints}
     file = MechanismFile(closed_loop=frames, type=[kind for _, kind in pairs], name_mot=motors)
-    return Source(path, file, urdf, True, tuple(notes))
+    return Source(path, file, urdf, True, (left_out,) * bool(dropped), values_there)
 
 
 def _loops(root: etree._Element, tree: MjcfTree) -> Iterator[Loop]:
@@ -188,18 +185,6 @@ def _motors(root: etree._Element, tree: MjcfTree) -> list[str]:
     return list(motors)
 
 
-def _assume_travel(tree: MjcfTree) -> list[str]:
-    """Write a travel for slides without a range, and return the note that says so."""
-    if not tree.open_sliders:
-        return []
-    lower, upper = assumed_travel(tree.poses)
-    for name, value in tree.open_sliders.items():
-        tree.text.joints[name] = tree.text.joints[name].replace(
-            limit(*NO_RANGE), limit(value + lower, value + upper)
-        )
-    return [travel_note(list(tree.open_sliders), (lower, upper))]
-
-
 def _without_loose_bodies(
     urdf: Urdf, frames: list[list[str]], tree: MjcfTree, name: str
 ) -> tuple[Urdf, list[str]]:
@@ -225,4 +210,4 @@ def _without_loose_bodies(
     for link in loose:
         del tree.text.links[link]
     freed = [f"'{j.child}'" for j in held if j.type == "floating"]
-    return parse_urdf(urdf.path, tree.text.robot(name)), freed
+    return parse_urdf(urdf.path, tree.text.robot(name), travel_needed=False), freed

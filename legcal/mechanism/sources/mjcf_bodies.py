@@ -11,7 +11,6 @@ from legcal.mechanism.sources.mjcf_values import Attributes, Values, own_attribu
 from legcal.mechanism.sources.tree_text import EYE, FULL_TURN, TextCylinder, TreeText
 
 WORLD = "world"
-NO_RANGE = (-1e9, 1e9)  # stands for the travel of a slide until one is assumed
 _Z = (0.0, 0.0, 1.0)
 _NOT_READ = ("include", "composite", "flexcomp", "attach", "replicate")
 
@@ -30,8 +29,8 @@ class MjcfTree:
         Body and pose there of every named site.
     joints : dict of str to str
         The type of every hinge, slide, ball or free joint.
-    open_sliders : dict of str to float
-        The values [m] of slides without a range in the configuration of the file.
+    references : dict of str to float
+        The values [rad, m] of hinges and slides in the configuration of the file.
     taken : set of str
         Names that no new link or joint may have.
     """
@@ -41,7 +40,7 @@ class MjcfTree:
     poses: dict[str, RigidTransform] = field(default_factory=dict)
     sites: dict[str, tuple[str, RigidTransform]] = field(default_factory=dict)
     joints: dict[str, str] = field(default_factory=dict)
-    open_sliders: dict[str, float] = field(default_factory=dict)
+    references: dict[str, float] = field(default_factory=dict)
     taken: set[str] = field(default_factory=set)
 
 
@@ -252,11 +251,12 @@ def _one_axis(
     limits = _range(tree, element, attributes)
     if kind == "slide":
         T_at_joint = T_at_joint * RigidTransform.from_translation(-zero * axis)
-        if limits is None:
-            tree.open_sliders[name] = zero
-        tree.text.joint(name, "prismatic", at, child, T_at_joint, axis, limits or NO_RANGE)
+        tree.references[name] = zero
+        tree.text.joint(name, "prismatic", at, child, T_at_joint, axis, limits)
         return
-    turn = Rotation.from_rotvec(-values.compiler.radians(zero) * axis)
+    zero = values.compiler.radians(zero)
+    tree.references[name] = zero
+    turn = Rotation.from_rotvec(-zero * axis)
     T_at_joint = T_at_joint * RigidTransform.from_rotation(turn)
     turns = (-FULL_TURN, FULL_TURN)
     if limits is not None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from legcal.errors import ModelError, OutOfClass
 from legcal.mechanism.files import find_model, read_file, yaml_of_urdf
 from legcal.mechanism.robot_xml import parse_xml
+from legcal.mechanism.sources.closed_start import completed
 from legcal.mechanism.sources.components import check_one_mechanism
 from legcal.mechanism.sources.mechanism_yaml import read_yaml_source
 from legcal.mechanism.sources.mjcf import read_mjcf_source
@@ -33,9 +34,10 @@ def read_source(model: str | Path) -> Source:
     path = find_model(model)
     is_xml = path.suffix.lower() in XML_SUFFIXES
     source = _read_xml(path) if is_xml else read_yaml_source(path)
-    if source.file.legcal is None:
-        check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
-    return source
+    if source.file.legcal is not None:
+        return source
+    check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
+    return completed(source)
 
 
 def _read_xml(path: Path) -> Source:

@@ -1,7 +1,10 @@
 """What every format of mechanism is read as: a tree, the closures that close it, its motors."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+
+from scipy.spatial.transform import RigidTransform
 
 from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.urdf import Urdf
@@ -24,6 +27,11 @@ class Source:
         of that format.
     notes : tuple of str
         What the reader should know of the conversion, one sentence each.
+    values : mapping of str to float
+        Joint values [rad, m] of the configuration that the file is drawn in; others are zero.
+    poses : mapping of str to RigidTransform or None
+        Where the links are in a closed configuration near that one, in the root link; None
+        where none was looked for or found.
     """
 
     path: Path
@@ -31,3 +39,5 @@ class Source:
     urdf: Urdf
     converted: bool = False
     notes: tuple[str, ...] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+    poses: Mapping[str, RigidTransform] | None = None

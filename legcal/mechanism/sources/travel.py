@@ -40,19 +40,22 @@ def travel_note(sliders: Sequence[str], travel: tuple[float, float]) -> str:
     """Return what the reader must know of sliders whose travel was assumed."""
     names = ", ".join(f"'{name}'" for name in sliders[:6])
     return (
-        f"The file gives no travel for {len(sliders)} sliders ({names}): {travel[0]:g} to "
-        f"{travel[1]:g} m was assumed; write their limits."
+        f"The file gives no travel for {len(sliders)} sliders ({names}): {travel[1]:g} m to either "
+        "side of where it is closed was assumed; write their limits."
     )
 
 
-def set_travel(robot: etree._Element, sliders: Sequence[str], travel: tuple[float, float]) -> None:
-    """Write the travel of sliders into a URDF."""
+def set_travel(
+    robot: etree._Element, readings: Mapping[str, float], travel: tuple[float, float]
+) -> None:
+    """Write the travel of sliders about some readings [m] into a URDF."""
     for element in robot:
-        if element.tag == "joint" and element.get("name") in sliders:
+        name = str(element.get("name"))
+        if element.tag == "joint" and name in readings:
             limit = element.find("limit")
             if limit is None:
                 limit = etree.SubElement(element, "limit")
-            limit.set("lower", repr(travel[0]))
-            limit.set("upper", repr(travel[1]))
+            limit.set("lower", repr(readings[name] + travel[0]))
+            limit.set("upper", repr(readings[name] + travel[1]))
             for key in ("effort", "velocity"):
                 limit.set(key, limit.get(key, "1000"))

@@ -62,12 +62,12 @@ class TreeText:
         child: str,
         T_parent_origin: RigidTransform = EYE,
         axis: Array | None = None,
-        limits: tuple[float, float] = (-FULL_TURN, FULL_TURN),
+        limits: tuple[float, float] | None = (-FULL_TURN, FULL_TURN),
     ) -> None:
         """Add a joint; ``axis`` and ``limits`` [rad] or [m] are those of a moving one."""
         moving = ""
         if axis is not None:
-            moving = f'<axis xyz="{_numbers(axis)}"/>' + limit(*limits)
+            moving = f'<axis xyz="{_numbers(axis)}"/>' + limit(limits)
         self.joints[name] = (
             f'  <joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
             f"<child link={quoteattr(child)}/>{origin(T_parent_origin)}{moving}</joint>"
@@ -89,9 +89,10 @@ def origin(T_parent_origin: RigidTransform) -> str:
     return f'<origin xyz="{_numbers(T_parent_origin.translation)}" rpy="{_numbers(rpy)}"/>'
 
 
-def limit(lower: float, upper: float) -> str:
+def limit(limits: tuple[float, float] | None) -> str:
     """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
-    return f'<limit lower="{lower!r}" upper="{upper!r}" effort="1000" velocity="1"/>'
+    ends = "" if limits is None else f'lower="{limits[0]!r}" upper="{limits[1]!r}" '
+    return f'<limit {ends}effort="1000" velocity="1"/>'
 
 
 def roll_pitch_yaw(matrix: Array) -> Array:

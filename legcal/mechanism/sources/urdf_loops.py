@@ -19,12 +19,6 @@ from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.sources.loops import Loop, LoopKind, close_loop
 from legcal.mechanism.sources.reference import reference_poses
 from legcal.mechanism.sources.source import Source
-from legcal.mechanism.sources.travel import (
-    assumed_travel,
-    set_travel,
-    sliders_without_travel,
-    travel_note,
-)
 from legcal.mechanism.sources.tree_text import TreeText
 from legcal.mechanism.urdf import LOOP_TAGS, Urdf, checked_tree, parse_urdf
 from legcal.mechanism.urdf_checks import Problems, number_list
@@ -69,18 +63,13 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         if line:
             robot.append(etree.fromstring(line))
             robot[-1].tail = "\n"
-    sliders = sliders_without_travel(bare)
-    if sliders:
-        travel = assumed_travel(poses)
-        notes.append(travel_note(sliders, travel))
-        set_travel(robot, sliders, travel)
     written = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
     file = MechanismFile(
         closed_loop=[frames for frames, _ in pairs],
         type=[kind for _, kind in pairs],
         name_mot=motors,
     )
-    return Source(path, file, parse_urdf(path, written), True, tuple(notes))
+    return Source(path, file, parse_urdf(path, written, travel_needed=False), True, tuple(notes))
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
