@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.authoring.checks import wrong_axes, wrong_lengths, wrong_sizes
 from legcal.authoring.home import find_home
 from legcal.authoring.machine import Description, Home, LegEntry, LegType
 from legcal.errors import ModelError
@@ -14,8 +15,6 @@ from legcal.geometry.frames import frame_on_points
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 
-LONGEST, SHORTEST = 20.0, 1e-3  # [m]; beyond, the unit is the likely mistake
-SQUARE = 1e-3  # [rad]
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # of the length at home, for passive sliders without limits
 
@@ -104,13 +103,13 @@ def assemble(described: Description) -> Assembled:
         If it cannot be: joints that coincide, lengths out of all proportion, a travel that does
         not reach home, an axis that does not fit the leg; one sentence for each.
     """
-    _refuse(_sizes(described))
+    _refuse(wrong_sizes(described))
     home = find_home(described)
     T = home.motion()
     A = np.array([leg.A_base for leg in described.legs])
     B = T.apply(np.array([leg.B_platform for leg in described.legs]))
     lengths = np.linalg.norm(B - A, axis=1)
-    _refuse(_lengths(described, lengths))
+    _refuse(wrong_lengths(described, lengths))
     u = (B - A) / lengths[:, None]
     tangents = np.array([across_leg(u[j], A[j] - A.mean(axis=0)) for j in range(len(A))])
     if all_revolute(described):
@@ -118,7 +117,7 @@ def assemble(described: Description) -> Assembled:
     legs, problems = [], []
     for j, entry in enumerate(described.legs):
         axes = _axes(entry, tangents[j], T)
-        problems += _crooked(described, entry, u[j], axes)
+        problems += wrong_axes(described, entry, u[j], axes)
         q0, travel = _law(entry, float(lengths[j]))
         legs.append(
             AssembledLeg(
@@ -209,97 +208,6 @@ def _degenerate(described: Description, chosen: Sequence[int]) -> bool:
     except ValueError:
         return True
     return False
-
-
-def _sizes(described: Description) -> list[str]:
-    """Return what the numbers alone say is wrong."""
-    problems = []
-    for leg in described.legs:
-        if leg.offset is None:
-            continue
-        ends = leg.travel or (0.0, 0.0)
-        for length in (leg.offset + ends[0], leg.offset + ends[1]):
-            problems += _out_of_proportion(described, leg.name, length)[:1]
-            if problems:
-                return problems
-    for side, joints in (
-        ("base", [leg.A_base for leg in described.legs]),
-        ("platform", [leg.B_platform for leg in described.legs]),
-    ):
-        reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        if reach > LONGEST:
-            problems.append(
-                f"{described.source}: the {side} joints could not be used: found them "
-                f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
-                f"{LONGEST:g} m; {_about_the_unit(described.unit, too_long=True)}."
-            )
-    return problems
-
-
-def _lengths(described: Description, lengths: Array) -> list[str]:
-    """Return what is wrong with the lengths of the legs at home."""
-    problems = list[str]()
-    for leg, length in zip(described.legs, lengths, strict=True):
-        found = _out_of_proportion(described, leg.name, float(length))
-        if found:
-            return found
-        if leg.kind is LegKind.CONSTANT or leg.travel is None:
-            continue
-        q0 = leg.offset or 0.0
-        low, high = q0 + leg.travel[0], q0 + leg.travel[1]
-        slack = 1e-9
-        if not low - slack <= length <= high + slack:
-            problems.append(
-                f"{described.source}: leg '{leg.name}' cannot close at home: found the length "
-                f"{1e3 * length:.6g} mm there, needed {1e3 * low:.6g} to {1e3 * high:.6g} mm "
-                "(offset plus travel); correct home, offsets or travel."
-            )
-    return problems
-
-
-def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
-    """Return that a leg has a length that no leg has."""
-    if SHORTEST <= length <= LONGEST:
-        return []
-    where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
-    return [
-        f"{where} with lengths in {described.unit}, needed {SHORTEST:g} to {LONGEST:g} m; "
-        f"{_about_the_unit(described.unit, too_long=length > LONGEST)}."
-    ]
-
-
-def _about_the_unit(unit: str, *, too_long: bool) -> str:
-    """Return what to do about sizes out of all proportion."""
-    if unit == "m" and too_long:
-        return "these look like mm values where m are stated: check the unit"
-    if unit == "mm" and not too_long:
-        return "these look like m values where mm are stated: check the unit"
-    return "check the numbers and the unit"
-
-
-def _crooked(
-    described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
-) -> list[str]:
-    """Return which axes do not fit their leg at home."""
-    problems = []
-    for side, letter, axis in (
-        ("base", entry.type.base, axes[0]),
-        ("platform", entry.type.platform, axes[1]),
-    ):
-        angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
-        if letter == "R" and 90.0 - angle > np.degrees(SQUARE):
-            problems.append(
-                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
-                f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
-                f"correct {side}_axes or home."
-            )
-        if letter == "U" and angle < 1.0:
-            problems.append(
-                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
-                f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "
-                f"needed it across the leg; correct {side}_axes or home."
-            )
-    return problems
 
 
 def _refuse(problems: list[str]) -> None:

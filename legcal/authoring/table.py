@@ -1,190 +1,28 @@
 """The table of a machine: YAML or CSV, read strictly, lengths in the unit that it states."""
 
-import re
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field
 from scipy.spatial.transform import Rotation
 
 from legcal.authoring.columns import read_columns
 from legcal.authoring.machine import (
-    NEEDED_TYPE,
     Description,
     Home,
     LegEntry,
     LegType,
     leg_type,
 )
+from legcal.authoring.table_schema import TableFile, is_pair
 from legcal.errors import DatasetError, ModelError
 from legcal.files import schema
-from legcal.files.motion import Quaternion, Vector
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 
 WHAT = "table"
 UNITS = {"m": 0, "mm": -3}
-PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-
-
-def plain_name(name: object) -> object:
-    """Refuse a name that cannot be part of a file name and of joint names."""
-    if not isinstance(name, str) or not PLAIN.fullmatch(name):
-        raise ValueError(
-            f"found {schema.describe(name)}, needed letters, digits, '-', '_' and '.', the first a "
-            "letter or digit; rename it."
-        )
-    return name
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
-
-
-def _wanted(value: Any, fits: bool, needed: str) -> Any:
-    """Return a value if it fits, else refuse it."""
-    if not fits:
-        raise ValueError(f"found {schema.describe(value)}, needed {needed}; correct it.")
-    return value
-
-
-def _numbers(value: Any) -> Any:
-    entries = value if isinstance(value, list) else [value]
-    return _wanted(
-        value,
-        all(_number(x) or (x is None and isinstance(value, list)) for x in entries),
-        "a number, or a list with a number (or null) for each leg",
-    )
-
-
-def _is_pair(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(_number(x) for x in value)
-
-
-def _travel(value: Any) -> Any:
-    fits = _is_pair(value) or (
-        isinstance(value, list) and all(x is None or _is_pair(x) for x in value)
-    )
-    _wanted(value, fits, "[lowest, highest] reading, or a list with that pair (or null) a leg")
-    for pair in [value] if _is_pair(value) or not isinstance(value, list) else value:
-        if pair is not None and not pair[0] < pair[1]:
-            raise ValueError(f"found {pair}, needed the lower reading first; correct it.")
-    return value
-
-
-def _is_radius(value: Any) -> bool:
-    if isinstance(value, dict):
-        return (
-            bool(value)
-            and value.keys() <= {"tube", "rod"}
-            and all(_number(x) and x > 0 for x in value.values())
-        )
-    return _number(value) and value > 0
-
-
-def _radius(value: Any) -> Any:
-    entries = value if isinstance(value, list) else [value]
-    return _wanted(
-        value,
-        all(_is_radius(x) or (x is None and isinstance(value, list)) for x in entries),
-        "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
-    )
-
-
-def _points(value: Any) -> Any:
-    rows = value if isinstance(value, list) else [value]
-    for i, row in enumerate(rows):
-        fits = isinstance(row, list) and len(row) in (2, 3) and all(_number(x) for x in row)
-        if not fits:
-            raise ValueError(
-                f"found {schema.describe(row)} in row {i + 1}, needed three numbers, x y z (two "
-                "in the plane); correct it."
-            )
-    return [[*row, 0.0][:3] for row in rows]
-
-
-def _directions(value: Any) -> Any:
-    rows = value if isinstance(value, list) else [value]
-    for i, row in enumerate(rows):
-        fits = row is None or (
-            isinstance(row, list)
-            and len(row) == 3
-            and all(_number(x) for x in row)
-            and float(np.linalg.norm(row)) > 1e-6
-        )
-        if not fits:
-            raise ValueError(
-                f"found {schema.describe(row)} in row {i + 1}, needed a direction of three numbers "
-                "that are not all zero, or null for the default; correct it."
-            )
-    return rows
-
-
-def _kinds(value: Any) -> Any:
-    entries = value if isinstance(value, list) else [value]
-    known = [kind.value for kind in LegKind]
-    for kind in entries:
-        if kind is not None and kind not in known:
-            raise ValueError(
-                f"found {schema.describe(kind)}, needed {', '.join(known)}, one for all legs or a "
-                "list; correct it."
-            )
-    return value
-
-
-def _type_of_leg(value: object) -> object:
-    if not isinstance(value, str) or leg_type(value) is None:
-        raise ValueError(
-            f"found the leg type {schema.describe(value)}, needed {NEEDED_TYPE}; correct it."
-        )
-    return value
-
-
-def _type(value: object) -> object:
-    text = value.split("-", 1) if isinstance(value, str) else [""]
-    if len(text) == 2 and (not text[0].isdigit() or int(text[0]) < 1):
-        raise ValueError(
-            f"found {schema.describe(value)}, needed a type such as 6-UPS; correct it."
-        )
-    _type_of_leg(text[-1])
-    return value
-
-
-PlainName = Annotated[str, BeforeValidator(plain_name)]
-Points = Annotated[list[Any], BeforeValidator(_points)]
-Directions = Annotated[list[Any], BeforeValidator(_directions)]
-
-
-class HomeEntry(schema.FileSchema):
-    """The block ``home``: a pose of the platform in the base."""
-
-    xyz: Vector
-    quat_xyzw: Quaternion | None = None
-    rpy_deg: Vector | None = None
-
-
-class TableFile(schema.FileSchema):
-    """A table in YAML. All lengths are in ``unit``; directions have no length."""
-
-    legcal_table: Literal[1]
-    name: PlainName
-    unit: Literal["m", "mm"]
-    type: Annotated[str | None, BeforeValidator(_type)] = None
-    types: list[Annotated[str, BeforeValidator(_type_of_leg)]] | None = None
-    legs: list[PlainName] | None = None
-    base_joints: Points
-    platform_joints: Points
-    offsets: Annotated[Any, BeforeValidator(_numbers)] = None
-    lengths: Annotated[Any, BeforeValidator(_numbers)] = None
-    travel: Annotated[Any, BeforeValidator(_travel)] = None
-    radius: Annotated[Any, BeforeValidator(_radius)] = None
-    kinds: Annotated[Any, BeforeValidator(_kinds)] = None
-    base_axes: Directions | None = None
-    platform_axes: Directions | None = None
-    home: HomeEntry | None = None
-    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
 
 
 def read_table(path: Path, unit: str | None = None, name: str | None = None) -> Description:
@@ -195,7 +33,7 @@ def read_table(path: Path, unit: str | None = None, name: str | None = None) -> 
     path : Path
         A YAML file, or a CSV file with one row for each leg.
     unit : {"m", "mm"}, optional
-        The unit of the lengths of a CSV that has no column for it.
+        The unit of all lengths, where the table does not state it.
     name : str, optional
         The name of the model, instead of the one in the YAML or the stem of the CSV.
 
@@ -213,6 +51,8 @@ def read_table(path: Path, unit: str | None = None, name: str | None = None) -> 
             found = {key: value for key, value in found.items() if value is not None}
             if name is not None:
                 found["name"] = name
+            if unit is not None:
+                found.setdefault("unit", unit)
         file = schema.validate(TableFile, found, path)
     except DatasetError as error:
         raise ModelError(error.problems) from error
@@ -257,11 +97,7 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
         "base_axes", "platform_axes",
     ):  # fmt: skip
         value = getattr(file, key)
-        if (
-            isinstance(value, list)
-            and not (key == "travel" and _is_pair(value))
-            and len(value) != n
-        ):
+        if isinstance(value, list) and not (key == "travel" and is_pair(value)) and len(value) != n:
             problems.append(
                 f"{source}: {key} could not be used: found {len(value)} entries and {n} "
                 "base_joints, needed one for each leg; correct their number."
@@ -314,7 +150,7 @@ def _description(file: TableFile, source: str) -> Description:
         return value if isinstance(value, list) else [value] * n
 
     names = file.legs or [f"leg{j + 1}" for j in range(n)]
-    travel = [file.travel] * n if _is_pair(file.travel) else per_leg(file.travel)
+    travel = [file.travel] * n if is_pair(file.travel) else per_leg(file.travel)
     legs = []
     for j, (name, kind_of_leg, kind, radius) in enumerate(
         zip(names, _types(file, n), per_leg(file.kinds), per_leg(file.radius), strict=True)

@@ -1,0 +1,102 @@
+"""What cannot be in a described machine: sizes, lengths and axes out of place, in sentences."""
+
+import numpy as np
+
+from legcal.authoring.machine import Description, LegEntry
+from legcal.geometry.types import Array
+from legcal.mechanism.leg import LegKind
+
+LONGEST, SHORTEST = 20.0, 1e-3  # [m]; beyond, the unit is the likely mistake
+SQUARE = 1e-3  # [rad]
+ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
+
+
+def wrong_sizes(described: Description) -> list[str]:
+    """Return what the numbers alone say is wrong."""
+    problems = []
+    for leg in described.legs:
+        if leg.offset is None:
+            continue
+        ends = leg.travel or (0.0, 0.0)
+        for length in (leg.offset + ends[0], leg.offset + ends[1]):
+            problems += _out_of_proportion(described, leg.name, length)[:1]
+            if problems:
+                return problems
+    for side, joints in (
+        ("base", [leg.A_base for leg in described.legs]),
+        ("platform", [leg.B_platform for leg in described.legs]),
+    ):
+        reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
+        if reach > LONGEST:
+            problems.append(
+                f"{described.source}: the {side} joints could not be used: found them "
+                f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
+                f"{LONGEST:g} m; {_about_the_unit(described.unit, too_long=True)}."
+            )
+    return problems
+
+
+def wrong_lengths(described: Description, lengths: Array) -> list[str]:
+    """Return what is wrong with the lengths of the legs at home."""
+    problems = list[str]()
+    for leg, length in zip(described.legs, lengths, strict=True):
+        found = _out_of_proportion(described, leg.name, float(length))
+        if found:
+            return found
+        if leg.kind is LegKind.CONSTANT or leg.travel is None:
+            continue
+        q0 = leg.offset or 0.0
+        low, high = q0 + leg.travel[0], q0 + leg.travel[1]
+        slack = 1e-9
+        if not low - slack <= length <= high + slack:
+            problems.append(
+                f"{described.source}: leg '{leg.name}' cannot close at home: found the length "
+                f"{1e3 * length:.6g} mm there, needed {1e3 * low:.6g} to {1e3 * high:.6g} mm "
+                "(offset plus travel); correct home, offsets or travel."
+            )
+    return problems
+
+
+def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
+    """Return that a leg has a length that no leg has."""
+    if SHORTEST <= length <= LONGEST:
+        return []
+    where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
+    return [
+        f"{where} with lengths in {described.unit}, needed {SHORTEST:g} to {LONGEST:g} m; "
+        f"{_about_the_unit(described.unit, too_long=length > LONGEST)}."
+    ]
+
+
+def _about_the_unit(unit: str, *, too_long: bool) -> str:
+    """Return what to do about sizes out of all proportion."""
+    if unit == "m" and too_long:
+        return "these look like mm values where m are stated: check the unit"
+    if unit == "mm" and not too_long:
+        return "these look like m values where mm are stated: check the unit"
+    return "check the numbers and the unit"
+
+
+def wrong_axes(
+    described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
+) -> list[str]:
+    """Return which axes do not fit their leg at home."""
+    problems = []
+    for side, letter, axis in (
+        ("base", entry.type.base, axes[0]),
+        ("platform", entry.type.platform, axes[1]),
+    ):
+        angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
+        if letter == "R" and 90.0 - angle > np.degrees(SQUARE):
+            problems.append(
+                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
+                f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
+                f"correct {side}_axes or home."
+            )
+        if letter == "U" and angle < ALONG:
+            problems.append(
+                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
+                f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "
+                f"needed it across the leg; correct {side}_axes or home."
+            )
+    return problems
