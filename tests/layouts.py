@@ -143,11 +143,12 @@ def write_machine(folder: Path, machine: Machine, layout: Layout, name: str = "m
         "base": "base",
         "platform": "platform",
         "platform_joint": None if virtual is None else "platform_free",
-        "base_frame": [names[j] for j in machine.frame_legs],
         "legs": {
             n: f"{n}_{'slider' if s else 'a1'}" for n, s in zip(names, has_slider, strict=True)
         },
     }
+    if len(names) >= len(machine.frame_legs):
+        block["base_frame"] = [names[j] for j in machine.frame_legs]
     if layout.home:
         block["home"] = {
             "xyz": [float(x) for x in machine.home.translation],

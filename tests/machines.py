@@ -56,7 +56,7 @@ def planar(normal: tuple[float, float, float] = (0.0, 0.0, 1.0), n_legs: int = 3
     A[:, 2] = B[:, 2] = heights
     B += [0.03, 0.02, 0.0]
     home = RigidTransform.from_components(
-        turn.apply([0.03, 0.02, 0.0]), Rotation.from_rotvec(0.2 * n)
+        turn.apply([0.03, 0.02, 0.0]), Rotation.from_rotvec(0.2 * n) * turn
     )
     legs = tuple(
         LegSpec("RR", turn.apply(a), turn.apply(b), "actuated", n, n)

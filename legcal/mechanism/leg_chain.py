@@ -373,11 +373,11 @@ def _check_axes(ends: _Ends, leg: str) -> None:
         if end.letter == "R" or (end.letter == "U" and without_s):
             tilt = off_square(end.axes[-1].along, ends.u)
             if tilt > PERPENDICULAR:
-                what = "revolute axis" if end.letter == "R" else "inner axis of a universal joint"
+                what = "a revolute axis" if end.letter == "R" else "an inner axis of a U joint"
                 raise OutOfClass(
                     f"the leg of joint '{leg}' is outside the method: found the axis of "
                     f"'{end.axes[-1].name}' {np.degrees(tilt):.4g} deg from perpendicular to the "
-                    f"leg, needed a {what} within {np.degrees(PERPENDICULAR):.2g} deg; correct it."
+                    f"leg, needed {what} within {np.degrees(PERPENDICULAR):.2g} deg; correct it."
                 )
 
 

@@ -64,9 +64,7 @@ def _spin_notes(mechanism: Mechanism) -> list[str]:
         legs, spin = "1 leg has", "spins about itself"
         if both > 1:
             legs, spin = f"{both} legs have", "spin about themselves"
-        notes.append(
-            f"{legs} an S joint at both ends and {spin}; this is not counted as mobility."
-        )
+        notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
     others = sum(chain.idle_spins for chain in chains) - both
     if others:
         joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"

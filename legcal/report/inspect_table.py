@@ -63,6 +63,8 @@ def _axes_table(legs: Sequence[dict[str, Any]]) -> Table:
     table.add_column("axis at platform", justify="right", no_wrap=True)
     table.add_column(r"twist \[deg]", justify="right", no_wrap=True)
     for leg in legs:
+        if not _has_axes([leg]):
+            continue
         twist = "" if leg["twist"] is None else f"{math.degrees(leg['twist']) + 0.0:.3f}"
         table.add_row(
             leg["name"], _direction(leg["base_axis"]), _direction(leg["platform_axis"]), twist
