@@ -1,0 +1,120 @@
+"""One mechanism, whatever format it is written in, is one analysis."""
+
+import os
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mechanism_formats import FORMATS, write_format
+
+from legcal import load_mechanism
+from legcal.errors import LegcalError, UsageError
+from legcal.geometry.types import Array
+from legcal.mechanism.model import Mechanism
+from legcal.report.model_files import write_model
+
+MACHINES = ("hexapod", "3-upu", "3-rpr", "tricept", "hexapod-strut")
+
+machine_of = cache(load_mechanism)
+
+
+def _difference(one: Array | float | None, two: Array | float | None) -> float:
+    assert (one is None) == (two is None)
+    if one is None or two is None:
+        return 0.0
+    return float(np.nanmax(np.abs(np.nan_to_num(one) - np.nan_to_num(two))))
+
+
+def assert_same_analysis(found: Mechanism, expected: Mechanism) -> None:
+    """Check that two mechanisms are one, legs matched by where they stand."""
+    assert (found.spatial, found.mobility, found.n_legs) == (
+        expected.spatial,
+        expected.mobility,
+        expected.n_legs,
+    )
+    assert len(found.motors) == len(expected.motors)
+    for wanted in expected.legs:
+        leg = min(found.legs, key=lambda leg: float(np.linalg.norm(leg.A_base - wanted.A_base)))
+        assert (leg.type, leg.kind, leg.sign) == (wanted.type, wanted.kind, wanted.sign)
+        assert leg.prismatic == wanted.prismatic
+        assert _difference(np.array(leg.travel), np.array(wanted.travel)) == 0.0
+        for key in ("A_base", "B_platform", "q0", "base_axis", "platform_axis", "twist"):
+            assert _difference(getattr(leg, key), getattr(wanted, key)) < 1e-9, key
+        radii = [[c.radius for c in one.cylinders] for one in (leg, wanted)]
+        assert radii[0] == radii[1]
+    off = found.home.inv() * expected.home
+    assert np.abs(off.as_matrix() - np.eye(4)).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("machine", MACHINES)
+def test_every_format_gives_the_same_analysis(machine: str, name: str, tmp_path: Path) -> None:
+    expected = machine_of(machine)
+    found = load_mechanism(write_format(expected, name, tmp_path))
+    if not name.startswith("mjcf"):  # these have no pose where they are closed
+        found = replace(found, home=expected.home)
+    assert_same_analysis(found, expected)
+
+
+@pytest.mark.parametrize("name", ["mjcf bodies", "loop_joint", "gepetto"])
+@pytest.mark.parametrize("machine", ["hexapod", "3-upu"])
+def test_what_is_written_down_loads_with_an_equal_analysis(
+    machine: str, name: str, tmp_path: Path
+) -> None:
+    found = load_mechanism(write_format(machine_of(machine), name, tmp_path / "from"))
+    yaml_path, urdf_path = write_model(found, tmp_path / "to")
+    assert (yaml_path.name, urdf_path.name) == ("machine.yaml", "machine.urdf")
+    written = load_mechanism(yaml_path)
+    assert_same_analysis(written, found)
+    assert written.leg_names == found.leg_names
+    assert written.frame_legs == found.frame_legs
+    assert written.platform_joint == found.platform_joint
+
+
+def test_a_urdf_that_needs_no_change_is_copied_byte_for_byte(tmp_path: Path) -> None:
+    mechanism = machine_of("hexapod")
+    _, urdf_path = write_model(mechanism, tmp_path)
+    assert urdf_path.read_bytes() == mechanism.urdf_path.read_bytes()
+
+
+def test_nothing_is_written_over(tmp_path: Path) -> None:
+    mechanism = machine_of("hexapod")
+    write_model(mechanism, tmp_path)
+    with pytest.raises(UsageError, match="already there, needed new files"):
+        write_model(mechanism, tmp_path)
+
+
+def _gepetto_robots() -> Path | None:
+    checkout = os.environ.get("LEGCAL_GEPETTO")
+    for robots in (checkout and Path(checkout) / "robots", checkout and Path(checkout)):
+        if robots and (robots / "wl16_like").is_dir():
+            return robots
+    return None
+
+
+def test_the_six_sps_leg_of_gepetto_is_understood() -> None:
+    robots = _gepetto_robots()
+    if robots is None:
+        pytest.skip("set LEGCAL_GEPETTO to a checkout of Gepetto/example-parallel-robots")
+    mechanism = load_mechanism(robots / "wl16_like")
+    assert [leg.type for leg in mechanism.legs] == ["SPS"] * 6
+    assert (mechanism.mobility, len(mechanism.motors)) == (6, 6)
+    assert (mechanism.base, mechanism.platform) == ("hip_part", "foot_part")
+    q0 = {leg.prismatic: leg.q0 for leg in mechanism.legs}
+    assert q0["motor_6"] == pytest.approx(0.3582 + 0.198, abs=1e-12)
+    assert q0["motor_1"] == pytest.approx(0.4878 + 0.099 + 0.099, abs=1e-12)
+    assert any("6 legs have an S joint at both ends" in note for note in mechanism.diagnostics)
+
+
+def test_the_other_robots_of_gepetto_are_refused_in_one_sentence() -> None:
+    robots = _gepetto_robots()
+    if robots is None:
+        pytest.skip("set LEGCAL_GEPETTO to a checkout of Gepetto/example-parallel-robots")
+    for yaml_path in sorted(robots.glob("*/robot.yaml")):
+        if yaml_path.parent.name == "wl16_like":
+            continue
+        with pytest.raises(LegcalError) as refusal:
+            load_mechanism(yaml_path.parent)
+        assert "\n" not in refusal.value.problems[0]
