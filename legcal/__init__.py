@@ -27,6 +27,7 @@ from legcal.version import __version__
 
 if TYPE_CHECKING:
     from legcal.dataset.folder import load_dataset
+    from legcal.identify.analysis import identifiability
     from legcal.mechanism.load import load_mechanism
     from legcal.pipeline import calibrate
     from legcal.report.accuracy import evaluate
@@ -36,6 +37,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "evaluate",
+    "identifiability",
     "load_dataset",
     "load_mechanism",
 ]
@@ -43,6 +45,7 @@ __all__ = [
 _HOME = {
     "calibrate": "legcal.pipeline",
     "evaluate": "legcal.report.accuracy",
+    "identifiability": "legcal.identify.analysis",
     "load_dataset": "legcal.dataset.folder",
     "load_mechanism": "legcal.mechanism.load",
 }

@@ -18,6 +18,7 @@ LAYERS = (
     "dataset",
     "stages",
     "refinement",
+    "identify",
     "calibration",
     "report",
     "pipeline",

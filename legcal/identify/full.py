@@ -1,0 +1,132 @@
+"""Everything at once: what all images, all readings and the mechanism say of the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.identify.elimination import compress, eliminate
+from legcal.identify.observed import at_base_joints, at_platform_joints
+from legcal.identify.session import Session
+from legcal.mechanism.equations import Demand
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.sensitivity import freedoms, pose_equations
+
+SIGMA_EXACT = 1e-7  # [m]: what the mechanism itself demands
+
+
+@dataclass(frozen=True, eq=False)
+class Demands:
+    """The whitened equations of all legs at the poses of a session.
+
+    Attributes
+    ----------
+    by_pose : (k, m, f) array
+        By the possible motions of the platform: turns [m at the leg's length], displacements.
+    by_parameters : (k, m, p) array
+        By the parameters in metres.
+    leg : (m,) array of int
+        The leg of each row.
+    demand : (m,) array of Demand
+        What it is about.
+    """
+
+    by_pose: Array
+    by_parameters: Array
+    leg: IntArray
+    demand: tuple[Demand, ...]
+
+    def rows(self, wanted: BoolArray) -> Array:
+        """Return [by_pose, by_parameters] of some rows, (k, m', f + p)."""
+        return np.concatenate([self.by_pose, self.by_parameters], axis=2)[:, wanted]
+
+
+def demands_of(session: Session) -> Demands:
+    """Return what readings and legs demand of the poses of a session."""
+    equations = pose_equations(session.legs, session.parametrization, session.R, session.t)
+    sigma = np.where(equations.measured, session.sigma_q, SIGMA_EXACT)[:, None]
+    demand = tuple(
+        d
+        for leg in session.legs
+        for d in leg.demands
+        if not (d is Demand.LENGTH and leg.kind is LegKind.PASSIVE)
+    )
+    columns = list(freedoms(session.frame_legs))
+    return Demands(
+        (equations.by_pose / sigma * pose_unit(session))[:, :, columns],
+        equations.by_parameters / sigma * session.unit,
+        equations.leg,
+        demand,
+    )
+
+
+def pose_unit(session: Session) -> Array:
+    """Return what a metre of the six components of a motion is: turns count at the leg's length."""
+    return np.repeat([1.0 / session.mean_length, 1.0], 3)
+
+
+def image_rows(session: Session) -> Array:
+    """Return what each image says, (n_images, n_legs, 4, f + 6 + p), whitened.
+
+    The unknowns are the platform's motion, the motion of the camera of that image, and the
+    parameters, all in metres.
+    """
+    base, platform = at_base_joints(session), at_platform_joints(session)
+    turns = pose_unit(session)
+    by_camera = np.concatenate([base.by_camera(), platform.by_camera()], axis=2) * turns
+    turn = np.cross(session.arm[session.pose][:, :, None], platform.gradient)
+    by_pose = np.zeros_like(by_camera)
+    by_pose[:, :, 2:] = np.concatenate([turn, platform.gradient], axis=3) * turns
+    scatter = session.local_to_parameters
+    inside = platform.gradient @ session.R[session.pose][:, None]
+    by_parameters = np.concatenate(
+        [base.gradient @ scatter[:, :3], inside @ scatter[:, 3:6]], axis=2
+    )
+    columns = list(freedoms(session.frame_legs))
+    return np.concatenate([by_pose[..., columns], by_camera, by_parameters], axis=3)
+
+
+def information(session: Session, *, common_cameras: bool = False) -> Array:
+    """Return what everything at once says of the parameters, (p, p) whitened rows [1/m].
+
+    Parameters
+    ----------
+    session : Session
+        The observations.
+    common_cameras : bool
+        Whether a calibration board on the base shows how the cameras stand to each other.
+    """
+    n_f, n_p = len(freedoms(session.frame_legs)), len(session.parametrization)
+    seen = image_rows(session).reshape(len(session.view), -1, n_f + 6 + n_p)
+    camera_of_view = np.arange(session.n_views) * (not common_cameras)
+    n_cameras = 6 * len(np.unique(camera_of_view))
+    wide = np.zeros((*seen.shape[:2], n_f + n_cameras + n_p))
+    wide[..., :n_f], wide[..., n_f + n_cameras :] = seen[..., :n_f], seen[..., n_f + 6 :]
+    for v, camera in enumerate(camera_of_view):
+        here = session.view == v
+        place = n_f + 6 * int(camera)
+        wide[here, :, place : place + 6] = seen[here, :, n_f : n_f + 6]
+    demands = demands_of(session)
+    equations = np.zeros((len(session.t), demands.by_pose.shape[1], wide.shape[2]))
+    equations[..., :n_f] = demands.by_pose
+    equations[..., n_f + n_cameras :] = demands.by_parameters
+    rows = np.concatenate([equations, by_group(wide, session.pose, len(session.t))], axis=1)
+    return compress(eliminate(compress_groups(eliminate(rows, n_f))[None], n_cameras))
+
+
+def compress_groups(rows: Array) -> Array:
+    """Return fewer rows that say the same."""
+    return rows if len(rows) < rows.shape[1] else np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def by_group(rows: Array, group: IntArray, n_groups: int) -> Array:
+    """Return rows (n, r, c) of members laid out by group, (n_groups, most * r, c), with zeros."""
+    number = np.bincount(group, minlength=n_groups)
+    place = np.zeros(len(group), dtype=np.intp)
+    order = np.argsort(group, kind="stable")
+    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(number) - number, number)
+    laid = np.zeros((n_groups, int(number.max(initial=0)), *rows.shape[1:]))
+    laid[group, place] = rows
+    return laid.reshape(n_groups, -1, rows.shape[2])

@@ -1,0 +1,146 @@
+"""Sessions to judge: one of default cameras and random poses, or that of a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, IntArray
+from legcal.identify.cameras import FOCAL_PX, default_cameras
+from legcal.identify.poses import random_poses
+from legcal.identify.session import Session
+from legcal.mechanism.equations import LegGeometry
+from legcal.mechanism.leg import Leg, LegKind, main_cylinders
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import Parametrization, geometries, parametrization_of
+
+SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
+_SEED = 2002
+_PERTURBATION = 1e-6  # of the mean leg length, and [rad]
+_THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
+
+
+def planned_session(
+    mechanism: Mechanism, views: Sequence[Sequence[int]], images: int = 15
+) -> Session:
+    """Return a session with cameras in default places and random poses inside the travel.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal machine. The session is that of a machine whose every parameter is a
+        micrometre or less elsewhere, so that no symmetry by accident decides.
+    views : sequence of sequences of int
+        The legs that each view shows.
+    images : int
+        Number of images, and poses, a view.
+
+    Raises
+    ------
+    DidNotConverge
+        If the machine cannot move inside its travel.
+    """
+    home = mechanism.T_base_Rb.inv() * mechanism.home * mechanism.T_platform_Re
+    legs, length, rng = machine_near(mechanism, home)
+    A, B = joints_at(legs, home)
+    R, t = random_poses(
+        legs, mechanism.frame_legs, home, _travel(mechanism), images * max(len(views), 1), rng
+    )
+    seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
+    for v, view in enumerate(views):
+        seen[v, list(view)] = True
+    return Session(
+        leg_names=mechanism.leg_names,
+        legs=legs,
+        frame_legs=mechanism.frame_legs,
+        parametrization=parametrization_of(mechanism),
+        radius=radii(mechanism.legs, length),
+        R=R,
+        t=t,
+        view=np.repeat(np.arange(len(views)), images),
+        pose=np.arange(images * len(views)),
+        seen=seen,
+        camera=default_cameras(A, B, views, mechanism.spatial, rng),
+        focal=np.full(len(views), FOCAL_PX),
+        sigma_q=SIGMA_Q,
+    )
+
+
+def machine_near(
+    mechanism: Mechanism, home: RigidTransform
+) -> tuple[tuple[LegGeometry, ...], float, np.random.Generator]:
+    """Return legs near the nominal ones, their mean length at home [m], and a source of chance."""
+    rng = np.random.default_rng(_SEED)
+    nominal = geometries(mechanism)
+    A, B = joints_at(nominal, home)
+    length = float(np.linalg.norm(B - A, axis=1).mean())
+    return perturbed(nominal, parametrization_of(mechanism), length, rng), length, rng
+
+
+def perturbed(
+    legs: Sequence[LegGeometry],
+    parametrization: Parametrization,
+    length: float,
+    rng: np.random.Generator,
+) -> tuple[LegGeometry, ...]:
+    """Return legs whose every parameter is slightly elsewhere."""
+    units = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
+    step = _PERTURBATION * units * rng.uniform(-1.0, 1.0, len(units))
+    return moved_legs(legs, parametrization.place, step)
+
+
+def moved_legs(
+    legs: Sequence[LegGeometry], place: IntArray, step: Array
+) -> tuple[LegGeometry, ...]:
+    """Return legs after a small step of the parameters, which stand at *place* of it."""
+    padded = np.append(step, 0.0)
+    moved = []
+    for leg, local in zip(legs, padded[place], strict=True):
+        moved.append(
+            replace(
+                leg,
+                A=leg.A + local[:3],
+                B=leg.B + local[3:6],
+                q0=leg.q0 + float(local[6]),
+                base_axis=turned(leg.base_axis, local[7:9]),
+                platform_axis=turned(leg.platform_axis, local[9:11]),
+                twist=None if leg.twist is None else leg.twist + float(local[11]),
+            )
+        )
+    return tuple(moved)
+
+
+def turned(axis: Array | None, turn: Array) -> Array | None:
+    """Return an axis turned by two angles about its :func:`normal_basis`."""
+    if axis is None:
+        return None
+    return np.asarray(Rotation.from_rotvec(turn @ normal_basis(axis)).apply(axis))
+
+
+def radii(legs: Sequence[Leg], length: float) -> Array:
+    """Return the radius of the thickest visible cylinder of each leg, (n_legs,) [m]."""
+    return np.array(
+        [
+            max((c.radius for c in main_cylinders(leg.cylinders).values()), default=_THIN * length)
+            for leg in legs
+        ]
+    )
+
+
+def joints_at(legs: Sequence[LegGeometry], T: RigidTransform) -> tuple[Array, Array]:
+    """Return the joint centres A and B at a pose, in R_b."""
+    A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
+    return A, np.asarray(T.apply(B))
+
+
+def _travel(mechanism: Mechanism) -> Array:
+    """Return shortest and longest length of each leg, (n_legs, 2) [m]."""
+    lengths = []
+    for leg in mechanism.legs:
+        ends = [leg.sign * q + leg.q0 for q in leg.travel]
+        lengths.append([leg.q0, leg.q0] if leg.kind is LegKind.CONSTANT else sorted(ends))
+    return np.array(lengths)

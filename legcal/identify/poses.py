@@ -1,0 +1,183 @@
+"""Random poses inside the travel, found in closed form for all of them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.equations import Demand, LegGeometry, linearize
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.sensitivity import freedoms
+
+_STEPS = 5  # from home to a pose, so that no pose jumps to another assembly mode
+_ITERATIONS = 3  # of Newton's method a step
+_LAST_ITERATIONS = 12
+_CLOSED = 1e-9  # of the mean leg length
+_SINGULAR = 0.05  # smallest singular value, of its value at home
+_RANK = 1e-9  # of the largest singular value
+_FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
+_ATTEMPTS = 6  # each with half the travel of the one before
+
+
+def random_poses(
+    legs: Sequence[LegGeometry],
+    frame_legs: Sequence[int],
+    home: RigidTransform,
+    travel: Array,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Return random poses with all sliders inside their travel.
+
+    Parameters
+    ----------
+    legs : sequence of LegGeometry
+        The legs in R_b and R_e.
+    frame_legs : sequence of int
+        The legs that define R_b and R_e.
+    home : RigidTransform
+        T_Rb_Re near a closed pose of the wanted assembly mode.
+    travel : (n_legs, 2) array
+        Shortest and longest length of each leg [m]; equal for legs of constant length.
+    count : int
+        Number of poses.
+    rng : numpy.random.Generator
+        Source of the poses.
+
+    Returns
+    -------
+    (count, 3, 3) and (count, 3) array
+        Rotations and positions [m] of R_e in R_b.
+
+    Raises
+    ------
+    DidNotConverge
+        If the machine cannot move inside its travel.
+    """
+    closing = _Closing(legs, frame_legs)
+    R0, t0 = _one(home)
+    R0, t0 = closing.close(R0, t0, None, _LAST_ITERATIONS)
+    home_lengths = closing.lengths(R0, t0)[0]
+    found_R, found_t = np.zeros((0, 3, 3)), np.zeros((0, 3))
+    share = 1.0
+    for _ in range(_ATTEMPTS):
+        n = 2 * (count - len(found_t)) + 10
+        wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))
+        wanted = home_lengths + share * (wanted - home_lengths)
+        R, t = closing.wander(R0, t0, n, share, rng)
+        first = closing.lengths(R, t)
+        for part in np.linspace(0.0, 1.0, _STEPS + 1)[1:]:
+            R, t = closing.close(R, t, first + part * (wanted - first), _ITERATIONS)
+        R, t = closing.close(R, t, wanted, _LAST_ITERATIONS - _ITERATIONS)
+        good = closing.is_closed(R, t, wanted) & closing.is_regular(R, t, R0, t0)
+        good &= _inside(closing.lengths(R, t), travel, home_lengths)
+        found_R, found_t = np.concatenate([found_R, R[good]]), np.concatenate([found_t, t[good]])
+        if len(found_t) >= count:
+            return found_R[:count], found_t[:count]
+        share *= 0.6
+    raise DidNotConverge(
+        f"The observations could not be predicted: found {len(found_t)} of {count} random poses "
+        "inside the travel, needed all; check the travel (limit lower, upper) and the home pose "
+        "of the model."
+    )
+
+
+class _Closing:
+    """The equations of legs with lengths, as a system for many poses at once."""
+
+    def __init__(self, legs: Sequence[LegGeometry], frame_legs: Sequence[int]) -> None:
+        self.legs = tuple(legs)
+        self.columns = list(freedoms(frame_legs))
+
+    def lengths(self, R: Array, t: Array) -> Array:
+        """Return the leg lengths, (k, n_legs) [m]."""
+        A, B = np.array([leg.A for leg in self.legs]), np.array([leg.B for leg in self.legs])
+        vector = np.einsum("kij,nj->kni", R, B) + t[:, None] - A
+        return np.asarray(np.linalg.norm(vector, axis=2))
+
+    def system(self, R: Array, t: Array, wanted: Array | None) -> tuple[Array, Array]:
+        """Return residuals (k, m), derivatives (k, m, f); without lengths motors are free."""
+        values, slopes = [np.zeros((len(t), 0))], [np.zeros((len(t), 0, 6))]
+        for j, leg in enumerate(self.legs):
+            found = linearize(leg, R, t)
+            length = found.values[:, :1] + leg.q0
+            for i, demand in enumerate(found.demands):
+                value, slope = found.values[:, i : i + 1], found.by_pose[:, i : i + 1]
+                if demand is not Demand.LENGTH:
+                    values.append(value * length)
+                    slopes.append(slope * length[..., None])
+                elif leg.kind is LegKind.CONSTANT:
+                    values.append(value)
+                    slopes.append(slope)
+                elif leg.kind is LegKind.ACTUATED and wanted is not None:
+                    values.append(length - wanted[:, j : j + 1])
+                    slopes.append(slope)
+        return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)[:, :, self.columns]
+
+    def close(
+        self, R: Array, t: Array, wanted: Array | None, iterations: int
+    ) -> tuple[Array, Array]:
+        """Return poses after some iterations of Newton's method, shortest steps."""
+        for _ in range(iterations):
+            values, slopes = self.system(R, t, wanted)
+            if values.shape[1] == 0:
+                break
+            step = -(np.linalg.pinv(slopes, rcond=_RANK) @ values[..., None])[..., 0]
+            R, t = self.moved(R, t, step)
+            if np.abs(step).max(initial=0.0) < 1e-14:
+                break
+        return R, t
+
+    def moved(self, R: Array, t: Array, step: Array) -> tuple[Array, Array]:
+        """Return poses after a step of their possible motions."""
+        full = np.zeros((len(t), 6))
+        full[:, self.columns] = np.clip(step, -0.3, 0.3)
+        return Rotation.from_rotvec(full[:, :3]).as_matrix() @ R, t + full[:, 3:]
+
+    def wander(
+        self, R: Array, t: Array, n: int, share: float, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return n poses that differ from home as far as no motor holds the platform."""
+        lengths = self.lengths(R, t)
+        size = float(lengths.mean())
+        _, slopes = self.system(R, t, lengths)
+        J = slopes[0] if slopes.shape[1] else np.zeros((1, len(self.columns)))
+        null = np.eye(len(self.columns)) - np.linalg.pinv(J, rcond=1e-6) @ J
+        step = rng.normal(size=(n, len(self.columns))) * share * _FREE @ null.T
+        scale = np.where(np.array(self.columns) < 3, 1.0, size)
+        return self.moved(np.repeat(R, n, axis=0), np.repeat(t, n, axis=0), step * scale)
+
+    def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:
+        """Return which poses meet what legs and lengths demand."""
+        values, _ = self.system(R, t, wanted)
+        limit = _CLOSED * self.lengths(R, t).mean(axis=1)
+        return np.asarray(np.abs(values).max(axis=1, initial=0.0) <= limit)
+
+    def is_regular(self, R: Array, t: Array, R0: Array, t0: Array) -> BoolArray:
+        """Return which poses are as far from singular as a share of home is, on the same side."""
+        J = self.system(R, t, self.lengths(R, t))[1]
+        J0 = self.system(R0, t0, self.lengths(R0, t0))[1]
+        if J.shape[1] == 0:
+            return np.ones(len(t), dtype=np.bool_)
+        s, s0 = np.linalg.svd(J, compute_uv=False), np.linalg.svd(J0, compute_uv=False)[0]
+        last = int(np.sum(s0 > 1e-6 * s0[0])) - 1
+        good = s[:, last] > _SINGULAR * s0[last]
+        if J.shape[1] == J.shape[2]:
+            good &= np.linalg.det(J) * np.linalg.det(J0) >= 0.0
+        return np.asarray(good)
+
+
+def _inside(lengths: Array, travel: Array, home: Array) -> BoolArray:
+    """Return which rows of lengths lie inside the travel; home counts as inside."""
+    slack = 1e-6 + 0.05 * (travel[:, 1] - travel[:, 0])
+    low, high = np.minimum(travel[:, 0], home) - slack, np.maximum(travel[:, 1], home) + slack
+    return np.asarray(np.all((lengths >= low) & (lengths <= high), axis=1))
+
+
+def _one(T: RigidTransform) -> tuple[Array, Array]:
+    """Return a pose as arrays of one."""
+    return T.rotation.as_matrix()[None], np.asarray(T.translation)[None]

@@ -1,0 +1,50 @@
+"""What ``legcal identify`` was asked: a model with views, or a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from legcal.errors import UsageError
+from legcal.identify.analysis import (
+    Identifiability,
+    identifiability,
+    identifiability_of_dataset,
+)
+from legcal.mechanism.load import load_mechanism
+
+_IMAGES = 15
+_DATASET = "dataset.yaml"
+
+
+def answer(source: str, views: Sequence[Sequence[str]], images: int | None) -> Identifiability:
+    """Return the report on a model with views, or on a dataset.
+
+    Parameters
+    ----------
+    source : str
+        A mechanism as :func:`legcal.mechanism.load.load_mechanism` takes it, or a dataset folder or
+        its ``dataset.yaml``.
+    views : sequence of sequences of str
+        Legs of each view; none for a dataset.
+    images : int or None
+        Images a view; None for 15, and for a dataset.
+
+    Raises
+    ------
+    UsageError
+        If views or images are given for a dataset, or do not fit the model.
+    """
+    path = Path(source)
+    if not (path.name == _DATASET or (path / _DATASET).is_file()):
+        return identifiability(load_mechanism(source), views, _IMAGES if images is None else images)
+    if views or images is not None:
+        option = "--view" if views else "--images"
+        raise UsageError(
+            f"{source}: the dataset could not be judged with {option}: found a dataset, which has "
+            f"its own views and images, needed a model for that; leave {option} out, or name the "
+            "model."
+        )
+    from legcal.dataset.folder import load_dataset
+
+    return identifiability_of_dataset(load_dataset(path, check_images=False))

@@ -1,0 +1,281 @@
+"""The four default steps: what each says of its parameters, given the steps before.
+
+Step 1 locates base joints and revolute axes in each camera frame (3.2); step 2 lays these parts of
+the base on each other (3.3); step 3 finds the offsets with which distances between leg ends are
+constant (3.4); step 4 lays the leg ends of all poses on each other, with the axes and the ends
+of passive legs (3.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.identify.elimination import compress, eliminate
+from legcal.identify.full import (
+    SIGMA_EXACT,
+    Demands,
+    by_group,
+    demands_of,
+    image_rows,
+    pose_unit,
+)
+from legcal.identify.observed import Across, at_base_joints, at_platform_joints
+from legcal.identify.session import Session
+from legcal.mechanism.sensitivity import freedoms
+
+_BASE, _PLATFORM, _LENGTH = (0, 1, 2), (3, 4, 5), (6,)
+_BASE_AXIS, _PLATFORM_AXIS, _TWIST = (7, 8), (9, 10), (11,)
+LARGEST_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Step 1: base joints and revolute axes in the camera frames.
+
+    Attributes
+    ----------
+    information : (n_views, n_legs, r, 5) array
+        Whitened rows by A along the axes of R_b [m] and the two turns of the axis [m at the leg's
+        length]; zero where the leg is not seen.
+    joint, axis : (n_views, n_legs) array of bool
+        Which joints are located, and which revolute axes.
+    rank, of : int
+        Unknowns that are determined, and all of them.
+    """
+
+    information: Array
+    joint: BoolArray
+    axis: BoolArray
+    rank: int
+    of: int
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One step's information on the parameters that it identifies.
+
+    Attributes
+    ----------
+    name : str
+        What it identifies.
+    columns : (c,) array of int
+        The parameters.
+    information : (m, c) array
+        Whitened rows by these parameters in metres.
+    """
+
+    name: str
+    columns: IntArray
+    information: Array
+
+
+def revolute_axes(session: Session) -> BoolArray:
+    """Return which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
+    return np.array(
+        [leg.base_joint == "R" and leg.base_axis is not None for leg in session.legs],
+        dtype=np.bool_,
+    )
+
+
+def locate_joints(session: Session) -> Located:
+    """Return what step 1 says: all axes of a leg in a view meet in A (6), and v . u = 0 (7)."""
+    A, B = at_base_joints(session), at_platform_joints(session)
+    revolute = revolute_axes(session)
+    found = np.zeros((session.n_views, session.n_legs, 5, 5))
+    for v in range(session.n_views):
+        here = np.flatnonzero(session.view == v)
+        for j in session.views[v]:
+            if revolute[j]:
+                found[v, j] = compress(_joint_and_axis(session, A, B, here, j))
+            else:
+                found[v, j, :3, :3] = compress(A.gradient[here, j].reshape(-1, 3))
+    limit = 1.0 / (LARGEST_SIGMA * session.mean_length)
+    singular = np.linalg.svd(found, compute_uv=False)
+    joint = np.linalg.svd(found[..., :3], compute_uv=False)[..., -1] > limit
+    axis = revolute & joint & (singular[..., -1] > limit)
+    wanted = (3 + 2 * revolute) * session.seen
+    return Located(found, joint, axis, int(np.sum(singular > limit)), int(wanted.sum()))
+
+
+def identify_base(session: Session, located: Located, *, common_cameras: bool = False) -> Step:
+    """Return what step 2 says of base joints and revolute axes, cameras being free.
+
+    With *common_cameras* a calibration board ties the cameras to each other.
+    """
+    columns = np.union1d(
+        session.columns(_BASE),
+        _of_legs(session, _BASE_AXIS, revolute_axes(session)),
+    )
+    pairs = np.argwhere(located.joint)
+    rows = np.zeros((len(pairs), 5, 6 + len(session.unit)))
+    for row, (v, j) in zip(rows, pairs, strict=True):
+        F = located.information[v, j]
+        if not located.axis[v, j]:  # what is known of A alone
+            F = np.zeros_like(F)
+            F[:3, :3] = compress(
+                eliminate(located.information[v, j][None][:, :, [3, 4, 0, 1, 2]], 2)
+            )[:3]
+        row[:, :6] = _by_camera(session, j, F)
+        scatter = session.local_to_parameters[j]
+        row[:, 6:] = F[:, :3] @ scatter[:3] + F[:, 3:] @ scatter[7:9] * session.mean_length
+    frame = np.zeros_like(pairs[:, 0]) if common_cameras else pairs[:, 0]
+    by_view = by_group(rows, frame, session.n_views)
+    return Step("base_joints", columns, eliminate(by_view, 6)[:, columns])
+
+
+def distance_rows(session: Session, located: Located) -> tuple[Array, Array, IntArray]:
+    """Return what distances between leg ends say of the offsets.
+
+    Returns
+    -------
+    (m, n_lengths) array
+        Derivative of each distance by the offsets and lengths, whitened.
+    (m,) array
+        One over the standard deviation of each distance [1/m].
+    (m, 4) array of int
+        View, pose, and both legs of each distance.
+    """
+    columns = session.columns(_LENGTH)
+    place = np.full(session.n_legs, -1)
+    place[session.with_length] = np.arange(len(columns))
+    B = at_platform_joints(session)
+    ends = located.joint & session.with_length
+    keys = [
+        (v, i, j, g)
+        for v in range(session.n_views)
+        for i in np.flatnonzero(session.view == v)
+        for j, g in combinations(np.flatnonzero(ends[v]).tolist(), 2)
+    ]
+    if not keys:
+        return np.zeros((0, len(columns))), np.zeros(0), np.zeros((0, 4), dtype=np.intp)
+    v, i, j, g = np.array(keys, dtype=np.intp).T
+    apart = B.point[i, j] - B.point[i, g]
+    n = apart / np.linalg.norm(apart, axis=1, keepdims=True)
+    pose = session.pose[i]
+    variance = sum(_end_variance(session, B, i, leg, n) for leg in (j, g))
+    weight = 1.0 / np.sqrt(variance)
+    rows = np.zeros((len(keys), len(columns)))
+    each = np.arange(len(keys))
+    rows[each, place[j]] = weight * np.einsum("ki,ki->k", n, session.u[pose, j])
+    rows[each, place[g]] = -weight * np.einsum("ki,ki->k", n, session.u[pose, g])
+    return rows, np.asarray(weight), np.stack([v, pose, j, g], axis=1)
+
+
+def identify_platform(session: Session, located: Located) -> Step:
+    """Return what step 4 says of platform joints and axes, and of universal axes at the base."""
+    universal = np.array([leg.base_joint == "U" for leg in session.legs], dtype=np.bool_)
+    columns = np.unique(
+        np.concatenate(
+            [
+                session.columns((*_PLATFORM, *_PLATFORM_AXIS, *_TWIST)),
+                _of_legs(session, _BASE_AXIS, universal),
+            ]
+        )
+    )
+    n_f, n_p = len(freedoms(session.frame_legs)), len(session.unit)
+    keep = np.concatenate([np.arange(n_f), n_f + columns])
+    groups = _groups(session, located)
+    seen = np.delete(image_rows(session)[:, :, 2:], np.s_[n_f : n_f + 6], axis=3)  # at B
+    seen = seen * groups.used[groups.of_image][:, :, None, None]
+    seen = seen * located.joint[session.view][:, :, None, None]
+    images = seen.reshape(len(session.view), 2 * session.n_legs, n_f + n_p)
+    demands = demands_of(session)
+    rows = np.concatenate([demands.by_pose, demands.by_parameters], axis=2)[groups.pose]
+    wanted = _step_4_demands(demands, groups)
+    rows = np.concatenate(
+        [rows * wanted[..., None], by_group(images, groups.of_image, len(groups.pose))], axis=1
+    )
+    return Step("platform_joints", columns, eliminate(rows[:, :, keep], n_f))
+
+
+def _joint_and_axis(session: Session, A: Across, B: Across, here: IntArray, j: int) -> Array:
+    """Return rows by A and the turns of the revolute axis, the leg's direction being free."""
+    axis = np.asarray(session.legs[j].base_axis)
+    pose = session.pose[here]
+    u, length = session.u[pose, j], session.length[pose, j]
+    E = normal_basis(u)
+    rows = np.zeros((len(here), 5, 7))  # the end moves by e1, e2 of the direction; A; the axis
+    rows[:, :2, 2:5] = A.gradient[here, j]
+    rows[:, 2:4, :2] = B.gradient[here, j] @ np.swapaxes(E, 1, 2)
+    rows[:, 2:4, 2:5] = B.gradient[here, j]
+    rows[:, 4, :2] = (E @ axis) * (session.mean_length / length)[:, None]
+    rows[:, 4, 5:] = u @ np.cross(normal_basis(axis), axis).T
+    rows[:, 4] /= SIGMA_EXACT
+    return eliminate(rows, 2)
+
+
+def _by_camera(session: Session, j: int, F: Array) -> Array:
+    """Return rows F by A and axis of a leg as rows by the turn and displacement of the camera."""
+    rows = np.zeros((len(F), 6))
+    rows[:, :3] = -np.cross(session.A[j], F[:, :3])
+    rows[:, 3:] = -F[:, :3]
+    axis = session.legs[j].base_axis
+    if axis is not None:
+        rows[:, :3] -= session.mean_length * F[:, 3:] @ normal_basis(axis)
+    return rows * pose_unit(session)
+
+
+def _of_legs(session: Session, kinds: tuple[int, ...], legs: BoolArray) -> IntArray:
+    """Return the parameters of some legs that stand for given ones of their twelve numbers."""
+    place = session.parametrization.place[legs][:, list(kinds)]
+    return np.unique(place[place >= 0])
+
+
+def _end_variance(session: Session, B: Across, image: IntArray, leg: IntArray, n: Array) -> Array:
+    """Return the variance of leg ends along directions n, (k,) [m^2], base joints being known."""
+    gradient = B.gradient[image, leg]
+    size = np.maximum(np.sum(gradient**2, axis=2), 1e-30)
+    across = np.sum((np.einsum("ki,kri->kr", n, gradient) / size) ** 2, axis=1)
+    along = np.einsum("ki,ki->k", n, session.u[session.pose[image], leg]) * session.sigma_q
+    return np.asarray(across + along**2)
+
+
+def offsets_from_distances(session: Session, rows: Array, weight: Array, key: IntArray) -> Step:
+    """Return what step 3 says: the distance of each pair is constant and free, (14)."""
+    columns = session.columns(_LENGTH)
+    _, pair = np.unique(key[:, 2:], axis=0, return_inverse=True)
+    pair = pair.ravel()
+    own = np.concatenate([weight[:, None], rows], axis=1)
+    laid = by_group(own[:, None], pair, int(pair.max(initial=-1)) + 1)
+    return Step("offsets", columns, eliminate(laid, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Groups:
+    """Legs of one pose that were seen in one frame: of all located cameras, or of one other."""
+
+    of_image: IntArray
+    pose: IntArray
+    in_base: BoolArray
+    used: BoolArray
+    enough: BoolArray
+
+
+def _groups(session: Session, located: Located) -> _Groups:
+    """Return the groups of a session, with the legs that take part in step 4."""
+    n_d = len(session.frame_legs)
+    in_base = (located.joint.sum(axis=1) >= n_d)[session.view]
+    key = np.stack([session.pose, np.where(in_base, -1, session.view)], axis=1)
+    distinct, of_image = np.unique(key, axis=0, return_inverse=True)
+    of_image = of_image.ravel()
+    legs = np.zeros((len(distinct), session.n_legs), dtype=np.bool_)
+    np.logical_or.at(legs, of_image, located.joint[session.view])
+    ends = legs & session.with_length
+    number = ends.sum(axis=1)
+    enough = number >= n_d
+    used = np.where(enough[:, None], legs, ends & (number >= 2)[:, None])
+    return _Groups(of_image, distinct[:, 0], distinct[:, 1] < 0, used, enough)
+
+
+def _step_4_demands(demands: Demands, groups: _Groups) -> BoolArray:
+    """Return which equations of the legs step 4 uses in each group, (n_groups, m)."""
+    kinds = np.array([d.name for d in demands.demand])
+    length, base_axis, twist = (kinds == d for d in ("LENGTH", "BASE_AXIS", "TWIST"))
+    others = ~length & ~base_axis & (~twist | groups.in_base[:, None])
+    wanted = length | (others & groups.enough[:, None])
+    return np.asarray(wanted & groups.used[:, demands.leg])

@@ -1,0 +1,57 @@
+"""Views as people give them: names of legs, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from legcal.errors import UsageError
+from legcal.files.schema import closest
+
+
+def read_views(
+    views: Sequence[Sequence[str]], leg_names: Sequence[str], images: int
+) -> tuple[tuple[int, ...], ...]:
+    """Return the legs of each view as indices.
+
+    Parameters
+    ----------
+    views : sequence of sequences of str
+        Names of the legs that each camera position shows.
+    leg_names : sequence of str
+        All legs.
+    images : int
+        Number of images a view.
+
+    Raises
+    ------
+    UsageError
+        With one sentence for each thing that is wrong.
+    """
+    problems = []
+    if images < 1:
+        problems.append(
+            f"The views could not be judged: found {images} images a view, needed at least 1; "
+            "pass --images 15 or leave it out."
+        )
+    for v, view in enumerate(views, start=1):
+        names = [name.strip() for name in view]
+        if not any(names):
+            problems.append(
+                f"View {v} could not be used: found no leg, needed at least one; name its legs, "
+                f"such as --view {','.join(leg_names[:3])}."
+            )
+            continue
+        for name in dict.fromkeys(names):
+            if name not in leg_names:
+                problems.append(
+                    f"View {v} could not be used: found '{name}', needed a leg of the model; "
+                    f"{closest(name, leg_names)}"
+                )
+            elif names.count(name) > 1:
+                problems.append(
+                    f"View {v} could not be used: found leg '{name}' {names.count(name)} times, "
+                    "needed every leg at most once; name it once."
+                )
+    if problems:
+        raise UsageError(problems)
+    return tuple(tuple(sorted(leg_names.index(name.strip()) for name in view)) for view in views)

@@ -1,0 +1,171 @@
+"""The tables of ``legcal identify``: conditions, ranks, weak directions and remedies."""
+
+from __future__ import annotations
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from legcal.identify.analysis import Identifiability
+from legcal.identify.weak import Ranks, WeakDirection
+from legcal.identify.words import joined, leg_labels
+
+_CONDITIONS = {
+    "eq12": "base joints and axes (12)",
+    "eq15": "offsets and lengths (15)",
+    "eq17": "platform joints (17)",
+    "every_leg_seen": "every leg seen",
+    "two_directions": "two directions of every leg",
+    "three_legs_at_once": "three legs at once (18, 19)",
+}
+_STEPS = {
+    "joints_in_cameras": "1 joints in the cameras (6, 7)",
+    "base_joints": "2 base joints and axes (9)",
+    "offsets": "3 offsets and lengths (14)",
+    "platform_joints": "4 platform joints, axes (16-19)",
+}
+_MOST_WEAK = 6  # directions shown
+
+
+def identify_table(report: Identifiability) -> RenderableType:
+    """Return an identifiability report as people read it, on 80 columns.
+
+    Parameters
+    ----------
+    report : Identifiability
+        The report.
+    """
+    parts: list[RenderableType] = [_heading(report), Text()]
+    if report.recommendation is not None:
+        parts += [_recommendation(report), Text()]
+    parts += [_conditions(report), Text(), _ranks(report)]
+    for title, ranks in (("step by step", report.staged), ("everything at once", report.full)):
+        if ranks.weak:
+            parts += [Text(), _weak(title, ranks)]
+    if report.remedies:
+        parts += [Text(), _remedies(report)]
+    return Group(*parts, Text(), *_verdict(report))
+
+
+def _heading(report: Identifiability) -> RenderableType:
+    """Return what is judged."""
+    space = "spatial" if report.spatial else "planar"
+    r = f", {report.r} with a revolute joint at the base" if report.r else ""
+    lines = [Text(f"{space}, {report.n} legs ({report.n_ac} of known length law{r})")]
+    names = list(dict.fromkeys(name for view in report.views for name in view))
+    labels = leg_labels(names)
+    for k, (view, images) in enumerate(zip(report.views, report.images, strict=True), start=1):
+        legs = ", ".join(labels[name] for name in view)
+        lines.append(Text(f"view {k}: legs {legs} in {images} image{'s' * (images != 1)}"))
+    return Group(*lines)
+
+
+def _recommendation(report: Identifiability) -> RenderableType:
+    """Return the sets of views that suffice."""
+    if not report.recommendation:
+        return Text("No set of views was found that suffices; all legs in one view are judged.")
+    lines = [Text("Smallest sets of views that suffice:", style="bold")]
+    for found in report.recommendation:
+        labels = leg_labels(list(dict.fromkeys(name for view in found.views for name in view)))
+        views = "  ".join(",".join(labels[name] for name in view) for view in found.views)
+        number = len(found.views)
+        lines.append(
+            Text(f"  {number} view{'s' * (number != 1)} of {found.legs_a_view} legs: {views}")
+        )
+    return Group(*lines)
+
+
+def _conditions(report: Identifiability) -> Table:
+    """Return the paper's conditions."""
+    table = _plain_table("condition of the paper", "equations", "unknowns", "")
+    for c in report.conditions:
+        legs = "" if c.ok or not c.legs else f": not legs {', '.join(str(j + 1) for j in c.legs)}"
+        numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
+        table.add_row(_CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}")
+    return table
+
+
+def _ranks(report: Identifiability) -> Table:
+    """Return the ranks of the steps and of everything at once."""
+    table = _plain_table("rank of the equations", "rank", "of", "as printed")
+    by_name = {(s.name, s.criteria): s for s in report.steps}
+    for name, title in _STEPS.items():
+        default, printed = by_name[name, "default"], by_name[name, "literal"]
+        other = f"{printed.rank} of {printed.of}"
+        table.add_row(title, str(default.rank), str(default.of), other)
+    table.add_row("the four steps", str(report.staged.rank), str(report.staged.of), "")
+    table.add_row("everything at once", str(report.full.rank), str(report.full.of), "")
+    return table
+
+
+def _weak(title: str, ranks: Ranks) -> Table:
+    """Return the directions that are not determined."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column(f"not determined {title}", overflow="fold", ratio=1)
+    table.add_column(r"hides \[mm]", justify="right")
+    table.add_column(r"\[deg]", justify="right")
+    for weak in ranks.weak[:_MOST_WEAK]:
+        table.add_row(weak.direction, *_hidden(weak))
+    if len(ranks.weak) > _MOST_WEAK:
+        table.add_row(f"and {len(ranks.weak) - _MOST_WEAK} more (see --json)", "", "")
+    return table
+
+
+def _hidden(weak: WeakDirection) -> tuple[str, str]:
+    """Return the platform error that a direction hides when its largest component is 1 mm."""
+    if weak.dX_m is None or weak.dE_rad is None:
+        return "?", "?"
+    if weak.harmless:
+        return "harmless", ""
+    return f"{1e3 * weak.dX_m:.2f}", f"{57.29577951308232 * weak.dE_rad:.3f}"
+
+
+def _remedies(report: Identifiability) -> Table:
+    """Return what would help."""
+    table = _plain_table("what would mend it", "steps", "at once", "")
+    for r in report.remedies:
+        of = report.full.of
+        enough = "enough" if r.enough else "helps"
+        table.add_row(r.remedy, f"{r.staged_rank}/{of}", f"{r.full_rank}/{of}", enough)
+    return table
+
+
+def _verdict(report: Identifiability) -> list[RenderableType]:
+    """Return what follows."""
+    harmless = sum(weak.harmless for weak in report.full.weak)
+    lines: list[RenderableType] = []
+    if report.identifiable:
+        rest = f", but for {harmless} directions that do not move the platform" if harmless else ""
+        lines.append(Text(f"Identifiable: everything at once determines all parameters{rest}."))
+        if not report.staged.complete:
+            lines.append(Text("The steps alone do not: calibration starts from the nominal model."))
+    else:
+        lines.append(Text("NOT identifiable: see what is not determined.", style="bold"))
+    if report.platform_sigma is not None:
+        shift, turn = report.platform_sigma
+        lines.append(
+            Text(
+                f"Platform sigma to expect: {1e3 * shift:.2g} mm, {57.29577951308232 * turn:.2g} "
+                "deg, from outlines good to 0.1 px at both ends of a leg.",
+                style="dim",
+            )
+        )
+    if any(not weak.harmless for weak in (*report.staged.weak, *report.full.weak)):
+        lines.append(
+            Text(
+                "What a direction hides is the platform's error for 1 mm in its largest component.",
+                style="dim",
+            )
+        )
+    failed = [_CONDITIONS[c.name] for c in report.conditions if not c.ok]
+    if failed:
+        lines.append(Text(f"The paper's conditions fail: {joined(failed)}."))
+    return [*lines, *(Text(f"note: {note}") for note in report.notes)]
+
+
+def _plain_table(*columns: str) -> Table:
+    """Return a table whose middle columns are numbers."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for k, title in enumerate(columns):
+        table.add_column(title, justify="left" if k in (0, len(columns) - 1) else "right")
+    return table
