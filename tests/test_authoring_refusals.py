@@ -107,6 +107,7 @@ def test_what_a_table_cannot_say(tmp_path: Path, changes: dict[str, Any], messag
             r"found the joints of the base or of the platform all in one point or on one line",
         ),
         (ROD | {"lengths": [None, None, 600]}, r"leg 'leg3' 456\.\d+ mm long instead of 600 mm"),
+        ({"base_frame": ["leg1", "leg2"]}, r"base_frame .* found leg1, leg2, needed 3 legs whose"),
         (PLANAR, r"axis of leg 'leg1' at .* deg to the leg instead of 90 deg"),
         (
             PLANAR | {"home": {"xyz": [0, 0, 0], "rpy_deg": [0, 10, 0]}, "offsets": 50},
@@ -155,6 +156,13 @@ def test_what_a_csv_cannot_say(tmp_path: Path, text: str, unit: str | None, mess
         read_table(path, unit)
 
 
+def test_a_unit_may_be_told_beside_the_table(tmp_path: Path) -> None:
+    machine = read_table(write_table(tmp_path, unit=None), unit="mm")
+    assert machine.legs[0].offset == 0.38
+    with pytest.raises(ModelError, match="found --unit m and 'mm' in the table"):
+        read_table(write_table(tmp_path), unit="m")
+
+
 def test_tables_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="found no such file"):
         read_table(tmp_path / "none.yaml")
@@ -178,7 +186,11 @@ GOOD = Family("6-UPS", "mm", 300.0, 150.0, 400.0)
         (Family("6-UPS", "inch", 3.0, 2.0, 4.0), r"found the unit 'inch', needed m or mm"),
         (Family("6-UPS", "mm", -3.0, 2.0, 4.0), r"found --base-radius -3, needed a positive"),
         (Family("6-UPS", "mm", 300.0, float("nan"), 4.0), r"--platform-radius nan, needed a pos"),
-        (Family("3-RPR", "mm", 300.0, 150.0, 4.0), r"found --height 4 for a planar machine"),
+        (Family("3-RPR", "mm", 300.0, 150.0, 4.0), r"found --height for a planar machine"),
+        (Family("3-RPR", "mm", 300.0, 150.0, tilt=4.0), r"found --tilt for axes that cannot tilt"),
+        (Family("6-SPS", "mm", 3.0, 2.0, 4.0, tilt=4.0), r"found --tilt for axes that cannot"),
+        (Family("3-RPS", "mm", 3.0, 2.0, 4.0, 30.0), r"found --base-spread for 3 legs, needed"),
+        (Family("6-SS", "mm", 3.0, 2.0, 4.0, offset=3.0), r"found --offset for legs without P"),
         (Family("6-UPS", "mm", 300.0, 150.0, 4.0, 0.0), r"found --base-spread 0 deg, needed an"),
         (Family("6-UPS", "mm", 3.0, 2.0, 4.0, tilt=90.0), r"found --tilt 90 deg, needed at most"),
         (Family("6-UPS", "mm", 3.0, 2.0, 4.0, turn=200.0), r"found --turn 200 deg, needed at"),

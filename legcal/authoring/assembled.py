@@ -127,7 +127,7 @@ def assemble(described: Description) -> Assembled:
         )  # fmt: skip
     _refuse(problems)
     planar = all_revolute(described) and is_planar(legs, T)
-    frame = described.base_frame or _base_frame(described, 2 if _in_a_plane(legs) else 3)
+    frame = _base_frame(described, 2 if _in_a_plane(legs) else 3)
     return Assembled(described.name, tuple(legs), home, frame, planar)
 
 
@@ -185,8 +185,18 @@ def _law(entry: LegEntry, length: float) -> tuple[float, tuple[float, float]]:
 
 
 def _base_frame(described: Description, count: int) -> tuple[str, ...]:
-    """Return the legs that define the frames: 1, 3, 5 of six, else the first that can."""
+    """Return the legs that define the frames: as told, or 1, 3, 5 of six, or the first that can."""
     legs = described.legs
+    if described.base_frame is not None:
+        names = [leg.name for leg in legs]
+        told = [names.index(name) for name in described.base_frame]
+        if len(told) != count or _degenerate(described, told):
+            raise ModelError(
+                f"{described.source}: base_frame could not be used: found "
+                f"{', '.join(described.base_frame)}, needed {count} legs whose joints on base and "
+                "platform are not in one point or on one line; choose others, or leave it out."
+            )
+        return described.base_frame
     combos = list(combinations(range(len(legs)), count))
     if len(legs) == 6 and count == 3:
         combos.insert(0, (0, 2, 4))

@@ -14,7 +14,7 @@ from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 
-_FAMILY = re.compile(r"([0-9]{1,3})-([A-Z]+)")
+_FAMILY = re.compile(r"([0-9]{1,2})-([A-Z]+)")
 SPREAD = 30.0  # [deg] between the two joints of a pair
 TURN_IN_PLANE = 30.0  # [deg]; without, the legs of a planar platform meet in one point
 SHORTEST, STROKE, RADIUS = 0.8, 0.4, 0.02  # parts of the length at home
@@ -34,9 +34,9 @@ class Family:
         Radii of the circles on which the joint centres lie; they must be stated.
     height : float or None
         Height of the platform over the base at home; to be stated unless all joints are R.
-    base_spread, platform_spread : float
-        Angle between the two joints of a pair, for 6 legs; the pairs of the platform stand
-        between those of the base. Other numbers of legs have no pairs.
+    base_spread, platform_spread : float or None
+        Angle between the two joints of a pair, for 6 legs, by default 30 deg; the pairs of the
+        platform stand between those of the base. Other numbers of legs have no pairs.
     turn : float or None
         Turn of the platform about z at home; 30 deg by default where all joints are R, else 0.
     offset : float or None
@@ -57,8 +57,8 @@ class Family:
     base_radius: float | None = None
     platform_radius: float | None = None
     height: float | None = None
-    base_spread: float = SPREAD
-    platform_spread: float = SPREAD
+    base_spread: float | None = None
+    platform_spread: float | None = None
     turn: float | None = None
     offset: float | None = None
     travel: tuple[float, float] | None = None
@@ -83,7 +83,7 @@ def describe_family(asked: Family) -> Description:
             f"from 2 and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
         )
     in_plane = (letters.base, letters.platform) == ("R", "R")
-    problems = _problems(asked, in_plane)
+    problems = _problems(asked, in_plane) + _pointless(asked, int(match[1]), letters, in_plane)
     if problems:
         raise UsageError(problems)
     unit = str(asked.unit)
@@ -98,7 +98,7 @@ def describe_family(asked: Family) -> Description:
     turn = asked.turn if asked.turn is not None else TURN_IN_PLANE * in_plane
     z_turn = Rotation.from_euler("z", turn, degrees=True)
     T = RigidTransform.from_components([0.0, 0.0, metres(asked.height)], z_turn)
-    tilt = 0.0 if in_plane else float(np.radians(asked.tilt))
+    tilt = float(np.radians(asked.tilt))
     legs = []
     for j in range(count):
         vector = T.apply(B[j]) - A[j]
@@ -131,11 +131,6 @@ def _problems(asked: Family, in_plane: bool) -> list[str]:
         )
     if asked.unit not in (None, "m", "mm"):
         problems.append(f"{where}: found the unit '{asked.unit}', needed m or mm; correct --unit.")
-    if in_plane and asked.height:
-        problems.append(
-            f"{where}: found --height {asked.height:g} for a planar machine, needed none; leave "
-            "it out."
-        )
     for option, value in (*needed.items(), ("--leg-radius", asked.leg_radius)):
         if isinstance(value, float | int) and not 0.0 < value < 1e9:
             problems.append(f"{where}: found {option} {value:g}, needed a positive length; fix it.")
@@ -143,7 +138,7 @@ def _problems(asked: Family, in_plane: bool) -> list[str]:
         ("--base-spread", asked.base_spread),
         ("--platform-spread", asked.platform_spread),
     ):
-        if not 0.0 < angle < 120.0:
+        if angle is not None and not 0.0 < angle < 120.0:
             problems.append(
                 f"{where}: found {option} {angle:g} deg, needed an angle between 0 and 120 deg; "
                 "mend it."
@@ -171,14 +166,35 @@ def _problems(asked: Family, in_plane: bool) -> list[str]:
     return problems
 
 
+def _pointless(asked: Family, count: int, letters: LegType, in_plane: bool) -> list[str]:
+    """Return which dimensions were told that a machine of this family does not have."""
+    no_axes = not {letters.base, letters.platform} & {"R", "U"}
+    found = {
+        "--height": in_plane and bool(asked.height) and "a planar machine",
+        "--tilt": (in_plane or no_axes) and bool(asked.tilt) and "axes that cannot tilt",
+        "--base-spread": count != 6 and asked.base_spread is not None and f"{count} legs",
+        "--platform-spread": count != 6 and asked.platform_spread is not None and f"{count} legs",
+        "--offset": not letters.has_slider and asked.offset is not None and "legs without P",
+        "--travel": not letters.has_slider and asked.travel is not None and "legs without P",
+    }
+    return [
+        f"The family {asked.family} could not be built: found {option} for {what}, needed none; "
+        "leave it out."
+        for option, what in found.items()
+        if what
+    ]
+
+
 def _angles(count: int, asked: Family) -> tuple[Array, Array]:
     """Return the angles of the joints on base and platform [rad]."""
     if count != 6:
         even = 2.0 * np.pi * np.arange(count) / count
         return even, even
     half = np.array([0.5, -0.5])
-    base = np.array([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + asked.base_spread * np.tile(half, 3)
-    platform = np.repeat([60.0, 180.0, 300.0], 2) - asked.platform_spread * np.tile(half, 3)
+    spreads = (SPREAD if s is None else s for s in (asked.base_spread, asked.platform_spread))
+    on_base, on_platform = (spread * np.tile(half, 3) for spread in spreads)
+    base = np.array([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + on_base
+    platform = np.repeat([60.0, 180.0, 300.0], 2) - on_platform
     return np.radians(base), np.radians(platform)
 
 
