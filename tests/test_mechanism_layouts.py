@@ -33,6 +33,9 @@ LAYOUTS = {
     "cut before the slider": Layout((LegLayout(cut="slider", mount=True),)),
     "flipped sliders and axes": Layout((LegLayout(flip_slider=True, flip_axes=True, slid=0.03),)),
     "mounts and idle spins": Layout((LegLayout(hung="platform", mount=True, spin=True),)),
+    "carried by leg 2": Layout(
+        (LegLayout(), LegLayout(cut="carry"), *[LegLayout(slid=0.01, seed=k) for k in range(5)])
+    ),
     "carried by leg 1": Layout(
         (LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0, seed=k) for k in range(1, 7)])
     ),
@@ -100,6 +103,19 @@ def test_every_layout_of_a_machine_gives_the_same_analysis(
     _check(mechanism, drawn, layout)
     freedoms = {"6": 6, "3": 3, "T": 3, "h": 5 if "rod" in machine else 6}
     assert mechanism.mobility == freedoms[machine[0]]
+
+
+@pytest.mark.parametrize("machine", ["3-RPR", "3-RPR, tilted plane"])
+@pytest.mark.parametrize("hung", ["base", "platform"])
+def test_a_planar_virtual_joint_changes_nothing(machine: str, hung: str, tmp_path: Path) -> None:
+    drawn, layout = MACHINES[machine](), Layout((LegLayout(hung=hung),), virtual="planar")
+    mechanism = load_mechanism(write_machine(tmp_path, drawn, layout))
+    _check(mechanism, drawn, layout)
+    assert mechanism.mobility == 3
+    assert drawn.normal is not None
+    _close(mechanism.T_base_Rb.rotation.apply([0.0, 0.0, 1.0]), drawn.normal)
+    z_e = (mechanism.home * mechanism.T_platform_Re).rotation.apply([0.0, 0.0, 1.0])
+    _close(z_e, drawn.normal)
 
 
 LEG_LAYOUTS = st.builds(

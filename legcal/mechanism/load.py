@@ -10,7 +10,6 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import ModelError
 from legcal.files.motion import MotionEntry
 from legcal.geometry.frames import motion_to_xyz_quat
-from legcal.geometry.types import Array
 from legcal.mechanism import agreement
 from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
@@ -22,7 +21,7 @@ from legcal.mechanism.leg_of_chain import leg_of
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.notes import diagnose, proposal_notes
-from legcal.mechanism.plane import check_virtual_joint, plane_of_motion
+from legcal.mechanism.plane import check_virtual_joint, in_links, plane_of_motion
 from legcal.mechanism.proposal import propose_block, propose_frame
 from legcal.mechanism.schema import LegcalBlock
 from legcal.mechanism.sources.read import read_source
@@ -103,6 +102,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         for name, leg_chain in zip(block.legs, chains, strict=True)
     )
     names = list(block.legs)
+    base_normal, platform_normal = (None, None) if normals is None else in_links(normals, ends)
     base_frame = block.base_frame or propose_frame(names, chains)
     mechanism = Mechanism(
         name=urdf.name,
@@ -119,8 +119,8 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         chain=chain,
         urdf=urdf,
         leg_chains=tuple(chains),
-        base_normal=None if normals is None else _in_link(ends[0], normals[0]),
-        platform_normal=None if normals is None else _in_link(ends[1], normals[1]),
+        base_normal=base_normal,
+        platform_normal=platform_normal,
     )
     agreement.check_frames(mechanism)
     return mechanism
@@ -130,8 +130,3 @@ def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
     """Return the limits of a leg's slider [m], zero for a rod."""
     limits = None if chain.motor is None else urdf.joints[chain.motor].limits
     return (0.0, 0.0) if limits is None else limits
-
-
-def _in_link(T_body_link: RigidTransform, direction: Array) -> Array:
-    """Return a direction of a body in one of its links."""
-    return np.asarray(T_body_link.rotation.inv().apply(direction))

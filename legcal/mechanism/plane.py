@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass
 from legcal.geometry.types import Array
@@ -28,8 +29,7 @@ def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
     Returns
     -------
     tuple of (3,) array or None
-        The unit normal in the bodies of base and platform, the same way up in both; its last
-        component that is not zero is positive in the base.
+        The unit normal in the bodies of base and platform, the same way up in both.
     """
     normals = [_normals(chain) for chain in chains]
     first = normals[0]
@@ -48,8 +48,19 @@ def _normals(chain: LegChain) -> Normals | None:
     v, w = chain.base.inner, chain.platform.inner
     if v is None or (w is not None and not parallel(v, w)):
         return None
-    up = undirected(v)
-    return up, np.asarray(chain.T_zero.rotation.inv().apply(up))
+    return v, np.asarray(chain.T_zero.rotation.inv().apply(v))
+
+
+def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform]) -> Normals:
+    """Return the normals in the links of base and platform.
+
+    The last component that is not zero is positive in the base.
+    """
+    base, platform = (
+        np.asarray(T.rotation.inv().apply(normal))
+        for normal, T in zip(normals, T_body_link, strict=True)
+    )
+    return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
 
 
 def check_virtual_joint(joint: UrdfJoint, normal: Array | None, path: Path) -> None:
