@@ -11,6 +11,7 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.model import Mechanism
 
 CLOSED = 1e-12  # [m], and [rad] for frames
+EXACT = 1e-11  # [m, rad]: where a held platform is
 NEAR = 2e-3  # [m, rad]: no other posture of a leg is as near as what axes may be off
 RESTARTS = 60
 RANK = 1e-10  # of the largest singular value
@@ -57,13 +58,13 @@ def close_at(
     DidNotConverge
         If a leg does not close, naming its closure and the distance left.
     """
-    configuration, residual = _posture(mechanism, T_base_platform, start)
+    configuration, residual = _posture(mechanism, T_base_platform, start, EXACT)
     if np.abs(residual).max(initial=0.0) >= CLOSED:
         held = partial(_equations, mechanism, T_base_platform)
         configuration, residual = _levenberg_marquardt(
             mechanism, held, configuration, _angles(mechanism) | _sliders(mechanism)
         )
-    _check(mechanism, T_base_platform, configuration, residual, CLOSED)
+    _check(mechanism, T_base_platform, configuration, residual, EXACT)
     return configuration
 
 
@@ -75,7 +76,7 @@ def close_near(
     Parameters, exceptions and result are those of :func:`close_at`, but the platform is let go
     at the end: it moves by what the axes of the model are off, or not at all.
     """
-    configuration, residual = _posture(mechanism, T_base_platform, start)
+    configuration, residual = _posture(mechanism, T_base_platform, start, NEAR)
     if np.abs(residual).max(initial=0.0) >= CLOSED:
         everything = np.ones(mechanism.chain.nv, dtype=np.bool_)
         configuration, residual = _levenberg_marquardt(
@@ -110,10 +111,10 @@ def slider_columns(mechanism: Mechanism, legs: tuple[int, ...]) -> tuple[list[in
 
 
 def _posture(
-    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None
+    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None, astray: float
 ) -> tuple[Array, Array]:
     """Return joint angles of all legs with the platform held and sliders set, and what is open."""
-    configuration = _placed(mechanism, T_base_platform, start)
+    configuration = _placed(mechanism, T_base_platform, start, astray)
     free = _angles(mechanism)
     held = partial(_equations, mechanism, T_base_platform)
     rng = np.random.default_rng(20020701)
@@ -138,27 +139,37 @@ def _check(
     astray: float,
 ) -> None:
     """Refuse a chain that is not closed, or whose platform is not where it should be."""
-    problem = None
+    off = _off(mechanism, T_base_platform, configuration)
     if np.abs(residual).max(initial=0.0) >= CLOSED:
         problem = f"{worst_closure(mechanism, residual)}, needed less than 1e-12 m"
+    elif off > astray:
+        problem = f"the platform went {off:.3g} (m or rad) away, needed a pose that the legs allow"
     else:
-        R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
-        matrix = T_base_platform.as_matrix()
-        off = float(max(np.abs(R - matrix[:3, :3]).max(), np.abs(t - matrix[:3, 3]).max()))
-        if off > max(astray, 1e-11):
-            problem = (
-                f"the platform stays {off:.3g} (m or rad) away, needed a pose that its "
-                "joint and its legs allow"
-            )
-    if problem is not None:
-        raise DidNotConverge(
-            f"{mechanism.yaml_path}: the legs could not be closed with the platform at "
-            f"{_millimetres(T_base_platform)} mm: {problem}; check that the legs reach this pose "
-            "(legcal.home)."
-        )
+        return
+    raise _not_closed(mechanism, T_base_platform, problem)
 
 
-def _placed(mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None) -> Array:
+def _off(mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array) -> float:
+    """Return how far the platform is from where it should be [m or rad]."""
+    R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
+    matrix = T_base_platform.as_matrix()
+    return float(max(np.abs(R - matrix[:3, :3]).max(), np.abs(t - matrix[:3, 3]).max()))
+
+
+def _not_closed(
+    mechanism: Mechanism, T_base_platform: RigidTransform, problem: str
+) -> DidNotConverge:
+    """Return the error of a pose at which the chain does not close."""
+    place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
+    return DidNotConverge(
+        f"{mechanism.yaml_path}: the legs could not be closed with the platform at {place} mm: "
+        f"{problem}; check that the legs reach this pose (legcal.home)."
+    )
+
+
+def _placed(
+    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None, astray: float
+) -> Array:
     """Return a configuration with the platform and the sliders set."""
     chain = mechanism.chain
     configuration = chain.neutral() if start is None else start.copy()
@@ -170,6 +181,14 @@ def _placed(mechanism: Mechanism, T_base_platform: RigidTransform, start: Array 
             mechanism.platform,
             T_base_platform,
         )
+        off = _off(mechanism, T_base_platform, configuration)
+        if off > astray:
+            raise _not_closed(
+                mechanism,
+                T_base_platform,
+                f"the virtual joint '{mechanism.platform_joint}' leaves it {off:.3g} (m or rad) "
+                "away, needed a joint that reaches it",
+            )
     q = readings_at(mechanism, T_base_platform)
     sliding = tuple(j for j, leg in enumerate(mechanism.legs) if leg.prismatic is not None)
     configuration[slider_columns(mechanism, sliding)[0]] = q[list(sliding)]
@@ -237,8 +256,3 @@ def _levenberg_marquardt(
         else:
             damping = max(10.0 * damping, 1e-8)
     return configuration, residual
-
-
-def _millimetres(T: RigidTransform) -> str:
-    """Return a position as a message shows it."""
-    return "(" + ", ".join(f"{1e3 * x:.1f}" for x in T.translation) + ")"

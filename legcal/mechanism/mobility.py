@@ -50,11 +50,6 @@ def freedoms(mechanism: Mechanism, configuration: Array) -> tuple[int, int]:
     return null_space.shape[1], int(np.sum(values > RANK_TOLERANCE))
 
 
-def idle_spins(mechanism: Mechanism) -> int:
-    """Return the number of legs that spin about themselves without moving anything else."""
-    return sum(leg.base_joint == leg.platform_joint == "S" for leg in mechanism.legs)
-
-
 def generic_configurations(mechanism: Mechanism, count: int) -> Iterator[Array]:
     """Yield home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
     chain = mechanism.chain
