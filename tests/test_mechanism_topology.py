@@ -11,6 +11,7 @@ from mechanisms import (
     SHIPPED_URDF,
     SHIPPED_YAML,
     TRUTH_YAML,
+    Geometry,
     Layout,
     geometry,
     poses_near_home,
@@ -300,3 +301,25 @@ def test_frame_legs_on_one_line_are_refused(tmp_path: Path) -> None:
     path = write_hexapod(tmp_path, None, machine)
     with pytest.raises(ModelError, match="base joints of leg1, leg3, leg5 in one point or on one"):
         load_mechanism(path)
+
+
+def test_lengths_in_millimetres_are_refused(tmp_path: Path) -> None:
+    machine = geometry()
+    scaled = Geometry(
+        1e3 * machine.A,
+        1e3 * machine.B,
+        1e3 * machine.q0,
+        RigidTransform.from_components(
+            1e3 * np.asarray(machine.home.translation), machine.home.rotation
+        ),
+        (-5.0, 155.0),
+    )
+    path = write_hexapod(tmp_path, None, scaled)
+    with pytest.raises(ModelError, match=r"m long at home, needed 1 mm to 20 m; write all lengths"):
+        load_mechanism(path)
+
+
+def test_a_rod_that_is_fixed_to_the_platform_shows_its_cylinder() -> None:
+    centre = load_mechanism("tricept").legs[3]
+    assert centre.type == "UP"
+    assert {(c.side, c.radius) for c in centre.cylinders} == {("base", 0.04), ("platform", 0.03)}

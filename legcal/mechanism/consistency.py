@@ -2,15 +2,16 @@
 
 import numpy as np
 
-from legcal.errors import OutOfClass
+from legcal.errors import ModelError, OutOfClass
 from legcal.mechanism.axes import CONCURRENT, PERPENDICULAR
-from legcal.mechanism.closing import platform_pose, slider_columns
+from legcal.mechanism.closing import leg_vectors, platform_pose, slider_columns
 from legcal.mechanism.equations import Demand, geometry_of, linearize
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.mobility import generic_configurations
 from legcal.mechanism.model import Mechanism
 
 CONFIGURATIONS = 3
+LENGTHS = 1e-3, 20.0  # [m], of legs; others are written in another unit
 
 _FOUND = {
     Demand.BASE_AXIS: "its revolute axis at the base {0:.3g} deg from perpendicular to the leg",
@@ -57,6 +58,25 @@ def check_equations(mechanism: Mechanism) -> None:
                     )
     if problems:
         raise OutOfClass(list(problems.values()))
+
+
+def check_unit(mechanism: Mechanism) -> None:
+    """Check that the legs are as long at home as legs written in metres are.
+
+    Raises
+    ------
+    ModelError
+        If one is longer than 20 m, or shorter than 1 mm.
+    """
+    lengths = np.linalg.norm(leg_vectors(mechanism, mechanism.home), axis=1)
+    fixed = np.array([leg.platform_joint == "" for leg in mechanism.legs])
+    odd = np.flatnonzero(~fixed & ((lengths < LENGTHS[0]) | (lengths > LENGTHS[1])))
+    if len(odd):
+        raise ModelError(
+            f"{mechanism.urdf_path}: the lengths could not be used: found leg "
+            f"'{mechanism.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home, needed 1 mm to "
+            "20 m; write all lengths in metres (are they millimetres?)."
+        )
 
 
 def _problem(demand: Demand, value: float) -> str | None:

@@ -127,6 +127,9 @@ def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
     if chain.slider is None:
         return halves
     B, u = chain.platform.centre_near, leg.sign * chain.u_upper
+    if leg.platform_joint == "":
+        last = chain.steps[-1]
+        halves[last.connection.bodies[last.far]] = "platform", B, u
     for step, body in zip(
         chain.steps[chain.n_lower + 1 :], chain.bodies[chain.n_lower :], strict=True
     ):

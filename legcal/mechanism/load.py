@@ -13,7 +13,7 @@ from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism import agreement
 from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
-from legcal.mechanism.consistency import check_equations
+from legcal.mechanism.consistency import check_equations, check_unit
 from legcal.mechanism.cylinders import with_cylinders
 from legcal.mechanism.home import closed_home
 from legcal.mechanism.leg_chain import LegChain
@@ -58,8 +58,11 @@ def load_mechanism(model: str | Path) -> Mechanism:
         block = block.model_copy(update={"home": drawn})
     mechanism = _assemble(source, block, closures)
     given = mechanism.home if block.home is not None else None
+    if given is not None:
+        check_unit(mechanism)  # before lengths of hundreds of metres fail to close
     pose, configuration = closed_home(mechanism, given)
     mechanism = replace(mechanism, home=pose, home_configuration=configuration)
+    check_unit(mechanism)
     mechanism = replace(mechanism, mobility=mobility(mechanism))
     check_equations(mechanism)
     proposed = proposal_notes(file.legcal, mechanism)
