@@ -15,7 +15,7 @@ from legcal.identify.conditions import (
 from legcal.identify.planned import planned_session
 from legcal.identify.ranks import Analysis, StepRank
 from legcal.identify.recommend import Recommendation, recommend
-from legcal.identify.remedies import Remedy, find_remedies
+from legcal.identify.remedies import ENOUGH_IMAGES, Remedy, Replanning, find_remedies
 from legcal.identify.session import Session
 from legcal.identify.views import read_views
 from legcal.identify.weak import Ranks
@@ -144,7 +144,11 @@ def identifiability(
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
     session = planned_session(mechanism, legs, images)
-    return _judge(mechanism, session, recommendation)
+    replanning = Replanning(
+        lambda more: planned_session(mechanism, legs, more),
+        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES)),
+    )
+    return _judge(mechanism, session, recommendation, replanning)
 
 
 def identifiability_of_dataset(dataset: Dataset) -> Identifiability:
@@ -162,16 +166,20 @@ def identifiability_of_dataset(dataset: Dataset) -> Identifiability:
     """
     from legcal.identify.recorded import recorded_session
 
-    return _judge(dataset.mechanism, recorded_session(dataset), None)
+    return _judge(dataset.mechanism, recorded_session(dataset), None, None)
 
 
 def _judge(
-    mechanism: Mechanism, session: Session, recommendation: tuple[Recommendation, ...] | None
+    mechanism: Mechanism,
+    session: Session,
+    recommendation: tuple[Recommendation, ...] | None,
+    replanning: Replanning | None,
 ) -> Identifiability:
     """Return the report on a session."""
     analysis = Analysis(session)
     conditions = conditions_of(mechanism, session)
     staged, full = analysis.staged, analysis.full
+    enough = staged.complete and full.complete
     notes = []
     if analysis.motion.why_not:
         notes.append(
@@ -193,7 +201,7 @@ def _judge(
         views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
         images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
-        remedies=() if staged.complete and full.complete else find_remedies(analysis),
+        remedies=() if enough else find_remedies(analysis, replanning),
         recommendation=recommendation,
         notes=tuple(notes),
     )

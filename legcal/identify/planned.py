@@ -70,6 +70,13 @@ def planned_session(
     )
 
 
+def cameras_for(session: Session, views: Sequence[Sequence[int]]) -> Array:
+    """Return where further cameras stand by default, (n_views, 3) in R_b [m]."""
+    B = (session.arm + session.t[:, None]).mean(axis=0)
+    rng = np.random.default_rng(_SEED + 1)
+    return default_cameras(session.A, B, views, session.spatial, rng)
+
+
 def machine_near(
     mechanism: Mechanism, home: RigidTransform
 ) -> tuple[tuple[LegGeometry, ...], float, np.random.Generator]:

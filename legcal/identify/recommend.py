@@ -1,28 +1,160 @@
-"""The smallest sets of views that suffice."""
+"""The smallest sets of views that suffice: number of camera positions, legs that each shows.
+
+Without shared poses the views of a session know nothing of each other but the parameters, so
+that what one view says is computed once and sets of views are sums.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
 
+import numpy as np
+
+from legcal.geometry.types import Array
+from legcal.identify.around import legs_around, neighbours
+from legcal.identify.conditions import count_conditions, three_legs_at_once
+from legcal.identify.elimination import compress
+from legcal.identify.planned import cameras_for, planned_session
+from legcal.identify.ranks import Analysis, missing, scattered
+from legcal.identify.steps import offsets_from_distances
+from legcal.identify.weak import PlatformMotion
 from legcal.mechanism.model import Mechanism
+
+_MOST_VIEWS = 4
+_ALL_VISIBLE = 5  # legs: one camera can see that many at once
+_VISIBLE = 2.0 / 3.0  # of more legs than that
 
 
 @dataclass(frozen=True)
 class Recommendation:
-    """A set of views.
+    """A set of views that satisfies the paper's conditions and the ranks.
 
     Attributes
     ----------
     views : tuple of tuples of str
-        The legs that each camera position shows.
+        The legs that each camera position shows: neighbours around the base.
     legs_a_view : int
         How many these are.
+    platform_sigma : tuple of float or None
+        Standard deviation of the platform to expect [m, rad]; None where the motors do not
+        determine its pose.
     """
 
     views: tuple[tuple[str, ...], ...]
     legs_a_view: int
+    platform_sigma: tuple[float, float] | None
 
 
 def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
-    """Return the smallest sets of views that suffice, the best first."""
-    return ()
+    """Return the smallest sets of views that suffice, fewest legs in all first.
+
+    For each number of camera positions the fewest legs a view; of all sets of that size the
+    one with the smallest standard deviation of the platform.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal model.
+    images : int
+        Images a view.
+
+    Returns
+    -------
+    tuple of Recommendation
+        Empty where no set was found.
+    """
+    n = mechanism.n_legs
+    largest = n if n <= _ALL_VISIBLE else int(np.ceil(_VISIBLE * n))
+    found: list[tuple[int, Recommendation]] = []
+    candidates = _Candidates(mechanism, images)
+    most = largest + 1
+    for n_views in range(1, _MOST_VIEWS + 1):
+        for size in range(1, most):
+            best = candidates.best(n_views, size)
+            if best is not None:
+                found.append((n_views * size, best))
+                most = size
+                break
+    return tuple(r for _, r in sorted(found, key=lambda pair: pair[0]))
+
+
+class _Candidates:
+    """Views of neighbouring legs, and what each says."""
+
+    def __init__(self, mechanism: Mechanism, images: int) -> None:
+        self.mechanism, self.images = mechanism, images
+        self.session = planned_session(mechanism, [range(mechanism.n_legs)], images)
+        self.motion = PlatformMotion(self.session)
+        self.ring = legs_around(self.session)
+        self.of_size: dict[int, list[Analysis]] = {}
+
+    def best(self, n_views: int, size: int) -> Recommendation | None:
+        """Return the best set of so many views of so many legs, or None if none suffices."""
+        windows = self.windows(size)
+        best: tuple[float, Recommendation] | None = None
+        for which in combinations(range(len(windows)), n_views):
+            views = [windows[k] for k in which]
+            if not self.counts_hold(views):
+                continue
+            chosen = [self.analyses(size)[k] for k in which]
+            information = compress(np.concatenate([a.information for a in chosen]))
+            if not self.suffices(chosen, information):
+                continue
+            sigma = self.motion.sigma(information)
+            worst = float(np.linalg.svd(information, compute_uv=False)[-1])
+            rank = 1.0 / worst if sigma is None else sigma[0]
+            if best is None or rank < best[0]:
+                names = tuple(tuple(self.session.leg_names[j] for j in legs) for legs in views)
+                best = (rank, Recommendation(names, size, sigma))
+        return None if best is None else best[1]
+
+    def windows(self, size: int) -> list[tuple[int, ...]]:
+        """Return neighbours around the base; several cameras where all legs are neighbours."""
+        if size >= self.mechanism.n_legs:
+            return [tuple(range(self.mechanism.n_legs))] * _MOST_VIEWS
+        return neighbours(self.ring, size)
+
+    def counts_hold(self, views: Sequence[Sequence[int]]) -> bool:
+        """Say whether the paper's counts hold."""
+        s = self.session
+        counts = count_conditions(
+            views,
+            s.n_legs,
+            spatial=s.spatial,
+            revolute=[j for j, leg in enumerate(s.legs) if leg.base_joint == "R"],
+            passive=np.flatnonzero(~s.with_length).tolist(),
+        )
+        at_once = three_legs_at_once(views, s.legs, spatial=s.spatial)
+        return all(c.ok for c in (*counts, at_once))
+
+    def analyses(self, size: int) -> list[Analysis]:
+        """Return what each view of so many legs says alone."""
+        if size not in self.of_size:
+            views = self.windows(size)
+            seen = np.zeros((len(views), self.mechanism.n_legs), dtype=np.bool_)
+            for row, legs in zip(seen, views, strict=True):
+                row[list(legs)] = True
+            camera = cameras_for(self.session, views)
+            self.of_size[size] = [
+                Analysis(replace(self.session, seen=seen[[k]], camera=camera[[k]]))
+                for k in range(len(views))
+            ]
+        return self.of_size[size]
+
+    def suffices(self, chosen: Sequence[Analysis], information: Array) -> bool:
+        """Say whether views determine all that moves the platform, at once and step by step."""
+        session, n_p = self.session, len(self.session.unit)
+        if missing(session, information, self.motion):
+            return False
+        for k in (0, 2):
+            rows = np.concatenate([a.default_steps[k].information for a in chosen])
+            step = replace(chosen[0].default_steps[k], information=rows)
+            if missing(session, scattered(step, n_p), self.motion):
+                return False
+        together = (
+            np.concatenate(parts) for parts in zip(*(a.distances for a in chosen), strict=True)
+        )
+        offsets = offsets_from_distances(session, *together)
+        return not missing(session, scattered(offsets, n_p), self.motion)

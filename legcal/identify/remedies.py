@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
 
-from legcal.geometry.types import Array
-from legcal.identify.cameras import FOCAL_PX, default_cameras
+from legcal.identify.around import legs_around, neighbours, steps_apart
+from legcal.identify.cameras import FOCAL_PX
+from legcal.identify.planned import cameras_for
 from legcal.identify.ranks import Analysis, missing, scattered
+from legcal.identify.recommend import Recommendation
 from legcal.identify.session import Session
-from legcal.identify.words import legs_in_words
+from legcal.identify.weak import WeakDirection, undetermined
+from legcal.identify.words import joined, legs_in_words
 
-_MOST = 6  # remedies told
-_MOST_FIXED = 4  # parameters tried
-_SEED = 2003
+_MOST_OF_A_KIND = 2
+_MOST_TRIED = 12  # of a kind
+_MOST_FIXED = 4  # parameters
+ENOUGH_IMAGES = 15  # a view
+_KNOWN = 1e12  # 1/m
 _ORDINAL = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 
 
@@ -40,35 +46,55 @@ class Remedy:
     enough: bool
 
 
-def find_remedies(analysis: Analysis) -> tuple[Remedy, ...]:
+@dataclass(frozen=True)
+class Replanning:
+    """Other sessions of the same machine.
+
+    Attributes
+    ----------
+    images : callable
+        Return the session with another number of images a view.
+    views : callable
+        Return the smallest sets of views that suffice.
+    """
+
+    images: Callable[[int], Session]
+    views: Callable[[], tuple[Recommendation, ...]]
+
+
+def find_remedies(analysis: Analysis, replanning: Replanning | None) -> tuple[Remedy, ...]:
     """Return what would help where directions are not determined.
 
     Parameters
     ----------
     analysis : Analysis
         What is known so far.
+    replanning : Replanning or None
+        How to plan the session anew; None for what was recorded.
 
     Returns
     -------
     tuple of Remedy
-        Only what raises a rank: what is enough first.
+        Only what raises a rank: what is enough, or what helps where nothing is.
     """
-    session = analysis.session
     before = _score(analysis)
-    found: list[Remedy] = []
-    for text, tried in _candidates(analysis):
-        remedy = _judge(text, _score(tried), before, len(session.unit))
-        if remedy is not None:
-            found.append(remedy)
-    found += _fixed(analysis, before)
-    enough = [r for r in found if r.enough]
-    helps = [] if len(enough) >= 2 else [r for r in found if not r.enough]
-    return tuple([*enough, *helps][:_MOST])
+    kinds: list[Iterable[tuple[str, Callable[[], _Score]]]] = [
+        _more_images(analysis, replanning),
+        _wider_views(analysis),
+        _further_cameras(analysis),
+        _board(analysis),
+        _known_parameters(analysis),
+    ]
+    found = [_try_kind(kind, before, len(analysis.session.unit)) for kind in kinds]
+    enough = tuple(r for kind in found for r in kind if r.enough)
+    if enough:
+        return enough
+    return tuple(r for kind in found for r in kind) + _other_views(analysis, replanning)
 
 
 @dataclass(frozen=True)
 class _Score:
-    """How many directions steps and everything at once leave open; those that move the platform."""
+    """How many directions are open, step by step and at once; those that move the platform."""
 
     staged: int
     full: int
@@ -76,141 +102,141 @@ class _Score:
     full_harm: int
 
 
-def _score(analysis: Analysis, fixed: Sequence[int] = ()) -> _Score:
-    """Return what is open, some parameters being known."""
+def _score(analysis: Analysis, known: Sequence[int] = ()) -> _Score:
+    """Return what is open when some parameters are known."""
     session, motion = analysis.session, analysis.motion
-    n_p = len(session.unit)
-    extra = np.zeros((len(fixed), n_p))
-    extra[np.arange(len(fixed)), list(fixed)] = 1e12
-    rows = [np.concatenate([scattered(s, n_p), extra]) for s in analysis.default_steps]
+    extra = np.zeros((len(known), len(session.unit)))
+    extra[np.arange(len(known)), list(known)] = _KNOWN
+    steps = [
+        np.concatenate([scattered(step, len(session.unit)), extra])
+        for step in analysis.default_steps
+    ]
     full = np.concatenate([analysis.information, extra])
     return _Score(
-        sum(_open(session, r) for r in rows),
-        _open(session, full),
-        sum(missing(session, r, motion) for r in rows),
+        sum(len(undetermined(session, rows)) for rows in steps),
+        len(undetermined(session, full)),
+        sum(missing(session, rows, motion) for rows in steps),
         missing(session, full, motion),
     )
 
 
-def _open(session: Session, rows: Array) -> int:
-    """Return how many directions rows leave open."""
-    from legcal.identify.weak import undetermined
+def _try_kind(
+    kind: Iterable[tuple[str, Callable[[], _Score]]], before: _Score, n_parameters: int
+) -> list[Remedy]:
+    """Return the first few candidates of a kind that are enough, else the best that helps."""
+    enough, helps = list[Remedy](), list[tuple[int, Remedy]]()
+    for tried, (text, score) in enumerate(kind):
+        after = score()
+        gain = before.staged_harm - after.staged_harm, before.full_harm - after.full_harm
+        if min(gain) < 0 or max(gain) == 0:
+            continue
+        complete = after.staged_harm == 0 and after.full_harm == 0
+        remedy = Remedy(text, n_parameters - after.staged, n_parameters - after.full, complete)
+        if complete:
+            enough.append(remedy)
+        else:
+            helps.append((sum(gain), remedy))
+        if len(enough) == _MOST_OF_A_KIND or tried + 1 >= _MOST_TRIED:
+            break
+    return enough or [r for _, r in sorted(helps, key=lambda pair: -pair[0])[:1]]
 
-    return len(undetermined(session, rows))
 
-
-def _judge(text: str, after: _Score, before: _Score, n_p: int) -> Remedy | None:
-    """Return a remedy if it helps and hurts nowhere."""
-    worse = after.staged_harm > before.staged_harm or after.full_harm > before.full_harm
-    better = after.staged_harm < before.staged_harm or after.full_harm < before.full_harm
-    if worse or not better:
-        return None
-    enough = after.staged_harm == 0 and after.full_harm == 0
-    return Remedy(text, n_p - after.staged, n_p - after.full, enough)
-
-
-def _candidates(analysis: Analysis) -> Iterator[tuple[str, Analysis]]:
-    """Return things to do about cameras and images, each with the analysis that it gives."""
-    session = analysis.session
-    weak = _weak_legs(analysis)
-    ring = legs_around(session)
-    largest = max(3, *(len(view) for view in session.views))
-    for v, legs in _wider_views(session, weak, ring):
-        together = legs_in_words(legs, session.leg_names)
+def _more_images(
+    analysis: Analysis, replanning: Replanning | None
+) -> Iterator[tuple[str, Callable[[], _Score]]]:
+    """Yield a session with more images a view."""
+    images = int(np.bincount(analysis.session.view).min())
+    if replanning is not None and images < ENOUGH_IMAGES:
         yield (
-            f"see {together} together in view {v + 1}",
-            _derived(analysis, _widened(session, v, legs)),
+            f"take {ENOUGH_IMAGES} images a view instead of {images}",
+            lambda: _score(Analysis(replanning.images(ENOUGH_IMAGES))),
         )
-    place = _ORDINAL[session.n_views] if session.n_views < len(_ORDINAL) else "further"
-    article = "an" if place == "eighth" else "a"
-    for legs in _windows(ring, sorted({3, min(4, session.n_legs), largest}), weak):
-        text = f"add {article} {place} camera position ({legs_in_words(legs, session.leg_names)})"
-        yield text, _derived(analysis, _extended(session, legs))
-    yield (
-        "put a calibration board on the base that every camera sees",
-        replace(analysis, common_cameras=True),
-    )
 
 
-def _derived(analysis: Analysis, session: Session) -> Analysis:
-    """Return the analysis of another session of the same machine and poses."""
-    derived = Analysis(session, analysis.common_cameras)
-    derived.__dict__["motion"] = analysis.motion
-    return derived
+def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
+    """Yield views with one leg more or two, so that weak legs are seen with others."""
+    session, weak = analysis.session, _weak_legs(analysis)
+    ring = legs_around(session)
+    for more in (1, 2):
+        choices = [
+            (sum(steps_apart(ring, j, view) for j in added), v, added)
+            for v, view in enumerate(session.views)
+            for added in combinations([j for j in ring if j not in view], more)
+            if set(weak) & {*view, *added}
+        ]
+        for _, v, added in sorted(choices)[: _MOST_TRIED // 2]:
+            legs = tuple(sorted((*session.views[v], *added)))
+            text = f"see {legs_in_words(legs, session.leg_names)} together in view {v + 1}"
+            yield text, _scored(analysis, _widened(session, v, legs))
 
 
-def _fixed(analysis: Analysis, before: _Score) -> list[Remedy]:
-    """Return the parameters that help when they are measured otherwise and held."""
-    session = analysis.session
-    names = session.parametrization.names
-    weak = [d for d in (*analysis.full.weak, *analysis.staged.weak) if not d.harmless]
-    first = list(dict.fromkeys(d.parameters[0] for d in weak))
-    found = []
+def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
+    """Yield camera positions that show neighbours, among them weak legs."""
+    session, weak = analysis.session, _weak_legs(analysis)
+    ring = legs_around(session)
+    largest = max(len(view) for view in session.views)
+    which = _ORDINAL[session.n_views] if session.n_views < len(_ORDINAL) else "further"
+    article = "an" if which == "eighth" else "a"
+    for size in sorted({min(k, session.n_legs) for k in (3, 4, largest)}):
+        groups = [legs for legs in neighbours(ring, size) if set(weak) & set(legs)]
+        groups.sort(key=lambda legs: -len(set(weak) & set(legs)))
+        for legs in groups:
+            named = legs_in_words(legs, session.leg_names)
+            text = f"add {article} {which} camera position ({named})"
+            yield text, _scored(analysis, _extended(session, legs))
+
+
+def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
+    """Yield a calibration board that ties the cameras to each other."""
+    if analysis.session.n_views > 1:
+        text = "put a calibration board on the base that every camera sees"
+        yield text, partial(_score, replace(analysis, common_cameras=True))
+
+
+def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
+    """Yield parameters to measure otherwise and to hold: one of each direction, or all of them."""
+    names = analysis.session.parametrization.names
+    first = list(dict.fromkeys(d.parameters[0] for d in _harmful(analysis)))
+    choices: list[tuple[str, ...]] = [(name,) for name in first[:_MOST_FIXED]]
     if 1 < len(first) <= _MOST_FIXED:
-        tried = [*[(name,) for name in first], tuple(first)]
-    else:
-        tried = [(name,) for name in first[:_MOST_FIXED]]
-    for which in tried:
-        score = _score(analysis, [names.index(name) for name in which])
-        text = f"measure and fix {' and '.join(which)}"
-        remedy = _judge(text, score, before, len(session.unit))
-        if remedy is not None:
-            found.append(remedy)
-    return found
+        choices.append(tuple(first))
+    for which in choices:
+        known = [names.index(name) for name in which]
+        yield f"fix {joined(which)}", partial(_score, analysis, known)
+
+
+def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Remedy, ...]:
+    """Return the smallest set of views that suffices, in place of the given ones."""
+    sets = () if replanning is None else replanning.views()
+    if not sets:
+        return ()
+    names = analysis.session.leg_names
+    views = [legs_in_words([names.index(n) for n in view], names) for view in sets[0].views]
+    n_p = len(analysis.session.unit)
+    return (Remedy(f"choose these views instead: {'; '.join(views)}", n_p, n_p, True),)
+
+
+def _scored(analysis: Analysis, session: Session) -> Callable[[], _Score]:
+    """Return what scores another session of the same machine and poses."""
+
+    def score() -> _Score:
+        derived = Analysis(session, analysis.common_cameras)
+        derived.__dict__["motion"] = analysis.motion
+        return _score(derived)
+
+    return score
 
 
 def _weak_legs(analysis: Analysis) -> list[int]:
     """Return the legs whose parameters are not determined."""
+    touched = {p for d in _harmful(analysis) for p in d.parameters}
     names = analysis.session.leg_names
-    weak = [d for d in (*analysis.full.weak, *analysis.staged.weak) if not d.harmless]
-    touched = {p for d in weak for p in d.parameters}
     return [j for j, name in enumerate(names) if any(p.startswith(f"{name}.") for p in touched)]
 
 
-def legs_around(session: Session) -> list[int]:
-    """Return the legs in their order around the base."""
-    points = session.A + (session.arm + session.t[:, None]).mean(axis=0)
-    centred = points - points.mean(axis=0)
-    _, _, basis = np.linalg.svd(session.A - session.A.mean(axis=0))
-    angle = np.arctan2(centred @ basis[1], centred @ basis[0])
-    return [int(j) for j in np.argsort(angle, kind="stable")]
-
-
-def _windows(ring: list[int], sizes: Sequence[int], weak: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return neighbours around the base that include weak legs, small groups first."""
-    found = []
-    n = len(ring)
-    for size in sizes:
-        for start in range(n if size < n else 1):
-            legs = tuple(sorted(ring[(start + k) % n] for k in range(min(size, n))))
-            if not weak or set(legs) & set(weak):
-                found.append(legs)
-    return list(dict.fromkeys(found))
-
-
-def _wider_views(
-    session: Session, weak: Sequence[int], ring: list[int]
-) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Return views with one or two legs more, so that weak legs are seen with others."""
-    place = {j: k for k, j in enumerate(ring)}
-    n = len(ring)
-
-    def apart(j: int, legs: Sequence[int]) -> int:
-        steps = [abs(place[j] - place[g]) for g in legs]
-        return min((min(s, n - s) for s in steps), default=0)
-
-    for more in (1, 2):
-        tried = set()
-        for v, view in enumerate(session.views):
-            others = [j for j in range(n) if j not in view]
-            choices = [c for c in combinations(others, more) if set(c) | set(view)]
-            choices = [c for c in choices if not weak or (set(c) | set(view)) & set(weak)]
-            choices.sort(key=lambda c: sum(apart(j, view) for j in c))
-            for choice in choices[:3]:
-                legs = tuple(sorted((*view, *choice)))
-                if legs not in tried:
-                    tried.add(legs)
-                    yield v, legs
+def _harmful(analysis: Analysis) -> list[WeakDirection]:
+    """Return the directions that move the platform, those of everything at once first."""
+    return [d for d in (*analysis.full.weak, *analysis.staged.weak) if not d.harmless]
 
 
 def _widened(session: Session, v: int, legs: Sequence[int]) -> Session:
@@ -225,9 +251,6 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
     """Return a session with one more camera, for as many images as the first."""
     images = session.pose[session.view == 0]
     new = len(session.t) + np.arange(len(images))
-    rng = np.random.default_rng(_SEED)
-    B = (session.arm + session.t[:, None]).mean(axis=0)
-    camera = default_cameras(session.A, B, [legs], session.spatial, rng)
     seen = np.zeros((1, session.n_legs), dtype=np.bool_)
     seen[0, list(legs)] = True
     return replace(
@@ -237,6 +260,6 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
         view=np.concatenate([session.view, np.full(len(images), session.n_views)]),
         pose=np.concatenate([session.pose, new]),
         seen=np.concatenate([session.seen, seen]),
-        camera=np.concatenate([session.camera, camera]),
+        camera=np.concatenate([session.camera, cameras_for(session, [legs])]),
         focal=np.append(session.focal, FOCAL_PX),
     )
