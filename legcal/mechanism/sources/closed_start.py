@@ -115,13 +115,15 @@ def _close(chain: ClosedChain, configuration: Array) -> Array | None:
         if float(np.abs(residual).max()) <= CLOSED:
             return configuration
         square = jacobian @ jacobian.T + damping * np.eye(len(residual))
+        if not np.linalg.cond(square) < 1e15:  # numbers of hugely different size
+            return None
         step = -jacobian.T @ np.linalg.solve(square, residual)
         step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
         tried = chain.integrate(configuration, step)
         new_residual, new_jacobian = chain.linearize(tried)
         if new_residual @ new_residual < residual @ residual:
             configuration, residual, jacobian = tried, new_residual, new_jacobian
-            damping = max(0.2 * damping, 1e-14)
+            damping = max(0.2 * damping, 1e-12)
         elif damping > 1e6:
             return None
         else:
