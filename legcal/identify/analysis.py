@@ -18,7 +18,7 @@ from legcal.identify.recommend import Recommendation, recommend
 from legcal.identify.remedies import ENOUGH_IMAGES, Remedy, Replanning, find_remedies
 from legcal.identify.session import Session
 from legcal.identify.views import read_views
-from legcal.identify.weak import Ranks
+from legcal.identify.weak import PlatformError, Ranks
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries
 
@@ -47,6 +47,8 @@ class Identifiability:
     ----------
     spatial : bool
         Whether the platform moves in space and not in a plane.
+    legs : tuple of str
+        Their names.
     n, n_d, r, n_ac : int
         Legs; joint centres that define a frame; legs with a revolute joint at the base; legs whose
         length is measured or constant.
@@ -64,10 +66,9 @@ class Identifiability:
         The legs that each view shows.
     images : tuple of int
         Number of images of each view.
-    platform_sigma : tuple of float or None
+    platform_sigma : PlatformError or None
         Standard deviation of the platform that is to be expected from outlines good to 0.1 px,
-        rms over the poses: displacement [m] and rotation [rad]. None where something that
-        moves the platform is not determined, or the motors do not determine its pose.
+        rms over the poses. None where something that moves the platform is not determined, or the motors do not determine its pose.
     remedies : tuple of Remedy
         What would mend what is missing; each was tried.
     recommendation : tuple of Recommendation or None
@@ -77,6 +78,7 @@ class Identifiability:
     """
 
     spatial: bool
+    legs: tuple[str, ...]
     n: int
     n_d: int
     r: int
@@ -89,7 +91,7 @@ class Identifiability:
     steps: tuple[StepRank, ...]
     views: tuple[tuple[str, ...], ...]
     images: tuple[int, ...]
-    platform_sigma: tuple[float, float] | None
+    platform_sigma: PlatformError | None
     remedies: tuple[Remedy, ...]
     recommendation: tuple[Recommendation, ...] | None
     notes: tuple[str, ...]
@@ -97,9 +99,7 @@ class Identifiability:
     def document(self) -> dict[str, Any]:
         """Return the report as plain JSON types; see the documentation of the files."""
         document = asdict(self)
-        document["conditions"] = [_condition(c, self) for c in self.conditions]
-        sigma = self.platform_sigma
-        document["platform_sigma"] = sigma and {"dX_m": sigma[0], "dE_rad": sigma[1]}
+        document["conditions"] = [_condition(c, self.legs) for c in self.conditions]
         return {key: _plain(value) for key, value in document.items()}
 
 
@@ -188,6 +188,7 @@ def _judge(
         )
     return Identifiability(
         spatial=mechanism.spatial,
+        legs=mechanism.leg_names,
         n=mechanism.n_legs,
         n_d=len(mechanism.frame_legs),
         r=sum(leg.base_joint == "R" for leg in mechanism.legs),
@@ -225,11 +226,13 @@ def conditions_of(mechanism: Mechanism, session: Session) -> tuple[Condition, ..
     )
 
 
-def _condition(condition: Condition, report: Identifiability) -> dict[str, Any]:
-    """Return a condition as a document: a count with its numbers, or the legs that fail."""
+def _condition(condition: Condition, legs: Sequence[str]) -> dict[str, Any]:
+    """Return a condition as a document: a count with its numbers, or the legs that fail it."""
     document: dict[str, Any] = {"name": condition.name, "ok": condition.ok}
     if condition.equations is not None:
         document |= {"equations": condition.equations, "unknowns": condition.unknowns}
+    else:
+        document["failing"] = [legs[j] for j in condition.legs]
     return document
 
 

@@ -19,7 +19,7 @@ from legcal.identify.elimination import compress
 from legcal.identify.planned import cameras_for, planned_session
 from legcal.identify.ranks import Analysis, missing, scattered
 from legcal.identify.steps import offsets_from_distances
-from legcal.identify.weak import PlatformMotion
+from legcal.identify.weak import PlatformError, PlatformMotion
 from legcal.mechanism.model import Mechanism
 
 _MOST_VIEWS = 4
@@ -37,14 +37,14 @@ class Recommendation:
         The legs that each camera position shows: neighbours around the base.
     legs_a_view : int
         How many these are.
-    platform_sigma : tuple of float or None
-        Standard deviation of the platform to expect [m, rad]; None where the motors do not
+    platform_sigma : PlatformError or None
+        Standard deviation of the platform to expect; None where the motors do not
         determine its pose.
     """
 
     views: tuple[tuple[str, ...], ...]
     legs_a_view: int
-    platform_sigma: tuple[float, float] | None
+    platform_sigma: PlatformError | None
 
 
 def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
@@ -104,7 +104,7 @@ class _Candidates:
                 continue
             sigma = self.motion.sigma(information)
             worst = float(np.linalg.svd(information, compute_uv=False)[-1])
-            rank = 1.0 / worst if sigma is None else sigma[0]
+            rank = 1.0 / worst if sigma is None else sigma.dX_m
             if best is None or rank < best[0]:
                 names = tuple(tuple(self.session.leg_names[j] for j in legs) for legs in views)
                 best = (rank, Recommendation(names, size, sigma))

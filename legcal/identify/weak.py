@@ -21,6 +21,22 @@ _SHOWN = 0.02  # of the largest component
 
 
 @dataclass(frozen=True)
+class PlatformError:
+    """How far the platform moves, root mean square over poses.
+
+    Attributes
+    ----------
+    dX_m : float
+        Displacement of the origin of R_e [m].
+    dE_rad : float
+        Rotation [rad].
+    """
+
+    dX_m: float
+    dE_rad: float
+
+
+@dataclass(frozen=True)
 class WeakDirection:
     """A combination of parameters that the observations do not determine.
 
@@ -86,16 +102,16 @@ class PlatformMotion:
             return
         self.by_metres = moved * session.unit
 
-    def effect(self, direction: Array) -> tuple[float, float] | None:
-        """Return the rms displacement [m] and rotation [rad] for a direction (p,) in metres."""
+    def effect(self, direction: Array) -> PlatformError | None:
+        """Return what a direction (p,) in metres does."""
         if self.by_metres is None:
             return None
         moved = self.by_metres @ direction
         turn, shift = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in np.split(moved, 2, 1))
-        return shift, turn
+        return PlatformError(shift, turn)
 
-    def sigma(self, information: Array) -> tuple[float, float] | None:
-        """Return the rms standard deviation of the platform [m, rad] that information leaves."""
+    def sigma(self, information: Array) -> PlatformError | None:
+        """Return the standard deviation of the platform that information leaves."""
         if self.by_metres is None:
             return None
         _, singular, basis = np.linalg.svd(information)
@@ -104,7 +120,7 @@ class PlatformMotion:
         turn, shift = (
             float(np.sqrt(np.mean(np.sum(x**2, (1, 2))))) for x in np.split(spread, 2, 1)
         )
-        return shift, turn
+        return PlatformError(shift, turn)
 
     def split(self, basis: Array) -> tuple[Array, Array]:
         """Return a space (w, p) as that which moves the platform and that which does not."""
@@ -184,8 +200,8 @@ def _direction(
         describe_direction(names, session.leg_names),
         names,
         tuple(float((row * session.unit)[i]) for i in shown),
-        None if effect is None else effect[0],
-        None if effect is None else effect[1],
+        None if effect is None else effect.dX_m,
+        None if effect is None else effect.dE_rad,
         harmless,
     )
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from math import degrees
+
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from legcal.identify.analysis import Identifiability
 from legcal.identify.weak import Ranks, WeakDirection
-from legcal.identify.words import joined, leg_labels
+from legcal.identify.words import joined, leg_labels, legs_in_words
 
 _CONDITIONS = {
     "eq12": "base joints and axes (12)",
@@ -52,8 +54,7 @@ def _heading(report: Identifiability) -> RenderableType:
     space = "spatial" if report.spatial else "planar"
     r = f", {report.r} with a revolute joint at the base" if report.r else ""
     lines = [Text(f"{space}, {report.n} legs ({report.n_ac} of known length law{r})")]
-    names = list(dict.fromkeys(name for view in report.views for name in view))
-    labels = leg_labels(names)
+    labels = leg_labels(report.legs)
     for k, (view, images) in enumerate(zip(report.views, report.images, strict=True), start=1):
         legs = ", ".join(labels[name] for name in view)
         lines.append(Text(f"view {k}: legs {legs} in {images} image{'s' * (images != 1)}"))
@@ -66,7 +67,7 @@ def _recommendation(report: Identifiability) -> RenderableType:
         return Text("No set of views was found that suffices; all legs in one view are judged.")
     lines = [Text("Smallest sets of views that suffice:", style="bold")]
     for found in report.recommendation:
-        labels = leg_labels(list(dict.fromkeys(name for view in found.views for name in view)))
+        labels = leg_labels(report.legs)
         views = "  ".join(",".join(labels[name] for name in view) for view in found.views)
         number = len(found.views)
         lines.append(
@@ -79,7 +80,7 @@ def _conditions(report: Identifiability) -> Table:
     """Return the paper's conditions."""
     table = _plain_table("condition of the paper", "equations", "unknowns", "")
     for c in report.conditions:
-        legs = "" if c.ok or not c.legs else f": not legs {', '.join(str(j + 1) for j in c.legs)}"
+        legs = f": {legs_in_words(c.legs, report.legs)}" if c.legs else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
         table.add_row(_CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}")
     return table
@@ -117,7 +118,7 @@ def _hidden(weak: WeakDirection) -> tuple[str, str]:
         return "?", "?"
     if weak.harmless:
         return "harmless", ""
-    return f"{1e3 * weak.dX_m:.2f}", f"{57.29577951308232 * weak.dE_rad:.3f}"
+    return f"{1e3 * weak.dX_m:.2f}", f"{degrees(weak.dE_rad):.3f}"
 
 
 def _remedies(report: Identifiability) -> Table:
@@ -142,15 +143,16 @@ def _verdict(report: Identifiability) -> list[RenderableType]:
     else:
         lines.append(Text("NOT identifiable: see what is not determined.", style="bold"))
     if report.platform_sigma is not None:
-        shift, turn = report.platform_sigma
+        sigma = report.platform_sigma
         lines.append(
             Text(
-                f"Platform sigma to expect: {1e3 * shift:.2g} mm, {57.29577951308232 * turn:.2g} "
-                "deg, from outlines good to 0.1 px at both ends of a leg.",
+                f"Platform sigma to expect: {1e3 * sigma.dX_m:.2g} mm, "
+                f"{degrees(sigma.dE_rad):.2g} deg, from outlines good to 0.1 px at both ends of a leg.",
                 style="dim",
             )
         )
-    if any(not weak.harmless for weak in (*report.staged.weak, *report.full.weak)):
+    weak = (*report.staged.weak, *report.full.weak)
+    if any(direction.dX_m is not None and not direction.harmless for direction in weak):
         lines.append(
             Text(
                 "What a direction hides is the platform's error for 1 mm in its largest component.",
