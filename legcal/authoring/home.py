@@ -10,7 +10,8 @@ from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 
-TRIALS = 60
+TRIALS = 40
+EVALUATIONS = 60  # of the closure in each trial; good starts need about ten
 CLOSED = 1e-10  # of the size of the machine
 SETTLED = 1e-13
 FAR = 0.01  # of the size: a home written with few digits is nearer
@@ -19,9 +20,9 @@ FAR = 0.01  # of the size: a home written with few digits is nearer
 def find_home(described: Description) -> Home:
     """Return a pose in which a machine closes, moved onto what its legs keep constant.
 
-    Without a given one it is the pose where all legs are at the middle of their travel that turns
-    the platform least; of mirror images in the plane of the base joints the one on the positive
-    side of z is taken.
+    Without a given one it is the pose where all motors are at the middle of their travel that
+    turns the platform least; of mirror images in the plane of the base joints the one on the
+    positive side of z is taken.
 
     Raises
     ------
@@ -34,9 +35,9 @@ def find_home(described: Description) -> Home:
     found = _search(closure, turning=False) or _search(closure, turning=True)
     if found is None:
         raise ModelError(
-            f"{described.source}: no home was found: no pose has all legs at the middle of their "
-            "travel with their axes in place, needed a pose in which the machine closes; write "
-            "home, or correct the joints, offsets or travel."
+            f"{described.source}: no home was found: no pose has all motors at the middle of "
+            "their travel with their axes in place, needed a pose in which the machine closes; "
+            "write home, or correct the joints, offsets or travel."
         )
     return found
 
@@ -55,7 +56,7 @@ class _Closure:
         for j, leg in enumerate(legs):
             if leg.kind is LegKind.CONSTANT:
                 self.wanted[j] = np.nan if leg.offset is None else leg.offset
-            elif mid_travel and leg.travel is not None:
+            elif mid_travel and leg.kind is LegKind.ACTUATED and leg.travel is not None:
                 self.wanted[j] = (leg.offset or 0.0) + 0.5 * sum(leg.travel)
         known = self.wanted[np.isfinite(self.wanted)]
         self.size = max(self.size, float(known.max(initial=0.0)))
@@ -117,12 +118,9 @@ def _settle(described: Description, home: Home) -> Home:
     miss = closure.residual(T)
     if np.abs(miss).max(initial=0.0) < SETTLED:
         return home
-    for _ in range(30 if np.abs(miss).max() < FAR else 0):
-        step = np.linalg.lstsq(_jacobian(closure, T), miss, rcond=1e-9)[0]
-        moved = _moved(T, np.asarray(-step), closure.size)
-        if np.abs(closure.residual(moved)).max() >= np.abs(miss).max():
-            break
-        T, miss = moved, closure.residual(moved)
+    if np.abs(miss).max() < FAR:
+        T = _polished(closure, T)
+        miss = closure.residual(T)
     if np.abs(miss).max() < CLOSED:
         return _written(T)
     raise ModelError(
@@ -132,6 +130,18 @@ def _settle(described: Description, home: Home) -> Home:
             for found in closure.misfits(home.motion())
         ]
     )
+
+
+def _polished(closure: _Closure, T: RigidTransform) -> RigidTransform:
+    """Return the nearest pose that closes, as far as steps get nearer to one."""
+    miss = closure.residual(T)
+    for _ in range(30):
+        step = np.linalg.lstsq(_jacobian(closure, T), miss, rcond=1e-9)[0]
+        moved = _moved(T, np.asarray(-step), closure.size)
+        if np.abs(closure.residual(moved)).max() >= np.abs(miss).max():
+            break
+        T, miss = moved, closure.residual(moved)
+    return T
 
 
 def _search(closure: _Closure, *, turning: bool) -> Home | None:
@@ -151,7 +161,7 @@ def _search(closure: _Closure, *, turning: bool) -> Home | None:
     for trial in range(TRIALS if turning else 8):
         shift = rng.normal(0.0, 1.0, 3) if trial else np.array([0.0, 0.0, 1.0])
         start = np.concatenate([centre / closure.size + shift, rng.normal(0.0, 0.3, n_free - 3)])
-        fit = least_squares(misfit, start, xtol=1e-15, gtol=1e-15)
+        fit = least_squares(misfit, start, xtol=1e-15, gtol=1e-15, max_nfev=EVALUATIONS)
         if np.abs(fit.fun).max(initial=0.0) > CLOSED:
             continue
         T = pose(fit.x)
@@ -161,7 +171,7 @@ def _search(closure: _Closure, *, turning: bool) -> Home | None:
             best = rank, T
         if best[0] < 10.0 and trial > (15 if turning else 0):
             break
-    return None if best is None else _written(best[1])
+    return None if best is None else _written(_polished(closure, best[1]))
 
 
 def _jacobian(closure: _Closure, T: RigidTransform) -> Array:
