@@ -11,7 +11,7 @@ from machines import MACHINES, of_types
 from mechanisms import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
+from legcal.errors import NotIdentifiable, UsageError
 from legcal.mechanism.closing import leg_vectors, slider_columns
 from legcal.mechanism.configurations import random_configurations
 from legcal.mechanism.demands import constraints_at, demands_at, moved
@@ -73,7 +73,7 @@ def test_generic_configurations_are_closed_and_differ(shipped: Mechanism) -> Non
     found = list(generic_configurations(shipped, 3))
     assert len(found) == 3
     for configuration in found:
-        assert np.abs(shipped.chain.residual(configuration)).max() < 1e-10
+        assert np.abs(shipped.chain.residual(configuration)).max() < 1e-12
     for one, two in pairwise(found):
         assert np.abs(one - two).max() > 1e-3
 
@@ -154,14 +154,12 @@ def test_every_layout_has_the_same_kinematics(machine: str, layout: str, tmp_pat
     assert np.abs(T.as_matrix() - plain.home.as_matrix()).max() > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("machine_name", "virtual"),
-    [("3-RPR", "floating"), ("3-RPR", "planar"), ("3-RPR, tilted plane", "floating")],
-)
+@pytest.mark.parametrize("name", ["3-RPR", "3-RPR, tilted plane"])
+@pytest.mark.parametrize("virtual", ["floating", "planar"])
 def test_a_planar_platform_is_where_three_distances_put_it(
-    machine_name: str, virtual: str, tmp_path: Path
+    name: str, virtual: str, tmp_path: Path
 ) -> None:
-    machine = MACHINES[machine_name]()
+    machine = MACHINES[name]()
     mechanism = load_mechanism(write_machine(tmp_path, machine, Layout(virtual=virtual)))
     assert not mechanism.spatial
     drawn = random_configurations(mechanism, 5, 2)
@@ -174,13 +172,6 @@ def test_a_planar_platform_is_where_three_distances_put_it(
         assert abs((T.translation - mechanism.home.translation) @ n) < 1e-12
         found = np.linalg.norm(leg_vectors(mechanism, T), axis=1)
         np.testing.assert_allclose(found, mechanism.sign * q + mechanism.q0, atol=1e-12)
-
-
-def test_a_virtual_joint_in_another_plane_is_refused_for_what_it_is(tmp_path: Path) -> None:
-    # the joint turns the platform out of the attitude that its home says
-    path = write_machine(tmp_path, MACHINES["3-RPR, tilted plane"](), Layout(virtual="planar"))
-    with pytest.raises(DidNotConverge, match=r"'platform_free' leaves it .* away"):
-        load_mechanism(path)
 
 
 def test_a_3_rpr_agrees_with_its_distance_equations() -> None:

@@ -16,7 +16,7 @@ from legcal.mechanism.model import Mechanism
 
 RANK_TOLERANCE = 1e-7  # of the largest singular value, lengths and angles made comparable
 STEP = 0.05  # [rad], and of a leg length
-CLOSED = 1e-10
+CLOSED = 1e-12  # [m], and [rad] for frames
 CONFIGURATIONS = 3
 
 
@@ -80,15 +80,15 @@ def project(mechanism: Mechanism, configuration: Array) -> Array | None:
     worst = np.inf
     for _ in range(15):
         residual, jacobian = chain.linearize(configuration)
-        if np.abs(residual).max(initial=0.0) < 1e-14 or np.abs(residual).max() > 2.0 * worst:
-            break
-        worst = float(np.abs(residual).max())
+        gap = float(np.abs(residual).max(initial=0.0))
+        if gap < CLOSED and gap > 0.1 * worst:
+            return configuration  # rounding
+        if gap > 2.0 * worst:
+            return None
+        worst = gap
         change = np.linalg.lstsq(jacobian * scale, residual, rcond=RANK_TOLERANCE)[0]
         configuration = chain.integrate(configuration, -scale * change)
-        if worst < 1e-12:
-            break
-    residual = chain.residual(configuration)
-    return configuration if np.abs(residual).max(initial=0.0) < CLOSED else None
+    return configuration if worst < CLOSED else None
 
 
 def free_motions(mechanism: Mechanism, configuration: Array) -> Array:

@@ -1,0 +1,106 @@
+"""Random closed configurations: closed, inside the travel, unflipped, in one assembly mode."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array
+from legcal.mechanism.closing import leg_vectors
+from legcal.mechanism.configurations import Configurations, random_configurations
+from legcal.mechanism.kinematics import forward_kinematics
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+
+
+def _lines(mechanism: Mechanism, T: RigidTransform) -> float:
+    """Return the determinant of the leg lines, written down once more."""
+    u = leg_vectors(mechanism, T)
+    arms = T.apply(mechanism.B_platform) - T.translation
+    return float(np.linalg.det(np.hstack([np.cross(arms, u), u])))
+
+
+def _check(mechanism: Mechanism, drawn: Configurations) -> None:
+    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    home = np.sign(_lines(mechanism, mechanism.home))
+    for configuration, q, T in zip(*drawn, strict=True):
+        assert np.abs(mechanism.chain.residual(configuration)).max() < 1e-12
+        assert np.all((q >= lower) & (q <= upper))
+        lengths = mechanism.sign * q + mechanism.q0
+        assert lengths.min() > 0.0
+        np.testing.assert_allclose(
+            np.linalg.norm(leg_vectors(mechanism, T), axis=1), lengths, atol=1e-12
+        )
+        assert np.sign(_lines(mechanism, T)) == home
+
+
+def test_a_thousand_random_poses_of_the_hexapod_close_in_its_assembly_mode() -> None:
+    mechanism = load_mechanism("hexapod")
+    drawn = random_configurations(mechanism, 1000, 2026)
+    assert len(drawn.poses) == len(drawn.readings) == len(drawn.configurations) == 1000
+    _check(mechanism, drawn)
+    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    share = (drawn.readings - lower) / (upper - lower)
+    assert np.abs(share.mean(axis=0) - 0.5).max() < 0.05  # none was drawn again
+    assert share.min() < 0.01
+    assert share.max() > 0.99
+
+
+def test_the_same_seed_gives_the_same_poses_and_another_one_others() -> None:
+    mechanism = load_mechanism("hexapod")
+    one, same, rng = (
+        random_configurations(mechanism, 5, chance).readings
+        for chance in (3, 3, np.random.default_rng(3))
+    )
+    np.testing.assert_array_equal(one, same)
+    np.testing.assert_array_equal(one, rng)
+    assert np.abs(one - random_configurations(mechanism, 5, 4).readings).max() > 1e-3
+
+
+def test_each_configuration_is_reached_from_home() -> None:
+    mechanism = load_mechanism("hexapod-strut")
+    drawn = random_configurations(mechanism, 10, 1)
+    for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        assert np.isfinite(q).all()  # the passive strut too
+        found = forward_kinematics(mechanism, q)
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-10)
+
+
+def test_long_travels_that_exclude_each_other_still_give_poses() -> None:
+    mechanism = load_mechanism("nategh-agheli")
+    drawn = random_configurations(mechanism, 15, 1)
+    _check(mechanism, drawn)
+    assert np.ptp(drawn.readings, axis=0).min() > 0.02
+
+
+def _without_a_motor(name: str) -> Mechanism:
+    mechanism = load_mechanism(name)
+    passive = replace(mechanism.legs[1], kind=LegKind.PASSIVE)
+    return replace(mechanism, legs=(mechanism.legs[0], passive, *mechanism.legs[2:]))
+
+
+@pytest.mark.parametrize("name", ["hexapod", "6-sps", "3-rpr", "3-upu", "tricept"])
+def test_without_enough_motors_home_wanders_inside_the_travel(name: str) -> None:
+    mechanism = _without_a_motor(name)
+    drawn = random_configurations(mechanism, 10, 1)
+    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    for configuration, q in zip(drawn.configurations, drawn.readings, strict=True):
+        assert np.abs(mechanism.chain.residual(configuration)).max() < 1e-12
+        assert np.all((q >= lower - 1e-9) & (q <= upper + 1e-9))
+    assert np.ptp(drawn.readings, axis=0).min() > 1e-3
+    middles: Array = np.array([T.translation for T in drawn.poses])
+    assert np.ptp(middles, axis=0).max() > 5e-3
+
+
+@pytest.mark.parametrize("motors", ["enough", "too few"])
+def test_a_travel_that_home_cannot_enter_is_refused_once(motors: str) -> None:
+    mechanism = load_mechanism("hexapod-strut")
+    if motors == "too few":
+        mechanism = _without_a_motor("hexapod-strut")
+    far = replace(mechanism.legs[6], travel=(5.0, 5.1))
+    mechanism = replace(mechanism, legs=(*mechanism.legs[:6], far))
+    with pytest.raises(DidNotConverge, match=r"found 0 of 3 inside the travel.*check legcal\.home"):
+        random_configurations(mechanism, 3, 1)
