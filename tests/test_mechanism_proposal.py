@@ -1,5 +1,6 @@
 """Base, platform and legs of a file that does not name them."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -69,16 +70,16 @@ def test_the_shipped_hexapod_is_proposed_as_it_is_written(tmp_path: Path) -> Non
     assert mechanism.frame_legs == (0, 2, 4)
 
 
-def test_a_closed_chain_without_a_platform_is_refused(tmp_path: Path) -> None:
-    links = "".join(f'<link name="{name}"/>' for name in ("base", "a", "b", "c", "end"))
+def test_a_closed_chain_in_which_the_joint_at_A_moves_is_refused(tmp_path: Path) -> None:
+    links = "".join(f'<link name="{name}"/>' for name in ("base", "a", "b", "c", "d", "e", "end"))
     joints = "".join(
         f'<joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="0.{i} 0 0"/><axis xyz="0 0 1"/>'
+        f'<origin xyz="0.{i + 1} 0.{i * i} 0"/><axis xyz="0 0 1"/>'
         '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
-        for i, (parent, child) in enumerate([("base", "a"), ("a", "b"), ("b", "c")])
+        for i, (parent, child) in enumerate(pairwise(["base", "a", "b", "c", "d", "e"]))
     )
-    joints += '<joint name="e" type="fixed"><parent link="c"/><child link="end"/></joint>'
+    joints += '<joint name="seat" type="fixed"><parent link="e"/><child link="end"/></joint>'
     (tmp_path / "r.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
     (tmp_path / "r.yaml").write_text("closed_loop: [[end, base]]\ntype: ['6d']\nname_mot: [j0]\n")
-    with pytest.raises(OutOfClass, match="no platform could be proposed: found no link where"):
+    with pytest.raises(OutOfClass, match="one closed chain in which no link is a platform on legs"):
         load_mechanism(tmp_path / "r.yaml")

@@ -8,6 +8,7 @@ in a plane.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -56,8 +57,9 @@ def propose_block(
     virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
     bodies = rigid_bodies(urdf, closures, None)
     base = bodies.body_of[urdf.root]
-    kept = _without_virtual(bodies, urdf)
-    platform = _platform_body(kept, base, [bodies.body_of[j.child] for j in virtual], path)
+    real = replace(bodies, connections=_without_virtual(bodies, urdf))
+    carried = [bodies.body_of[j.child] for j in virtual]
+    platform = _platform_body(real, base, carried, urdf, path)
     carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
         base, platform}]  # fmt: skip
     joint = carrier[0].name if carrier else None
@@ -121,43 +123,56 @@ def any_joint(chain: LegChain) -> str:
     return chain.motor or (named[0] if named else "")
 
 
-def _without_virtual(bodies: Bodies, urdf: Urdf) -> list[Connection]:
+def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
     """Return the connections that are joints of legs."""
-    return [
+    return tuple(
         c for c in bodies.connections if c.joint is None or urdf.joints[c.joint].type not in VIRTUAL
-    ]
+    )
 
 
 def _platform_body(
-    connections: Sequence[Connection], base: str, carried: Sequence[str], path: Path
+    bodies: Bodies, base: str, carried: Sequence[str], urdf: Urdf, path: Path
 ) -> str:
-    """Return the body where most chains end, or that a virtual joint carries."""
-    degree: dict[str, int] = {}
-    for connection in connections:
-        for body in connection.bodies:
-            degree[body] = degree.get(body, 0) + 1
-    n_base = degree.pop(base, 0)
+    """Return the body where the legs end: every chain from the base to it is a leg of the class."""
+    at: dict[str, list[str]] = {}
+    for connection in bodies.connections:
+        for here, there in (connection.bodies, connection.bodies[::-1]):
+            at.setdefault(here, []).append(there)
+    n_base = len(at.get(base, []))
     if n_base < 2:
+        joints = "1 joint" if n_base == 1 else "no joint"
         raise OutOfClass(
-            f"{path}: no legs could be proposed: found {n_base} joints on the base (the root of "
+            f"{path}: this is not a parallel mechanism: found {joints} on the base (the root of "
             "the URDF), needed one for each leg; write legcal.base, legcal.platform and "
-            "legcal.legs."
+            "legcal.legs if another link is the base."
         )
-    most = max(degree.values(), default=0)
-    ends = [body for body, count in degree.items() if count == most and count > 2]
-    if len(ends) != 1:
-        ends = [body for body in carried if degree.get(body, 0) >= 2 and body in (ends or degree)]
-    if len(set(ends)) != 1:
-        found = (
-            "no link where more than two chains meet"
-            if most < 3
-            else f"several links where {most} chains meet"
-        )
+    meeting = [body for body in at if body != base and len(at[body]) > 2]
+    candidates = meeting or [body for body in at if body != base]
+    candidates = [body for body in candidates if body in carried] or candidates
+    candidates.sort(key=lambda body: (base in at[body], -len(at[body])))  # arms come last
+    found, reasons = [], list[OutOfClass]()
+    for body in candidates:
+        try:
+            find_chains(bodies, urdf, urdf.root, body)
+        except OutOfClass as error:
+            reasons.append(error)
+        else:
+            found.append(body)
+    if len(found) == 1:
+        return found[0]
+    if found:
         raise OutOfClass(
-            f"{path}: no platform could be proposed: found {found}, needed one link where all legs "
-            "end; write legcal.platform and legcal.legs if this is a platform on legs."
+            f"{path}: no platform could be proposed: found several links where legs could end "
+            f"({', '.join(found)}), needed one; write legcal.platform and legcal.legs."
         )
-    return ends[0]
+    if meeting:
+        raise reasons[0]
+    raise OutOfClass(
+        f"{path}: this mechanism is outside the method: found one closed chain in which no link is "
+        "a platform on legs, because on each side of any link more than a slider or a rod moves "
+        "the joint at A; needed legs of type joint, slider or rod, joint; this machine cannot be "
+        "calibrated this way."
+    )
 
 
 def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: str) -> str:

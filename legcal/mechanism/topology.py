@@ -3,10 +3,12 @@
 Nothing here reads names for meaning. A leg is a chain of bodies from base to platform.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from legcal.errors import OutOfClass
-from legcal.mechanism.axes import Step
+from legcal.mechanism.axes import CONCURRENT, Axis, Step, nearest
 from legcal.mechanism.bodies import Bodies, Connection
 from legcal.mechanism.leg_chain import LegChain, understand
 from legcal.mechanism.urdf import Urdf
@@ -145,7 +147,7 @@ def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: 
         found = "returns to the base"
     elif n_onward == 0:
         found = f"ends at link '{body}' without reaching the platform"
-    elif len(steps) == 1 and first.type != "sphere" and n_onward > 1:
+    elif n_onward > 1 and _is_an_arm(steps):
         found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
         needed = "needed joints whose centres are fixed in the base"
     else:
@@ -154,6 +156,19 @@ def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: 
         f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
         f"{_name(first)} {found}, {needed}; check closed_loop, legcal.base and legcal.platform."
     )
+
+
+def _is_an_arm(steps: list[Step]) -> bool:
+    """Say whether joints make an arm whose end moves: one revolute, or several apart."""
+    if any(step.connection.type != "revolute" for step in steps):
+        return False
+    if len(steps) == 1:
+        return True
+    for one, two in pairwise(steps):
+        near, far = nearest(Axis(one.name, *one.line(one.far)), Axis(two.name, *two.line(two.near)))
+        if near is None or far is None or float(np.linalg.norm(far - near)) > CONCURRENT:
+            return True
+    return False
 
 
 def _name(connection: Connection) -> str:
