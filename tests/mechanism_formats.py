@@ -224,3 +224,32 @@ def _group(mechanism: Mechanism, first: UrdfJoint) -> list[UrdfJoint]:
 def _letter(joint: UrdfJoint) -> str | None:
     axes = dict(zip("XYZ", np.eye(3), strict=True))
     return next((k for k, axis in axes.items() if np.allclose(axis, joint.axis)), None)
+
+
+def with_loops_at_joints(mechanism: Mechanism, tag: str) -> str:
+    """Return the URDF of legs without S, closed by their revolute or universal platform joints."""
+    robot = etree.fromstring(mechanism.urdf.content)
+    above = {j.child: j for j in mechanism.urdf.joints.values()}
+    for i, closure in enumerate(mechanism.chain.closures):
+        end, seat = above[closure.frame_1], above[closure.frame_2]
+        joints = [above[end.parent]]
+        while above[joints[-1].parent].type == "revolute":
+            joints.append(above[joints[-1].parent])
+        first, last = joints[-1], joints[0]
+        for joint in (end, seat, *joints):
+            _remove(robot, joint)
+        sides = []
+        for name, joint in (("link1", first), ("link2", seat)):
+            place = etree.fromstring(origin(joint.T_parent_origin))
+            sides.append((name, joint.parent, f'xyz="{place.get("xyz")}" rpy="{place.get("rpy")}"'))
+        axes = numbers(first.axis), numbers(last.axis)
+        kind = "revolute" if len(joints) == 1 else "universal"
+        if tag == "loop_joint":
+            text = "".join(f'<{name} link="{link}" {at}/>' for name, link, at in sides)
+            text += f'<axis xyz="{axes[0]}"/>'
+        else:
+            text = ""
+            for side, (_, link, at), axis in zip(("parent", "child"), sides, axes, strict=True):
+                text += f'<{side} link="{link}"/><{side}_origin {at}/><{side}_axis xyz="{axis}"/>'
+        robot.append(etree.fromstring(f'<{tag} name="loop{i}" type="{kind}">{text}</{tag}>'))
+    return etree.tostring(robot, encoding="unicode")

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mechanism_formats import FORMATS, write_format
+from mechanism_formats import FORMATS, with_loops_at_joints, write_format
 
 from legcal import load_mechanism
+from legcal.cli import main
 from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 from legcal.report.model_files import write_model
+from legcal.report.urdf import reload_and_check, write_calibrated_urdf, write_calibrated_yaml
 
 MACHINES = ("hexapod", "3-upu", "3-rpr", "tricept", "hexapod-strut")
 
@@ -56,6 +58,57 @@ def test_every_format_gives_the_same_analysis(machine: str, name: str, tmp_path:
     if not name.startswith("mjcf"):  # these have no pose where they are closed
         found = replace(found, home=expected.home)
     assert_same_analysis(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("machine", "tag"),
+    [("3-rpr", "loop_joint"), ("3-rpr", "constraint"), ("3-upu", "constraint")],
+)
+def test_loops_are_closed_by_revolute_and_universal_joints(
+    machine: str, tag: str, tmp_path: Path
+) -> None:
+    expected = machine_of(machine)
+    path = tmp_path / "machine.urdf"
+    path.write_text(with_loops_at_joints(expected, tag))
+    found = load_mechanism(path)
+    assert_same_analysis(replace(found, home=expected.home), expected)
+
+
+@pytest.mark.parametrize("name", ["mjcf bodies", "mjcf sites", "loop_joint", "gepetto"])
+def test_a_calibrated_model_of_any_format_is_complete(name: str, tmp_path: Path) -> None:
+    nominal = load_mechanism(write_format(machine_of("hexapod"), name, tmp_path))
+    rng = np.random.default_rng(3)
+    known = nominal.parameters
+    base, platform = known.base_joints.copy(), known.platform_joints.copy()
+    moved = [j for j in range(6) if j not in nominal.frame_legs]
+    base[moved] += rng.uniform(-1e-3, 1e-3, (3, 3))
+    platform[moved] += rng.uniform(-1e-3, 1e-3, (3, 3))
+    offsets = known.offsets + rng.uniform(-1e-3, 1e-3, 6)
+    calibrated = replace(known, base_joints=base, platform_joints=platform, offsets=offsets)
+    write_calibrated_urdf(nominal, calibrated, tmp_path / "calibrated.urdf")
+    write_calibrated_yaml(nominal, tmp_path / "calibrated.yaml", "calibrated.urdf")
+    written = reload_and_check(tmp_path / "calibrated.yaml")
+    assert written.leg_names == nominal.leg_names
+    assert np.abs(written.parameters.base_joints - base).max() < 1e-12
+    assert np.abs(written.parameters.platform_joints - platform).max() < 1e-12
+    assert np.abs(written.parameters.offsets - offsets).max() < 1e-12
+
+
+def test_inspect_writes_a_model_down(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_format(machine_of("hexapod"), "mjcf sites", tmp_path)
+    to = tmp_path / "to"
+    monkeypatch.setattr("sys.argv", ["legcal", "inspect", str(path), "--write", str(to)])
+    with pytest.raises(SystemExit) as done:
+        main()
+    assert done.value.code == 0
+    assert f"Wrote {to / 'models' / 'machine.yaml'}." in capsys.readouterr().err
+    assert load_mechanism(to / "models" / "machine.yaml").n_legs == 6
+    with pytest.raises(SystemExit) as done:
+        main()
+    assert done.value.code == 2
+    assert "already there" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["mjcf bodies", "loop_joint", "gepetto"])
