@@ -10,7 +10,8 @@ import numpy as np
 from legcal.errors import OutOfClass
 from legcal.mechanism.axes import CONCURRENT, Axis, Step, nearest
 from legcal.mechanism.bodies import Bodies, Connection
-from legcal.mechanism.leg_chain import LegChain, understand
+from legcal.mechanism.leg_chain import LegChain
+from legcal.mechanism.understanding import understand
 from legcal.mechanism.urdf import Urdf
 
 
