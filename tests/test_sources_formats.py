@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mechanism_formats import FORMATS, with_loops_at_joints, write_format
+from mechanism_formats import FORMATS, mjcf, numbers, with_loops_at_joints, write_format
 
 from legcal import load_mechanism
 from legcal.cli import main
@@ -58,6 +58,20 @@ def test_every_format_gives_the_same_analysis(machine: str, name: str, tmp_path:
     if not name.startswith("mjcf"):  # these have no pose where they are closed
         found = replace(found, home=expected.home)
     assert_same_analysis(found, expected)
+
+
+def test_slides_and_a_ball_that_nothing_drives_carry_a_platform_freely(tmp_path: Path) -> None:
+    expected = machine_of("hexapod")
+    joints = "".join(
+        f'<joint name="p{i}" type="slide" axis="{numbers(axis)}"/>'
+        for i, axis in enumerate(np.eye(3))
+    )
+    text = mjcf(expected, "sites")
+    path = tmp_path / "machine.xml"
+    path.write_text(
+        text.replace('<freejoint name="platform_free"/>', f'{joints}<joint type="ball"/>')
+    )
+    assert_same_analysis(load_mechanism(path), expected)
 
 
 @pytest.mark.parametrize(

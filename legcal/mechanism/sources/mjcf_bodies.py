@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array
 from legcal.mechanism.sources.mjcf_values import Attributes, Values, own_attributes, z_onto
 from legcal.mechanism.sources.tree_text import EYE, FULL_TURN, TextCylinder, TreeText
+from legcal.mechanism.urdf_checks import number_list
 
 WORLD = "world"
 _Z = (0.0, 0.0, 1.0)
@@ -33,6 +34,8 @@ class MjcfTree:
         The values [rad, m] of hinges and slides in the configuration of the file.
     taken : set of str
         Names that no new link or joint may have.
+    driven : frozenset of str
+        The joints that actuators drive or sensors measure.
     """
 
     values: Values
@@ -42,6 +45,7 @@ class MjcfTree:
     joints: dict[str, str] = field(default_factory=dict)
     references: dict[str, float] = field(default_factory=dict)
     taken: set[str] = field(default_factory=set)
+    driven: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +69,8 @@ def read_bodies(root: etree._Element, values: Values) -> MjcfTree:
     values : Values
         Its defaults and options.
     """
-    tree = MjcfTree(values)
+    named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
+    tree = MjcfTree(values, driven=frozenset(str(element.get("joint")) for element in named))
     for element in root.iter(*_NOT_READ):
         values.problems.add(
             element, "is not expanded", "save the compiled model with MuJoCo and give that file"
@@ -149,6 +154,9 @@ def _body(
         tree, element, _Place(name, EYE, _class_within(tree, element, place.childclass))
     )
     at, T_at_body = place.body, T_parent_body
+    if at == WORLD and _is_free(tree, inside.joints):
+        tree.text.joint(_unused(tree, f"{name}_free"), "floating", at, name, T_at_body)
+        at, inside.joints = name, []
     for i, (joint, where) in enumerate(inside.joints):
         only = len(inside.joints) == 1
         at, T_at_body = _joint(
@@ -158,6 +166,26 @@ def _body(
         tree.text.joint(_unused(tree, f"{name}_fixed"), "fixed", at, name, T_at_body)
     tree.text.link(name, tuple(inside.cylinders))
     return inside.bodies
+
+
+def _is_free(tree: MjcfTree, joints: list[tuple[etree._Element, _Place]]) -> bool:
+    """Say whether the joints of a body, none of them driven, leave it all six freedoms."""
+    axes: dict[str, list[Array]] = {"slide": [], "hinge": [], "ball": []}
+    for element, place in joints:
+        attributes = tree.values.attributes(element, place.childclass)
+        kind = attributes.get("type", "hinge")
+        axis = number_list(attributes.get("axis", "0 0 1"), 3)
+        driven = attributes.get("name") in tree.driven
+        if element.tag != "joint" or kind not in axes or axis is None or driven:
+            return False
+        axes[kind].append(np.array(axis))
+    turns_freely = len(axes["ball"]) == 1 if axes["ball"] else _span_space(axes["hinge"])
+    return _span_space(axes["slide"]) and turns_freely and len(axes["hinge"]) in (0, 3)
+
+
+def _span_space(axes: list[Array]) -> bool:
+    """Say whether there are three axes, independent of each other."""
+    return len(axes) == 3 and int(np.linalg.matrix_rank(np.array(axes), tol=1e-3)) == 3
 
 
 def _joint(
