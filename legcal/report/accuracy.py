@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array
+from legcal.mechanism.configurations import random_configurations
 from legcal.mechanism.kinematics import forward_kinematics, forward_kinematics_many
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
@@ -23,7 +24,7 @@ from legcal.mechanism.platform import platform_in_base, pose_differences
 
 N_RANDOM_POSES = 100
 _SEED = 20020721
-_TRIES_PER_POSE = 20
+_TRIES_PER_POSE = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,17 +179,15 @@ def _random_poses(
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
     """Return platform poses of both models at the same random readings inside the travel."""
     rng = np.random.default_rng(_SEED)
-    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
     for _ in range(_TRIES_PER_POSE * N_RANDOM_POSES):
-        q = rng.uniform(lower, upper)
+        drawn = random_configurations(reference, 1, rng)
         try:
-            pair = forward_kinematics(mechanism, q), forward_kinematics(reference, q)
-        except DidNotConverge:  # the legs cannot have these lengths at the same time
+            poses.append(forward_kinematics(mechanism, drawn.readings[0]))
+        except DidNotConverge:  # the legs of this model cannot have these lengths together
             continue
-        poses.append(pair[0])
-        reference_poses.append(pair[1])
+        reference_poses += drawn.poses
         if len(poses) == N_RANDOM_POSES:
             return poses, reference_poses
     raise DidNotConverge(
