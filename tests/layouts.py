@@ -56,6 +56,7 @@ class LegLayout:
 
     ``cut``: ``far`` (3d where the far joint is an S and ``sphere``), ``mid`` or ``slider``
     (welded behind or before the slider), ``carry`` (the leg carries the platform, uncut).
+    ``spin``: a revolute along the leg beside its ``S``, or on the side of ``base`` or ``platform``.
     """
 
     hung: str = "base"
@@ -65,7 +66,7 @@ class LegLayout:
     flip_axes: bool = False
     slid: float = 0.0
     mount: bool = False
-    spin: bool = False
+    spin: str = ""
     seed: int = 0
 
 
@@ -185,10 +186,15 @@ class _Leg:
         base, platform = leg.ends
         lower = self._group("a", base, leg.A, leg.base_axis)
         upper = self._group("b", platform, self.B, leg.platform_axis)[::-1]
-        if layout.spin and "S" in leg.type:
-            place = self.B - 0.1 * u if platform == "S" else leg.A + 0.1 * u
+        side = layout.spin
+        if side == "S":
+            side = "" if "S" not in leg.type else "platform" if platform == "S" else "base"
+        if side:
+            place = self.B - 0.1 * u if side == "platform" else leg.A + 0.1 * u
             spin = _Joint(f"{name}_spin", "revolute", place, u)
-            lower, upper = (lower, [spin, *upper]) if platform == "S" else ([*lower, spin], upper)
+            lower, upper = (
+                (lower, [spin, *upper]) if side == "platform" else ([*lower, spin], upper)
+            )
         slider = [] if leg.kind == "constant" else [_Joint(f"{name}_slider", "prismatic", leg.A, u)]
         self.joints = [*lower, *slider, *upper]
         self.n_lower, self.n_upper = len(lower), len(upper)

@@ -18,6 +18,7 @@ from layouts import (
 )
 from machines import MACHINES, of_types
 
+from legcal.errors import OutOfClass
 from legcal.mechanism.leg import Leg
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
@@ -32,7 +33,7 @@ LAYOUTS = {
     "cut behind the slider": Layout((LegLayout(cut="mid", slid=0.02),)),
     "cut before the slider": Layout((LegLayout(cut="slider", mount=True),)),
     "flipped sliders and axes": Layout((LegLayout(flip_slider=True, flip_axes=True, slid=0.03),)),
-    "mounts and idle spins": Layout((LegLayout(hung="platform", mount=True, spin=True),)),
+    "mounts and idle spins": Layout((LegLayout(hung="platform", mount=True, spin="S"),)),
     "carried by leg 2": Layout(
         (LegLayout(), LegLayout(cut="carry"), *[LegLayout(slid=0.01, seed=k) for k in range(5)])
     ),
@@ -43,7 +44,7 @@ LAYOUTS = {
         (
             LegLayout(hung="platform", slid=0.01, seed=4),
             LegLayout(cut="mid", flip_slider=True, seed=5),
-            LegLayout(sphere=False, spin=True, mount=True, seed=6),
+            LegLayout(sphere=False, spin="S", mount=True, seed=6),
             LegLayout(cut="slider", flip_axes=True, slid=0.04, seed=7),
         )
     ),
@@ -67,7 +68,7 @@ def _check(mechanism: Mechanism, machine: Machine, layout: Layout) -> None:
         out = 0.0 if spec.kind == "constant" else PASSED
         _close(leg.q0, length - out)
         spins = mechanism.leg_chains[j].idle_spins
-        added = layout.of(j).spin and "S" in spec.type
+        added = layout.of(j).spin == "S" and "S" in spec.type
         assert spins == (spec.type == "SS") + added
 
 
@@ -127,7 +128,7 @@ LEG_LAYOUTS = st.builds(
     flip_axes=st.booleans(),
     slid=st.sampled_from([0.0, 0.01, 0.05]),
     mount=st.booleans(),
-    spin=st.booleans(),
+    spin=st.sampled_from(["", "S"]),
     seed=st.integers(0, 9),
 )
 LEG_TYPES = st.sampled_from(["US", "SU", "SS", "RS", "SR", "UU", "RU", "UR", "RR", "U", "S"])
@@ -147,3 +148,39 @@ def test_any_legs_in_any_layout_are_found_as_drawn(
     machine, layout = of_types(types, seed=seed), Layout(tuple(layouts))
     mechanism = load_mechanism(write_machine(tmp_path, machine, layout))
     _check(mechanism, machine, layout)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "side", "found", "idle"),
+    [
+        ("UU", "base", "SPU", 0),
+        ("UU", "platform", "UPS", 0),
+        ("RU", "base", "RPS", 0),
+        ("UR", "platform", "SPR", 0),
+        ("U", "base", "SP", 0),
+        ("U", "platform", "SP", 0),
+        ("RS", "base", "RPS", 1),
+        ("US", "base", "SPS", 1),
+        ("SS", "platform", "SPS", 2),
+    ],
+)
+def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
+    drawn: str, side: str, found: str, idle: int, tmp_path: Path
+) -> None:
+    machine = of_types([drawn] * 3)
+    for layout in (LegLayout(spin=side, sphere=False), LegLayout(spin=side, cut="mid", slid=0.03)):
+        mechanism = load_mechanism(write_machine(tmp_path, machine, Layout((layout,))))
+        assert [leg.type for leg in mechanism.legs] == [found] * 3
+        assert [chain.idle_spins for chain in mechanism.leg_chains] == [idle] * 3
+        assert all(leg.twist is None for leg in mechanism.legs)
+        for j, leg in enumerate(mechanism.legs):
+            _close(leg.A_base, machine.legs[j].A)
+            _close(leg.B_platform, expected_B(machine, j))
+
+
+@pytest.mark.parametrize("drawn", ["RR", "R"])
+def test_a_revolute_along_a_leg_between_revolutes_is_refused(drawn: str, tmp_path: Path) -> None:
+    machine = of_types([drawn] * 3)
+    path = write_machine(tmp_path, machine, Layout((LegLayout(spin="base"),)))
+    with pytest.raises(OutOfClass, match="'leg1_spin' along the leg, and no S joint"):
+        load_mechanism(path)

@@ -129,7 +129,8 @@ def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
     B, u = chain.platform.centre_near, leg.sign * chain.u_upper
     if leg.platform_joint == "":
         last = chain.steps[-1]
-        halves[last.connection.bodies[last.far]] = "platform", B, u
+        on_platform = chain.platform.centre_far, leg.sign * chain.u_platform
+        halves[last.connection.bodies[last.far]] = "platform", *on_platform
     for step, body in zip(
         chain.steps[chain.n_lower + 1 :], chain.bodies[chain.n_lower :], strict=True
     ):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
@@ -79,6 +80,11 @@ class LegChain:
     def motor(self) -> str | None:
         """The slider's joint, None for a rod."""
         return None if self.slider is None else self.slider.connection.joint
+
+    @property
+    def u_platform(self) -> Array:
+        """The direction ``u_zero`` in the body of the platform, for a leg that is fixed to it."""
+        return np.asarray(self.T_zero.rotation.inv().apply(self.u_zero))
 
     @property
     def twists(self) -> bool:

@@ -53,7 +53,7 @@ def leg_of(
     base_axis = _axis(chain, chain.base, T_base)
     platform_axis = _axis(chain, chain.platform, T_platform)
     if chain.platform.letter == "":
-        platform_axis = sign * np.asarray(T_platform.rotation.inv().apply(chain.u_upper))
+        platform_axis = sign * np.asarray(T_platform.rotation.inv().apply(chain.u_platform))
     return Leg(
         name=name,
         base_joint=cast("JointLetter", chain.base.letter),
