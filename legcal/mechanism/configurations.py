@@ -19,9 +19,11 @@ from legcal.mechanism.following import follow
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.mobility import free_motions, project
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.singularity import singularity
 
 TRIES = 20  # draws for each configuration
 NEARER = 1.3 * 0.8 ** np.arange(TRIES)  # how far from home draws go, at most all of the way
+REGULAR = 0.1  # of the singularity measure at home: nobody works nearer to a singularity
 SHORTEST = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
 WALK = 6  # steps of a random walk between two configurations
 STRIDE = 0.15  # [rad], and of a leg length
@@ -52,8 +54,8 @@ def random_configurations(
     """Return random closed configurations with every slider inside its travel.
 
     Readings of motors are uniform in the travel and followed from home without crossing a
-    singularity; those that cannot be reached are drawn again, nearer and nearer to home. Where
-    motors do not determine the pose, the mechanism takes a random walk from home.
+    singularity or ending beside one; those that cannot be reached are drawn again, nearer and
+    nearer to home. Where motors do not determine the pose, the mechanism takes a random walk.
 
     Parameters
     ----------
@@ -95,6 +97,7 @@ def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Ite
     motors = [mechanism.legs[j] for j in mechanism.motors]
     lower, upper = np.array([leg.travel for leg in motors]).T
     home = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
+    least = REGULAR * singularity(mechanism, mechanism.home)
     for _ in range(count):
         for nearer in NEARER:
             q = chance.uniform(lower, upper)
@@ -104,7 +107,9 @@ def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Ite
                 reached = follow(mechanism, mechanism.home_configuration, q, shortest=SHORTEST)
             except DidNotConverge:  # the legs cannot have these lengths at the same time
                 continue
-            if not _outside(mechanism, reached).any():
+            if _outside(mechanism, reached).any():
+                continue
+            if singularity(mechanism, platform_pose(mechanism, reached)) >= least:
                 yield reached
                 break
 

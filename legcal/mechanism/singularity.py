@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
-from legcal.mechanism.demands import Demands, demands_at, is_constrained, leg_scale
+from legcal.mechanism.demands import demands_at, is_constrained, leg_scale
 from legcal.mechanism.model import Mechanism
 
 
@@ -35,20 +35,10 @@ def singularity(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
         Zero at a singular pose, and wherever the motors do not determine the pose; of the order
         of the platform's size in leg lengths at a good one.
     """
-    demands = demands_at(mechanism, T_base_platform)
-    jacobian = dimensionless(mechanism, T_base_platform, demands)
+    jacobian = dimensionless(mechanism, T_base_platform)
     if len(jacobian) < 6:
         return 0.0
     return float(np.linalg.svd(jacobian, compute_uv=False)[5])
-
-
-def dimensionless(mechanism: Mechanism, T_base_platform: RigidTransform, demands: Demands) -> Array:
-    """Return the Jacobian of :func:`singularity`, (n_rows, 6)."""
-    scale = leg_scale(mechanism, T_base_platform)
-    centre = T_base_platform.rotation.apply(mechanism.B_platform.mean(axis=0))
-    gradient, moment = demands.jacobian[:, 3:], demands.jacobian[:, :3]
-    about_centre = moment - np.cross(centre, gradient)
-    return np.hstack([about_centre / scale, gradient])
 
 
 def side(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
@@ -56,22 +46,32 @@ def side(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
 
     Between two poses of different sign lies a singularity.
     """
-    if not is_constrained(mechanism):
-        rows = _lines(mechanism, T_base_platform)
-    else:
-        demands = demands_at(mechanism, T_base_platform)
-        rows = dimensionless(mechanism, T_base_platform, demands)
+    rows = dimensionless(mechanism, T_base_platform)
     return float(np.sign(np.linalg.det(rows))) if len(rows) == 6 else 0.0
 
 
-def _lines(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
-    """Return the lines of the motors' legs, (n_motors, 6), where nothing else is demanded.
+def dimensionless(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the Jacobian of :func:`singularity`, (n_rows, 6): rotation, displacement."""
+    if not is_constrained(mechanism):
+        return _lines(mechanism, T_base_platform)
+    demands = demands_at(mechanism, T_base_platform)
+    scale = leg_scale(mechanism, T_base_platform)
+    centre = T_base_platform.rotation.apply(mechanism.B_platform.mean(axis=0))
+    gradient, moment = demands.jacobian[:, 3:], demands.jacobian[:, :3]
+    return np.hstack([(moment - np.cross(centre, gradient)) / scale, gradient])
 
-    The moments u x arm are written out: ``np.cross`` is slow on six rows.
+
+def _lines(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the same of the motors' legs alone, (n_motors, 6): there is nothing else to meet.
+
+    The moments arm x u are written out: ``np.cross`` is slow on six rows.
     """
     motors = list(mechanism.motors)
     matrix = T_base_platform.as_matrix()
-    arms = mechanism.B_platform[motors] @ matrix[:3, :3].T
-    u = arms + matrix[:3, 3] - mechanism.A_base[motors]
+    turned = mechanism.B_platform @ matrix[:3, :3].T
+    vectors = turned + matrix[:3, 3] - mechanism.A_base
+    lengths = np.linalg.norm(vectors, axis=1)
+    arms = (turned - turned.mean(axis=0))[motors] / lengths.mean()
+    u = (vectors / lengths[:, None])[motors]
     (x, y, z), (a, b, c) = arms.T, u.T
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)

@@ -24,7 +24,7 @@ from legcal.mechanism.platform import platform_in_base, pose_differences
 
 N_RANDOM_POSES = 100
 _SEED = 20020721
-_TRIES_PER_POSE = 3
+_ROUNDS = 20  # of drawing again what the reference does not reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,13 +181,14 @@ def _random_poses(
     rng = np.random.default_rng(_SEED)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
-    for _ in range(_TRIES_PER_POSE * N_RANDOM_POSES):
-        drawn = random_configurations(reference, 1, rng)
-        try:
-            poses.append(forward_kinematics(mechanism, drawn.readings[0]))
-        except DidNotConverge:  # the legs of this model cannot have these lengths together
-            continue
-        reference_poses += drawn.poses
+    for _ in range(_ROUNDS):
+        drawn = random_configurations(mechanism, N_RANDOM_POSES - len(poses), rng)
+        for q, T in zip(drawn.readings, drawn.poses, strict=True):
+            try:
+                reference_poses.append(forward_kinematics(reference, q))
+            except DidNotConverge:  # the reference cannot have these lengths at the same time
+                continue
+            poses.append(T)
         if len(poses) == N_RANDOM_POSES:
             return poses, reference_poses
     raise DidNotConverge(
