@@ -17,7 +17,8 @@ from legcal.mechanism.robot_xml import parse_xml
 from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.sources.components import moving_groups
 from legcal.mechanism.sources.loops import Loop, LoopKind, close_loop
-from legcal.mechanism.sources.mjcf_bodies import WORLD, MjcfTree, read_bodies
+from legcal.mechanism.sources.mjcf_bodies import read_bodies
+from legcal.mechanism.sources.mjcf_tree import WORLD, MjcfTree
 from legcal.mechanism.sources.mjcf_values import Values, own_attributes
 from legcal.mechanism.sources.source import Source
 from legcal.mechanism.urdf import Urdf, parse_urdf
