@@ -1,6 +1,7 @@
 """Machines that the method does not cover are refused in one sentence with the true reason."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -208,6 +209,15 @@ def test_too_few_legs_are_refused(types: list[str], message: str, tmp_path: Path
 def test_one_leg_in_a_plane_is_refused(tmp_path: Path) -> None:
     path = write_machine(tmp_path, planar(n_legs=1), Layout())
     assert "found 1 leg in a plane, needed at least 2" in _refusal(path)
+
+
+def test_a_leg_that_is_fixed_to_the_platform_of_a_planar_machine_is_refused(
+    tmp_path: Path,
+) -> None:
+    machine = planar()
+    fixed = replace(machine.legs[2], type="R", platform_axis=None)
+    path = write_machine(tmp_path, replace(machine, legs=(*machine.legs[:2], fixed)), Layout())
+    assert "'leg3_slider' is outside the method: found it fixed to the platform" in _refusal(path)
 
 
 def _moved(path: Path, leg: str, by: Array) -> Path:

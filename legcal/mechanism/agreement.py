@@ -91,12 +91,12 @@ def check_virtual_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
 
 
 def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
-    """Check that there are as many legs as define a frame.
+    """Check that there are as many legs as define a frame, and no fixed one in a plane.
 
     Raises
     ------
     OutOfClass
-        If there are fewer.
+        If there are fewer, or a leg of a planar mechanism is fixed to the platform.
     """
     n_d = n_frame_legs(spatial=spatial)
     if len(chains) < n_d:
@@ -105,6 +105,13 @@ def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
             f"{path}: this mechanism is outside the method: found {len(chains)} "
             f"{'leg' if len(chains) == 1 else 'legs'} {where}, needed at least {n_d}, whose joints "
             "define the frames of base and platform; this machine cannot be calibrated this way."
+        )
+    fixed = [chain for chain in chains if chain.platform.letter == ""]
+    if fixed and not spatial:
+        raise OutOfClass(
+            f"{path}: the leg of joint '{any_joint(fixed[0])}' is outside the method: found it "
+            "fixed to the platform of a planar mechanism, needed a revolute joint there; this "
+            "machine cannot be calibrated this way."
         )
 
 
