@@ -158,6 +158,11 @@ def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
     assert "needed at most 4000000" in _problems(path)[0]
 
 
+def test_a_file_with_thousands_of_bodies_is_not_followed(tmp_path: Path) -> None:
+    problems = _mjcf_problems(tmp_path, "</worldbody>", "<body/>" * 6000 + "</worldbody>")
+    assert "needed at most 5000" in problems[0]
+
+
 def test_a_folder_without_robot_yaml(tmp_path: Path) -> None:
     assert "found a folder without robot.yaml" in _problems(tmp_path)[0]
 

@@ -11,7 +11,7 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import OutOfClass
+from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.mechanism.robot_xml import parse_xml
 from legcal.mechanism.schema import MechanismFile
@@ -24,6 +24,7 @@ from legcal.mechanism.sources.source import Source
 from legcal.mechanism.urdf import Urdf, parse_urdf
 from legcal.mechanism.urdf_checks import Problems
 
+MOST_PARTS = 5000
 _COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
 _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
 
@@ -39,10 +40,16 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
         If nothing closes a loop, or there is another machine beside the mechanism.
     """
     root = parse_xml(path, content, "MJCF file")
+    n_parts = sum(1 for _ in root.iter("body", "joint", "default", "frame"))
+    if n_parts > MOST_PARTS:
+        raise ModelError(
+            f"{path}: the MJCF file could not be used: found {n_parts} bodies, joints, frames and "
+            f"default classes, needed at most {MOST_PARTS}; give the mechanism alone."
+        )
     problems = Problems(path)
     values = Values(root, problems)
     tree = read_bodies(root, values)
-    loops = list(_loops(root, tree))
+    loops = list(closing_joints(root, tree))
     motors = _motors(root, tree)
     problems.raise_if_any()
     if not loops:
@@ -62,7 +69,7 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     return Source(path, file, urdf, True, (left_out,) * bool(dropped), values_there)
 
 
-def _loops(root: etree._Element, tree: MjcfTree) -> Iterator[Loop]:
+def closing_joints(root: etree._Element, tree: MjcfTree) -> Iterator[Loop]:
     """Give the loops of all ``<equality>`` elements; problems are noted."""
     problems = tree.values.problems
     names: set[str] = set()
