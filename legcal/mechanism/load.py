@@ -36,8 +36,8 @@ def load_mechanism(model: str | Path) -> Mechanism:
     Parameters
     ----------
     model : str or Path
-        A mechanism YAML, a URDF with its YAML beside it (or in ``../models``), or the name of
-        a shipped model.
+        A mechanism YAML, or a folder with ``robot.yaml``; a URDF with its YAML beside it (or in
+        ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
 
     Raises
     ------
