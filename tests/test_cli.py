@@ -34,7 +34,7 @@ def test_help_and_version_load_nothing_heavy() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    for command in ("inspect", "calibrate", "evaluate"):
+    for command in ("inspect", "identify", "calibrate", "evaluate"):
         assert command in done.stdout
 
 

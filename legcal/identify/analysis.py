@@ -68,7 +68,8 @@ class Identifiability:
         Number of images of each view.
     platform_sigma : PlatformError or None
         Standard deviation of the platform that is to be expected from outlines good to 0.1 px,
-        rms over the poses. None where something that moves the platform is not determined, or the motors do not determine its pose.
+        rms over the poses. None where something that moves the platform is not determined, or the
+        motors do not determine its pose.
     remedies : tuple of Remedy
         What would mend what is missing; each was tried.
     recommendation : tuple of Recommendation or None

@@ -127,6 +127,7 @@ def by_group(rows: Array, group: IntArray, n_groups: int) -> Array:
     place = np.zeros(len(group), dtype=np.intp)
     order = np.argsort(group, kind="stable")
     place[order] = np.arange(len(group)) - np.repeat(np.cumsum(number) - number, number)
-    laid = np.zeros((n_groups, int(number.max(initial=0)), *rows.shape[1:]))
+    most = int(number.max(initial=0))
+    laid = np.zeros((n_groups, most, *rows.shape[1:]))
     laid[group, place] = rows
-    return laid.reshape(n_groups, -1, rows.shape[2])
+    return laid.reshape(n_groups, most * rows.shape[1], rows.shape[2])

@@ -34,6 +34,12 @@ def read_views(
             "pass --images 15 or leave it out."
         )
     for v, view in enumerate(views, start=1):
+        if isinstance(view, str):
+            problems.append(
+                f"View {v} could not be used: found the text '{view}', needed a sequence of leg "
+                "names; pass one list of names a view."
+            )
+            continue
         names = [name.strip() for name in view]
         if not any(names):
             problems.append(

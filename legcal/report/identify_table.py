@@ -147,7 +147,8 @@ def _verdict(report: Identifiability) -> list[RenderableType]:
         lines.append(
             Text(
                 f"Platform sigma to expect: {1e3 * sigma.dX_m:.2g} mm, "
-                f"{degrees(sigma.dE_rad):.2g} deg, from outlines good to 0.1 px at both ends of a leg.",
+                f"{degrees(sigma.dE_rad):.2g} deg, from outlines good to 0.1 px at both ends of "
+                "a leg.",
                 style="dim",
             )
         )

@@ -1,0 +1,207 @@
+"""``legcal identify``: the document, the tables, and what is refused."""
+
+import json
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hexapod_example import HEXAPOD
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mechanisms import SHIPPED_URDF, SHIPPED_YAML
+
+import legcal
+from legcal import cli
+from legcal.dataset.folder import load_dataset
+from legcal.errors import UsageError
+from legcal.identify.analysis import identifiability_of_dataset
+from legcal.identify.recorded import recorded_session
+from legcal.mechanism.model import Mechanism
+
+PAPER = ("leg1,leg2,leg3,leg4", "leg3,leg4,leg5,leg6", "leg1,leg2,leg5,leg6")
+MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["legcal", "identify", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert isinstance(stop.value.code, int)
+    return stop.value.code
+
+
+@cache
+def loaded(name: str) -> Mechanism:
+    return legcal.load_mechanism(name)
+
+
+def options(views: tuple[str, ...]) -> Iterator[str]:
+    for view in views:
+        yield from ("--view", view)
+
+
+def test_json_is_one_document_with_the_keys_of_the_contract(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "hexapod", *options(PAPER), "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {k: document[k] for k in ("spatial", "n", "n_d", "r", "n_ac")} == {
+        "spatial": True, "n": 6, "n_d": 3, "r": 0, "n_ac": 6,
+    }  # fmt: skip
+    assert document["conditions"][0] == {
+        "name": "eq12", "equations": 18, "unknowns": 12, "ok": True,
+    }  # fmt: skip
+    assert [c["name"] for c in document["conditions"]] == [
+        "eq12", "eq15", "eq17", "every_leg_seen", "two_directions", "three_legs_at_once",
+    ]  # fmt: skip
+    assert document["paper"] == {"ok": True}
+    assert document["staged"] == document["full"] == {"rank": 30, "of": 30, "weak": []}
+    assert document["identifiable"] is True
+    assert document["recommendation"] is None
+    assert document["views"] == [view.split(",") for view in PAPER]
+
+
+def test_the_api_returns_the_same_object() -> None:
+    mechanism = loaded("hexapod")
+    views = [view.split(",") for view in PAPER]
+    first, again = (legcal.identifiability(mechanism, views, images=5) for _ in range(2))
+    assert first.document() == again.document()
+    assert (first.full.rank, first.paper.ok, first.images) == (30, True, (5, 5, 5))
+    assert first == again
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("views", [(), ((0, 1), (1, 2))])
+def test_tables_fit_80_columns_and_say_the_verdict(
+    name: str,
+    views: tuple[tuple[int, ...], ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    legs = yaml.safe_load((SHIPPED_YAML.parent / f"{name}.yaml").read_text())["legcal"]["legs"]
+    chosen = tuple(",".join(list(legs)[j] for j in view) for view in views)
+    assert run(monkeypatch, name, *options(chosen)) == 0
+    out = capsys.readouterr().out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    assert "dentifiable: everything at once" in out or "NOT identifiable" in out
+    assert ("Smallest sets of views" in out) == (not views)
+
+
+def test_weak_directions_and_remedies_are_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weak = ("leg1,leg2,leg3,leg4,leg5", "leg1,leg2,leg3,leg4,leg5", "leg5,leg6")
+    assert run(monkeypatch, "hexapod", *options(weak)) == 0
+    out = capsys.readouterr().out
+    assert "z of base joint 6" in out
+    assert "add a fourth camera position" in out
+    assert "calibration starts from the nominal model" in " ".join(out.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "kind", "said"),
+    [
+        (("hexapod", "--view", "leg1,lge2"), 2, "UsageError", "View 1 could not be used: found 'l"),
+        (("hexapod", "--view", "leg1,lge2"), 2, "UsageError", "did you mean 'leg2'?"),
+        (("hexapod", "--view", ""), 2, "UsageError", "found no leg, needed at least one"),
+        (("hexapod", "--view", "leg1,,leg2"), 2, "UsageError", "found '', needed a leg"),
+        (("hexapod", "--view", "leg1, leg1"), 2, "UsageError", "found leg 'leg1' 2 times"),
+        (("hexapod", "--images", "0"), 2, "UsageError", "found 0 images a view"),
+        (("hexapod", "--images", "many"), 2, "UsageError", "'--images'"),
+        ((HEXAPOD, "--view", "leg1"), 2, "UsageError", "could not be judged with --view"),
+        ((HEXAPOD, "--images", "3"), 2, "UsageError", "could not be judged with --images"),
+        (("nowhere.yaml",), 2, "ModelError", "nowhere.yaml"),
+        ((), 2, "UsageError", "MODEL|DATASET"),
+    ],
+)
+def test_refusals_are_one_sentence_in_one_document(
+    words: tuple[str | Path, ...],
+    code: int,
+    kind: str,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(monkeypatch, *words, "--json") == code
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["kind"] == kind
+    assert said in error["message"]
+
+
+def test_all_problems_of_views_are_told_at_once() -> None:
+    mechanism = loaded("hexapod")
+    with pytest.raises(UsageError) as refused:
+        legcal.identifiability(mechanism, [["leg7"], [], ["leg1", "leg1"], "leg1"], images=-1)
+    assert len(refused.value.problems) == 5
+    assert "found the text 'leg1'" in refused.value.problems[-1]
+
+
+def test_a_dataset_is_judged_by_its_own_readings_cameras_and_legs(tmp_path: Path) -> None:
+    dataset = load_dataset(HEXAPOD, check_images=False)
+    session, m = recorded_session(dataset), dataset.measurements
+    assert (session.n_views, len(session.view), len(session.t)) == (3, m.n_rows, m.n_poses)
+    q = (session.length - dataset.mechanism.q0) * dataset.mechanism.sign
+    np.testing.assert_allclose(q, m.q[m.first_rows], atol=1e-5)
+    to_Rb = dataset.mechanism.T_base_Rb.inv()
+    for camera, view in zip(session.camera, m.views, strict=True):
+        if view.T_base_camera is not None:
+            np.testing.assert_allclose(camera, (to_Rb * view.T_base_camera).translation)
+    found = identifiability_of_dataset(dataset)
+    assert found.identifiable
+    assert found.recommendation is None
+    assert (found.full.rank, sum(found.images)) == (30, m.n_rows)
+
+
+def test_the_legs_of_a_datasets_views_count(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    entry = yaml.safe_load((HEXAPOD / "dataset.yaml").read_text())
+    entry["mechanism"] = str((HEXAPOD / entry["mechanism"]).resolve())
+    for view in entry["views"].values():
+        view["legs"] = ["leg1", "leg2"]
+        camera = HEXAPOD / view["camera"]
+        (tmp_path / view["camera"]).write_text(camera.read_text())
+    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(entry))
+    table = entry["measurements"]
+    (tmp_path / table).write_text((HEXAPOD / table).read_text())
+    assert run(monkeypatch, tmp_path, "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["views"] == [["leg1", "leg2"]] * 3
+    assert not document["paper"]["ok"]
+
+
+def test_without_enough_motors_ranks_are_told_and_what_is_not_predicted(tmp_path: Path) -> None:
+    entry = yaml.safe_load(SHIPPED_YAML.read_text())
+    entry["name_mot"] = entry["name_mot"][:-1]
+    entry["legcal"]["urdf"] = "hexapod.urdf"
+    (tmp_path / "hexapod.urdf").write_text(SHIPPED_URDF.read_text())
+    (tmp_path / "hexapod.yaml").write_text(yaml.safe_dump(entry))
+    mechanism = legcal.load_mechanism(tmp_path / "hexapod.yaml")
+    found = legcal.identifiability(mechanism, [mechanism.leg_names] * 2)
+    assert (found.full.rank, found.full.of, found.n_ac) == (29, 29, 5)
+    assert found.platform_sigma is None
+    assert "5 motors do not determine the pose" in found.notes[0]
+    few = legcal.identifiability(mechanism, [["leg1", "leg2"]])
+    assert few.full.weak[0].dX_m is None
+    assert not few.identifiable
+
+
+@settings(deadline=None, max_examples=10)
+@given(data=st.data())
+def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
+    mechanism = loaded(data.draw(st.sampled_from(MODELS)))
+    view = st.sets(st.sampled_from(mechanism.leg_names), min_size=1).map(sorted)
+    views = data.draw(st.lists(view, min_size=1, max_size=3))
+    found = legcal.identifiability(mechanism, views, images=data.draw(st.integers(1, 6)))
+    document = found.document()
+    json.dumps(document, allow_nan=False)
+    for ranks in (found.staged, found.full):
+        assert ranks.rank + len(ranks.weak) == ranks.of
+    assert found.identifiable == all(d.harmless for d in found.full.weak)
+    assert found.full.rank >= found.staged.rank or not found.staged.complete

@@ -1,0 +1,97 @@
+"""The ranks of steps, against the problems that the steps themselves build."""
+
+from functools import cache
+from typing import cast
+
+import numpy as np
+import pytest
+from mechanisms import SHIPPED_YAML
+from staged_hexapods import exact_session
+
+from legcal.geometry.types import Array
+from legcal.identify.planned import planned_session
+from legcal.identify.ranks import Analysis
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.stages import joints_in_base, offsets, platform_joints
+from legcal.stages.joints_in_base import JointsInBase, register_views
+from legcal.stages.joints_in_camera import locate_joints_in_cameras
+from legcal.stages.least_squares import LeastSquares, jacobian_of
+from legcal.stages.leg_directions import directions_through_joints
+from legcal.stages.solution import Solution
+
+VIEWS = [
+    ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5)),
+    ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5)),
+    ((0, 1, 2), (3, 4, 5), (0, 1, 2)),
+    ((0, 1), (2, 3), (4, 5)),
+    ((0, 1, 2, 3), (3, 4, 5)),
+    ((0, 1, 2, 3, 4, 5),),
+]
+
+
+@cache
+def hexapod() -> Mechanism:
+    return load_mechanism(SHIPPED_YAML)
+
+
+def rank_of_first(problem: LeastSquares, wanted: int, known: slice = slice(0, 0)) -> int:
+    """Return how many of the first unknowns a problem determines, others being free or known."""
+    J = np.asarray(jacobian_of(problem)(problem.start).full())
+    J[:, known] = 0.0
+    J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    return _rank(J) - _rank(J[:, wanted:])
+
+
+def _rank(J: Array) -> int:
+    return int(np.linalg.matrix_rank(J, tol=1e-7)) if J.size else 0
+
+
+@pytest.mark.parametrize("views", VIEWS)
+def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
+    views: tuple[tuple[int, ...], ...],
+) -> None:
+    session = exact_session(legs=views, n_poses=8)
+    machine, axes, m = session.machine, session.axes, session.measurements
+    joints = locate_joints_in_cameras(machine, axes, m)
+    cameras = register_views(machine.parameters.base_joints, joints)
+    base = JointsInBase(machine.parameters.base_joints, cameras, cast(Solution, None))
+    directions = directions_through_joints(machine, axes, m, joints, base)
+    q0 = machine.parameters.offsets
+    step2 = joints_in_base.build_rigid(machine, joints, cameras)
+    step3 = offsets.build_constant_distances(machine, directions, q0, m.sigma_q)
+    step4 = platform_joints.build_rigid(machine, directions, q0, m.sigma_q)
+    built = [
+        3 * int(joints.located.sum()),
+        rank_of_first(step2, 12),
+        rank_of_first(step3, 6),
+        rank_of_first(step4, 12, known=slice(12, 18)),
+    ]
+    found = Analysis(planned_session(hexapod(), views)).step_ranks
+    assert [s.rank for s in found if s.criteria == "default"] == built
+
+
+@pytest.mark.parametrize("coplanar", [True, False])
+def test_printed_ranks_are_those_of_the_problems_that_the_steps_solve(coplanar: bool) -> None:
+    views = VIEWS[0]
+    session = exact_session(legs=views, n_poses=8, coplanar=coplanar)
+    machine, axes, m = session.machine, session.axes, session.measurements
+    joints = locate_joints_in_cameras(machine, axes, m, criteria="literal")
+    base = JointsInBase(
+        machine.parameters.base_joints,
+        register_views(machine.parameters.base_joints, joints),
+        cast(Solution, None),
+    )
+    directions = directions_through_joints(machine, axes, m, joints, base)
+    built = [
+        rank_of_first(joints_in_base.build_scalar_products(machine, joints), 12),
+        rank_of_first(offsets.build_consecutive(machine, directions), 6),
+        rank_of_first(
+            platform_joints.build_mean_distances(machine, directions, machine.parameters.offsets),
+            12,
+        ),
+    ]
+    assert built == ([9, 6, 9] if coplanar else [12, 6, 12])
+    if coplanar:
+        found = Analysis(planned_session(hexapod(), views)).step_ranks
+        assert [s.rank for s in found if s.criteria == "literal"][1:] == built
