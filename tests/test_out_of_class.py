@@ -341,6 +341,26 @@ def test_a_planar_virtual_joint_in_another_plane_is_refused(tmp_path: Path) -> N
     assert "from the plane in which the legs move" in _refusal(path)
 
 
+def test_a_virtual_joint_that_carries_another_link_is_refused(tmp_path: Path) -> None:
+    path = write_machine(tmp_path, of_types(["US"] * 3), Layout())
+    urdf = path.with_suffix(".urdf")
+    text = urdf.read_text()
+    joint = '<joint name="platform_free" type="floating"><parent link="base"/><child link="'
+    assert joint in text
+    extra = '<link name="plate"/><joint name="p" type="floating"><parent link="base"/>'
+    extra += '<child link="plate"/></joint></robot>'
+    urdf.write_text(text.replace("</robot>", extra))
+    path.write_text(path.read_text().replace("platform_joint: platform_free", "platform_joint: p"))
+    assert "floating joint 'platform_free' inside it" in _refusal(path)
+    text = text.replace('name="platform_free" type="floating"', 'name="free" type="fixed"')
+    text = text.replace('<parent link="base"/><child link="platform"/>', (
+        '<parent link="base"/><child link="spare"/>'), 1)  # fmt: skip
+    extra = extra.replace("plate", "platform").replace('<link name="platform"/>', "")
+    extra = extra.replace('<parent link="base"/>', '<parent link="leg1_a1_link"/>')
+    urdf.write_text(text.replace("</robot>", f'<link name="spare"/>{extra}'))
+    assert "found it between the parent 'leg1_a1_link'" in _refusal(path)
+
+
 def test_a_serial_arm_is_refused(tmp_path: Path) -> None:
     drawing = _planar_arms(1)
     (tmp_path / "arm.urdf").write_text(

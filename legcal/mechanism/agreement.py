@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.mechanism.bodies import Bodies
@@ -59,35 +57,6 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
         )
     if problems:
         raise ModelError(problems)
-
-
-def check_virtual_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
-    """Check that the virtual joint is one that is covered.
-
-    Raises
-    ------
-    OutOfClass
-        If it is not.
-    """
-    problems = []
-    virtual = block.platform_joint
-    if virtual is not None:
-        joint = urdf.joints[virtual]
-        if joint.type not in ("floating", "planar"):
-            problems.append(
-                f"{path}: legcal.platform_joint '{virtual}' is not covered: found a {joint.type} "
-                "joint, needed a floating or planar one, which only says where the platform is; "
-                "correct it, or write null if a leg carries the platform."
-            )
-        elif joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
-            axis = ", ".join(f"{x:g}" for x in joint.axis)
-            problems.append(
-                f"{path}: legcal.platform_joint '{virtual}' is not covered: found a planar joint "
-                f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
-                "plane of its frame; turn its origin rpy instead."
-            )
-    if problems:
-        raise OutOfClass(problems)
 
 
 def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:

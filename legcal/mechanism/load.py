@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import ModelError
 from legcal.files.motion import MotionEntry
 from legcal.geometry.frames import motion_to_xyz_quat
-from legcal.mechanism import agreement
+from legcal.mechanism import agreement, virtual_joint
 from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
 from legcal.mechanism.consistency import check_equations, check_unit
@@ -21,7 +21,7 @@ from legcal.mechanism.leg_of_chain import leg_of
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.notes import diagnose, proposal_notes
-from legcal.mechanism.plane import check_virtual_joint, in_links, plane_of_motion
+from legcal.mechanism.plane import in_links, plane_of_motion
 from legcal.mechanism.proposal import propose_block, propose_frame
 from legcal.mechanism.schema import LegcalBlock
 from legcal.mechanism.sources.read import read_source
@@ -73,12 +73,13 @@ def load_mechanism(model: str | Path) -> Mechanism:
 def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Mechanism:
     """Return the mechanism, its chain not closed yet."""
     file, urdf, yaml_path = source.file, source.urdf, source.path
-    agreement.check_virtual_type(block, urdf, yaml_path)
+    virtual_joint.check_type(block, urdf, yaml_path)
     bodies = rigid_bodies(urdf, closures, block.platform_joint)
     chains = agreement.legs_in_order(
         find_chains(bodies, urdf, block.base, block.platform), bodies, urdf, block, yaml_path
     )
     agreement.check_motors(file, chains, urdf, yaml_path)
+    virtual_joint.check_bodies(block, bodies, urdf, yaml_path)
     ends = bodies.T_body_link[block.base], bodies.T_body_link[block.platform]
     normals = plane_of_motion(chains)
     agreement.check_count(chains, spatial=normals is None, path=yaml_path)
@@ -86,7 +87,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         virtual = urdf.joints[block.platform_joint]
         turn = bodies.T_body_link[virtual.parent].rotation.inv()
         normal = None if normals is None else np.asarray(turn.apply(normals[0]))
-        check_virtual_joint(virtual, normal, yaml_path)
+        virtual_joint.check_plane(virtual, normal, yaml_path)
     try:
         chain = ClosedChain(urdf.text, closures)
     except ModelError as error:

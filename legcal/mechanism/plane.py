@@ -1,16 +1,13 @@
 """Whether a mechanism moves in a plane: all revolutes parallel to one normal (section 2)."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import OutOfClass
 from legcal.geometry.types import Array
-from legcal.mechanism.axes import off_square, parallel, undirected
+from legcal.mechanism.axes import parallel, undirected
 from legcal.mechanism.leg_chain import LegChain
-from legcal.mechanism.urdf import UrdfJoint
 
 Normals = tuple[Array, Array]
 
@@ -61,38 +58,3 @@ def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform
         for normal, T in zip(normals, T_body_link, strict=True)
     )
     return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
-
-
-def check_virtual_joint(joint: UrdfJoint, normal: Array | None, path: Path) -> None:
-    """Check that a planar virtual joint lets the platform move as its legs do.
-
-    Parameters
-    ----------
-    joint : UrdfJoint
-        The virtual joint.
-    normal : (3,) array or None
-        The normal of the plane of motion in the parent link; None for a mechanism in space.
-    path : Path
-        The file that names it.
-
-    Raises
-    ------
-    OutOfClass
-        If the mechanism moves in space or in another plane.
-    """
-    if joint.type != "planar":
-        return
-    if normal is None:
-        raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint, "
-            "needed a floating one, because the axes of the legs do not let the platform move in "
-            "one plane; correct its type."
-        )
-    z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
-    if not parallel(z, normal):
-        tilt = 90.0 - np.degrees(off_square(z, normal))
-        raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found its plane "
-            f"{tilt:.4g} deg from the plane in which the legs move, needed the same plane within "
-            "0.057 deg; correct its origin rpy."
-        )
