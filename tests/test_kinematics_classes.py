@@ -48,7 +48,7 @@ LAYOUTS = {
     "carried by leg 1": Layout(
         (LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0, seed=k) for k in range(1, 7)])
     ),
-    "idle spins": Layout((LegLayout(spin=True, flip_axes=True),)),
+    "idle spins": Layout((LegLayout(spin="S", flip_axes=True),)),
 }
 
 
@@ -214,6 +214,18 @@ def test_a_follower_goes_where_forward_kinematics_goes(shipped: Mechanism) -> No
     rounded = RigidTransform.from_matrix(np.round(poses[-2].as_matrix(), 4))
     near = forward_kinematics(shipped, q, start=rounded)
     np.testing.assert_allclose(near.as_matrix(), cold.as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "6-sps", "3-rpr", "3-rps"])
+def test_without_a_determinant_a_path_is_followed_in_small_changes(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mechanism = load_mechanism(name)
+    drawn = random_configurations(mechanism, 3, 9)
+    monkeypatch.setattr("legcal.mechanism.following.side", lambda *_: 0.0)
+    for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        found = forward_kinematics(mechanism, q)
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
 
 @pytest.mark.parametrize(

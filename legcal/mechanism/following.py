@@ -4,7 +4,7 @@ A hexapod has at least nine assembly modes at its home lengths. Newton on Pinocc
 is trusted only where its steps contract from the first on and the legs' equations keep the sign
 of their determinant; else the way is halved, and the next step starts from what was reached.
 Where the Jacobian of the closures hardly changes on the way there is no room for a singularity, and
-no need to look at the determinant.
+no need to look at the determinant; where the equations are not square there is no other way.
 """
 
 from dataclasses import dataclass
@@ -81,7 +81,8 @@ def follow(
         if accepted and not _hardly_changes(known, reached.jacobian):
             if here is None:
                 here = side(mechanism, platform_pose(mechanism, configuration))
-            accepted = here == side(mechanism, platform_pose(mechanism, reached.configuration))
+            there = side(mechanism, platform_pose(mechanism, reached.configuration))
+            accepted = here == there != 0.0  # not square: only ways on which little changes
         if accepted:
             configuration, known = reached.configuration, reached.jacobian
             done, step = wanted, 2.0 * step
