@@ -108,6 +108,12 @@ class _Text:
             f"{_origin(T)}{moving}</joint>"
         )
 
+    def any_joint(self, leg: str) -> str:
+        """Return the slider of a leg, or a revolute of a rod that was not cut away."""
+        written = "".join(self.joints)
+        names = [f"{leg}_{joint}" for joint in ("slider", "a1", "b1")]
+        return next(name for name in names if f'<joint name="{name}"' in written)
+
 
 def _numbers(values: Sequence[float] | Array) -> str:
     return " ".join(repr(float(x)) for x in values)
@@ -138,15 +144,12 @@ def write_machine(folder: Path, machine: Machine, layout: Layout, name: str = "m
             loops.append(written[1:])
             kinds.append(written[0])
     names = [f"leg{j + 1}" for j in range(len(machine.legs))]
-    has_slider = [leg.kind != "constant" for leg in machine.legs]
     block = {
         "version": 1,
         "base": "base",
         "platform": "platform",
         "platform_joint": None if virtual is None else "platform_free",
-        "legs": {
-            n: f"{n}_{'slider' if s else 'a1'}" for n, s in zip(names, has_slider, strict=True)
-        },
+        "legs": {n: text.any_joint(n) for n in names},
     }
     if len(names) >= len(machine.frame_legs):
         block["base_frame"] = [names[j] for j in machine.frame_legs]
