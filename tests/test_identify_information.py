@@ -170,12 +170,16 @@ def test_elimination_keeps_what_is_said_whatever_the_own_unknowns_do(
 @given(seed=SEEDS)
 def test_a_further_image_of_a_known_pose_takes_nothing_away(seed: int) -> None:
     session = random_session(seed)
-    both = information(session)
+    both = _information(session)
     first = np.flatnonzero(session.view == 0)
-    one = information(_with(session, view=session.view[first], pose=session.pose[first]))
+    one = _information(_with(session, view=session.view[first], pose=session.pose[first]))
     gain = both.T @ both - one.T @ one
     scale = np.linalg.norm(both.T @ both)
     assert np.linalg.eigvalsh(gain)[0] > -1e-6 * scale
+
+
+def _information(session: Session) -> Array:
+    return information(session, image_rows(session), demands_of(session))
 
 
 def _with(session: Session, **changes: Any) -> Session:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, IntArray
 from legcal.identify.elimination import compress, eliminate
 from legcal.identify.observed import at_base_joints, at_platform_joints
 from legcal.identify.session import Session
@@ -38,9 +38,9 @@ class Demands:
     leg: IntArray
     demand: tuple[Demand, ...]
 
-    def rows(self, wanted: BoolArray) -> Array:
-        """Return [by_pose, by_parameters] of some rows, (k, m', f + p)."""
-        return np.concatenate([self.by_pose, self.by_parameters], axis=2)[:, wanted]
+    def at(self, poses: IntArray) -> Demands:
+        """Return the equations at some of the poses, in that order."""
+        return replace(self, by_pose=self.by_pose[poses], by_parameters=self.by_parameters[poses])
 
 
 def demands_of(session: Session) -> Demands:
@@ -88,18 +88,24 @@ def image_rows(session: Session) -> Array:
     return np.concatenate([by_pose[..., columns], by_camera, by_parameters], axis=3)
 
 
-def information(session: Session, *, common_cameras: bool = False) -> Array:
+def information(
+    session: Session, images: Array, demands: Demands, *, common_cameras: bool = False
+) -> Array:
     """Return what everything at once says of the parameters, (p, p) whitened rows [1/m].
 
     Parameters
     ----------
     session : Session
         The observations.
+    images : (n_images, n_legs, 4, f + 6 + p) array
+        What :func:`image_rows` says of them.
+    demands : Demands
+        What :func:`demands_of` says of them.
     common_cameras : bool
         Whether a calibration board on the base shows how the cameras stand to each other.
     """
     n_f, n_p = len(freedoms(session.frame_legs)), len(session.parametrization)
-    seen = image_rows(session).reshape(len(session.view), -1, n_f + 6 + n_p)
+    seen = images.reshape(len(session.view), -1, n_f + 6 + n_p)
     camera_of_view = np.arange(session.n_views) * (not common_cameras)
     n_cameras = 6 * len(np.unique(camera_of_view))
     wide = np.zeros((*seen.shape[:2], n_f + n_cameras + n_p))
@@ -108,7 +114,6 @@ def information(session: Session, *, common_cameras: bool = False) -> Array:
         here = session.view == v
         place = n_f + 6 * int(camera)
         wide[here, :, place : place + 6] = seen[here, :, n_f : n_f + 6]
-    demands = demands_of(session)
     equations = np.zeros((len(session.t), demands.by_pose.shape[1], wide.shape[2]))
     equations[..., :n_f] = demands.by_pose
     equations[..., n_f + n_cameras :] = demands.by_parameters

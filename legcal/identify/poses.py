@@ -17,6 +17,8 @@ _STEPS = 5  # from home to a pose, so that no pose jumps to another assembly mod
 _ITERATIONS = 3  # of Newton's method a step
 _LAST_ITERATIONS = 12
 _CLOSED = 1e-9  # of the mean leg length
+_NEARLY_CLOSED = 1e-5  # where more is demanded than freedoms are left, and joints give way
+_DEPENDENT = 1e-4  # singular values of equations below this are those of the others
 _SINGULAR = 0.05  # smallest singular value, of its value at home
 _RANK = 1e-9  # of the largest singular value
 _FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
@@ -61,6 +63,7 @@ def random_poses(
     closing = _Closing(legs, frame_legs)
     R0, t0 = _one(home)
     R0, t0 = closing.close(R0, t0, None, _LAST_ITERATIONS)
+    closing.drive(R0, t0)
     home_lengths = closing.lengths(R0, t0)[0]
     found_R, found_t = np.zeros((0, 3, 3)), np.zeros((0, 3))
     share = 1.0
@@ -92,6 +95,23 @@ class _Closing:
     def __init__(self, legs: Sequence[LegGeometry], frame_legs: Sequence[int]) -> None:
         self.legs = tuple(legs)
         self.columns = list(freedoms(frame_legs))
+        self.driven = {j for j, leg in enumerate(legs) if leg.kind is LegKind.ACTUATED}
+
+    def drive(self, R: Array, t: Array) -> None:
+        """Let only motors that are independent at a pose draw their lengths; others follow."""
+        everyone, self.driven = sorted(self.driven), set()
+        rank = self.rank(R, t)
+        for j in everyone:
+            self.driven.add(j)
+            if self.rank(R, t) == rank:
+                self.driven.remove(j)
+            else:
+                rank += 1
+
+    def rank(self, R: Array, t: Array) -> int:
+        """Return the number of independent equations at a pose."""
+        slopes = self.system(R, t, self.lengths(R, t))[1][0]
+        return int(np.linalg.matrix_rank(slopes, tol=_DEPENDENT)) if slopes.size else 0
 
     def lengths(self, R: Array, t: Array) -> Array:
         """Return the leg lengths, (k, n_legs) [m]."""
@@ -113,7 +133,7 @@ class _Closing:
                 elif leg.kind is LegKind.CONSTANT:
                     values.append(value)
                     slopes.append(slope)
-                elif leg.kind is LegKind.ACTUATED and wanted is not None:
+                elif j in self.driven and wanted is not None:
                     values.append(length - wanted[:, j : j + 1])
                     slopes.append(slope)
         return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)[:, :, self.columns]
@@ -154,7 +174,8 @@ class _Closing:
     def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:
         """Return which poses meet what legs and lengths demand."""
         values, _ = self.system(R, t, wanted)
-        limit = _CLOSED * self.lengths(R, t).mean(axis=1)
+        redundant = values.shape[1] > len(self.columns)
+        limit = (_NEARLY_CLOSED if redundant else _CLOSED) * self.lengths(R, t).mean(axis=1)
         return np.asarray(np.abs(values).max(axis=1, initial=0.0) <= limit)
 
     def is_regular(self, R: Array, t: Array, R0: Array, t0: Array) -> BoolArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from legcal.geometry.types import Array, IntArray
 from legcal.identify import literal, steps
-from legcal.identify.full import information
+from legcal.identify.full import Demands, demands_of, image_rows, information
 from legcal.identify.session import Session
 from legcal.identify.weak import (
     PlatformMotion,
@@ -56,6 +56,22 @@ class Analysis:
     session: Session
     common_cameras: bool = False
 
+    def elsewhere(self, session: Session, poses: IntArray) -> Analysis:
+        """Return the analysis of other images of the same machine, at some of the same poses."""
+        other = Analysis(session, self.common_cameras)
+        other.__dict__.update(motion=self.motion, demands=self.demands.at(poses))
+        return other
+
+    @cached_property
+    def images(self) -> Array:
+        """What the images say."""
+        return image_rows(self.session)
+
+    @cached_property
+    def demands(self) -> Demands:
+        """What readings and legs demand."""
+        return demands_of(self.session)
+
     @cached_property
     def located(self) -> steps.Located:
         """Step 1."""
@@ -72,7 +88,7 @@ class Analysis:
         return (
             steps.identify_base(self.session, self.located, common_cameras=self.common_cameras),
             steps.offsets_from_distances(self.session, *self.distances),
-            steps.identify_platform(self.session, self.located),
+            steps.identify_platform(self.session, self.located, self.images, self.demands),
         )
 
     @cached_property
@@ -88,7 +104,9 @@ class Analysis:
     @cached_property
     def information(self) -> Array:
         """Everything at once, (p, p)."""
-        return information(self.session, common_cameras=self.common_cameras)
+        return information(
+            self.session, self.images, self.demands, common_cameras=self.common_cameras
+        )
 
     @cached_property
     def motion(self) -> PlatformMotion:

@@ -19,7 +19,7 @@ from legcal.identify.elimination import compress
 from legcal.identify.planned import cameras_for, planned_session
 from legcal.identify.ranks import Analysis, missing, scattered
 from legcal.identify.steps import offsets_from_distances
-from legcal.identify.weak import PlatformError, PlatformMotion
+from legcal.identify.weak import PlatformError
 from legcal.mechanism.model import Mechanism
 
 _MOST_VIEWS = 4
@@ -86,7 +86,8 @@ class _Candidates:
     def __init__(self, mechanism: Mechanism, images: int) -> None:
         self.mechanism, self.images = mechanism, images
         self.session = planned_session(mechanism, [range(mechanism.n_legs)], images)
-        self.motion = PlatformMotion(self.session)
+        self.every = Analysis(self.session)
+        self.motion = self.every.motion
         self.ring = legs_around(self.session)
         self.of_size: dict[int, list[Analysis]] = {}
 
@@ -137,8 +138,11 @@ class _Candidates:
             for row, legs in zip(seen, views, strict=True):
                 row[list(legs)] = True
             camera = cameras_for(self.session, views)
+            poses = np.arange(len(self.session.t))
             self.of_size[size] = [
-                Analysis(replace(self.session, seen=seen[[k]], camera=camera[[k]]))
+                self.every.elsewhere(
+                    replace(self.session, seen=seen[[k]], camera=camera[[k]]), poses
+                )
                 for k in range(len(views))
             ]
         return self.of_size[size]

@@ -9,6 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
+from legcal.geometry.types import IntArray
 from legcal.identify.around import legs_around, neighbours, steps_apart
 from legcal.identify.cameras import FOCAL_PX
 from legcal.identify.planned import cameras_for
@@ -19,7 +20,7 @@ from legcal.identify.weak import WeakDirection, undetermined
 from legcal.identify.words import joined, legs_in_words
 
 _MOST_OF_A_KIND = 2
-_MOST_TRIED = 12  # of a kind
+_MOST_TRIED = 8  # of a kind
 _MOST_FIXED = 4  # parameters
 ENOUGH_IMAGES = 15  # a view
 _KNOWN = 1e12  # 1/m
@@ -167,7 +168,8 @@ def _wider_views(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]
         for _, v, added in sorted(choices)[: _MOST_TRIED // 2]:
             legs = tuple(sorted((*session.views[v], *added)))
             text = f"see {legs_in_words(legs, session.leg_names)} together in view {v + 1}"
-            yield text, _scored(analysis, _widened(session, v, legs))
+            wider = _widened(session, v, legs)
+            yield text, partial(_more, analysis, wider, np.arange(len(session.t)))
 
 
 def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
@@ -183,7 +185,8 @@ def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Sc
         for legs in groups:
             named = legs_in_words(legs, session.leg_names)
             text = f"add {article} {which} camera position ({named})"
-            yield text, _scored(analysis, _extended(session, legs))
+            poses = np.append(np.arange(len(session.t)), session.pose[session.view == 0])
+            yield text, partial(_more, analysis, _extended(session, legs), poses)
 
 
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
@@ -216,15 +219,12 @@ def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Rem
     return (Remedy(f"choose these views instead: {'; '.join(views)}", n_p, n_p, True),)
 
 
-def _scored(analysis: Analysis, session: Session) -> Callable[[], _Score]:
-    """Return what scores another session of the same machine and poses."""
-
-    def score() -> _Score:
-        derived = Analysis(session, analysis.common_cameras)
-        derived.__dict__["motion"] = analysis.motion
-        return _score(derived)
-
-    return score
+def _more(analysis: Analysis, session: Session, poses: IntArray) -> _Score:
+    """Return what is open in a session that shows more, at these of the poses of another."""
+    other = analysis.elsewhere(session, poses)
+    if len(analysis.full.weak) == 0:  # nothing to gain: more images take nothing away
+        other.__dict__.update(information=analysis.information)
+    return _score(other)
 
 
 def _weak_legs(analysis: Analysis) -> list[int]:

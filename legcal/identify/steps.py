@@ -20,8 +20,6 @@ from legcal.identify.full import (
     SIGMA_EXACT,
     Demands,
     by_group,
-    demands_of,
-    image_rows,
     pose_unit,
 )
 from legcal.identify.observed import Across, at_base_joints, at_platform_joints
@@ -166,8 +164,11 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
     return rows, np.asarray(weight), np.stack([v, pose, j, g], axis=1)
 
 
-def identify_platform(session: Session, located: Located) -> Step:
-    """Return what step 4 says of platform joints and axes, and of universal axes at the base."""
+def identify_platform(session: Session, located: Located, images: Array, demands: Demands) -> Step:
+    """Return what step 4 says of platform joints and axes, and of universal axes at the base.
+
+    *images* and *demands* are those of :func:`legcal.identify.full.information`.
+    """
     universal = np.array([leg.base_joint == "U" for leg in session.legs], dtype=np.bool_)
     columns = np.unique(
         np.concatenate(
@@ -180,15 +181,14 @@ def identify_platform(session: Session, located: Located) -> Step:
     n_f, n_p = len(freedoms(session.frame_legs)), len(session.unit)
     keep = np.concatenate([np.arange(n_f), n_f + columns])
     groups = _groups(session, located)
-    seen = np.delete(image_rows(session)[:, :, 2:], np.s_[n_f : n_f + 6], axis=3)  # at B
+    seen = np.delete(images[:, :, 2:], np.s_[n_f : n_f + 6], axis=3)  # at B
     seen = seen * groups.used[groups.of_image][:, :, None, None]
     seen = seen * located.joint[session.view][:, :, None, None]
-    images = seen.reshape(len(session.view), 2 * session.n_legs, n_f + n_p)
-    demands = demands_of(session)
+    seen = seen.reshape(len(session.view), 2 * session.n_legs, n_f + n_p)
     rows = np.concatenate([demands.by_pose, demands.by_parameters], axis=2)[groups.pose]
     wanted = _step_4_demands(demands, groups)
     rows = np.concatenate(
-        [rows * wanted[..., None], by_group(images, groups.of_image, len(groups.pose))], axis=1
+        [rows * wanted[..., None], by_group(seen, groups.of_image, len(groups.pose))], axis=1
     )
     return Step("platform_joints", columns, eliminate(rows[:, :, keep], n_f))
 
