@@ -19,7 +19,7 @@ from legcal.mechanism.model import Mechanism
 
 TRIALS = 200
 ENOUGH = 20  # trials, where one of them found a pose above the base
-SETTLED = 1e-15  # of a leg length
+SETTLED = 1e-13  # of a leg length
 FURTHEST = 0.01  # of a leg length
 PATIENCE = 5  # steps that change little
 _RANK = 1e-9
