@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.equations import Demand, geometry_of, linearize
+from legcal.mechanism.equations import Demand, demanded, geometry_of
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.model import Mechanism
 
@@ -93,21 +93,12 @@ def demands_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Demands
     rows: list[Array] = []
     measured: list[bool] = []
     for leg in mechanism.legs:
-        geometry = geometry_of(leg)
-        passive = leg.kind is LegKind.PASSIVE
-        if passive and len(geometry.demands) == 1:
-            continue
-        at = linearize(geometry, R, t)
-        length = float(at.values[0, 0]) + geometry.q0
+        at = demanded(geometry_of(leg), R, t)
         for demand, value, by_pose in zip(at.demands, at.values[0], at.by_pose[0], strict=True):
-            is_length = demand is Demand.LENGTH
-            if is_length and passive:
-                continue
-            arm = 1.0 if is_length else length
             found.append((f"leg '{leg.name}'", _WORDS[demand]))
-            values.append(arm * float(value))
-            rows.append(arm * by_pose)
-            measured.append(is_length and leg.kind is LegKind.ACTUATED)
+            values.append(float(value))
+            rows.append(by_pose)
+            measured.append(demand is Demand.LENGTH and leg.kind is LegKind.ACTUATED)
     if not mechanism.spatial:
         for value, row in _plane(mechanism, matrix):
             found.append(("the platform", "out of its plane"))

@@ -147,6 +147,24 @@ def linearize(leg: LegGeometry, R: Array, t: Array) -> Linearization:
     )
 
 
+def demanded(leg: LegGeometry, R: Array, t: Array) -> Linearization:
+    """Return what a leg really demands at poses: a passive one nothing of its length.
+
+    All rows are lengths [m]: those without a unit are counted at the far end of the leg. For the
+    rest see :func:`linearize`.
+    """
+    found = linearize(leg, R, t)
+    rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
+    is_length = np.array([d is Demand.LENGTH for d in found.demands[rows]], dtype=np.bool_)
+    arm = np.where(is_length, 1.0, found.values[:, :1] + leg.q0)
+    return Linearization(
+        found.demands[rows],
+        arm * found.values[:, rows],
+        arm[..., None] * found.by_pose[:, rows],
+        arm[..., None] * found.by_local[:, rows],
+    )
+
+
 class _State:
     """A leg at poses: its direction, and its axes turned into the frame of the base."""
 
@@ -172,7 +190,7 @@ class _Row:
 
     def depends_on_leg(self, gradient: Array) -> None:
         """Add the dependence on the vector from A to B."""
-        self.by_pose[:, :3] += np.cross(self.state.arm, gradient)
+        self.by_pose[:, :3] += _cross(self.state.arm, gradient)
         self.by_pose[:, 3:] += gradient
         self.by_local[:, :3] -= gradient
         self.by_local[:, 3:6] += _back(self.state.R, gradient)
@@ -192,10 +210,10 @@ class _Row:
     def depends_on_platform_vector(self, vector: Array, gradient: Array) -> None:
         """Add the dependence on a direction that is tied to the platform and to its axis."""
         axis = _given(self.state.leg.platform_axis)
-        self.by_pose[:, :3] += np.cross(self.state.turned(vector), gradient)
+        self.by_pose[:, :3] += _cross(self.state.turned(vector), gradient)
         inside = _back(self.state.R, gradient)
         for column, e in zip((9, 10), normal_basis(axis), strict=True):
-            self.by_local[:, column] += inside @ np.cross(e, vector)
+            self.by_local[:, column] += inside @ _cross(e, vector)
 
 
 def _length(state: _State) -> _Row:
@@ -238,27 +256,27 @@ def _twist(state: _State) -> _Row:
     """Return sin(angle - twist) of the inner axes p and w about u."""
     leg, u = state.leg, state.u
     a, tau = _given(leg.base_axis), float(leg.twist or 0.0)
-    across = np.cross(a, u)
+    across = _cross(a, u)
     reach = np.linalg.norm(across, axis=1)[:, None]
     p = np.broadcast_to(a, u.shape) if leg.base_joint == "R" else across / reach
     b = _given(leg.platform_axis)
     outer = normal_basis(b)[0] if leg.platform_joint == "" else b
-    far = np.cross(state.turned(outer), u)
+    far = _cross(state.turned(outer), u)
     far_reach = np.linalg.norm(far, axis=1)[:, None]
     w = far / far_reach if leg.platform_joint == "U" else state.turned(outer)
     c, s = np.cos(tau), np.sin(tau)
-    row = _Row(state, c * _dot(u, np.cross(p, w)) - s * _dot(p, w))
-    by_p, by_w = c * np.cross(w, u) - s * w, c * np.cross(u, p) - s * p
-    row.depends_on_u(c * np.cross(p, w))
+    row = _Row(state, c * _dot(u, _cross(p, w)) - s * _dot(p, w))
+    by_p, by_w = c * _cross(w, u) - s * w, c * _cross(u, p) - s * p
+    row.depends_on_u(c * _cross(p, w))
     if leg.base_joint == "U":
-        row.depends_on_u(np.cross(by_p, a) / reach)
-        by_p = np.cross(u, by_p) / reach
+        row.depends_on_u(_cross(by_p, a) / reach)
+        by_p = _cross(u, by_p) / reach
     row.depends_on_base_axis(by_p)
     if leg.platform_joint == "U":
-        row.depends_on_u(np.cross(by_w, state.turned(outer)) / far_reach)
-        by_w = np.cross(u, by_w) / far_reach
+        row.depends_on_u(_cross(by_w, state.turned(outer)) / far_reach)
+        by_w = _cross(u, by_w) / far_reach
     row.depends_on_platform_vector(outer, by_w)
-    row.by_local[:, 11] = -(s * _dot(u, np.cross(p, w)) + c * _dot(p, w))
+    row.by_local[:, 11] = -(s * _dot(u, _cross(p, w)) + c * _dot(p, w))
     return row
 
 
@@ -300,6 +318,12 @@ def _given(vector: Array | None) -> Array:
     if vector is None:
         raise ValueError("a leg whose joints need an axis was described without one")
     return vector
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return vector products of rows or single vectors; np.cross is slow on few of them."""
+    (x, y, z), (i, j, k) = a.T, b.T
+    return np.stack([y * k - z * j, z * i - x * k, x * j - y * i], axis=-1)
 
 
 def _dot(a: Array, b: Array) -> Array:

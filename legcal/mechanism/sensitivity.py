@@ -12,7 +12,7 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.mechanism.equations import Demand, LegGeometry, linearize
+from legcal.mechanism.equations import Demand, LegGeometry, demanded
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.parametrization import Parametrization
 
@@ -70,15 +70,12 @@ def pose_equations(
     by_parameters = [np.zeros((len(t), 0, len(parametrization)))]
     measured, of_leg = list[bool](), list[int]()
     for j, leg in enumerate(legs):
-        found = linearize(leg, R, t)
-        rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
-        is_length = np.array([d is Demand.LENGTH for d in found.demands[rows]], dtype=np.bool_)
-        length = found.values[:, :1] + leg.q0
-        weight = np.where(is_length, 1.0, length)[..., None]
-        by_pose.append(weight * found.by_pose[:, rows])
-        by_parameters.append(parametrization.scatter(weight * found.by_local[:, rows], j))
-        measured += (is_length & (leg.kind is LegKind.ACTUATED)).tolist()
-        of_leg += [j] * len(is_length)
+        found = demanded(leg, R, t)
+        by_pose.append(found.by_pose)
+        by_parameters.append(parametrization.scatter(found.by_local, j))
+        actuated = leg.kind is LegKind.ACTUATED
+        measured += [actuated and demand is Demand.LENGTH for demand in found.demands]
+        of_leg += [j] * len(found.demands)
     return PoseEquations(
         np.concatenate(by_pose, axis=1),
         np.concatenate(by_parameters, axis=1),
