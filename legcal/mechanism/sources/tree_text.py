@@ -1,8 +1,8 @@
 """A URDF written from links and joints, for formats that are not URDF."""
 
 from dataclasses import dataclass, field
+from html import escape
 from math import pi
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -52,7 +52,7 @@ class TreeText:
             for c in cylinders
         )
         inside = f">{visuals}</link>" if visuals else "/>"
-        self.links[name] = f"  <link name={quoteattr(name)}{inside}"
+        self.links[name] = f"  <link name={_quoted(name)}{inside}"
 
     def joint(
         self,
@@ -69,8 +69,8 @@ class TreeText:
         if axis is not None:
             moving = f'<axis xyz="{_numbers(axis)}"/>' + limit(limits)
         self.joints[name] = (
-            f'  <joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
-            f"<child link={quoteattr(child)}/>{origin(T_parent_origin)}{moving}</joint>"
+            f'  <joint name={_quoted(name)} type="{kind}"><parent link={_quoted(parent)}/>'
+            f"<child link={_quoted(child)}/>{origin(T_parent_origin)}{moving}</joint>"
         )
 
     def body(self) -> str:
@@ -79,7 +79,7 @@ class TreeText:
 
     def robot(self, name: str) -> bytes:
         """Return the whole URDF."""
-        head = f'<?xml version="1.0" encoding="utf-8"?>\n<robot name={quoteattr(name)}>\n'
+        head = f'<?xml version="1.0" encoding="utf-8"?>\n<robot name={_quoted(name)}>\n'
         return f"{head}{self.body()}\n</robot>\n".encode()
 
 
@@ -112,3 +112,8 @@ def roll_pitch_yaw(matrix: Array) -> Array:
 def _numbers(values: Array) -> str:
     """Return numbers with all their digits."""
     return " ".join(repr(float(x) + 0.0) for x in values)
+
+
+def _quoted(text: str) -> str:
+    """Return a text as the value of an attribute."""
+    return f'"{escape(text)}"'
