@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from legcal.identify.conditions import (
@@ -162,12 +162,16 @@ def identifiability_of_dataset(dataset: Dataset) -> Identifiability:
 
     Raises
     ------
-    NotIdentifiable, DidNotConverge
-        If the readings do not give the platform's poses.
+    DidNotConverge
+        If the readings do not lead to closed poses.
     """
-    from legcal.identify.recorded import recorded_session
+    from legcal.identify.recorded import has_known_poses, recorded_session
 
-    return _judge(dataset.mechanism, recorded_session(dataset), None, None)
+    report = _judge(dataset.mechanism, recorded_session(dataset), None, None)
+    if has_known_poses(dataset.mechanism):
+        return report
+    note = "The readings do not give the poses of the images: random ones stand for them."
+    return replace(report, notes=(*report.notes, note))
 
 
 def _judge(

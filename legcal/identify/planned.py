@@ -16,7 +16,12 @@ from legcal.identify.session import Session
 from legcal.mechanism.equations import LegGeometry
 from legcal.mechanism.leg import Leg, LegKind, main_cylinders
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import Parametrization, geometries, parametrization_of
+from legcal.mechanism.parametrization import (
+    Parametrization,
+    geometries,
+    parametrization_of,
+    twist_after,
+)
 
 SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
@@ -48,7 +53,7 @@ def planned_session(
     legs, length, rng = machine_near(mechanism, home)
     A, B = joints_at(legs, home)
     R, t = random_poses(
-        legs, mechanism.frame_legs, home, _travel(mechanism), images * max(len(views), 1), rng
+        legs, mechanism.frame_legs, home, travel_of(mechanism), images * max(len(views), 1), rng
     )
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
@@ -107,6 +112,7 @@ def moved_legs(
     padded = np.append(step, 0.0)
     moved = []
     for leg, local in zip(legs, padded[place], strict=True):
+        twist = twist_after(leg, turn_of(leg.platform_axis, local[9:11]))
         moved.append(
             replace(
                 leg,
@@ -115,7 +121,7 @@ def moved_legs(
                 q0=leg.q0 + float(local[6]),
                 base_axis=turned(leg.base_axis, local[7:9]),
                 platform_axis=turned(leg.platform_axis, local[9:11]),
-                twist=None if leg.twist is None else leg.twist + float(local[11]),
+                twist=None if twist is None else twist + float(local[11]),
             )
         )
     return tuple(moved)
@@ -123,9 +129,12 @@ def moved_legs(
 
 def turned(axis: Array | None, turn: Array) -> Array | None:
     """Return an axis turned by two angles about its :func:`normal_basis`."""
-    if axis is None:
-        return None
-    return np.asarray(Rotation.from_rotvec(turn @ normal_basis(axis)).apply(axis))
+    return None if axis is None else np.asarray(turn_of(axis, turn).apply(axis))
+
+
+def turn_of(axis: Array | None, turn: Array) -> Rotation:
+    """Return the rotation by two angles about the :func:`normal_basis` of an axis."""
+    return Rotation.from_rotvec(np.zeros(3) if axis is None else turn @ normal_basis(axis))
 
 
 def radii(legs: Sequence[Leg], length: float) -> Array:
@@ -144,7 +153,7 @@ def joints_at(legs: Sequence[LegGeometry], T: RigidTransform) -> tuple[Array, Ar
     return A, np.asarray(T.apply(B))
 
 
-def _travel(mechanism: Mechanism) -> Array:
+def travel_of(mechanism: Mechanism) -> Array:
     """Return shortest and longest length of each leg, (n_legs, 2) [m]."""
     lengths = []
     for leg in mechanism.legs:

@@ -72,11 +72,12 @@ def random_poses(
         wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))
         wanted = home_lengths + share * (wanted - home_lengths)
         R, t = closing.wander(R0, t0, n, share, rng)
-        first = closing.lengths(R, t)
+        first, good = closing.lengths(R, t), np.ones(n, dtype=np.bool_)
         for part in np.linspace(0.0, 1.0, _STEPS + 1)[1:]:
             R, t = closing.close(R, t, first + part * (wanted - first), _ITERATIONS)
+            good &= closing.is_regular(R, t, R0, t0)
         R, t = closing.close(R, t, wanted, _LAST_ITERATIONS - _ITERATIONS)
-        good = closing.is_closed(R, t, wanted) & closing.is_regular(R, t, R0, t0)
+        good &= closing.is_closed(R, t, wanted)
         good &= _inside(closing.lengths(R, t), travel, home_lengths)
         found_R, found_t = np.concatenate([found_R, R[good]]), np.concatenate([found_t, t[good]])
         if len(found_t) >= count:

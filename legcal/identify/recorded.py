@@ -7,9 +7,11 @@ import numpy as np
 from legcal.dataset.folder import Dataset
 from legcal.geometry.types import Array
 from legcal.identify.cameras import default_cameras
-from legcal.identify.planned import joints_at, machine_near, radii
+from legcal.identify.planned import joints_at, machine_near, radii, travel_of
+from legcal.identify.poses import random_poses
 from legcal.identify.session import Session
 from legcal.mechanism.kinematics import forward_kinematics_many
+from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import parametrization_of
 
 
@@ -23,15 +25,20 @@ def recorded_session(dataset: Dataset) -> Session:
 
     Raises
     ------
-    NotIdentifiable, DidNotConverge
-        If the readings do not give the platform's poses.
+    DidNotConverge
+        If the readings do not lead to closed poses.
     """
     mechanism, m = dataset.mechanism, dataset.measurements
-    poses = forward_kinematics_many(mechanism, m.q[m.first_rows])
     to_Rb, from_Re = mechanism.T_base_Rb.inv(), mechanism.T_platform_Re
     home = to_Rb * mechanism.home * from_Re
-    T = [to_Rb * pose * from_Re for pose in poses]
     legs, length, rng = machine_near(mechanism, home)
+    if has_known_poses(mechanism):
+        poses = forward_kinematics_many(mechanism, m.q[m.first_rows])
+        T = [to_Rb * pose * from_Re for pose in poses]
+        R, t = np.array([x.rotation.as_matrix() for x in T]), np.array([x.translation for x in T])
+    else:
+        travel = travel_of(mechanism)
+        R, t = random_poses(legs, mechanism.frame_legs, home, travel, m.n_poses, rng)
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
     seen = np.array(
@@ -49,8 +56,8 @@ def recorded_session(dataset: Dataset) -> Session:
         frame_legs=mechanism.frame_legs,
         parametrization=parametrization_of(mechanism),
         radius=radii(mechanism.legs, length),
-        R=np.array([x.rotation.as_matrix() for x in T]),
-        t=np.array([x.translation for x in T]),
+        R=R,
+        t=t,
         view=np.searchsorted(used, m.view),
         pose=m.pose,
         seen=seen,
@@ -58,6 +65,11 @@ def recorded_session(dataset: Dataset) -> Session:
         focal=np.array([_focal(view.camera.K) for view in views]),
         sigma_q=m.sigma_q,
     )
+
+
+def has_known_poses(mechanism: Mechanism) -> bool:
+    """Say whether readings give poses; random ones inside the travel take their place if not."""
+    return mechanism.mobility == len(mechanism.motors)
 
 
 def _focal(K: Array) -> float:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -66,9 +66,24 @@ def geometries(mechanism: Mechanism) -> tuple[LegGeometry, ...]:
             B=parameters.platform_joints[j],
             base_axis=_turned(T_Rb, leg.base_axis),
             platform_axis=_turned(T_Re, leg.platform_axis),
+            twist=twist_after(geometry_of(leg), T_Re.rotation),
         )
         for j, leg in enumerate(mechanism.legs)
     )
+
+
+def twist_after(leg: LegGeometry, turn: Rotation) -> float | None:
+    """Return the twist of a leg after its platform axis has been turned, and what is tied to it.
+
+    The twist of a leg that is fixed to the platform counts to the first :func:`normal_basis` vector
+    of its direction, which is not turned with it.
+    """
+    if leg.twist is None or leg.platform_axis is None or leg.platform_joint != "":
+        return leg.twist
+    outer = np.asarray(turn.apply(normal_basis(leg.platform_axis)[0]))
+    e1, e2 = normal_basis(np.asarray(turn.apply(leg.platform_axis)))
+    twist = leg.twist - float(np.arctan2(outer @ e2, outer @ e1))
+    return float(twist - np.pi * np.ceil(twist / np.pi - 0.5))
 
 
 def parametrize(

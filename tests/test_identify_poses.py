@@ -1,0 +1,109 @@
+"""Random poses for predictions: closed, inside the travel, in the assembly mode of home."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layouts import Layout, write_machine
+from machines import MACHINES, of_types
+
+import legcal
+from legcal.errors import DidNotConverge
+from legcal.identify.cameras import default_cameras
+from legcal.identify.planned import planned_session
+from legcal.identify.poses import random_poses
+from legcal.mechanism.equations import Demand, linearize
+from legcal.mechanism.kinematics import forward_kinematics_many
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import geometries
+
+SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
+
+
+@cache
+def written(name: str, folder: Path) -> Mechanism:
+    return legcal.load_mechanism(write_machine(folder / "m", MACHINES[name](), Layout()))
+
+
+@pytest.mark.parametrize("name", sorted(MACHINES))
+def test_poses_close_every_leg_inside_its_travel(
+    name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    mechanism = written(name, tmp_path_factory.getbasetemp() / name.replace(" ", "_"))
+    session = planned_session(mechanism, [range(mechanism.n_legs)], 12)
+    assert len(session.t) == 12
+    for j, (leg, drawn) in enumerate(zip(session.legs, mechanism.legs, strict=True)):
+        found = linearize(leg, session.R, session.t)
+        for demand, value in zip(found.demands, found.values.T, strict=True):
+            if demand is not Demand.LENGTH or leg.kind is LegKind.CONSTANT:
+                assert np.abs(value).max() < 1e-8
+        if leg.kind is not LegKind.CONSTANT:
+            q = drawn.sign * (session.length[:, j] - drawn.q0)
+            slack = 0.06 * (drawn.travel[1] - drawn.travel[0]) + 1e-5
+            assert drawn.travel[0] - slack < q.min()
+            assert q.max() < drawn.travel[1] + slack
+    assert np.ptp(session.u, axis=0).max() > 0.02
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_legs_close_at_home_in_the_frames_on_their_joints(name: str) -> None:
+    mechanism = legcal.load_mechanism(name)
+    home = mechanism.T_base_Rb.inv() * mechanism.home * mechanism.T_platform_Re
+    for leg in geometries(mechanism):
+        found = linearize(leg, home.rotation.as_matrix()[None], home.translation[None])
+        np.testing.assert_allclose(found.values[0, 1:], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-upu-tilted", "3-rpr", "3-spr", "tricept"])
+def test_poses_are_those_of_forward_kinematics(
+    name: str,
+) -> None:
+    """Pinocchio closes the loops of the nominal machine; ours is a micrometre away from it."""
+    mechanism = legcal.load_mechanism(name)
+    session = planned_session(mechanism, [range(mechanism.n_legs)], 4)
+    q = mechanism.sign * (session.length - mechanism.q0)
+    q[:, [leg.kind is LegKind.CONSTANT for leg in mechanism.legs]] = 0.0
+    for T, R, t in zip(forward_kinematics_many(mechanism, q), session.R, session.t, strict=True):
+        T_Rb_Re = mechanism.T_base_Rb.inv() * T * mechanism.T_platform_Re
+        np.testing.assert_allclose(T_Rb_Re.translation, t, atol=1e-4)
+        np.testing.assert_allclose(T_Rb_Re.rotation.as_matrix(), R, atol=1e-4)
+
+
+def test_more_motors_than_freedoms_are_followed(tmp_path: Path) -> None:
+    mechanism = legcal.load_mechanism(write_machine(tmp_path, of_types(["US"] * 7), Layout()))
+    assert (mechanism.mobility, len(mechanism.motors)) == (6, 7)
+    found = legcal.identifiability(mechanism, [mechanism.leg_names] * 2)
+    assert (found.full.rank, found.full.of) == (37, 37)
+
+
+def test_a_machine_that_cannot_reach_its_travel_is_refused() -> None:
+    mechanism = legcal.load_mechanism("hexapod")
+    legs = geometries(mechanism)
+    home = mechanism.T_base_Rb.inv() * mechanism.home * mechanism.T_platform_Re
+    away = np.tile([5.0, 5.0], (6, 1))
+    away[0] = [0.01, 0.01]
+    with pytest.raises(DidNotConverge, match=r"found 0 of 3 random poses .* check the travel"):
+        random_poses(legs, mechanism.frame_legs, home, away, 3, np.random.default_rng(0))
+
+
+def test_no_two_cameras_stand_in_one_place_and_all_stand_outside() -> None:
+    mechanism = legcal.load_mechanism("hexapod")
+    views = [(0, 1, 2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5), (3,)]
+    session = planned_session(mechanism, views, 3)
+    apart = np.linalg.norm(session.camera[:, None] - session.camera, axis=2)
+    assert apart[~np.eye(5, dtype=bool)].min() > 0.01
+    points = np.concatenate([session.A, (session.arm + session.t[:, None]).reshape(-1, 3)])
+    reach = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
+    assert np.linalg.norm(session.camera - points.mean(axis=0), axis=1).min() > 2.0 * reach
+    side = session.camera[4] - points.mean(axis=0)  # the camera of leg 4 stands on its side
+    assert side @ (session.A[3] - session.A.mean(axis=0)) > 0.0
+
+
+def test_planar_machines_are_seen_from_along_their_normal() -> None:
+    A = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.8, 0.0]])
+    cameras = default_cameras(A, 0.5 * A + 0.2, [(0, 1, 2)] * 3, False, np.random.default_rng(0))
+    for place in cameras - A.mean(axis=0):
+        assert place[2] / np.linalg.norm(place) > 0.7
+        assert place[2] / np.linalg.norm(place) < 0.99
