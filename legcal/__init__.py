@@ -28,26 +28,39 @@ from legcal.version import __version__
 if TYPE_CHECKING:
     from legcal.dataset.folder import load_dataset
     from legcal.identify.analysis import identifiability
+    from legcal.mechanism.configurations import random_configurations
+    from legcal.mechanism.kinematics import Follower, forward_kinematics, inverse_kinematics
     from legcal.mechanism.load import load_mechanism
+    from legcal.mechanism.singularity import singularity
     from legcal.pipeline import calibrate
     from legcal.report.accuracy import evaluate
 
 __all__ = [
+    "Follower",
     "LegcalError",
     "__version__",
     "calibrate",
     "evaluate",
+    "forward_kinematics",
     "identifiability",
+    "inverse_kinematics",
     "load_dataset",
     "load_mechanism",
+    "random_configurations",
+    "singularity",
 ]
 
 _HOME = {
+    "Follower": "legcal.mechanism.kinematics",
     "calibrate": "legcal.pipeline",
     "evaluate": "legcal.report.accuracy",
+    "forward_kinematics": "legcal.mechanism.kinematics",
     "identifiability": "legcal.identify.analysis",
+    "inverse_kinematics": "legcal.mechanism.kinematics",
     "load_dataset": "legcal.dataset.folder",
     "load_mechanism": "legcal.mechanism.load",
+    "random_configurations": "legcal.mechanism.configurations",
+    "singularity": "legcal.mechanism.singularity",
 }
 
 
