@@ -1,5 +1,6 @@
 """The ranks of steps, against the problems that the steps themselves build."""
 
+from dataclasses import replace
 from functools import cache
 from typing import cast
 
@@ -11,6 +12,7 @@ from staged_hexapods import exact_session
 from legcal.geometry.types import Array
 from legcal.identify.planned import planned_session
 from legcal.identify.ranks import Analysis
+from legcal.identify.session import Session
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.stages import joints_in_base, offsets, platform_joints
@@ -47,11 +49,19 @@ def _rank(J: Array) -> int:
     return int(np.linalg.matrix_rank(J, tol=1e-7)) if J.size else 0
 
 
+def shared_poses(session: Session) -> Session:
+    """Return the session in which all views show the poses of the first."""
+    n = int((session.view == 0).sum())
+    pose = np.tile(np.arange(n), session.n_views)
+    return replace(session, R=session.R[:n], t=session.t[:n], pose=pose)
+
+
+@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("views", VIEWS)
 def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
-    views: tuple[tuple[int, ...], ...],
+    views: tuple[tuple[int, ...], ...], shared: bool
 ) -> None:
-    session = exact_session(legs=views, n_poses=8)
+    session = exact_session(legs=views, n_poses=8, share_poses=shared)
     machine, axes, m = session.machine, session.axes, session.measurements
     joints = locate_joints_in_cameras(machine, axes, m)
     cameras = register_views(machine.parameters.base_joints, joints)
@@ -67,8 +77,15 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
         rank_of_first(step3, 6),
         rank_of_first(step4, 12, known=slice(12, 18)),
     ]
-    found = Analysis(planned_session(hexapod(), views)).step_ranks
+    planned = planned_session(hexapod(), views)
+    found = Analysis(shared_poses(planned) if shared else planned).step_ranks
     assert [s.rank for s in found if s.criteria == "default"] == built
+
+
+def test_images_of_one_pose_from_several_cameras_say_more_at_once() -> None:
+    planned = planned_session(hexapod(), ((0, 1), (2, 3), (4, 5)), 1)
+    alone, together = (Analysis(s).full.rank for s in (planned, shared_poses(planned)))
+    assert (alone, together) == (12, 24)
 
 
 @pytest.mark.parametrize("coplanar", [True, False])
