@@ -125,7 +125,7 @@ def identify(
         ),
     ] = None,
     images: Annotated[
-        int | None, typer.Option(help="Images a view, each of another pose.  [default: 15]")
+        int | None, typer.Option(help="Images a view, each of another pose; 15 without it.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

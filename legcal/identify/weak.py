@@ -193,7 +193,7 @@ def _direction(
     """Return a direction with its largest component at 1 mm."""
     row = row * (_ERROR / row[np.argmax(np.abs(row))])
     shown = np.flatnonzero(np.abs(row) > _SHOWN * _ERROR)
-    shown = shown[np.argsort(-np.abs(row[shown]).round(9), kind="stable")]
+    shown = shown[np.argsort(-np.abs(row[shown] / _ERROR).round(3), kind="stable")]
     names = tuple(session.parametrization.names[i] for i in shown)
     effect = motion.effect(row)
     return WeakDirection(

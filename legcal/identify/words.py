@@ -61,7 +61,9 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
         coordinates.setdefault((kind, leg), []).append(rest[0] if rest else "")
     groups: dict[tuple[str, str], list[str]] = {}
     for (kind, leg), which in coordinates.items():
-        axes = joined(sorted(which)) if kind in ("base", "platform") else ""
+        axes = joined(sorted(which))
+        if kind.endswith("_axis"):
+            axes = f"angle{'s' * (len(which) > 1)} {axes}"
         groups.setdefault((kind, axes), []).append(leg)
     phrases = []
     for (kind, axes), legs in groups.items():

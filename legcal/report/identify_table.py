@@ -41,7 +41,10 @@ def identify_table(report: Identifiability) -> RenderableType:
     if report.recommendation is not None:
         parts += [_recommendation(report), Text()]
     parts += [_conditions(report), Text(), _ranks(report)]
-    for title, ranks in (("step by step", report.staged), ("everything at once", report.full)):
+    tables = [("step by step", report.staged), ("everything at once", report.full)]
+    if _directions(report.staged) == _directions(report.full):
+        tables = [("step by step or at once", report.full)]
+    for title, ranks in tables:
         if ranks.weak:
             parts += [Text(), _weak(title, ranks)]
     if report.remedies:
@@ -110,6 +113,11 @@ def _weak(title: str, ranks: Ranks) -> Table:
     if len(ranks.weak) > _MOST_WEAK:
         table.add_row(f"and {len(ranks.weak) - _MOST_WEAK} more (see --json)", "", "")
     return table
+
+
+def _directions(ranks: Ranks) -> list[str]:
+    """Return the directions that are not determined."""
+    return [weak.direction for weak in ranks.weak]
 
 
 def _hidden(weak: WeakDirection) -> tuple[str, str]:
