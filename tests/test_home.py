@@ -1,11 +1,12 @@
 """Home: settled on what legs demand, found where none is given, refused where it is wrong."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import Layout, LegLayout, write_machine
-from machines import MACHINES, of_types
+from layouts import Layout, LegLayout, Machine, write_machine
+from machines import HOME, MACHINES, of_types
 from mechanisms import ROOT
 from scipy.spatial.transform import RigidTransform
 
@@ -119,6 +120,19 @@ def test_a_home_is_found_for_general_machines(machine: str, tmp_path: Path) -> N
     middle = [leg.sign * 0.5 * sum(leg.travel) for leg in mechanism.legs]
     wanted = np.array([middle[j] for j in mechanism.motors])
     np.testing.assert_allclose(values.values[values.measured], wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("types", [["SU"] * 6, ["US"] * 3 + ["UR"]])
+def test_small_machines_close_from_far_joint_angles(types: list[str], tmp_path: Path) -> None:
+    large = of_types(types)
+    legs = tuple(replace(leg, A=0.05 * leg.A, B_home=0.05 * leg.B_home) for leg in large.legs)
+    home = RigidTransform.from_components(0.05 * HOME.translation, HOME.rotation)
+    mechanism = load_mechanism(write_machine(tmp_path, Machine(legs, home), CARRIED))
+    rng = np.random.default_rng(5)
+    for _ in range(30):
+        turned = rng.uniform(-2.0, 2.0, mechanism.chain.nv)
+        start = mechanism.chain.integrate(mechanism.chain.neutral(), turned)
+        assert _gap(mechanism, close_near(mechanism, mechanism.home, start)) < 1e-12
 
 
 def test_no_home_at_all_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

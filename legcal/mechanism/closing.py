@@ -60,7 +60,7 @@ def close_at(
     """
     configuration, residual = _posture(mechanism, T_base_platform, start, EXACT)
     if np.abs(residual).max(initial=0.0) >= CLOSED:
-        held = partial(_equations, mechanism, T_base_platform)
+        held = partial(_equations, mechanism, T_base_platform, 1.0)
         configuration, residual = _levenberg_marquardt(
             mechanism, held, configuration, _angles(mechanism) | _sliders(mechanism)
         )
@@ -113,10 +113,15 @@ def slider_columns(mechanism: Mechanism, legs: tuple[int, ...]) -> tuple[list[in
 def _posture(
     mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None, astray: float
 ) -> tuple[Array, Array]:
-    """Return joint angles of all legs with the platform held and sliders set, and what is open."""
+    """Return joint angles of all legs with the platform held and sliders set, and what is open.
+
+    Gaps of legs shorter than a metre are counted in leg lengths: beside angles in radians they
+    would weigh too little to be closed, and :data:`NEAR` would be a large part of a leg.
+    """
     configuration = _placed(mechanism, T_base_platform, start, astray)
     free = _angles(mechanism)
-    held = partial(_equations, mechanism, T_base_platform)
+    lengths = np.linalg.norm(leg_vectors(mechanism, T_base_platform), axis=1)
+    held = partial(_equations, mechanism, T_base_platform, min(1.0, float(lengths.mean())))
     rng = np.random.default_rng(20020701)
     residual = np.zeros(0)
     for _ in range(RESTARTS):
@@ -128,7 +133,7 @@ def _posture(
         columns = free & (np.abs(jacobian[stuck]).max(axis=0) > 1e-9)
         step = np.where(columns, rng.uniform(-np.pi, np.pi, len(columns)), 0.0)
         configuration = mechanism.chain.integrate(configuration, step)
-    return configuration, residual
+    return configuration, _equations(mechanism, T_base_platform, 1.0, configuration)[0]
 
 
 def _check(
@@ -214,9 +219,12 @@ def _sliders(mechanism: Mechanism) -> BoolArray:
 
 
 def _equations(
-    mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array
+    mechanism: Mechanism, T_base_platform: RigidTransform, metre: float, configuration: Array
 ) -> tuple[Array, Array]:
-    """Return residual and Jacobian of the closures, and of the platform where legs carry it."""
+    """Return residual and Jacobian of the closures, and of the platform where legs carry it.
+
+    Lengths are divided by ``metre``.
+    """
     residual, jacobian = mechanism.chain.linearize(configuration)
     if mechanism.platform_joint is None:
         held, held_jacobian = mechanism.chain.welded(
@@ -224,7 +232,12 @@ def _equations(
         )
         residual = np.concatenate([residual, held])
         jacobian = np.concatenate([jacobian, held_jacobian])
-    return residual, jacobian
+    weights = np.ones(len(residual))
+    row = 0
+    for rows in [closure.rows for closure in mechanism.chain.closures] + [6]:
+        weights[row : row + 3] = 1.0 / metre
+        row += rows
+    return residual * weights, jacobian * weights[:, np.newaxis]
 
 
 def _levenberg_marquardt(
