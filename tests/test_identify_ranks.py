@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from authoring import made
 
 import legcal
 from legcal.identify.analysis import Identifiability, identifiability
@@ -113,6 +114,25 @@ def test_a_translating_3_upu_shows_only_differences_of_its_axes() -> None:
     assert found.identifiable
     assert not found.remedies
     assert report("3-upu-tilted", [(0, 1, 2)] * 3).full.rank == 21
+
+
+def test_legs_on_one_platform_joint_have_no_distance(tmp_path: Path) -> None:
+    """An octahedral hexapod: three joints on either side, each of two legs."""
+    base = [[300, 0, 0], [-150, 260, 0], [-150, -260, 0]]
+    platform = [[100, 173, 0], [-200, 0, 0], [100, -173, 0]]
+    mechanism = made(
+        tmp_path,
+        type="6-SPS",
+        base_joints=[base[k // 2] for k in range(6)],
+        platform_joints=[platform[(k + 5) // 2 % 3] for k in range(6)],
+        offsets=350,
+        home={"xyz": [0, 0, 350], "rpy_deg": [0, 0, 0]},
+    )
+    found = identifiability(mechanism, [mechanism.leg_names] * 2)
+    # coplanar joints: the distances do not see the three free heights, nor what separates a pair
+    assert rank_of(found, "platform_joints", "literal") == (9, 12)
+    assert rank_of(found, "platform_joints", "default") == (12, 12)
+    assert (found.staged.rank, found.full.rank, found.full.of) == (30, 30, 30)
 
 
 def test_an_unseen_strut_is_not_determined_and_harmless() -> None:

@@ -29,6 +29,7 @@ from legcal.mechanism.sensitivity import freedoms
 _BASE, _PLATFORM, _LENGTH = (0, 1, 2), (3, 4, 5), (6,)
 _BASE_AXIS, _PLATFORM_AXIS, _TWIST = (7, 8), (9, 10), (11,)
 LARGEST_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
+_APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +130,8 @@ def identify_base(session: Session, located: Located, *, common_cameras: bool = 
 def distance_rows(session: Session, located: Located) -> tuple[Array, Array, IntArray]:
     """Return what distances between leg ends say of the offsets.
 
+    Two legs on one platform joint have none: their distance is zero whatever the offsets are.
+
     Returns
     -------
     (m, n_lengths) array
@@ -143,11 +146,14 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
     place[session.with_length] = np.arange(len(columns))
     B = at_platform_joints(session)
     ends = located.joint & session.with_length
+    centres = np.array([leg.B for leg in session.legs])
+    gaps = np.linalg.norm(centres[:, None] - centres, axis=2)
     keys = [
         (v, i, j, g)
         for v in range(session.n_views)
         for i in np.flatnonzero(session.view == v)
         for j, g in combinations(np.flatnonzero(ends[v]).tolist(), 2)
+        if gaps[j, g] > _APART * session.mean_length
     ]
     if not keys:
         return np.zeros((0, len(columns))), np.zeros(0), np.zeros((0, 4), dtype=np.intp)
