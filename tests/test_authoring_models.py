@@ -15,7 +15,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.authoring.assembled import assemble
 from legcal.authoring.create import create_model
 from legcal.authoring.table import read_table
-from legcal.authoring.writer import roll_pitch_yaw, urdf_text, yaml_text
+from legcal.authoring.writer import urdf_text, yaml_text
+from legcal.geometry.frames import roll_pitch_yaw
 from legcal.mechanism.files import shipped_names
 from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
 from legcal.mechanism.leg import LegKind

@@ -5,14 +5,11 @@ from its other end; a leg without S hangs from the base and is welded to the pla
 joints except the slider are at zero at home, with the z axis of every frame along the leg.
 """
 
-from typing import Any
-
 import numpy as np
 import yaml
-from scipy.spatial.transform import RigidTransform
 
 from legcal.authoring.assembled import Assembled, AssembledLeg
-from legcal.geometry.frames import motion_to_xyz_quat
+from legcal.geometry.frames import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 
@@ -231,21 +228,6 @@ class _Branch:
             return
         length = VISIBLE * leg.shortest_shown
         self._tree.cylinder(self._link, radius, 0.0, length if near else -length)
-
-
-def roll_pitch_yaw(rotation: Array) -> Array:
-    """Return the angles of ``rpy``, (3,) [rad], exact also near a pitch of 90 deg."""
-    r = rotation
-    yaw = np.arctan2(r[1, 0], r[0, 0])
-    s, c = np.sin(yaw), np.cos(yaw)
-    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
-    roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
-    return np.array([roll, pitch, yaw])
-
-
-def home_entry(T: RigidTransform) -> dict[str, Any]:
-    """Return a pose as files write it, without negative zeros."""
-    return {key: [x + 0.0 for x in value] for key, value in motion_to_xyz_quat(T).items()}
 
 
 def _unit(vector: Array) -> Array:

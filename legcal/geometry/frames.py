@@ -65,3 +65,22 @@ def motion_to_xyz_quat(T: RigidTransform) -> dict[str, list[float]]:
         "xyz": [float(x) for x in T.translation],
         "quat_xyzw": [float(x) for x in T.rotation.as_quat(canonical=True)],
     }
+
+
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """Return the angles of a rotation about fixed x, y, z, (3,) [rad], to rounding everywhere.
+
+    Near a pitch of 90 degrees the yaw is badly determined: whatever it comes out as, the roll
+    makes up for it.
+
+    Parameters
+    ----------
+    rotation : (3, 3) array
+        Rotation matrix.
+    """
+    r = rotation
+    yaw = np.arctan2(r[1, 0], r[0, 0])
+    s, c = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
+    return np.array([roll, pitch, yaw])

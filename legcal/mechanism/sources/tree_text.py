@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 from html import escape
 from math import pi
 
-import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.geometry.frames import roll_pitch_yaw
 from legcal.geometry.types import Array
 
 FULL_TURN = 2.0 * pi
@@ -93,20 +93,6 @@ def limit(limits: tuple[float, float] | None) -> str:
     """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
     ends = "" if limits is None else f'lower="{limits[0]!r}" upper="{limits[1]!r}" '
     return f'<limit {ends}effort="1000" velocity="1"/>'
-
-
-def roll_pitch_yaw(matrix: Array) -> Array:
-    """Return the angles of a rotation about fixed x, y, z, (3,) [rad], to rounding everywhere.
-
-    Near a pitch of 90 degrees the yaw is badly determined: whatever it comes out as, the roll
-    makes up for it.
-    """
-    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
-    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
-    y_column = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-    z_column = np.array([np.sin(pitch) * np.cos(yaw), np.sin(pitch) * np.sin(yaw), np.cos(pitch)])
-    roll = np.arctan2(matrix[:, 1] @ z_column, matrix[:, 1] @ y_column)
-    return np.array([roll, pitch, yaw])
 
 
 def _numbers(values: Array) -> str:
