@@ -1,6 +1,7 @@
 """``legcal identify``: the document, the tables, and what is refused."""
 
 import json
+import re
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -16,6 +17,8 @@ from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
 import legcal
 from legcal import cli
+from legcal.authoring.create import create_model
+from legcal.authoring.families import Family, describe_family
 from legcal.dataset.folder import load_dataset
 from legcal.errors import UsageError
 from legcal.identify.analysis import identifiability_of_dataset
@@ -190,6 +193,19 @@ def test_without_enough_motors_ranks_are_told_and_what_is_not_predicted(tmp_path
     few = legcal.identifiability(mechanism, [["leg1", "leg2"]])
     assert few.full.weak[0].dX_m is None
     assert not few.identifiable
+
+
+def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
+    asked = Family("6-SPS", "mm", 300.0, 150.0, 400.0, 60.0, 60.0)  # regular hexagons
+    mechanism = create_model(describe_family(asked), tmp_path).mechanism
+    text = mechanism.urdf_path.read_text()
+    text = re.sub(r'(<link name="leg1_\w+">)<visual>.*</visual>', r"\1", text)
+    mechanism.urdf_path.write_text(text)
+    hidden, singular = legcal.identifiability(
+        legcal.load_mechanism(mechanism.yaml_path), [mechanism.leg_names]
+    ).notes
+    assert hidden.startswith("The model has no <visual> cylinder along leg 1:")
+    assert singular.startswith("The mechanism is singular at home: the platform moves")
 
 
 @settings(deadline=None, max_examples=10)

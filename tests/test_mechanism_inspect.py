@@ -5,9 +5,12 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from mechanisms import Layout, write_hexapod
 from rich.console import Console
 
+from legcal.authoring.create import create_model
+from legcal.authoring.families import Family, describe_family
 from legcal.mechanism.inspect import describe
 from legcal.mechanism.load import load_mechanism
 from legcal.report.inspect_table import inspect_table
@@ -61,6 +64,29 @@ def test_the_table_shows_signs_kinds_and_notes(tmp_path: Path) -> None:
     assert "344.217 - q" in text
     assert "note: the motors do not determine the pose" in text
     assert max(len(line) for line in text.splitlines()) <= 80
+
+
+@pytest.mark.parametrize(
+    ("family", "found", "notes"),
+    [
+        ("4-RPR", "more than it needs", ["more motors than the pose needs: mobility 3"]),
+        ("8-SPS", "more than it needs", ["mobility 6, motors 8", "is singular at home"]),
+        ("3-SPS", "NOT determined", ["do not determine the pose: mobility 6"]),
+        ("6-SS", "it cannot move", ["the platform cannot move: mobility 0"]),
+    ],
+)
+def test_motors_that_are_too_many_or_hold_nothing_are_noted(
+    family: str, found: str, notes: list[str], tmp_path: Path
+) -> None:
+    planar = family.endswith("RPR")
+    asked = Family(
+        family, "mm", base_radius=300, platform_radius=150, height=None if planar else 400
+    )
+    description = describe(create_model(describe_family(asked), tmp_path).mechanism)
+    assert found in _table(description)
+    told = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
+    assert len(told) == len(notes)
+    assert all(note in text for note, text in zip(notes, told, strict=True))
 
 
 def test_the_table_shows_axes_and_twists_where_they_are_parameters() -> None:

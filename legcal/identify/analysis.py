@@ -12,14 +12,16 @@ from legcal.identify.conditions import (
     three_legs_at_once,
     two_directions,
 )
-from legcal.identify.planned import planned_session
+from legcal.identify.planned import THIN, planned_session
 from legcal.identify.ranks import Analysis, StepRank
 from legcal.identify.recommend import Recommendation, recommend
 from legcal.identify.remedies import ENOUGH_IMAGES, Remedy, Replanning, find_remedies
 from legcal.identify.session import Session
 from legcal.identify.views import read_views
 from legcal.identify.weak import PlatformError, Ranks
+from legcal.identify.words import legs_in_words
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.notes import singular_note
 from legcal.mechanism.parametrization import geometries
 
 if TYPE_CHECKING:
@@ -165,10 +167,10 @@ def identifiability_of_dataset(dataset: Dataset) -> Identifiability:
     DidNotConverge
         If the readings do not lead to closed poses.
     """
-    from legcal.identify.recorded import has_known_poses, recorded_session
+    from legcal.identify.recorded import recorded_session
 
     report = _judge(dataset.mechanism, recorded_session(dataset), None, None)
-    if has_known_poses(dataset.mechanism):
+    if dataset.mechanism.is_determined:
         return report
     note = "The readings do not give the poses of the images: random ones stand for them."
     return replace(report, notes=(*report.notes, note))
@@ -191,6 +193,7 @@ def _judge(
             f"Platform errors are not predicted: {len(mechanism.motors)} motors do not determine "
             f"the pose of a platform with mobility {mechanism.mobility}."
         )
+    notes += _machine_notes(mechanism)
     return Identifiability(
         spatial=mechanism.spatial,
         legs=mechanism.leg_names,
@@ -211,6 +214,20 @@ def _judge(
         recommendation=recommendation,
         notes=tuple(notes),
     )
+
+
+def _machine_notes(mechanism: Mechanism) -> list[str]:
+    """Return what is odd about a machine, whatever views show of it."""
+    hidden = [j for j, leg in enumerate(mechanism.legs) if not leg.cylinders]
+    notes = []
+    if hidden:
+        which = legs_in_words(hidden, mechanism.leg_names)
+        notes.append(
+            f"The model has no <visual> cylinder along {which}: they were taken as visible, with "
+            f"{100 * THIN:g} % of the mean leg length as radius; add one to each."
+        )
+    singular = singular_note(mechanism)
+    return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
 
 
 def conditions_of(mechanism: Mechanism, session: Session) -> tuple[Condition, ...]:

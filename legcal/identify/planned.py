@@ -26,7 +26,7 @@ from legcal.mechanism.parametrization import (
 SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
-_THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
+THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
 
 
 def planned_session(
@@ -141,7 +141,7 @@ def radii(legs: Sequence[Leg], length: float) -> Array:
     """Return the radius of the thickest visible cylinder of each leg, (n_legs,) [m]."""
     return np.array(
         [
-            max((c.radius for c in main_cylinders(leg.cylinders).values()), default=_THIN * length)
+            max((c.radius for c in main_cylinders(leg.cylinders).values()), default=THIN * length)
             for leg in legs
         ]
     )

@@ -11,12 +11,13 @@ from legcal.identify.planned import joints_at, machine_near, radii, travel_of
 from legcal.identify.poses import random_poses
 from legcal.identify.session import Session
 from legcal.mechanism.kinematics import forward_kinematics_many
-from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import parametrization_of
 
 
 def recorded_session(dataset: Dataset) -> Session:
     """Return the session of a dataset.
+
+    Where readings do not give its poses, random ones inside the travel take their place.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ def recorded_session(dataset: Dataset) -> Session:
     to_Rb, from_Re = mechanism.T_base_Rb.inv(), mechanism.T_platform_Re
     home = to_Rb * mechanism.home * from_Re
     legs, length, rng = machine_near(mechanism, home)
-    if has_known_poses(mechanism):
+    if mechanism.is_determined:
         poses = forward_kinematics_many(mechanism, m.q[m.first_rows])
         T = [to_Rb * pose * from_Re for pose in poses]
         R, t = np.array([x.rotation.as_matrix() for x in T]), np.array([x.translation for x in T])
@@ -65,11 +66,6 @@ def recorded_session(dataset: Dataset) -> Session:
         focal=np.array([_focal(view.camera.K) for view in views]),
         sigma_q=m.sigma_q,
     )
-
-
-def has_known_poses(mechanism: Mechanism) -> bool:
-    """Say whether readings give poses; random ones inside the travel take their place if not."""
-    return mechanism.mobility == len(mechanism.motors)
 
 
 def _focal(K: Array) -> float:

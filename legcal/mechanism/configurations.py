@@ -77,8 +77,8 @@ def random_configurations(
         If too few are reached.
     """
     chance = np.random.default_rng(rng)
-    determined = mechanism.mobility == len(mechanism.motors)
-    found = list((_drawn if determined else _wandered)(mechanism, count, chance))
+    draw = _drawn if mechanism.is_determined else _wandered
+    found = list(draw(mechanism, count, chance))
     if len(found) < count:
         raise DidNotConverge(
             f"{mechanism.yaml_path}: random poses could not be drawn: found {len(found)} of "

@@ -239,7 +239,7 @@ def _readings(mechanism: Mechanism, q: Array) -> Array:
 
 def _check_determined(mechanism: Mechanism) -> None:
     """Refuse a mechanism whose motors do not determine the pose."""
-    if mechanism.mobility != len(mechanism.motors):
+    if not mechanism.is_determined:
         raise NotIdentifiable(
             f"{mechanism.yaml_path}: the pose cannot be computed from readings: found mobility "
             f"{mechanism.mobility} and {len(mechanism.motors)} motors, needed as many motors as "

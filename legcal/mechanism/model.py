@@ -91,6 +91,11 @@ class Mechanism:
         """Indices of the actuated legs."""
         return tuple(j for j, leg in enumerate(self.legs) if leg.kind is LegKind.ACTUATED)
 
+    @property
+    def is_determined(self) -> bool:
+        """Whether the platform has as many freedoms as there are motors: readings give its pose."""
+        return self.mobility == len(self.motors)
+
     @cached_property
     def A_base(self) -> Array:
         """Base joint centres in the base link, (n_legs, 3) [m]."""

@@ -4,6 +4,9 @@ from legcal.mechanism.closing import readings_at
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.schema import LegcalBlock
+from legcal.mechanism.singularity import singularity
+
+REGULAR = 1e-4  # singularity measure: less than that is the rounding of a file
 
 
 def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
@@ -29,13 +32,7 @@ def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
                 f"leg '{leg.name}' has no <visual> cylinder along its axis: it cannot be seen in "
                 "images; add one with its radius."
             )
-    n_motors = len(mechanism.motors)
-    if mechanism.mobility != n_motors:
-        notes.append(
-            f"the motors do not determine the pose: mobility {mechanism.mobility}, motors "
-            f"{n_motors}; forward kinematics is refused."
-        )
-    return (*notes, *_spin_notes(mechanism))
+    return (*notes, *_motor_notes(mechanism), *_spin_notes(mechanism))
 
 
 def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[str, ...]:
@@ -53,6 +50,38 @@ def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[s
             "it down to choose others.",
         )
     return ()
+
+
+def singular_note(mechanism: Mechanism) -> str | None:
+    """Return that the motors do not hold the platform at home, None where they do."""
+    if not 0 < mechanism.mobility <= len(mechanism.motors):
+        return None
+    measure = singularity(mechanism, mechanism.home)
+    if measure > REGULAR:
+        return None
+    return (
+        "the mechanism is singular at home: the platform moves there although all motors stand "
+        f"(singularity measure {measure:.1g}, needed above {REGULAR:g}); correct legcal.home, or "
+        "the joints if they make similar figures on base and platform."
+    )
+
+
+def _motor_notes(mechanism: Mechanism) -> list[str]:
+    """Return where forward kinematics has too few motors, or too many, or a singular start."""
+    notes = []
+    if mechanism.mobility == 0:
+        return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
+    if not mechanism.is_determined:
+        n_motors = len(mechanism.motors)
+        found = "the motors do not determine the pose"
+        if n_motors > mechanism.mobility:
+            found = "there are more motors than the pose needs"
+        notes.append(
+            f"{found}: mobility {mechanism.mobility}, motors {n_motors}; forward kinematics is "
+            "refused."
+        )
+    singular = singular_note(mechanism)
+    return notes if singular is None else [*notes, singular]
 
 
 def _spin_notes(mechanism: Mechanism) -> list[str]:

@@ -19,6 +19,10 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
     """
     motors, mobility = description["motors"], description["mobility"]
     verdict = "the motors determine the pose" if motors == mobility else "NOT determined by motors"
+    if motors > mobility:
+        verdict = "more than it needs"
+    if mobility == 0:
+        verdict = "it cannot move"
     heading = Text.assemble(
         (description["name"], "bold"),
         f": {'spatial' if description['spatial'] else 'planar'}, {len(description['legs'])} legs, "
