@@ -12,12 +12,14 @@ from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry.types import Array
+from legcal.identify.analysis import identifiability
 from legcal.identify.elimination import compress, eliminate
 from legcal.identify.full import SIGMA_EXACT, demands_of, image_rows, information
 from legcal.identify.observed import at_base_joints, at_platform_joints
 from legcal.identify.session import SIGMA_PX, Session
 from legcal.mechanism.equations import linearize
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.parametrization import parametrize
 
 FAST = settings(deadline=None, max_examples=10)
@@ -184,3 +186,11 @@ def _information(session: Session) -> Array:
 
 def _with(session: Session, **changes: Any) -> Session:
     return replace(session, seen=session.seen[:1], camera=session.camera[:1], **changes)
+
+
+@pytest.mark.parametrize(("seen", "most"), [(1, 0), (3, 6), (4, 10)])
+def test_one_image_tells_no_more_than_it_measures(seen: int, most: int) -> None:
+    mechanism = load_mechanism("hexapod")  # 4 numbers a leg, 6 readings; 6 for pose and for camera
+    full = identifiability(mechanism, [mechanism.leg_names[:seen]], images=1).full
+    assert full.rank == most
+    assert full.rank + len(full.weak) == full.of

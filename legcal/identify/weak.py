@@ -129,7 +129,7 @@ class PlatformMotion:
         moved = self.by_metres @ basis.T
         moved[:, :3] *= self.session.mean_length
         flat = moved.reshape(-1, len(basis)) / np.sqrt(len(moved))
-        _, singular, turn = np.linalg.svd(flat, full_matrices=False)
+        _, singular, turn = np.linalg.svd(compress(flat))
         harmless = singular < _HARMLESS
         return turn[~harmless] @ basis, turn[harmless] @ basis
 
