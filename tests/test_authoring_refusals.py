@@ -33,15 +33,25 @@ PLANAR = {"type": "3-RPR", "home": {"xyz": [0, 0, 440], "rpy_deg": [0, 0, 30]}}
         ({"type": "6-RPS"}, r"type 6-RPS could not be used: found 3 base_joints, needed 6"),
         ({"type": "3-PRS"}, r"found the leg type 'PRS', needed R, U or S at the base"),
         ({"type": "x-RPS"}, r"type could not be used: found 'x-RPS', needed a type such as 6-UPS"),
-        ({"type": 3}, r"found the leg type"),
+        ({"type": 3}, r"type could not be used: found 3, needed a type such as 6-UPS"),
+        ({"type": "²-RPS"}, r"type could not be used: found '²-RPS', needed a type such as 6-UPS"),
+        ({"type": "3-RPX"}, r"found the leg type 'RPX', needed R, U or S at the base"),
+        ({"base_joints": [[1e300, 2, 3]] * 3}, r"row 1, needed three numbers below 1e\+09"),
+        ({"base_joints": [[1, 2, 3]] * 33}, r"base_joints .* found 33 legs, needed 2 to 32; leave"),
+        ({"name": "x" * 101}, r"name could not .* digit, at most 100 of them; rename it"),
+        ({"lengths": 455}, r"lengths could not .* leg 'leg1', whose type is with P, needed it for"),
+        (ROD | {"lengths": [None, 455, 455]}, r"lengths could not be used: .* for leg 'leg2'"),
+        (ROD | {"offsets": [380, 380, 380]}, r"offsets could not .* 'leg3', whose type is without"),
+        ({"home": {"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 0]}}, r"a quaternion of norm 0"),
+        ({"home": {"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 2]}}, r"yaml: home.quat_xyzw"),
         ({"type": None, "types": ["RPS", "S", "RPS"]}, r"types.1 could not be used: found .* 'S'"),
         ({"type": None, "types": ["RPS"] * 2}, r"types could not be used: found 2 entries and 3"),
         ({"platform_joints": [[1, 2, 3]]}, r"platform_joints could not .* found 1 entries and 3"),
-        ({"base_joints": [[1, 2, 3]]}, r"found 1 legs, needed at least 2"),
+        ({"base_joints": [[1, 2, 3]]}, r"found 1 leg, needed 2 to 32; add rows"),
         ({"base_joints": [[1, 2, 3, 4]] * 3}, r"base_joints could not .* in row 1, needed three"),
         ({"base_joints": [[1, 2, "x"]] * 3}, r"base_joints could not .* in row 1, needed three"),
         ({"base_joints": 7}, r"base_joints could not be used: found 7 in row 1"),
-        ({"offsets": "long"}, r"offsets could not be used: found 'long', needed a number, or"),
+        ({"offsets": "long"}, r"offsets could not be used: found 'long', needed a number below"),
         ({"offsets": [380, 380]}, r"offsets could not be used: found 2 entries and 3"),
         ({"offsets": None}, r"leg 'leg1' .* an actuated slider without an offset"),
         ({"travel": None}, r"leg 'leg1' .* an actuated slider without travel"),
@@ -89,6 +99,9 @@ def test_what_a_table_cannot_say(tmp_path: Path, changes: dict[str, Any], messag
             SPS | {"unit": "m", "kinds": "passive", "offsets": None, "travel": None},
             r"the base joints could not be used: found them .* mm values where m are stated",
         ),
+        ({"offsets": -380}, r"length of -0.38 m .* correct its joints, offset or travel"),
+        ({"radius": 0.014}, r"leg 'leg1' .* a radius of 0.014 mm on a length of 4.* its unit"),
+        ({"radius": {"rod": 1e4}}, r"a radius of 1e\+04 mm on a length"),
         (SPS | {"offsets": 100}, r"leg 'leg1' cannot close at home: .* needed 100 to 250 mm"),
         (
             {"base_axes": [[0, 1, 0.1], None, None]},
@@ -180,7 +193,7 @@ GOOD = Family("6-UPS", "mm", 300.0, 150.0, 400.0)
     ("family", "message"),
     [
         (Family("6-UPS"), r"found no --base-radius and no --platform-radius and no --height and"),
-        (Family("hexapod"), r"found 'hexapod', needed a number of legs from 2 and their type"),
+        (Family("hexapod"), r"found 'hexapod', needed a number of legs from 2 to 32 and"),
         (Family("1-UPS"), r"found '1-UPS', needed a number of legs from 2"),
         (Family("3-PRS"), r"found '3-PRS', needed a number of legs"),
         (Family("6-UPS", "inch", 3.0, 2.0, 4.0), r"found the unit 'inch', needed m or mm"),
@@ -236,6 +249,16 @@ def test_files_that_are_there_stay_without_force(tmp_path: Path) -> None:
     assert written.read_bytes() == before
     create_model(described(tmp_path, offsets=385), tmp_path, force=True)
     assert 'xyz="0.0 0.0 0.385"' in (tmp_path / "urdf" / "tripod.urdf").read_text()
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "models" / "tripod.yaml").mkdir(parents=True)
+    machine = described(tmp_path)
+    with pytest.raises(UsageError, match=r"found the folder .*tripod.yaml, needed a place for a"):
+        create_model(machine, tmp_path, force=True)
+    assert not (tmp_path / "urdf").exists()
 
 
 def test_a_model_that_does_not_load_leaves_nothing_behind(

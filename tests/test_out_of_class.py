@@ -206,6 +206,13 @@ def test_too_few_legs_are_refused(types: list[str], message: str, tmp_path: Path
     assert message in _refusal(path)
 
 
+def test_far_too_many_legs_are_refused_before_any_work(tmp_path: Path) -> None:
+    machine = of_types(["US"] * 3)
+    many = replace(machine, legs=machine.legs * 11)
+    path = write_machine(tmp_path, many, Layout())
+    assert "found 33 legs, needed at most 32" in _refusal(path)
+
+
 def test_one_leg_in_a_plane_is_refused(tmp_path: Path) -> None:
     path = write_machine(tmp_path, planar(n_legs=1), Layout())
     assert "found 1 leg in a plane, needed at least 2" in _refusal(path)

@@ -7,6 +7,7 @@ from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 
 LONGEST, SHORTEST = 20.0, 1e-3  # [m]; beyond, the unit is the likely mistake
+THICKEST, THINNEST = 0.5, 2e-4  # radius in leg lengths; beyond, its unit is
 SQUARE = 1e-3  # [rad]
 ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
 
@@ -43,6 +44,13 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
         found = _out_of_proportion(described, leg.name, float(length))
         if found:
             return found
+        for radius in (leg.tube, leg.rod):
+            if radius is not None and not THINNEST < radius / length < THICKEST:
+                return [
+                    f"{described.source}: leg '{leg.name}' could not be used: found a radius of "
+                    f"{1e3 * radius:.4g} mm on a length of {1e3 * length:.4g} mm, needed "
+                    f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
+                ]
         if leg.kind is LegKind.CONSTANT or leg.travel is None:
             continue
         q0 = leg.offset or 0.0
@@ -64,12 +72,14 @@ def _out_of_proportion(described: Description, leg: str, length: float) -> list[
     where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
     return [
         f"{where} with lengths in {described.unit}, needed {SHORTEST:g} to {LONGEST:g} m; "
-        f"{_about_the_unit(described.unit, too_long=length > LONGEST)}."
+        f"{_about_the_unit(described.unit, too_long=length > LONGEST, positive=length > 0.0)}."
     ]
 
 
-def _about_the_unit(unit: str, *, too_long: bool) -> str:
+def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
     """Return what to do about sizes out of all proportion."""
+    if not positive:
+        return "correct its joints, offset or travel (length = offset + reading)"
     if unit == "m" and too_long:
         return "these look like mm values where m are stated: check the unit"
     if unit == "mm" and not too_long:

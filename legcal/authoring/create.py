@@ -47,12 +47,18 @@ def create_model(described: Description, output: Path, *, force: bool = False) -
     ModelError, OutOfClass, DidNotConverge
         If the machine cannot be put together or is outside the method; nothing is left behind.
     UsageError
-        If a file is there already.
+        If a file is there already and ``force`` is not given, or a folder is.
     OutOfResources
         If the files cannot be written.
     """
     machine = assemble(described)
     paths = model_paths(machine.name, output)
+    folders = [str(path) for path in paths if path.is_dir()]
+    if folders:
+        raise UsageError(
+            f"{described.source}: the model '{machine.name}' could not be written: found the "
+            f"folder {folders[0]}, needed a place for a file; give another --name or --output."
+        )
     there = [str(path) for path in paths if os.path.lexists(path)]
     if there and not force:
         raise UsageError(

@@ -12,7 +12,7 @@ from legcal.authoring.table import in_metres
 from legcal.authoring.table_schema import plain_name
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg import MOST_LEGS, LegKind
 
 _FAMILY = re.compile(r"([0-9]{1,2})-([A-Z]+)")
 SPREAD = 30.0  # [deg] between the two joints of a pair
@@ -77,10 +77,10 @@ def describe_family(asked: Family) -> Description:
     """
     match = _FAMILY.fullmatch(asked.family)
     letters = None if match is None else leg_type(match[2])
-    if match is None or letters is None or int(match[1]) < 2:
+    if match is None or letters is None or not 2 <= int(match[1]) <= MOST_LEGS:
         raise UsageError(
             f"The family could not be understood: found '{asked.family}', needed a number of legs "
-            f"from 2 and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
+            f"from 2 to {MOST_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
         )
     in_plane = (letters.base, letters.platform) == ("R", "R")
     problems = _problems(asked, in_plane) + _pointless(asked, int(match[1]), letters, in_plane)

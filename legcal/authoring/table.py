@@ -19,7 +19,7 @@ from legcal.authoring.table_schema import TableFile, is_pair
 from legcal.errors import DatasetError, ModelError
 from legcal.files import schema
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg import MOST_LEGS, LegKind
 
 WHAT = "table"
 UNITS = {"m": 0, "mm": -3}
@@ -108,15 +108,18 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
             f"{source}: type {file.type} could not be used: found {n} base_joints, needed "
             f"{int(told[0])}; correct the type or the rows."
         )
-    if n < 2:
+    if not 2 <= n <= MOST_LEGS:
+        remedy = "add rows" if n < 2 else "leave out passive legs"
         problems.append(
-            f"{source}: base_joints could not be used: found {n} legs, needed at least 2; add rows."
+            f"{source}: base_joints could not be used: found {n} {'leg' if n == 1 else 'legs'}, "
+            f"needed 2 to {MOST_LEGS}; {remedy}."
         )
     names = file.legs or [f"leg{j + 1}" for j in range(n)]
     problems += [
         f"{source}: legs could not be used: found '{leg}' twice, needed unique names; rename it."
         for leg in sorted({leg for leg in names if names.count(leg) > 1})
     ]
+    problems += _unused(file, source, names)
     frame = file.base_frame or []
     problems += [
         f"{source}: base_frame could not be used: found '{leg}', which is not a leg; "
@@ -134,6 +137,29 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
             f"{source}: home could not be used: needed its turn once, as quat_xyzw or as rpy_deg; "
             "write one of them."
         )
+    return problems
+
+
+def _unused(file: TableFile, source: str, names: list[str]) -> list[str]:
+    """Return which entries are for legs that have no use for them."""
+    has_slider = [leg.has_slider for leg in _types(file, len(names))]
+    problems = []
+    for key, of_sliders in (("lengths", False), ("offsets", True), ("travel", True)):
+        value = getattr(file, key)
+        shared = not isinstance(value, list) or is_pair(value)
+        entries = [value] * len(names) if shared else value
+        useless = [
+            leg
+            for leg, entry, slides in zip(names, entries, has_slider, strict=False)
+            if entry is not None and slides is not of_sliders
+        ]
+        if useless and not (shared and len(useless) < len(names)):
+            with_p, without_p = ("with", "without") if of_sliders else ("without", "with")
+            problems.append(
+                f"{source}: {key} could not be used: found an entry for leg '{useless[0]}', whose "
+                f"type is {without_p} P, needed it for legs {with_p} P only; leave it out, or "
+                "write null in a list."
+            )
     return problems
 
 

@@ -11,7 +11,8 @@ from legcal.files import schema
 from legcal.files.motion import Quaternion, Vector
 from legcal.mechanism.leg import LegKind
 
-PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+LARGEST = 1e9  # of any number, whatever its unit
+PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 
 
 def plain_name(name: object) -> object:
@@ -19,13 +20,13 @@ def plain_name(name: object) -> object:
     if not isinstance(name, str) or not PLAIN.fullmatch(name):
         raise ValueError(
             f"found {schema.describe(name)}, needed letters, digits, '-', '_' and '.', the first a "
-            "letter or digit; rename it."
+            "letter or digit, at most 100 of them; rename it."
         )
     return name
 
 
 def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
 
 
 def _wanted(value: Any, fits: bool, needed: str) -> Any:
@@ -40,7 +41,7 @@ def _numbers(value: Any) -> Any:
     return _wanted(
         value,
         all(_number(x) or (x is None and isinstance(value, list)) for x in entries),
-        "a number, or a list with a number (or null) for each leg",
+        f"a number below {LARGEST:g}, or a list with a number (or null) for each leg",
     )
 
 
@@ -85,8 +86,8 @@ def _points(value: Any) -> Any:
         fits = isinstance(row, list) and len(row) in (2, 3) and all(_number(x) for x in row)
         if not fits:
             raise ValueError(
-                f"found {schema.describe(row)} in row {i + 1}, needed three numbers, x y z (two "
-                "in the plane); correct it."
+                f"found {schema.describe(row)} in row {i + 1}, needed three numbers below "
+                f"{LARGEST:g}, x y z (two in the plane); correct it."
             )
     return [[*row, 0.0][:3] for row in rows]
 
@@ -129,12 +130,13 @@ def _type_of_leg(value: object) -> object:
 
 
 def _type(value: object) -> object:
-    text = value.split("-", 1) if isinstance(value, str) else [""]
-    if len(text) == 2 and (not text[0].isdigit() or int(text[0]) < 1):
+    number, _, leg = value.rpartition("-") if isinstance(value, str) else ("", "", "")
+    counts = number.isascii() and number.isdigit() and len(number) < 10 and int(number) > 0
+    if not leg or (not counts and value != leg):
         raise ValueError(
             f"found {schema.describe(value)}, needed a type such as 6-UPS; correct it."
         )
-    _type_of_leg(text[-1])
+    _type_of_leg(leg)
     return value
 
 

@@ -1,8 +1,9 @@
 """How files write a rigid motion."""
 
 import math
+from typing import Annotated
 
-from pydantic import field_validator
+from pydantic import AfterValidator, field_validator
 from scipy.spatial.transform import RigidTransform
 
 from legcal.files.schema import FileSchema, Metres, Number
@@ -11,7 +12,20 @@ from legcal.geometry.frames import motion_from_xyz_quat
 QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
 
 Vector = tuple[Metres, Metres, Metres]
-Quaternion = tuple[Number, Number, Number, Number]
+
+
+def _of_unit_norm(quat: tuple[float, ...]) -> tuple[float, ...]:
+    """Refuse a quaternion that is not one of a turn, up to its last digits."""
+    norm = math.hypot(*quat)
+    if abs(norm - 1.0) > QUATERNION_TOLERANCE:
+        raise ValueError(
+            f"found a quaternion of norm {norm:.6g}, needed 1 within {QUATERNION_TOLERANCE:g}; "
+            "check its four numbers, x y z w."
+        )
+    return quat
+
+
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_of_unit_norm)]
 
 
 class MotionEntry(FileSchema):
@@ -22,13 +36,8 @@ class MotionEntry(FileSchema):
 
     @field_validator("quat_xyzw")
     @classmethod
-    def _has_unit_norm(cls, quat: Quaternion) -> Quaternion:
+    def _made_exact(cls, quat: Quaternion) -> Quaternion:
         norm = math.hypot(*quat)
-        if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-            raise ValueError(
-                f"found a quaternion of norm {norm:.6g}, needed 1 within {QUATERNION_TOLERANCE:g}; "
-                "check its four numbers, x y z w."
-            )
         x, y, z, w = (c / norm for c in quat)
         return x, y, z, w
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from legcal.errors import ModelError, OutOfClass
 from legcal.files.schema import closest
 from legcal.mechanism.bodies import Bodies
+from legcal.mechanism.leg import MOST_LEGS
 from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.proposal import any_joint
@@ -60,12 +61,13 @@ def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
 
 
 def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
-    """Check that there are as many legs as define a frame, and no fixed one in a plane.
+    """Check that there are as many legs as define a frame, not far more, no fixed one in a plane.
 
     Raises
     ------
     OutOfClass
-        If there are fewer, or a leg of a planar mechanism is fixed to the platform.
+        If there are fewer, or more than MOST_LEGS, or a leg of a planar mechanism is fixed to
+        the platform.
     """
     n_d = n_frame_legs(spatial=spatial)
     if len(chains) < n_d:
@@ -74,6 +76,11 @@ def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
             f"{path}: this mechanism is outside the method: found {len(chains)} "
             f"{'leg' if len(chains) == 1 else 'legs'} {where}, needed at least {n_d}, whose joints "
             "define the frames of base and platform; this machine cannot be calibrated this way."
+        )
+    if len(chains) > MOST_LEGS:
+        raise OutOfClass(
+            f"{path}: this mechanism is outside the method: found {len(chains)} legs, needed at "
+            f"most {MOST_LEGS}, since the work grows with their cube; leave out passive legs."
         )
     fixed = [chain for chain in chains if chain.platform.letter == ""]
     if fixed and not spatial:

@@ -10,6 +10,8 @@ from legcal.geometry.types import Array
 JointLetter = Literal["R", "U", "S"]
 PlatformLetter = Literal["R", "U", "S", ""]
 
+MOST_LEGS = 32  # the work of all that is done with them grows with the cube of their number
+
 
 class LegKind(StrEnum):
     """What moves along a leg: a motor with an encoder, a free slider, or nothing."""
