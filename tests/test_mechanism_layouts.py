@@ -1,5 +1,6 @@
 """Equal mechanisms give equal analyses, whatever tree they are written in."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from layouts import (
 from machines import MACHINES, of_types
 
 from legcal.errors import OutOfClass
+from legcal.mechanism.closing import readings_at
+from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
 from legcal.mechanism.leg import Leg
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
@@ -117,6 +120,45 @@ def test_a_planar_virtual_joint_changes_nothing(machine: str, hung: str, tmp_pat
     _close(mechanism.T_base_Rb.rotation.apply([0.0, 0.0, 1.0]), drawn.normal)
     z_e = (mechanism.home * mechanism.T_platform_Re).rotation.apply([0.0, 0.0, 1.0])
     _close(z_e, drawn.normal)
+
+
+@pytest.mark.parametrize("machine", ["3-RPR", "3-RPR, tilted plane"])
+@pytest.mark.parametrize("name", [*LAYOUTS, "planar joint"])
+def test_a_planar_machine_may_be_written_with_few_digits(
+    machine: str, name: str, tmp_path: Path
+) -> None:
+    drawn = MACHINES[machine]()
+    layout = LAYOUTS.get(name, Layout((LegLayout(slid=0.01),), virtual="planar"))
+    path = write_machine(tmp_path, drawn, layout)
+    _round(path.with_suffix(".urdf"), 6)
+    mechanism = load_mechanism(path)
+    assert (mechanism.spatial, mechanism.mobility) == (False, 3)
+    for j, leg in enumerate(mechanism.legs):
+        np.testing.assert_allclose(leg.A_base, drawn.legs[j].A, atol=1e-5)
+    step = mechanism.sign * np.array([0.01, -0.02, 0.03])
+    q = inverse_kinematics(mechanism, mechanism.home) + step
+    T = forward_kinematics(mechanism, q)
+    np.testing.assert_allclose(readings_at(mechanism, T), q, atol=1e-5)
+
+
+def _round(path: Path, digits: int) -> None:
+    """Write all numbers of a file with few digits."""
+    text = re.sub(r"-?\d+\.\d+(e-?\d+)?", lambda x: f"{float(x[0]):.{digits}f}", path.read_text())
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("virtual", ["floating", "planar"])
+def test_a_planar_loop_that_is_open_across_its_plane_is_refused(
+    virtual: str, tmp_path: Path
+) -> None:
+    path = write_machine(tmp_path, MACHINES["3-RPR"](), Layout(virtual=virtual))
+    urdf = path.with_suffix(".urdf")
+    seat = '<child link="leg2_seat"/><origin xyz="'
+    start = urdf.read_text().index(seat) + len(seat)
+    x, y, z, rest = re.split('[ "]', urdf.read_text()[start:], maxsplit=3)
+    urdf.write_text(f'{urdf.read_text()[:start]}{x} {y} {float(z) + 1e-3}"{rest}')
+    with pytest.raises(OutOfClass, match=r"'leg2_end' and 'leg2_seat' 1 mm and 0\.000 deg apart"):
+        load_mechanism(path)
 
 
 LEG_LAYOUTS = st.builds(

@@ -44,6 +44,9 @@ class ClosedChain:
         A checked URDF.
     closures : sequence of Closure
         What coincides.
+    normals : sequence of (3,) array or None
+        For each frame closure that need hold in a plane only, the normal of the plane in its first
+        frame. Where all joints move in the plane, rounding of their axes opens it across.
 
     Raises
     ------
@@ -51,9 +54,13 @@ class ClosedChain:
         If Pinocchio cannot build the model.
     """
 
-    def __init__(self, text: str, closures: Sequence[Closure]) -> None:
+    def __init__(
+        self, text: str, closures: Sequence[Closure], normals: Sequence[Array | None] = ()
+    ) -> None:
         self.text = text
         self.closures = tuple(closures)
+        self.normals = tuple(normals) or (None,) * len(self.closures)
+        self._held = [None if n is None else _in_plane(n) for n in self.normals]
         try:
             self._model: Any = pin.buildModelFromXML(text)
         except (ValueError, RuntimeError) as error:
@@ -69,8 +76,8 @@ class ClosedChain:
         self.nv: int = self._model.nv
         self.n_rows = sum(closure.rows for closure in self.closures)
 
-    def __reduce__(self) -> tuple[type["ClosedChain"], tuple[str, tuple[Closure, ...]]]:
-        return ClosedChain, (self.text, self.closures)
+    def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
+        return ClosedChain, (self.text, self.closures, self.normals)
 
     def neutral(self) -> Array:
         """Return the configuration with every joint at zero."""
@@ -81,7 +88,10 @@ class ClosedChain:
         return np.asarray(pin.integrate(self._model, configuration, step))
 
     def residual(self, configuration: Array) -> Array:
-        """Return how far every closure is from closed, (n_rows,) [m] and [rad]."""
+        """Return how far every closure is from closed, (n_rows,) [m] and [rad].
+
+        What opens across a plane counts here, in contrast to :meth:`linearize`.
+        """
         pin.forwardKinematics(self._model, self._data, configuration)
         pieces = []
         for anchor, data in zip(self._anchors, self._anchor_data, strict=True):
@@ -108,8 +118,8 @@ class ClosedChain:
         pin.computeJointJacobians(model, data, configuration)
         residual, jacobian = np.empty(self.n_rows), np.empty((self.n_rows, self.nv))
         row = 0
-        for closure, anchor, anchor_data in zip(
-            self.closures, self._anchors, self._anchor_data, strict=True
+        for closure, anchor, anchor_data, held in zip(
+            self.closures, self._anchors, self._anchor_data, self._held, strict=True
         ):
             anchor.calc(model, data, anchor_data)
             rows = slice(row, row + closure.rows)
@@ -118,6 +128,8 @@ class ClosedChain:
             if closure.kind == "6d":
                 M = anchor_data.c1Mc2
                 block = pin.Jlog6(M) @ M.inverse().action @ block
+            if held is not None:
+                residual[rows], block = held @ residual[rows], held @ block
             jacobian[rows] = block
             row = rows.stop
         return residual, jacobian
@@ -248,3 +260,11 @@ class ClosedChain:
             else pin.FrameAnchorConstraintModel
         )
         return make(self._model, one.parentJoint, one.placement, two.parentJoint, two.placement)
+
+
+def _in_plane(normal: Array) -> Array:
+    """Return what keeps displacements in a plane and turns about its normal, (6, 6)."""
+    held = np.zeros((6, 6))
+    held[3:, 3:] = np.outer(normal, normal)
+    held[:3, :3] = np.eye(3) - held[3:, 3:]
+    return held

@@ -60,6 +60,32 @@ def check_equations(mechanism: Mechanism) -> None:
         raise OutOfClass(list(problems.values()))
 
 
+def check_across(mechanism: Mechanism) -> None:
+    """Check that the closures of a planar mechanism hold across its plane too.
+
+    Raises
+    ------
+    OutOfClass
+        If one is more than 10 um open, or turned by more than 1 mrad.
+    """
+    row, residual = 0, mechanism.chain.residual(mechanism.home_configuration)
+    problems = []
+    for closure in mechanism.chain.closures:
+        gap = float(np.linalg.norm(residual[row : row + 3]))
+        tilt = float(np.linalg.norm(residual[row + 3 : row + closure.rows]))
+        row += closure.rows
+        if gap > CONCURRENT or tilt > PERPENDICULAR:
+            problems.append(
+                f"{mechanism.yaml_path}: the loops could not be closed: found "
+                f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
+                f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move, needed "
+                f"at most 0.01 mm and {np.degrees(PERPENDICULAR):.2g} deg; correct the origins and "
+                "axes along this leg."
+            )
+    if problems:
+        raise OutOfClass(problems)
+
+
 def check_unit(mechanism: Mechanism) -> None:
     """Check that the legs are as long at home as legs written in metres are.
 

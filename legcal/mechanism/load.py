@@ -13,7 +13,7 @@ from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism import agreement, virtual_joint
 from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
-from legcal.mechanism.consistency import check_equations, check_unit
+from legcal.mechanism.consistency import check_across, check_equations, check_unit
 from legcal.mechanism.cylinders import with_cylinders
 from legcal.mechanism.home import closed_home
 from legcal.mechanism.leg_chain import LegChain
@@ -21,7 +21,7 @@ from legcal.mechanism.leg_of_chain import leg_of
 from legcal.mechanism.mobility import mobility
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.notes import diagnose, proposal_notes
-from legcal.mechanism.plane import in_links, plane_of_motion
+from legcal.mechanism.plane import in_links, normals_of_closures, plane_of_motion
 from legcal.mechanism.proposal import propose_block, propose_frame
 from legcal.mechanism.schema import LegcalBlock
 from legcal.mechanism.sources.read import read_source
@@ -63,6 +63,7 @@ def load_mechanism(model: str | Path) -> Mechanism:
     pose, configuration = closed_home(mechanism, given)
     mechanism = replace(mechanism, home=pose, home_configuration=configuration)
     check_unit(mechanism)
+    check_across(mechanism)
     mechanism = replace(mechanism, mobility=mobility(mechanism))
     check_equations(mechanism)
     proposed = proposal_notes(file.legcal, mechanism)
@@ -88,8 +89,11 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         turn = bodies.T_body_link[virtual.parent].rotation.inv()
         normal = None if normals is None else np.asarray(turn.apply(normals[0]))
         virtual_joint.check_plane(virtual, normal, yaml_path)
+    in_plane = None if normals is None else in_links(normals, ends)
     try:
-        chain = ClosedChain(urdf.text, closures)
+        chain = ClosedChain(
+            urdf.text, closures, normals_of_closures(in_plane, closures, block, urdf)
+        )
     except ModelError as error:
         raise ModelError([f"{urdf.path}: {problem}" for problem in error.problems]) from error
     home = None if block.home is None else block.home.motion()
@@ -106,7 +110,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         for name, leg_chain in zip(block.legs, chains, strict=True)
     )
     names = list(block.legs)
-    base_normal, platform_normal = (None, None) if normals is None else in_links(normals, ends)
+    base_normal, platform_normal = in_plane or (None, None)
     base_frame = block.base_frame or propose_frame(names, chains)
     mechanism = Mechanism(
         name=urdf.name,

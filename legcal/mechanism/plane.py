@@ -7,7 +7,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
 from legcal.mechanism.axes import parallel, undirected
+from legcal.mechanism.bodies import frame_link
+from legcal.mechanism.chain import Closure
 from legcal.mechanism.leg_chain import LegChain
+from legcal.mechanism.schema import LegcalBlock
+from legcal.mechanism.sources.reference import reference_poses
+from legcal.mechanism.urdf import Urdf
 
 Normals = tuple[Array, Array]
 
@@ -58,3 +63,46 @@ def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform
         for normal, T in zip(normals, T_body_link, strict=True)
     )
     return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
+
+
+def normals_of_closures(
+    in_links: Normals | None, closures: Sequence[Closure], block: LegcalBlock, urdf: Urdf
+) -> list[Array | None]:
+    """Return for which closures it is enough to hold in the plane, with its normal there.
+
+    Closures of a planar mechanism repeat that it is planar, and contradict each other by what
+    its axes are rounded. All are held in the plane alone; but where a floating joint carries the
+    platform, one more is needed to hold that in the plane.
+
+    Parameters
+    ----------
+    in_links : tuple of (3,) array or None
+        The normals in the links of base and platform; None in space.
+    closures : sequence of Closure
+        What coincides.
+    block : LegcalBlock
+        The links of base and platform, and the virtual joint.
+    urdf : Urdf
+        The tree.
+
+    Returns
+    -------
+    list of (3,) array or None
+        The normal in the first frame of each closure, None where everything is to hold.
+    """
+    if in_links is None:
+        return [None] * len(closures)
+    poses, parents = reference_poses(urdf), {j.child: j for j in urdf.joints.values()}
+    virtual = None if block.platform_joint is None else urdf.joints[block.platform_joint]
+    floats = virtual is not None and virtual.type == "floating"
+    normals: list[Array | None] = []
+    for closure in closures:
+        link = above = frame_link(urdf, closure.frame_1)
+        while above in parents and parents[above] is not virtual:
+            above = parents[above].parent
+        root, normal = (block.base, in_links[0])
+        if above in parents and floats:
+            root, normal = (block.platform, in_links[1])
+        turn = poses[link].rotation.inv() * poses[root].rotation
+        normals.append(np.asarray(turn.apply(normal)) if closure.kind == "6d" else None)
+    return [None, *normals[1:]] if floats else normals
