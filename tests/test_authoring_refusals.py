@@ -45,6 +45,10 @@ PLANAR = {"type": "3-RPR", "home": {"xyz": [0, 0, 440], "rpy_deg": [0, 0, 30]}}
         ({"home": {"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 0]}}, r"a quaternion of norm 0"),
         ({"home": {"xyz": [0, 0, 440], "quat_xyzw": [0, 0, 0, 2]}}, r"yaml: home.quat_xyzw"),
         ({"type": None, "types": ["RPS", "S", "RPS"]}, r"types.1 could not be used: found .* 'S'"),
+        (
+            {"base_joints": [[None, 2, 3]] * 3},
+            r"base_joints .* found \[null, 2, 3\] in row",
+        ),
         ({"type": None, "types": ["RPS"] * 2}, r"types could not be used: found 2 entries and 3"),
         ({"platform_joints": [[1, 2, 3]]}, r"platform_joints could not .* found 1 entries and 3"),
         ({"base_joints": [[1, 2, 3]]}, r"found 1 leg, needed 2 to 32; add rows"),
@@ -155,10 +159,17 @@ def test_all_problems_of_a_table_are_told_at_once(tmp_path: Path) -> None:
         ("{h}\n{r}\n", None, r"found no unit, needed m or mm; add a column 'unit', or give --unit"),
         ("{h},unit\n{r},mm\n{r},m\n", None, r"found m and mm, needed the same in all lines"),
         ("{h},unit\n{r},mm\n{r},mm\n", "m", r"found --unit m and 'mm' in the table"),
-        ("{h}\n{r}\nRPS,,2,3,4\n", "mm", r"base_joints could not be used: found .* in row 2"),
+        ("{h}\n{r}\nRPS,,2,3,4\n", "mm", r"line 3: base_x could not be read: found nothing"),
         ("{h}\n{r}\n,1,2,3,4\n", "mm", r"types.1 could not be used: found the leg type nothing"),
         ("{h},travel_low\n{r},0\n{r},0\n", "mm", r"travel could not be used"),
-        ("{h}\nRPS,nan,2,3,4\n{r}\n", "mm", r"base_joints could not be used: found .* in row 1"),
+        ("{h}\nRPS,nan,2,3,4\n{r}\n", "mm", r"line 2: base_x could not be read: found 'nan'"),
+        ("type;base_x\nRPS;1\n", "mm", r"found ';' between the columns, needed ',' there"),
+        ("type\tbase_x\nRPS\t1\n", "mm", r"found tabs between the columns, needed ',' there"),
+        (
+            "{h},radius,rod\n{r},9,8\n",
+            "mm",
+            r"line 2: the radius could not be decided",
+        ),
     ],
 )
 def test_what_a_csv_cannot_say(tmp_path: Path, text: str, unit: str | None, message: str) -> None:

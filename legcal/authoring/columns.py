@@ -1,8 +1,10 @@
 """The table of a machine in CSV: one row a leg, columns by name."""
 
+import math
 from pathlib import Path
 from typing import Any
 
+from legcal.authoring.table_schema import LARGEST
 from legcal.errors import DatasetError
 from legcal.files.csv_file import read_lines
 from legcal.files.schema import closest
@@ -39,7 +41,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
             f"{path}: the table could not be read: found {len(lines)} lines, needed a header and "
             "one line for each leg; add them."
         )
-    header = lines[0][1]
+    header = [name.lower() for name in lines[0][1]]
     _check_header(header, path)
     problems, rows = list[str](), list[dict[str, Any]]()
     for number, cells in lines[1:]:
@@ -50,6 +52,11 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
             )
             continue
         row = dict(zip(header, cells, strict=True))
+        if row.get("radius") and (row.get("tube") or row.get("rod")):
+            problems.append(
+                f"{path}, line {number}: the radius could not be decided: found radius beside tube "
+                "or rod, needed one of them; empty the others."
+            )
         rows.append({key: _cell(key, text, path, number, problems) for key, text in row.items()})
     if problems:
         raise DatasetError(problems)
@@ -58,6 +65,13 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
 
 def _check_header(header: list[str], path: Path) -> None:
     """Refuse columns that are unknown, repeated or missing."""
+    other = next((mark for mark in ";\t" if len(header) == 1 and mark in header[0]), None)
+    if other is not None:
+        mark = "';'" if other == ";" else "tabs"
+        raise DatasetError(
+            f"{path}: the table could not be read: found {mark} between the columns, needed ',' "
+            "there and '.' in numbers; save it again as comma-separated text."
+        )
     known = (*_TEXTS, *_NUMBERS)
     problems = [
         f"{path}: the column '{name}' could not be used: found an unknown name; "
@@ -79,17 +93,20 @@ def _check_header(header: list[str], path: Path) -> None:
 
 
 def _cell(key: str, text: str, path: Path, line: int, problems: list[str]) -> str | float | None:
-    """Return the value of a cell; an empty one has none."""
-    if not text or key in _TEXTS:
+    """Return the value of a cell; an empty one has none, if it need not."""
+    if key in _TEXTS or (not text and key not in _NEEDED):
         return text or None
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
+        value = math.nan
+    if not abs(value) < LARGEST:
+        found = f"'{text}'" if text else "nothing"
         problems.append(
-            f"{path}, line {line}: {key} could not be read: found '{text}', needed a number; "
-            "correct the cell."
+            f"{path}, line {line}: {key} could not be read: found {found}, needed a number below "
+            f"{LARGEST:g}; correct the cell."
         )
-        return None
+    return value
 
 
 def _unit(rows: list[dict[str, Any]], told: str | None, path: Path) -> str:

@@ -207,9 +207,21 @@ def validate(
         raise DatasetError([_sentence(schema, e, path, prefix) for e in error.errors()]) from error
 
 
+class _Short(reprlib.Repr):
+    """Values as YAML writes them where Python does otherwise."""
+
+    def repr_NoneType(self, value: None, level: int) -> str:
+        return "null"
+
+    def repr_date(self, value: object, level: int) -> str:
+        return str(value)
+
+    repr_datetime = repr_date
+
+
 def describe(value: object) -> str:
     """Return a value as a message shows it, on one short line."""
-    short = reprlib.Repr()
+    short = _Short()
     short.maxstring = short.maxother = 60
     return "nothing" if value is None else short.repr(value)
 
