@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,9 +140,11 @@ def test_refusals_are_one_sentence_in_one_document(
 
 def test_all_problems_of_views_are_told_at_once() -> None:
     mechanism = loaded("hexapod")
+    views: list[Any] = [["leg7"], [], ["leg1", "leg1"], ["leg1", 2], "leg1"]
     with pytest.raises(UsageError) as refused:
-        legcal.identifiability(mechanism, [["leg7"], [], ["leg1", "leg1"], "leg1"], images=-1)
-    assert len(refused.value.problems) == 5
+        legcal.identifiability(mechanism, views, images=-1)
+    assert len(refused.value.problems) == 6
+    assert "View 4 could not be used: found 2, needed names" in refused.value.problems[-2]
     assert "found the text 'leg1'" in refused.value.problems[-1]
 
 

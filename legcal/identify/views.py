@@ -40,6 +40,13 @@ def read_views(
                 "names; pass one list of names a view."
             )
             continue
+        unnamed = [name for name in view if not isinstance(name, str)]
+        if unnamed:
+            problems.append(
+                f"View {v} could not be used: found {unnamed[0]!r}, needed names of legs; pass "
+                "texts."
+            )
+            continue
         names = [name.strip() for name in view]
         if not any(names):
             problems.append(
