@@ -107,3 +107,15 @@ def test_planar_machines_are_seen_from_along_their_normal() -> None:
     for place in cameras - A.mean(axis=0):
         assert place[2] / np.linalg.norm(place) > 0.7
         assert place[2] / np.linalg.norm(place) < 0.99
+
+
+def test_machines_that_reach_few_drawn_poses_get_all_in_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    chance = np.random.default_rng(1)
+    monkeypatch.setattr(
+        "legcal.identify.poses._Closing.is_regular",
+        lambda _self, _R, t, _R0, _t0: chance.random(len(t)) < 0.75,  # in each of five steps
+    )
+    mechanism = legcal.load_mechanism("hexapod")
+    assert len(planned_session(mechanism, [range(6)], 60).t) == 60

@@ -22,7 +22,7 @@ _DEPENDENT = 1e-4  # singular values of equations below this are those of the ot
 _SINGULAR = 0.05  # smallest singular value, of its value at home
 _RANK = 1e-9  # of the largest singular value
 _FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
-_ATTEMPTS = 6  # each with half the travel of the one before
+_ATTEMPTS = 12  # each with 0.6 of the travel of the one before
 
 
 def random_poses(
