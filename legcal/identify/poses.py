@@ -22,7 +22,9 @@ _DEPENDENT = 1e-4  # singular values of equations below this are those of the ot
 _SINGULAR = 0.05  # smallest singular value, of its value at home
 _RANK = 1e-9  # of the largest singular value
 _FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
-_ATTEMPTS = 12  # each with 0.6 of the travel of the one before
+_ATTEMPTS = 12
+_SHRINKING = 0.6  # each attempt with that part of the travel of the one before, but
+_LEAST_SHARE = 0.078  # of the travel at least
 
 
 def random_poses(
@@ -82,7 +84,7 @@ def random_poses(
         found_R, found_t = np.concatenate([found_R, R[good]]), np.concatenate([found_t, t[good]])
         if len(found_t) >= count:
             return found_R[:count], found_t[:count]
-        share *= 0.6
+        share = max(_SHRINKING * share, _LEAST_SHARE)
     raise DidNotConverge(
         f"The observations could not be predicted: found {len(found_t)} of {count} random poses "
         "inside the travel, needed all; check the travel (limit lower, upper) and the home pose "
