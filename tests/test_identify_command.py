@@ -24,7 +24,9 @@ from legcal.dataset.folder import load_dataset
 from legcal.errors import UsageError
 from legcal.identify.analysis import identifiability_of_dataset
 from legcal.identify.recorded import recorded_session
+from legcal.identify.weak import WeakDirection
 from legcal.mechanism.model import Mechanism
+from legcal.report.identify_table import _hidden, _two_digits
 
 PAPER = ("leg1,leg2,leg3,leg4", "leg3,leg4,leg5,leg6", "leg1,leg2,leg5,leg6")
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
@@ -117,6 +119,13 @@ def test_weak_directions_and_remedies_are_printed(
         (("hexapod", "--view", "leg1,,leg2"), 2, "UsageError", "found '', needed a leg"),
         (("hexapod", "--view", "leg1, leg1"), 2, "UsageError", "found leg 'leg1' 2 times"),
         (("hexapod", "--images", "0"), 2, "UsageError", "found 0 images a view"),
+        (("hexapod", "--images", "2001"), 2, "UsageError", "found 2001 images a view, needed at"),
+        (
+            ("hexapod", *options(("leg1",) * 51)),
+            2,
+            "UsageError",
+            "found 51 of them, needed",
+        ),
         (("hexapod", "--images", "many"), 2, "UsageError", "'--images'"),
         ((HEXAPOD, "--view", "leg1"), 2, "UsageError", "could not be judged with --view"),
         ((HEXAPOD, "--images", "3"), 2, "UsageError", "could not be judged with --images"),
@@ -136,6 +145,15 @@ def test_refusals_are_one_sentence_in_one_document(
     error = json.loads(capsys.readouterr().out)["error"]
     assert error["kind"] == kind
     assert said in error["message"]
+
+
+def test_numbers_beyond_sense_are_told_as_bounds() -> None:
+    def hidden(dX_m: float, dE_rad: float) -> tuple[str, str]:
+        return _hidden(WeakDirection("x", ("leg1.base.x",), (1.0,), dX_m, dE_rad, False))
+
+    assert hidden(0.0123, 0.01) == ("12.30", "0.573")
+    assert hidden(14.9, 50.0) == ("> 1000", "> 180")
+    assert [_two_digits(x) for x in (0.0123, 12.3, 114.0)] == ["0.012", "12", "110"]
 
 
 def test_all_problems_of_views_are_told_at_once() -> None:

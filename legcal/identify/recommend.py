@@ -25,6 +25,7 @@ from legcal.mechanism.model import Mechanism
 _MOST_VIEWS = 4
 _ALL_VISIBLE = 5  # legs: one camera can see that many at once
 _VISIBLE = 2.0 / 3.0  # of more legs than that
+_MOST_WINDOWS = 12  # views of one size that are tried; of more legs, evenly around the base
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,8 @@ class _Candidates:
         """Return neighbours around the base; several cameras where all legs are neighbours."""
         if size >= self.mechanism.n_legs:
             return [tuple(range(self.mechanism.n_legs))] * _MOST_VIEWS
-        return neighbours(self.ring, size)
+        views = neighbours(self.ring, size)
+        return views[:: -(-len(views) // _MOST_WINDOWS)]
 
     def counts_hold(self, views: Sequence[Sequence[int]]) -> bool:
         """Say whether the paper's counts hold."""

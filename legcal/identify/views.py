@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from legcal.errors import UsageError
 from legcal.files.schema import closest
 
+MOST_VIEWS, MOST_IMAGES = 50, 2000  # of a session; more says nothing new and takes minutes
+
 
 def read_views(
     views: Sequence[Sequence[str]], leg_names: Sequence[str], images: int
@@ -32,6 +34,16 @@ def read_views(
         problems.append(
             f"The views could not be judged: found {images} images a view, needed at least 1; "
             "pass --images 15 or leave it out."
+        )
+    if len(views) > MOST_VIEWS:
+        raise UsageError(
+            f"The views could not be judged: found {len(views)} of them, needed at most "
+            f"{MOST_VIEWS}; leave out views of the same legs."
+        )
+    if images * max(len(views), 1) > MOST_IMAGES:
+        problems.append(
+            f"The views could not be judged: found {images} images a view, needed at most "
+            f"{MOST_IMAGES} in all views together; pass fewer --images."
         )
     for v, view in enumerate(views, start=1):
         if isinstance(view, str):

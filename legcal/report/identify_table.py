@@ -27,6 +27,7 @@ _STEPS = {
     "platform_joints": "4 platform joints, axes (16-19)",
 }
 _MOST_WEAK = 6  # directions shown
+_FAR, _HALF_TURN = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
 def identify_table(report: Identifiability) -> RenderableType:
@@ -126,7 +127,16 @@ def _hidden(weak: WeakDirection) -> tuple[str, str]:
         return "?", "?"
     if weak.harmless:
         return "harmless", ""
-    return f"{1e3 * weak.dX_m:.2f}", f"{degrees(weak.dE_rad):.3f}"
+    dX_mm, dE_deg = 1e3 * weak.dX_m, degrees(weak.dE_rad)
+    return (
+        f"{dX_mm:.2f}" if dX_mm < _FAR else f"> {_FAR:.0f}",
+        f"{dE_deg:.3f}" if dE_deg < _HALF_TURN else f"> {_HALF_TURN:.0f}",
+    )
+
+
+def _two_digits(value: float) -> str:
+    """Return a number with two digits, never with an exponent where it is large."""
+    return f"{float(f'{value:.2g}'):.12g}"
 
 
 def _remedies(report: Identifiability) -> Table:
@@ -154,9 +164,9 @@ def _verdict(report: Identifiability) -> list[RenderableType]:
         sigma = report.platform_sigma
         lines.append(
             Text(
-                f"Platform sigma to expect: {1e3 * sigma.dX_m:.2g} mm, "
-                f"{degrees(sigma.dE_rad):.2g} deg, from outlines good to 0.1 px at both ends of "
-                "a leg.",
+                f"Platform sigma to expect: {_two_digits(1e3 * sigma.dX_m)} mm, "
+                f"{_two_digits(degrees(sigma.dE_rad))} deg, from outlines good to 0.1 px "
+                "at both ends of a leg.",
                 style="dim",
             )
         )
