@@ -35,6 +35,7 @@ from legcal.detection.observe import (
 )
 from legcal.detection.workers import Run, worker_pool
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible, OutOfClass
+from legcal.identify.check import check_identifiable
 from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.model import Mechanism
@@ -109,10 +110,12 @@ def calibrate(
     if output is not None:
         check_destination(Path(output))
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    _refuse_other_legs(dataset.mechanism)
+    left_open = check_identifiable(dataset)
     with worker_pool(workers) as run:
         work = _workpiece(dataset, run, criteria, use_cache=use_cache)
         outlines, steps, solution = _observe_and_fit(work, progress)
-    notes = [*dataset.notes, *_keep_outlines(work, outlines)]
+    notes = [*dataset.notes, *left_open, *_keep_outlines(work, outlines)]
     calibration = judge(
         dataset,
         in_file_order(solution, work.order, dataset),
@@ -181,7 +184,6 @@ class _Workpiece:
 
 def _workpiece(dataset: Dataset, run: Run, criteria: Criteria, *, use_cache: bool) -> _Workpiece:
     """Put a dataset into the order of work, and see which images are still to be searched."""
-    _refuse_other_legs(dataset.mechanism)
     names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, names)
     current = fingerprint(dataset, detection_settings())

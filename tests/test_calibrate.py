@@ -14,6 +14,7 @@ from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset, load_mechanism
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
+from legcal.identify.check import check_identifiable
 
 
 def _table(folder: Path) -> list[list[str]]:
@@ -192,9 +193,20 @@ def test_too_few_images_are_refused_with_both_numbers(tmp_path: Path) -> None:
     folder = copy_of_the_example(tmp_path / "two")
     header, *rows = _table(folder)
     _write_table(folder, [header, rows[0], rows[15]])
-    with pytest.raises(NotIdentifiable, match=r"\d+ .*\d+"):
+    with pytest.raises(NotIdentifiable, match=r"determine \d+ of 30 at best and leave .* open"):
         calibrate(folder, output=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_what_the_steps_alone_leave_open_is_noted(example_run: Run, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(example_run.folder, tmp_path / "narrow"))
+    entry = _entry(folder)
+    entry["views"]["c1"]["legs"] = entry["views"]["c3"]["legs"] = ["leg1", "leg2", "leg3"]
+    entry["views"]["c2"]["legs"] = ["leg4", "leg5", "leg6"]
+    _write_entry(folder, entry)
+    notes = check_identifiable(load_dataset(folder))
+    assert len(notes) == 1
+    assert re.match(r"The four steps alone leave z of base joint 2, .* \d+ more open", notes[0])
 
 
 def test_a_camera_pose_that_sees_no_leg_is_named(tmp_path: Path) -> None:
