@@ -7,8 +7,6 @@ from legcal.errors import NotIdentifiable
 from legcal.identify.analysis import Identifiability, identifiability_of_dataset
 from legcal.identify.weak import Ranks
 
-_NAMED = 3  # directions in one message
-
 
 def check_identifiable(dataset: Dataset) -> tuple[str, ...]:
     """Return what a dataset leaves open that does no harm, one sentence each.
@@ -28,14 +26,14 @@ def check_identifiable(dataset: Dataset) -> tuple[str, ...]:
     if not report.identifiable:
         raise NotIdentifiable(_refusal(dataset, report))
     notes = []
-    if not report.staged.complete:
+    if any(not weak.harmless for weak in report.staged.weak):
         notes.append(
-            f"The four steps alone leave {_directions(report.staged, harmless=False)} open; the "
+            f"The four steps alone leave open {_directions(report.staged, harmless=False)}; the "
             "fit of everything does not."
         )
-    if report.full.weak:
+    if report.full.weak:  # what is left is harmless
         notes.append(
-            f"Not determined, and without effect on the platform: "
+            "Not determined, and without effect on the platform: "
             f"{_directions(report.full, harmless=True)}."
         )
     return tuple(notes)
@@ -47,14 +45,16 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
     remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
     return (
         f"{dataset.folder}: the parameters cannot be identified: found that these views and poses "
-        f"determine {report.full.rank} of {report.full.of} at best and leave "
-        f"{_directions(report.full, harmless=False)} open, needed everything that moves the "
-        f"platform; {remedy}."
+        f"determine {report.full.rank} of {report.full.of} at best and leave open "
+        f"{_directions(report.full, harmless=False)}, needed everything that moves the platform; "
+        f"{remedy}."
     )
 
 
 def _directions(ranks: Ranks, *, harmless: bool) -> str:
-    """Return the first directions that stay open, in words."""
+    """Return the simplest direction that stays open, in words, and how many there are."""
     words = [weak.direction for weak in ranks.weak if weak.harmless == harmless]
-    more = [f"{len(words) - _NAMED} more"] if len(words) > _NAMED else []
-    return ", ".join([*words[:_NAMED], *more])
+    simplest = min(words, key=len)
+    if len(words) == 1:
+        return simplest
+    return f"{len(words)} independent changes of them, such as {simplest}"
