@@ -319,6 +319,14 @@ def test_lengths_in_millimetres_are_refused(tmp_path: Path) -> None:
         load_mechanism(path)
 
 
+def test_travel_in_millimetres_is_refused(tmp_path: Path) -> None:
+    machine = geometry()
+    machine = Geometry(machine.A, machine.B, machine.q0, machine.home, (-5.0, 155.0))
+    path = write_hexapod(tmp_path, None, machine)
+    with pytest.raises(ModelError, match=r"travel of leg 'leg1' .* -5 to 155 m, needed at most"):
+        load_mechanism(path)
+
+
 def test_a_rod_that_is_fixed_to_the_platform_shows_its_cylinder() -> None:
     centre = load_mechanism("tricept").legs[3]
     assert centre.type == "UP"

@@ -87,12 +87,12 @@ def check_across(mechanism: Mechanism) -> None:
 
 
 def check_unit(mechanism: Mechanism) -> None:
-    """Check that the legs are as long at home as legs written in metres are.
+    """Check that the legs are as long at home, and move as far, as those written in metres.
 
     Raises
     ------
     ModelError
-        If one is longer than 20 m, or shorter than 1 mm.
+        If one is longer than 20 m or shorter than 1 mm, or its motor moves further than 20 m.
     """
     lengths = np.linalg.norm(leg_vectors(mechanism, mechanism.home), axis=1)
     fixed = np.array([leg.platform_joint == "" for leg in mechanism.legs])
@@ -103,6 +103,14 @@ def check_unit(mechanism: Mechanism) -> None:
             f"'{mechanism.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home, needed 1 mm to "
             "20 m; write all lengths in metres (are they millimetres?)."
         )
+    for leg in mechanism.legs:
+        reach = leg.travel[1] - leg.travel[0]
+        if leg.kind is LegKind.ACTUATED and reach > LENGTHS[1]:
+            raise ModelError(
+                f"{mechanism.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
+                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
+                "limits of its slider in metres (are they millimetres?)."
+            )
 
 
 def _problem(demand: Demand, value: float) -> str | None:

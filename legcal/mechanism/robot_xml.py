@@ -69,7 +69,7 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
         content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ModelError(
-            f"{path}: the {what} could not be read: found text in {document.encoding}, needed "
+            f"{path}: the {what} could not be read: found text in another encoding, needed "
             "UTF-8; save it as UTF-8."
         ) from error
     return root

@@ -43,7 +43,7 @@ class Problems:
         what = f"{element.tag} '{element.get('name')}'" if element.get("name") else element.tag
         self.sentences.append(
             f"{self.path}, line {element.sourceline}: {what} could not be used: it {found}; "
-            f"{remedy}."
+            f"{remedy}{'' if remedy.endswith('?') else '.'}"
         )
 
     def raise_if_any(self) -> None:

@@ -136,7 +136,9 @@ def _bodies(element: etree._Element, tree: MjcfTree) -> _Ends | None:
     for key in ("body1", "body2"):
         name = element.get(key, WORLD if key == "body2" else "")
         names.append(name)
-        if name not in tree.poses:
+        if not name:
+            values.problems.add(element, f"has no {key}", "name the body that it holds")
+        elif name not in tree.poses:
             values.problems.add(
                 element, f"names the body '{name}' as {key}, which is not in the file",
                 closest(name, tree.poses).rstrip("."),
