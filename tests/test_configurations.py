@@ -1,9 +1,12 @@
 """Random closed configurations: closed, inside the travel, unflipped, in one assembly mode."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from layouts import Layout, LegSpec, Machine, write_machine
+from machines import HOME, ring
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
@@ -104,3 +107,12 @@ def test_a_travel_that_home_cannot_enter_is_refused_once(motors: str) -> None:
     mechanism = replace(mechanism, legs=(*mechanism.legs[:6], far))
     with pytest.raises(DidNotConverge, match=r"found 0 of 3 inside the travel.*check legcal\.home"):
         random_configurations(mechanism, 3, 1)
+
+
+def test_poses_are_drawn_where_home_is_nearly_singular(tmp_path: Path) -> None:
+    chance = np.random.default_rng(3)
+    A, B = ring(list(np.arange(6) * 60.0), 0.3), ring(list(np.arange(6) * 60.0 + 6.0), 0.15)
+    A, B = A + chance.normal(0.0, 0.02, A.shape), B + chance.normal(0.0, 0.015, B.shape)
+    legs = tuple(LegSpec("SU", a, HOME.apply(b)) for a, b in zip(A, B, strict=True))
+    mechanism = load_mechanism(write_machine(tmp_path, Machine(legs, HOME), Layout()))
+    _check(mechanism, random_configurations(mechanism, 20, 1))

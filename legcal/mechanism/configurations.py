@@ -21,7 +21,7 @@ from legcal.mechanism.mobility import free_motions, project
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.singularity import singularity
 
-TRIES = 20  # draws for each configuration
+TRIES = 40  # draws for each configuration
 NEARER = 1.3 * 0.8 ** np.arange(TRIES)  # how far from home draws go, at most all of the way
 REGULAR = 0.1  # of the singularity measure at home: nobody works nearer to a singularity
 SHORTEST = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
