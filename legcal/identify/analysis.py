@@ -75,7 +75,7 @@ class Identifiability:
     remedies : tuple of Remedy
         What would mend what is missing; each was tried.
     recommendation : tuple of Recommendation or None
-        The smallest sets of views, the best first; None where views were given.
+        The smallest sets of views, fewest first; None where views were given.
     notes : tuple of str
         What the reader should know.
     """
@@ -117,7 +117,7 @@ def identifiability(
         The nominal model.
     views : sequence of sequences of str
         Names of the legs that each camera position shows; without any, the smallest sets of
-        views that suffice are recommended and the best of them is judged.
+        views that suffice are recommended and the first of them is judged.
     images : int
         Images a view, each of another pose.
 

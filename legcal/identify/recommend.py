@@ -23,8 +23,6 @@ from legcal.identify.weak import PlatformError
 from legcal.mechanism.model import Mechanism
 
 _MOST_VIEWS = 4
-_ALL_VISIBLE = 5  # legs: one camera can see that many at once
-_VISIBLE = 2.0 / 3.0  # of more legs than that
 _MOST_WINDOWS = 12  # views of one size that are tried; of more legs, evenly around the base
 
 
@@ -49,10 +47,11 @@ class Recommendation:
 
 
 def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
-    """Return the smallest sets of views that suffice, fewest legs in all first.
+    """Return the smallest sets of views that suffice, fewest camera positions first.
 
     For each number of camera positions the fewest legs a view; of all sets of that size the
-    one with the smallest standard deviation of the platform.
+    one with the smallest standard deviation of the platform. More positions are listed only
+    where fewer legs a view suffice then: which legs one camera can see, the user knows.
 
     Parameters
     ----------
@@ -66,19 +65,17 @@ def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
     tuple of Recommendation
         Empty where no set was found.
     """
-    n = mechanism.n_legs
-    largest = n if n <= _ALL_VISIBLE else int(np.ceil(_VISIBLE * n))
-    found: list[tuple[int, Recommendation]] = []
+    found = list[Recommendation]()
     candidates = _Candidates(mechanism, images)
-    most = largest + 1
+    most = mechanism.n_legs + 1
     for n_views in range(1, _MOST_VIEWS + 1):
         for size in range(1, most):
             best = candidates.best(n_views, size)
             if best is not None:
-                found.append((n_views * size, best))
+                found.append(best)
                 most = size
                 break
-    return tuple(r for _, r in sorted(found, key=lambda pair: pair[0]))
+    return tuple(found)
 
 
 class _Candidates:

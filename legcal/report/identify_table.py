@@ -69,15 +69,18 @@ def _recommendation(report: Identifiability) -> RenderableType:
     """Return the sets of views that suffice."""
     if not report.recommendation:
         return Text("No set of views was found that suffices; all legs in one view are judged.")
-    lines = [Text("Smallest sets of views that suffice:", style="bold")]
+    labels = leg_labels(report.legs)
+    table = _plain_table("smallest sets of views that suffice", "legs each", "sigma \\[mm]")
     for found in report.recommendation:
-        labels = leg_labels(report.legs)
-        views = "  ".join(",".join(labels[name] for name in view) for view in found.views)
         number = len(found.views)
-        lines.append(
-            Text(f"  {number} view{'s' * (number != 1)} of {found.legs_a_view} legs: {views}")
+        views = "; ".join(",".join(labels[name] for name in view) for view in found.views)
+        sigma = "" if found.platform_sigma is None else f"{1e3 * found.platform_sigma.dX_m:.2g}"
+        judged = "  *" if found.views == report.views else ""
+        table.add_row(
+            f"{number} view{'s' * (number != 1)}: {views}", str(found.legs_a_view), sigma + judged
         )
-    return Group(*lines)
+    legend = "sigma: of the platform, to expect; *: judged here"
+    return Group(table, Text(legend, style="dim"))
 
 
 def _conditions(report: Identifiability) -> Table:
