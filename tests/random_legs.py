@@ -1,5 +1,6 @@
 """Random legs of every kind that close at a pose, in closed form."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.mechanism.equations import LegGeometry, twist_of
+from legcal.mechanism.equations import linearize
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 
 
 def leg_and_pose(joints: str, seed: int) -> tuple[LegGeometry, Array, Array]:
@@ -49,6 +51,29 @@ def closed_leg(
         twist=None if "S" in joints else 0.0,
     )
     return leg if leg.twist is None else replace(leg, twist=twist_of(leg, R, t))
+
+
+def twist_of(leg: LegGeometry, R: Array, t: Array) -> float:
+    """Return the twist with which a leg without an S joint closes at a pose.
+
+    Parameters
+    ----------
+    leg : LegGeometry
+        The leg; its own twist does not matter.
+    R, t : (3, 3) and (3,) array
+        Rotation and position [m] of the platform's frame in that of the base.
+
+    Returns
+    -------
+    float
+        In (-pi/2, pi/2] [rad].
+    """
+    sine, cosine = (
+        float(linearize(replace(leg, twist=twist), R[None], t[None]).values[0, -1])
+        for twist in (0.0, -0.5 * np.pi)
+    )
+    angle = math.atan2(sine, cosine)
+    return angle - math.pi * math.ceil(angle / math.pi - 0.5)
 
 
 def turned(vector: Array | None, axis: Array | None, angles: Array) -> Array | None:

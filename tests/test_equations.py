@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_legs import changed, leg_and_pose
+from random_legs import changed, leg_and_pose, twist_of
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
-from legcal.mechanism.equations import Demand, linearize, twist_of
+from legcal.mechanism.equations import linearize
+from legcal.mechanism.leg_geometry import Demand
 
 FAST = settings(deadline=None, max_examples=20)
 SEEDS = st.integers(0, 2**32 - 1)

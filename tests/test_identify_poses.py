@@ -13,9 +13,10 @@ from legcal.errors import DidNotConverge
 from legcal.identify.cameras import default_cameras
 from legcal.identify.planned import planned_session
 from legcal.identify.poses import random_poses
-from legcal.mechanism.equations import Demand, linearize
+from legcal.mechanism.equations import linearize
 from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import Demand
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries
 

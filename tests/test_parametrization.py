@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from legcal import load_mechanism
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.mechanism.equations import LegGeometry, linearize
+from legcal.mechanism.equations import linearize
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parameters import parameter_names, to_vector
 from legcal.mechanism.parametrization import (
     Parametrization,

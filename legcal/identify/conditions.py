@@ -14,8 +14,8 @@ from math import comb
 import numpy as np
 
 from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.equations import LegGeometry
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
 _AT_ONCE = 3  # legs that give the pose of the platform in the camera frame, eq (18)

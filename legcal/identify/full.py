@@ -10,8 +10,8 @@ from legcal.geometry.types import Array, IntArray
 from legcal.identify.elimination import compress, eliminate
 from legcal.identify.observed import at_base_joints, at_platform_joints
 from legcal.identify.session import Session
-from legcal.mechanism.equations import Demand
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import Demand
 from legcal.mechanism.sensitivity import freedoms, pose_equations
 
 SIGMA_EXACT = 1e-7  # [m]: what the mechanism itself demands

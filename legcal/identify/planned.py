@@ -13,8 +13,8 @@ from legcal.geometry.types import Array, IntArray
 from legcal.identify.cameras import FOCAL_PX, default_cameras
 from legcal.identify.poses import random_poses
 from legcal.identify.session import Session
-from legcal.mechanism.equations import LegGeometry
 from legcal.mechanism.leg import Leg, LegKind, main_cylinders
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import (
     Parametrization,

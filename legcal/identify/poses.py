@@ -9,8 +9,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.equations import Demand, LegGeometry, linearize
+from legcal.mechanism.equations import linearize
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import Demand, LegGeometry
 from legcal.mechanism.sensitivity import freedoms
 
 _STEPS = 5  # from home to a pose, so that no pose jumps to another assembly mode

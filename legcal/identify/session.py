@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.mechanism.equations import N_LOCAL, LegGeometry
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import N_LOCAL, LegGeometry
 from legcal.mechanism.parametrization import Parametrization
 
 SIGMA_PX = 0.1  # of an outline across a leg, in the image

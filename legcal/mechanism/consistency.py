@@ -5,8 +5,9 @@ import numpy as np
 from legcal.errors import ModelError, OutOfClass
 from legcal.mechanism.axes import CONCURRENT, PERPENDICULAR
 from legcal.mechanism.closing import leg_vectors, platform_pose, slider_columns
-from legcal.mechanism.equations import Demand, geometry_of, linearize
+from legcal.mechanism.equations import linearize
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import Demand, geometry_of
 from legcal.mechanism.mobility import generic_configurations
 from legcal.mechanism.model import Mechanism
 

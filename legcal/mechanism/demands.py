@@ -14,8 +14,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.equations import Demand, demanded, geometry_of
+from legcal.mechanism.equations import demanded
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import Demand, geometry_of
 from legcal.mechanism.model import Mechanism
 
 _WORDS = {

@@ -13,73 +13,14 @@ and a pose is that of the second frame in the first. Planar mechanisms keep thei
 length only.
 """
 
-import math
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import dataclass
 
 import numpy as np
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import JointLetter, Leg, LegKind, PlatformLetter
-
-N_LOCAL = 12  # A, B, length, base axis 1 and 2, platform axis 1 and 2, twist
-
-
-class Demand(StrEnum):
-    """What an equation of a leg is about."""
-
-    LENGTH = "length"
-    BASE_AXIS = "base axis"
-    PLATFORM_AXIS = "platform axis"
-    ALONG_1 = "direction in the platform, first angle"
-    ALONG_2 = "direction in the platform, second angle"
-    TWIST = "twist"
-
-
-@dataclass(frozen=True, eq=False)
-class LegGeometry:
-    """The numbers that a leg's equations contain.
-
-    Attributes
-    ----------
-    base_joint, platform_joint : str
-        The letters of :class:`legcal.mechanism.leg.Leg`.
-    kind : LegKind
-        Whether the length is measured, free or constant.
-    A, B : (3,) array
-        Joint centres in the frames of base and platform [m].
-    q0 : float
-        Length at reading zero [m]; that of a constant leg.
-    base_axis, platform_axis : (3,) array or None
-        Unit axes in the frames of base and platform.
-    twist : float or None
-        Angle that the leg keeps [rad].
-    """
-
-    base_joint: JointLetter
-    platform_joint: PlatformLetter
-    kind: LegKind
-    A: Array
-    B: Array
-    q0: float
-    base_axis: Array | None = None
-    platform_axis: Array | None = None
-    twist: float | None = None
-
-    @property
-    def demands(self) -> tuple[Demand, ...]:
-        """The equations of this leg, in the order of :func:`linearize`."""
-        found = [Demand.LENGTH]
-        if self.base_joint == "R" and self.base_axis is not None:
-            found.append(Demand.BASE_AXIS)
-        if self.platform_joint == "R" and self.platform_axis is not None:
-            found.append(Demand.PLATFORM_AXIS)
-        if self.platform_joint == "":
-            found += [Demand.ALONG_1, Demand.ALONG_2]
-        if self.twist is not None:
-            found.append(Demand.TWIST)
-        return tuple(found)
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import N_LOCAL, Demand, LegGeometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,21 +47,6 @@ class Linearization:
     values: Array
     by_pose: Array
     by_local: Array
-
-
-def geometry_of(leg: Leg) -> LegGeometry:
-    """Return the geometry of a leg in the links of base and platform."""
-    return LegGeometry(
-        leg.base_joint,
-        leg.platform_joint,
-        leg.kind,
-        leg.A_base,
-        leg.B_platform,
-        leg.q0,
-        leg.base_axis,
-        leg.platform_axis,
-        leg.twist,
-    )
 
 
 def linearize(leg: LegGeometry, R: Array, t: Array) -> Linearization:
@@ -288,29 +214,6 @@ _ROWS = {
     Demand.ALONG_2: lambda state: _along(1, state),
     Demand.TWIST: _twist,
 }
-
-
-def twist_of(leg: LegGeometry, R: Array, t: Array) -> float:
-    """Return the twist with which a leg without an S joint closes at a pose.
-
-    Parameters
-    ----------
-    leg : LegGeometry
-        The leg; its own twist does not matter.
-    R, t : (3, 3) and (3,) array
-        Rotation and position [m] of the platform's frame in that of the base.
-
-    Returns
-    -------
-    float
-        In (-pi/2, pi/2] [rad].
-    """
-    sine, cosine = (
-        float(linearize(replace(leg, twist=twist), R[None], t[None]).values[0, -1])
-        for twist in (0.0, -0.5 * np.pi)
-    )
-    angle = math.atan2(sine, cosine)
-    return angle - math.pi * math.ceil(angle / math.pi - 0.5)
 
 
 def _given(vector: Array | None) -> Array:

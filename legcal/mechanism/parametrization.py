@@ -17,8 +17,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.mechanism.equations import N_LOCAL, LegGeometry, geometry_of
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import N_LOCAL, LegGeometry, geometry_of
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import free_coordinates
 

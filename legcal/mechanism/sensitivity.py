@@ -12,8 +12,9 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.mechanism.equations import Demand, LegGeometry, demanded
+from legcal.mechanism.equations import demanded
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import Demand, LegGeometry
 from legcal.mechanism.parametrization import Parametrization
 
 IN_SPACE = (0, 1, 2, 3, 4, 5)

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
-from legcal.mechanism.equations import LegGeometry
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.parametrization import parametrize
 from legcal.mechanism.sensitivity import pose_sensitivity
