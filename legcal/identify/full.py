@@ -18,7 +18,7 @@ SIGMA_EXACT = 1e-7  # [m]: what the mechanism itself demands
 
 
 @dataclass(frozen=True, eq=False)
-class Demands:
+class WhitenedDemands:
     """The whitened equations of all legs at the poses of a session.
 
     Attributes
@@ -38,12 +38,12 @@ class Demands:
     leg: IntArray
     demand: tuple[Demand, ...]
 
-    def at(self, poses: IntArray) -> Demands:
+    def at(self, poses: IntArray) -> WhitenedDemands:
         """Return the equations at some of the poses, in that order."""
         return replace(self, by_pose=self.by_pose[poses], by_parameters=self.by_parameters[poses])
 
 
-def demands_of(session: Session) -> Demands:
+def demands_of(session: Session) -> WhitenedDemands:
     """Return what readings and legs demand of the poses of a session."""
     equations = pose_equations(session.legs, session.parametrization, session.R, session.t)
     sigma = np.where(equations.measured, session.sigma_q, SIGMA_EXACT)[:, None]
@@ -54,7 +54,7 @@ def demands_of(session: Session) -> Demands:
         if not (d is Demand.LENGTH and leg.kind is LegKind.PASSIVE)
     )
     columns = list(freedoms(session.frame_legs))
-    return Demands(
+    return WhitenedDemands(
         (equations.by_pose / sigma * pose_unit(session))[:, :, columns],
         equations.by_parameters / sigma * session.unit,
         equations.leg,
@@ -89,7 +89,7 @@ def image_rows(session: Session) -> Array:
 
 
 def information(
-    session: Session, images: Array, demands: Demands, *, common_cameras: bool = False
+    session: Session, images: Array, demands: WhitenedDemands, *, common_cameras: bool = False
 ) -> Array:
     """Return what everything at once says of the parameters, (p, p) whitened rows [1/m].
 
@@ -99,7 +99,7 @@ def information(
         The observations.
     images : (n_images, n_legs, 4, f + 6 + p) array
         What :func:`image_rows` says of them.
-    demands : Demands
+    demands : WhitenedDemands
         What :func:`demands_of` says of them.
     common_cameras : bool
         Whether a calibration board on the base shows how the cameras stand to each other.

@@ -9,7 +9,7 @@ import numpy as np
 
 from legcal.geometry.types import Array, IntArray
 from legcal.identify import literal, steps
-from legcal.identify.full import Demands, demands_of, image_rows, information
+from legcal.identify.full import WhitenedDemands, demands_of, image_rows, information
 from legcal.identify.session import Session
 from legcal.identify.weak import (
     PlatformMotion,
@@ -68,7 +68,7 @@ class Analysis:
         return image_rows(self.session)
 
     @cached_property
-    def demands(self) -> Demands:
+    def demands(self) -> WhitenedDemands:
         """What readings and legs demand."""
         return demands_of(self.session)
 

@@ -18,7 +18,7 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.identify.elimination import compress, eliminate
 from legcal.identify.full import (
     SIGMA_EXACT,
-    Demands,
+    WhitenedDemands,
     by_group,
     pose_unit,
 )
@@ -170,7 +170,9 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
     return rows, np.asarray(weight), np.stack([v, pose, j, g], axis=1)
 
 
-def identify_platform(session: Session, located: Located, images: Array, demands: Demands) -> Step:
+def identify_platform(
+    session: Session, located: Located, images: Array, demands: WhitenedDemands
+) -> Step:
     """Return what step 4 says of platform joints and axes, and of universal axes at the base.
 
     *images* and *demands* are those of :func:`legcal.identify.full.information`.
@@ -278,7 +280,7 @@ def _groups(session: Session, located: Located) -> _Groups:
     return _Groups(of_image, distinct[:, 0], distinct[:, 1] < 0, used, enough)
 
 
-def _step_4_demands(demands: Demands, groups: _Groups) -> BoolArray:
+def _step_4_demands(demands: WhitenedDemands, groups: _Groups) -> BoolArray:
     """Return which equations of the legs step 4 uses in each group, (n_groups, m)."""
     kinds = np.array([d.name for d in demands.demand])
     length, base_axis, twist = (kinds == d for d in ("LENGTH", "BASE_AXIS", "TWIST"))

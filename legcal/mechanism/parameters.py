@@ -3,6 +3,9 @@
 The frames R_b and R_e are built on the joint centres of N_d legs: origin, x axis, xy
 plane. The coordinates that this makes zero are not parameters: 12 + 12 + 6 = 30 remain for
 a 6-SPU.
+
+This is the vector of machines with point-like joints, which steps and fit use;
+:mod:`legcal.mechanism.parametrization` has that of every class, with axes and twists.
 """
 
 from collections.abc import Sequence
