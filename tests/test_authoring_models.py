@@ -234,13 +234,16 @@ def test_a_rod_without_a_length_has_the_one_at_home(tmp_path: Path) -> None:
     assert [c.radius for c in mechanism.legs[2].cylinders] == [0.014]
 
 
-def test_a_passive_slider_reads_its_length_and_moves_freely(tmp_path: Path) -> None:
+@pytest.mark.parametrize("travel", [[None, [0, 150], [0, 150]], [0, 150]])
+def test_a_passive_slider_reads_its_length_and_moves_freely(
+    tmp_path: Path, travel: list[Any]
+) -> None:
     mechanism = made(
         tmp_path,
         type="SPS",
         kinds=["passive", None, None],
         offsets=[None, 380, 380],
-        travel=[None, [0, 150], [0, 150]],
+        travel=travel,
     )
     leg = mechanism.legs[0]
     length = float(np.linalg.norm(mechanism.home.apply(leg.B_platform) - leg.A_base))

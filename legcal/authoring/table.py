@@ -186,7 +186,10 @@ def _description(file: TableFile, source: str) -> Description:
         default = LegKind.CONSTANT if constant else LegKind.ACTUATED
         kind = default if kind is None or constant else LegKind(kind)
         offset = per_leg(file.lengths if constant else file.offsets)[j]
-        limits = None if constant else metres(travel[j])
+        reads_length = kind is LegKind.PASSIVE and offset is None  # a pair for all means readings
+        limits = metres(travel[j])
+        if constant or (reads_length and is_pair(file.travel)):
+            limits = None
         legs.append(
             LegEntry(
                 name, kind_of_leg, kind,
