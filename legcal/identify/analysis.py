@@ -20,6 +20,7 @@ from legcal.identify.session import Session
 from legcal.identify.views import read_views
 from legcal.identify.weak import PlatformError, Ranks
 from legcal.identify.words import legs_in_words
+from legcal.mechanism.home_travel import NEAR, legs_outside
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.notes import singular_note
 from legcal.mechanism.parametrization import geometries
@@ -225,6 +226,15 @@ def _machine_notes(mechanism: Mechanism) -> list[str]:
         notes.append(
             f"The model has no <visual> cylinder along {which}: they were taken as visible, with "
             f"{100 * THIN:g} % of the mean leg length as radius; add one to each."
+        )
+    outside = list(legs_outside(mechanism, NEAR))
+    if outside:
+        which = legs_in_words(outside, mechanism.leg_names)
+        stand = "stand outside their" if len(outside) > 1 else "stands outside its"
+        notes.append(
+            f"At home {which} {stand} travel by more than {100 * NEAR:g} % of it: poses between "
+            "home and travel were judged too, which the machine may not reach; correct "
+            "legcal.home or the limits."
         )
     singular = singular_note(mechanism)
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]

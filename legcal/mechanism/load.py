@@ -16,6 +16,7 @@ from legcal.mechanism.chain import ClosedChain, Closure
 from legcal.mechanism.consistency import check_across, check_equations, check_unit
 from legcal.mechanism.cylinders import with_cylinders
 from legcal.mechanism.home import closed_home
+from legcal.mechanism.home_travel import check_home_travel
 from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.leg_of_chain import leg_of
 from legcal.mechanism.mobility import mobility
@@ -60,6 +61,8 @@ def load_mechanism(model: str | Path) -> Mechanism:
     given = mechanism.home if block.home is not None else None
     if given is not None:
         check_unit(mechanism)  # before lengths of hundreds of metres fail to close
+    if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
+        check_home_travel(mechanism)
     pose, configuration = closed_home(mechanism, given)
     mechanism = replace(mechanism, home=pose, home_configuration=configuration)
     check_unit(mechanism)

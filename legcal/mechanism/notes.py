@@ -1,7 +1,7 @@
 """What a person should know of a mechanism that loads: diagnostics, one sentence each."""
 
 from legcal.mechanism.closing import readings_at
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.home_travel import legs_outside
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.schema import LegcalBlock
 from legcal.mechanism.singularity import singularity
@@ -20,9 +20,10 @@ def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
             f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
         )
     q = readings_at(mechanism, mechanism.home)
+    outside = legs_outside(mechanism)
     for j, leg in enumerate(mechanism.legs):
         lower, upper = leg.travel
-        if leg.kind is not LegKind.CONSTANT and not lower <= q[j] <= upper:
+        if j in outside:
             notes.append(
                 f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
                 f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
