@@ -4,11 +4,10 @@ import numpy as np
 
 from legcal.authoring.machine import Description, LegEntry
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.axes import PERPENDICULAR
+from legcal.mechanism.leg import LONGEST, SHORTEST, LegKind
 
-LONGEST, SHORTEST = 20.0, 1e-3  # [m]; beyond, the unit is the likely mistake
 THICKEST, THINNEST = 0.5, 2e-4  # radius in leg lengths; beyond, its unit is
-SQUARE = 1e-3  # [rad]
 ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
 
 
@@ -97,7 +96,7 @@ def wrong_axes(
         ("platform", entry.type.platform, axes[1]),
     ):
         angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
-        if letter == "R" and 90.0 - angle > np.degrees(SQUARE):
+        if letter == "R" and 90.0 - angle > np.degrees(PERPENDICULAR):
             problems.append(
                 f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
                 f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "

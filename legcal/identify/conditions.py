@@ -16,6 +16,7 @@ import numpy as np
 from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.parameters import n_frame_legs
 
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
 _AT_ONCE = 3  # legs that give the pose of the platform in the camera frame, eq (18)
@@ -78,7 +79,7 @@ def count_conditions(
     As printed. Of E = l + 2(n - N_d) the first term is read as 1; passive legs count in E
     although (19) finds them.
     """
-    n_d = 3 if spatial else 2
+    n_d = n_frame_legs(spatial=spatial)
     joints_base = 3 + 3 * (n_legs - n_d) + 2 * len(revolute) if spatial else 2 + 2 * (n_legs - n_d)
     joints_platform = 3 + 3 * (n_legs - n_d) if spatial else 1 + 2 * (n_legs - n_d)
     products = distances = 0

@@ -9,6 +9,7 @@ from legcal.mechanism.bodies import Bodies
 from legcal.mechanism.leg import MOST_LEGS
 from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parameters import n_frame_legs
 from legcal.mechanism.proposal import any_joint
 from legcal.mechanism.schema import LegcalBlock, MechanismFile
 from legcal.mechanism.urdf import Urdf
@@ -89,11 +90,6 @@ def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
             "fixed to the platform of a planar mechanism, needed a revolute joint there; this "
             "machine cannot be calibrated this way."
         )
-
-
-def n_frame_legs(*, spatial: bool) -> int:
-    """Return N_d, the number of legs whose joints define a frame."""
-    return 3 if spatial else 2
 
 
 def legs_in_order(

@@ -6,13 +6,10 @@ from legcal.errors import ModelError, OutOfClass
 from legcal.mechanism.axes import CONCURRENT, PERPENDICULAR
 from legcal.mechanism.closing import leg_vectors, platform_pose, slider_columns
 from legcal.mechanism.equations import linearize
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg import LONGEST, SHORTEST, LegKind
 from legcal.mechanism.leg_geometry import Demand, geometry_of
-from legcal.mechanism.mobility import generic_configurations
+from legcal.mechanism.mobility import CONFIGURATIONS, generic_configurations
 from legcal.mechanism.model import Mechanism
-
-CONFIGURATIONS = 3
-LENGTHS = 1e-3, 20.0  # [m], of legs; others are written in another unit
 
 _FOUND = {
     Demand.BASE_AXIS: "its revolute axis at the base {0:.3g} deg from perpendicular to the leg",
@@ -97,7 +94,7 @@ def check_unit(mechanism: Mechanism) -> None:
     """
     lengths = np.linalg.norm(leg_vectors(mechanism, mechanism.home), axis=1)
     fixed = np.array([leg.platform_joint == "" for leg in mechanism.legs])
-    odd = np.flatnonzero(~fixed & ((lengths < LENGTHS[0]) | (lengths > LENGTHS[1])))
+    odd = np.flatnonzero(~fixed & ((lengths < SHORTEST) | (lengths > LONGEST)))
     if len(odd):
         raise ModelError(
             f"{mechanism.urdf_path}: the lengths could not be used: found leg "
@@ -106,7 +103,7 @@ def check_unit(mechanism: Mechanism) -> None:
         )
     for leg in mechanism.legs:
         reach = leg.travel[1] - leg.travel[0]
-        if leg.kind is LegKind.ACTUATED and reach > LENGTHS[1]:
+        if leg.kind is LegKind.ACTUATED and reach > LONGEST:
             raise ModelError(
                 f"{mechanism.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "

@@ -10,6 +10,7 @@ from legcal.geometry.types import Array
 JointLetter = Literal["R", "U", "S"]
 PlatformLetter = Literal["R", "U", "S", ""]
 
+SHORTEST, LONGEST = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
 MOST_LEGS = 32  # the work of all that is done with them grows with the cube of their number
 
 

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.mechanism.closing import CLOSED
 from legcal.mechanism.demands import leg_scale
 from legcal.mechanism.model import Mechanism
 
 RANK_TOLERANCE = 1e-7  # of the largest singular value, lengths and angles made comparable
 STEP = 0.05  # [rad], and of a leg length
-CLOSED = 1e-12  # [m], and [rad] for frames
 CONFIGURATIONS = 3
 
 

@@ -35,6 +35,11 @@ class KinematicParameters:
     offsets: Array
 
 
+def n_frame_legs(*, spatial: bool) -> int:
+    """Return N_d, the number of legs whose joints define a frame."""
+    return 3 if spatial else 2
+
+
 def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     """Return which joint coordinates are parameters and not zero by the frame's definition.
 

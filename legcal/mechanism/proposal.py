@@ -15,10 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from legcal.errors import OutOfClass
+from legcal.files.schema import is_plain_name
 from legcal.geometry.types import Array
 from legcal.mechanism.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.mechanism.chain import Closure
 from legcal.mechanism.leg_chain import LegChain
+from legcal.mechanism.parameters import n_frame_legs
 from legcal.mechanism.plane import plane_of_motion
 from legcal.mechanism.schema import LegcalBlock
 from legcal.mechanism.topology import find_chains
@@ -95,7 +97,7 @@ def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]
         where several span the same.
     """
     normals = plane_of_motion(chains)
-    count = 3 if normals is None else 2
+    count = n_frame_legs(spatial=normals is None)
     if len(names) <= count:
         return list(names)
     ends = (
@@ -192,7 +194,7 @@ def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: st
 def _leg_names(joints: Sequence[str]) -> list[str]:
     """Return names of legs made of the names of their joints where these tell them apart."""
     fronts = [joint.split("_")[0] for joint in joints]
-    if len(set(fronts)) == len(fronts) and all(fronts):
+    if len(set(fronts)) == len(fronts) and all(map(is_plain_name, fronts)):
         return fronts
     return [f"leg{j + 1}" for j in range(len(joints))]
 
