@@ -71,7 +71,17 @@ def test_a_home_beyond_reason_and_a_leg_without_a_name_are_refused(
     assert old in text
     path = tmp_path / "hexapod.yaml"
     path.write_text(text.replace(old, new))
-    with pytest.raises(ModelError, match=r"needed a number less than|needed printable"):
+    with pytest.raises(ModelError, match=r"needed a number less than|needed letters, digits"):
+        load_mechanism(path)
+
+
+@pytest.mark.parametrize("name", ["leg1,", "../xleg1", "leg 1", "a" * 101, "-leg"])
+def test_a_leg_whose_name_is_no_plain_one_is_refused_as_in_tables(
+    tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / "hexapod.yaml"
+    path.write_text(HEXAPOD.read_text().replace("leg2: leg2", f'"{name}": leg2'))
+    with pytest.raises(ModelError, match=r"legs.*, the first a letter or digit.*; rename it"):
         load_mechanism(path)
 
 

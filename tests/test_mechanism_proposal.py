@@ -12,6 +12,7 @@ from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
 from legcal.errors import OutOfClass
 from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.proposal import _leg_names
 
 LAYOUTS = {
     "hung from the base": Layout(),
@@ -83,3 +84,8 @@ def test_a_closed_chain_in_which_the_joint_at_A_moves_is_refused(tmp_path: Path)
     (tmp_path / "r.yaml").write_text("closed_loop: [[end, base]]\ntype: ['6d']\nname_mot: [j0]\n")
     with pytest.raises(OutOfClass, match="one closed chain in which no link is a platform on legs"):
         load_mechanism(tmp_path / "r.yaml")
+
+
+def test_legs_are_numbered_where_the_names_of_their_joints_give_no_plain_names() -> None:
+    assert _leg_names(["a_q", "b.1_q"]) == ["a", "b.1"]
+    assert _leg_names(["rig/a_q", "rig/b_q"]) == ["leg1", "leg2"]

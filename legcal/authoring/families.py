@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.authoring.assembled import across_leg
 from legcal.authoring.machine import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
 from legcal.authoring.table import in_metres
-from legcal.authoring.table_schema import plain_name
 from legcal.errors import UsageError
+from legcal.files.schema import plain_name
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import MOST_LEGS, LegKind
 

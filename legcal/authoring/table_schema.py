@@ -1,6 +1,5 @@
 """What a table may say, value by value: the schema of its keys."""
 
-import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,17 +11,6 @@ from legcal.files.motion import Quaternion, Vector
 from legcal.mechanism.leg import LegKind
 
 LARGEST = 1e9  # of any number, whatever its unit
-PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-
-
-def plain_name(name: object) -> object:
-    """Refuse a name that cannot be part of a file name and of joint names."""
-    if not isinstance(name, str) or not PLAIN.fullmatch(name):
-        raise ValueError(
-            f"found {schema.describe(name)}, needed letters, digits, '-', '_' and '.', the first a "
-            "letter or digit, at most 100 of them; rename it."
-        )
-    return name
 
 
 def _number(value: object) -> bool:
@@ -140,7 +128,6 @@ def _type(value: object) -> object:
     return value
 
 
-PlainName = Annotated[str, BeforeValidator(plain_name)]
 Points = Annotated[list[Any], BeforeValidator(_points)]
 Directions = Annotated[list[Any], BeforeValidator(_directions)]
 
@@ -157,11 +144,11 @@ class TableFile(schema.FileSchema):
     """A table in YAML. All lengths are in ``unit``; directions have no length."""
 
     legcal_table: Literal[1]
-    name: PlainName
+    name: schema.PlainName
     unit: Literal["m", "mm"]
     type: Annotated[str | None, BeforeValidator(_type)] = None
     types: list[Annotated[str, BeforeValidator(_type_of_leg)]] | None = None
-    legs: list[PlainName] | None = None
+    legs: list[schema.PlainName] | None = None
     base_joints: Points
     platform_joints: Points
     offsets: Annotated[Any, BeforeValidator(_numbers)] = None

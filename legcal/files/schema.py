@@ -10,13 +10,22 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
 
 from legcal.errors import DatasetError
 
 MAX_BYTES = 4_000_000
 MAX_NODES = 100_000  # aliases let a small file stand for a tree without bound
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 
 _NEEDED = {
     "float_type": "a number",
@@ -44,7 +53,23 @@ def _one_plain_line(name: str) -> str:
     return name
 
 
+def is_plain_name(name: object) -> bool:
+    """Say whether a name can be part of a file name, of joint names and of a list with commas."""
+    return isinstance(name, str) and _PLAIN.fullmatch(name) is not None
+
+
+def plain_name(name: object) -> object:
+    """Refuse a name that is not plain, see :func:`is_plain_name`."""
+    if not is_plain_name(name):
+        raise ValueError(
+            f"found {describe(name)}, needed letters, digits, '-', '_' and '.', the first a "
+            "letter or digit, at most 100 of them; rename it."
+        )
+    return name
+
+
 Name = Annotated[str, AfterValidator(_one_plain_line)]
+PlainName = Annotated[str, BeforeValidator(plain_name)]
 Number = Annotated[float, Strict()]  # true is not one, nor is text
 Metres = Annotated[Number, Field(gt=-1e6, lt=1e6)]  # squares of far larger ones overflow
 

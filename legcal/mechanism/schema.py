@@ -26,7 +26,7 @@ class LegcalBlock(schema.FileSchema):
     platform_joint: str | None = None
     base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
     home: MotionEntry | None = None
-    legs: Annotated[dict[schema.Name, str], Field(min_length=1)]
+    legs: Annotated[dict[schema.PlainName, str], Field(min_length=1)]
 
     @field_validator("base_frame")
     @classmethod
