@@ -45,8 +45,12 @@ def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) ->
     return Machine(tuple(legs), HOME)
 
 
-def planar(normal: tuple[float, float, float] = (0.0, 0.0, 1.0), n_legs: int = 3) -> Machine:
-    """Return a planar n-RPR whose legs stand at different heights."""
+def planar(
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    kinds: tuple[str, ...] = ("actuated",) * 3,
+) -> Machine:
+    """Return a planar machine of RPR and RR legs that stand at different heights."""
+    n_legs = len(kinds)
     n = np.array(normal) / np.linalg.norm(normal)
     turn = Rotation.align_vectors([n], [[0.0, 0.0, 1.0]])[0]
     angles = [200.0, 330.0, 95.0, 20.0][:n_legs]
@@ -59,8 +63,8 @@ def planar(normal: tuple[float, float, float] = (0.0, 0.0, 1.0), n_legs: int = 3
         turn.apply([0.03, 0.02, 0.0]), Rotation.from_rotvec(0.2 * n) * turn
     )
     legs = tuple(
-        LegSpec("RR", turn.apply(a), turn.apply(b), "actuated", n, n)
-        for a, b in zip(A, B, strict=True)
+        LegSpec("RR", turn.apply(a), turn.apply(b), kind, n, n)
+        for a, b, kind in zip(A, B, kinds, strict=True)
     )
     return Machine(legs, home, frame_legs=(0, 1), normal=n)
 
@@ -70,6 +74,7 @@ MACHINES: dict[str, Callable[[], Machine]] = {
     "6-SPS": lambda: of_types(["SS"] * 6),
     "3-RPR": planar,
     "3-RPR, tilted plane": lambda: planar((0.3, -0.5, 0.8)),
+    "2-RPR with a rod": lambda: planar(kinds=("actuated", "constant", "actuated")),
     "3-UPU": lambda: of_types(["UU"] * 3),
     "3-RPS": lambda: of_types(["RS"] * 3),
     "3-SPR": lambda: of_types(["SR"] * 3),

@@ -105,7 +105,7 @@ def test_every_layout_of_a_machine_gives_the_same_analysis(
     drawn, layout = MACHINES[machine](), LAYOUTS[name]
     mechanism = load_mechanism(write_machine(tmp_path, drawn, layout))
     _check(mechanism, drawn, layout)
-    freedoms = {"6": 6, "3": 3, "T": 3, "h": 5 if "rod" in machine else 6}
+    freedoms = {"6": 6, "3": 3, "2": 2, "T": 3, "h": 5 if "rod" in machine else 6}
     assert mechanism.mobility == freedoms[machine[0]]
 
 

@@ -214,7 +214,7 @@ def test_far_too_many_legs_are_refused_before_any_work(tmp_path: Path) -> None:
 
 
 def test_one_leg_in_a_plane_is_refused(tmp_path: Path) -> None:
-    path = write_machine(tmp_path, planar(n_legs=1), Layout())
+    path = write_machine(tmp_path, planar(kinds=("actuated",)), Layout())
     assert "found 1 leg in a plane, needed at least 2" in _refusal(path)
 
 

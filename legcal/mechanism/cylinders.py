@@ -3,7 +3,7 @@
 import io
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -23,8 +23,20 @@ COAXIAL = 1e-4  # [m], at both ends of a cylinder
 Half = tuple[Literal["base", "platform"], Array, Array]
 
 
+class VisualCylinder(NamedTuple):
+    """A visual cylinder of the file: its link, its pose there, radius and length [m]."""
+
+    link: str
+    T_link_cylinder: RigidTransform
+    radius: float
+    length: float
+
+
 def with_cylinders(
-    legs: Sequence[Leg], urdf: Urdf, bodies: Bodies, chains: Sequence[LegChain]
+    legs: Sequence[Leg],
+    shown: Sequence[VisualCylinder],
+    bodies: Bodies,
+    chains: Sequence[LegChain],
 ) -> tuple[Leg, ...]:
     """Return the legs with the visual cylinders that are coaxial with them.
 
@@ -35,24 +47,30 @@ def with_cylinders(
     ----------
     legs : sequence of Leg
         The legs, with their sign.
-    urdf : Urdf
-        The tree.
+    shown : sequence of VisualCylinder
+        The cylinders of the file.
     bodies : Bodies
-        Its rigid bodies.
+        The rigid bodies.
     chains : sequence of LegChain
         The joints of the legs.
     """
-    if not urdf.has_cylinders:
-        return tuple(legs)
-    shown = _visual_cylinders(urdf)
     return tuple(
         replace(leg, cylinders=_of_leg(leg, chain, bodies, shown))
         for leg, chain in zip(legs, chains, strict=True)
     )
 
 
-def _visual_cylinders(urdf: Urdf) -> list[tuple[str, RigidTransform, float, float]]:
-    """Return link, pose in the link, radius and length of every visual cylinder."""
+def ends_in_body(cylinder: VisualCylinder, bodies: Bodies) -> Array:
+    """Return both ends of a cylinder's axis in the body that it is on, (2, 3) [m]."""
+    T = bodies.T_body_link[cylinder.link] * cylinder.T_link_cylinder
+    half = np.array([0.0, 0.0, 0.5 * cylinder.length])
+    return np.asarray(T.apply(np.stack([-half, half])))
+
+
+def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
+    """Return the visual cylinders of a tree."""
+    if not urdf.has_cylinders:
+        return []
     from yourdfpy import URDF  # half a second: only where there is something to read
 
     robot: Any = URDF.load(
@@ -65,7 +83,8 @@ def _visual_cylinders(urdf: Urdf) -> list[tuple[str, RigidTransform, float, floa
             if cylinder is not None:
                 T = np.eye(4) if visual.origin is None else np.asarray(visual.origin)
                 pose = RigidTransform.from_matrix(T)
-                found.append((str(link.name), pose, float(cylinder.radius), float(cylinder.length)))
+                size = float(cylinder.radius), float(cylinder.length)
+                found.append(VisualCylinder(str(link.name), pose, *size))
     return found
 
 
@@ -96,21 +115,20 @@ def _of_leg(
     leg: Leg,
     chain: LegChain,
     bodies: Bodies,
-    shown: Sequence[tuple[str, RigidTransform, float, float]],
+    shown: Sequence[VisualCylinder],
 ) -> tuple[Cylinder, ...]:
     """Return the cylinders of one leg, in the order of the file."""
     halves = _halves(leg, chain)
     found = []
-    for link, T_link_cylinder, radius, length in shown:
-        if bodies.body_of[link] not in halves:
+    for cylinder in shown:
+        if bodies.body_of[cylinder.link] not in halves:
             continue
-        side, origin, u = halves[bodies.body_of[link]]
-        T = bodies.T_body_link[link] * T_link_cylinder
-        ends = T.apply(np.array([[0.0, 0.0, -0.5 * length], [0.0, 0.0, 0.5 * length]])) - origin
+        side, origin, u = halves[bodies.body_of[cylinder.link]]
+        ends = ends_in_body(cylinder, bodies) - origin
         along = ends @ u
         if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < COAXIAL:
             start, end = sorted(float(x) for x in along)
-            found.append(Cylinder(link, radius, side, start, end))
+            found.append(Cylinder(cylinder.link, cylinder.radius, side, start, end))
     return tuple(found)
 
 

@@ -14,7 +14,8 @@ from legcal.mechanism import agreement, virtual_joint
 from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
 from legcal.mechanism.consistency import check_across, check_equations, check_unit
-from legcal.mechanism.cylinders import with_cylinders
+from legcal.mechanism.cylinders import visual_cylinders, with_cylinders
+from legcal.mechanism.heights import at_visible_heights
 from legcal.mechanism.home import closed_home
 from legcal.mechanism.home_travel import check_home_travel
 from legcal.mechanism.leg_chain import LegChain
@@ -93,6 +94,9 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         normal = None if normals is None else np.asarray(turn.apply(normals[0]))
         virtual_joint.check_plane(virtual, normal, yaml_path)
     in_plane = None if normals is None else in_links(normals, ends)
+    shown = visual_cylinders(urdf)
+    if normals is not None:
+        chains = at_visible_heights(chains, shown, bodies)
     try:
         chain = ClosedChain(
             urdf.text, closures, normals_of_closures(in_plane, closures, block, urdf)
@@ -122,7 +126,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base=block.base,
         platform=block.platform,
         platform_joint=block.platform_joint,
-        legs=with_cylinders(legs, urdf, bodies, chains),
+        legs=with_cylinders(legs, shown, bodies, chains),
         frame_legs=tuple(names.index(name) for name in base_frame),
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
