@@ -319,6 +319,21 @@ def test_lengths_in_millimetres_are_refused(tmp_path: Path) -> None:
         load_mechanism(path)
 
 
+@pytest.mark.parametrize(("radius", "said"), [("1e11", "1e+14 mm"), ("0.25", "250 mm"),
+                                              ("1e-5", "0.01 mm")])  # fmt: skip
+def test_a_cylinder_too_thick_or_too_thin_for_its_leg_is_refused(
+    radius: str, said: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "hexapod.yaml"
+    path.write_text(SHIPPED_YAML.read_text().replace("../urdf/", ""))
+    text = SHIPPED_URDF.read_text().replace('radius="0.01"', f'radius="{radius}"', 1)
+    (tmp_path / "hexapod.urdf").write_text(text)
+    with pytest.raises(ModelError, match=r"<visual> cylinder of link 'leg\d_\w+'.*") as caught:
+        load_mechanism(path)
+    assert f"found a radius of {said} along leg" in str(caught.value)
+    assert "needed 0.0002 to 0.5 of the length" in str(caught.value)
+
+
 def test_travel_in_millimetres_is_refused(tmp_path: Path) -> None:
     machine = geometry()
     machine = Geometry(machine.A, machine.B, machine.q0, machine.home, (-5.0, 155.0))

@@ -5,9 +5,8 @@ import numpy as np
 from legcal.authoring.machine import Description, LegEntry
 from legcal.geometry.types import Array
 from legcal.mechanism.axes import PERPENDICULAR
-from legcal.mechanism.leg import LONGEST, SHORTEST, LegKind
+from legcal.mechanism.leg import LONGEST, SHORTEST, THICKEST, THINNEST, LegKind
 
-THICKEST, THINNEST = 0.5, 2e-4  # radius in leg lengths; beyond, its unit is
 ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
 
 

@@ -3,10 +3,11 @@
 import numpy as np
 
 from legcal.errors import ModelError, OutOfClass
+from legcal.geometry.types import Array
 from legcal.mechanism.axes import CONCURRENT, PERPENDICULAR
 from legcal.mechanism.closing import leg_vectors, platform_pose, slider_columns
 from legcal.mechanism.equations import linearize
-from legcal.mechanism.leg import LONGEST, SHORTEST, LegKind
+from legcal.mechanism.leg import LONGEST, SHORTEST, THICKEST, THINNEST, LegKind
 from legcal.mechanism.leg_geometry import Demand, geometry_of
 from legcal.mechanism.mobility import CONFIGURATIONS, generic_configurations
 from legcal.mechanism.model import Mechanism
@@ -90,7 +91,8 @@ def check_unit(mechanism: Mechanism) -> None:
     Raises
     ------
     ModelError
-        If one is longer than 20 m or shorter than 1 mm, or its motor moves further than 20 m.
+        If one is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or a
+        cylinder along it is thicker than half of it or thinner than 2e-4 of it.
     """
     lengths = np.linalg.norm(leg_vectors(mechanism, mechanism.home), axis=1)
     fixed = np.array([leg.platform_joint == "" for leg in mechanism.legs])
@@ -109,6 +111,20 @@ def check_unit(mechanism: Mechanism) -> None:
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
                 "limits of its slider in metres (are they millimetres?)."
             )
+    _check_radii(mechanism, np.where(fixed, lengths.max(), lengths))
+
+
+def _check_radii(mechanism: Mechanism, lengths: Array) -> None:
+    """Check that what a camera sees of each leg is no thicker and no thinner than a leg is."""
+    for leg, length in zip(mechanism.legs, lengths, strict=True):
+        for cylinder in leg.cylinders:
+            if not THINNEST < cylinder.radius / length < THICKEST:
+                raise ModelError(
+                    f"{mechanism.urdf_path}: the <visual> cylinder of link '{cylinder.link}' "
+                    f"could not be used: found a radius of {1e3 * cylinder.radius:.4g} mm along "
+                    f"leg '{leg.name}', which is {1e3 * length:.4g} mm long at home, needed "
+                    f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
+                )
 
 
 def _problem(demand: Demand, value: float) -> str | None:

@@ -11,6 +11,7 @@ JointLetter = Literal["R", "U", "S"]
 PlatformLetter = Literal["R", "U", "S", ""]
 
 SHORTEST, LONGEST = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
+THINNEST, THICKEST = 2e-4, 0.5  # radius of a leg in its length; beyond, its unit is the mistake
 MOST_LEGS = 32  # the work of all that is done with them grows with the cube of their number
 
 
