@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mechanisms import SHIPPED_URDF, SHIPPED_YAML
+from mechanisms import ROOT, SHIPPED_URDF, SHIPPED_YAML
 
 from legcal.errors import LegcalError, ModelError, OutOfClass
 from legcal.mechanism.load import load_mechanism
@@ -149,3 +149,22 @@ def test_an_unknown_name_lists_the_shipped_models(tmp_path: Path) -> None:
         load_mechanism("octopod")
     with pytest.raises(ModelError, match="found a folder"):
         load_mechanism(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["hexapod.yaml", "hexapod.csv"])
+def test_a_table_of_legs_is_no_model_and_says_how_to_make_one(name: str, tmp_path: Path) -> None:
+    table = tmp_path / name
+    table.write_text((ROOT / "models" / "tables" / "hexapod.yaml").read_text())
+    with pytest.raises(ModelError, match=r"found a (table|CSV).*: legcal new .* -o DIR") as caught:
+        load_mechanism(table)
+    assert str(table) in str(caught.value)
+    assert len(caught.value.problems) == 1
+
+
+@pytest.mark.parametrize("file", ["", "dataset.yaml"])
+def test_a_dataset_is_no_model_and_says_what_takes_one(file: str, tmp_path: Path) -> None:
+    (tmp_path / "dataset.yaml").write_text("model: hexapod\n")
+    with pytest.raises(ModelError, match="found a dataset, needed a model") as caught:
+        load_mechanism(tmp_path / file)
+    assert f"legcal identify {tmp_path}," in str(caught.value)
+    assert f"legcal calibrate {tmp_path} -o OUT" in str(caught.value)

@@ -13,7 +13,7 @@ from legcal.errors import DatasetError
 from legcal.files.inside import path_problem
 from legcal.files.schema import closest, describe, parse_yaml, read_text, validate
 from legcal.geometry.types import Image
-from legcal.mechanism.files import shipped_folders, shipped_names
+from legcal.mechanism.files import DATASET_YAML, shipped_folders, shipped_names
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements, View
@@ -23,7 +23,6 @@ from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import image_problem, read_image
 
-FILE_NAME = "dataset.yaml"
 OBSERVATIONS_NAME = "observations.csv"
 CACHE_NAME = ".legcal-cache.json"
 
@@ -192,12 +191,12 @@ def _dataset_file(given: Path) -> Path:
     path = (
         given
         if given.suffix in (".yaml", ".yml") and not os.path.isdir(given)
-        else given / FILE_NAME
+        else given / DATASET_YAML
     )
     if not os.path.isdir(path.parent):
         raise DatasetError(
             f"{given}: the dataset could not be read: found no such folder, needed a folder with a "
-            f"{FILE_NAME}; check the path."
+            f"{DATASET_YAML}; check the path."
         )
     if not os.path.exists(path):
         raise DatasetError(

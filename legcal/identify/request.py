@@ -11,10 +11,10 @@ from legcal.identify.analysis import (
     identifiability,
     identifiability_of_dataset,
 )
+from legcal.mechanism.files import DATASET_YAML
 from legcal.mechanism.load import load_mechanism
 
 _IMAGES = 15
-_DATASET = "dataset.yaml"
 
 
 def answer(source: str, views: Sequence[Sequence[str]], images: int | None) -> Identifiability:
@@ -36,7 +36,7 @@ def answer(source: str, views: Sequence[Sequence[str]], images: int | None) -> I
         If views or images are given for a dataset, or do not fit the model.
     """
     path = Path(source)
-    if not (path.name == _DATASET or (path / _DATASET).is_file()):
+    if not (path.name == DATASET_YAML or (path / DATASET_YAML).is_file()):
         return identifiability(load_mechanism(source), views, _IMAGES if images is None else images)
     if views or images is not None:
         option = "--view" if views else "--images"

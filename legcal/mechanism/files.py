@@ -9,6 +9,7 @@ from legcal.files import schema
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 FOLDER_YAML = "robot.yaml"  # as Gepetto names it
+DATASET_YAML = "dataset.yaml"
 
 
 def shipped_folders() -> tuple[Path, Path]:
@@ -48,17 +49,34 @@ def find_model(model: str | Path) -> Path:
     if os.path.isdir(path) and not is_shipped:
         if (path / FOLDER_YAML).is_file():
             return path / FOLDER_YAML
+        if (path / DATASET_YAML).is_file():
+            raise ModelError(what_a_dataset_is_for(path))
         raise ModelError(
             f"{path}: the mechanism could not be read: found a folder without {FOLDER_YAML}, "
             "needed a folder with it, or a YAML, URDF or MJCF file; give the file."
         )
     if os.path.exists(path) and not os.path.isdir(path):
+        if path.suffix.lower() == ".csv":
+            raise ModelError(
+                f"{path}: the mechanism could not be read: found a CSV file, needed a mechanism "
+                f"YAML, URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR"
+            )
         return path
     if is_shipped:
         return shipped_folders()[0] / f"{model}.yaml"
     raise ModelError(
         f"{path}: the mechanism could not be read: found no such file and no shipped model of that "
         f"name, needed a mechanism YAML, its URDF, or one of {', '.join(names)}; check the path."
+    )
+
+
+def what_a_dataset_is_for(path: Path) -> str:
+    """Return that a dataset is no model, and the commands that take one."""
+    folder = path.parent if path.name == DATASET_YAML else path
+    return (
+        f"{path}: the mechanism could not be read: found a dataset, needed a model; give the "
+        f"model that it names, or judge the dataset with: legcal identify {folder}, and calibrate "
+        f"it with: legcal calibrate {folder} -o OUT"
     )
 
 

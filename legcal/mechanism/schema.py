@@ -1,5 +1,6 @@
 """The mechanism YAML: five keys that Gepetto's ``robot.yaml`` shares, and the ``legcal`` block."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from legcal.errors import DatasetError, ModelError
 from legcal.files import schema
 from legcal.files.motion import MotionEntry
-from legcal.mechanism.files import read_file
+from legcal.mechanism.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
 WHAT = "mechanism file"
 
@@ -71,6 +72,7 @@ def read_mechanism_file(path: Path) -> MechanismFile:
     content = read_file(path, WHAT)
     try:
         found = schema.parse_yaml(content, path, WHAT)
+        _check_kind(found, path)
         file = schema.validate(MechanismFile, _without_nulls(found), path)
     except DatasetError as error:
         raise ModelError(error.problems) from error
@@ -78,6 +80,17 @@ def read_mechanism_file(path: Path) -> MechanismFile:
     if problems:
         raise ModelError(problems)
     return file
+
+
+def _check_kind(found: Mapping[str, Any], path: Path) -> None:
+    """Refuse the other YAML files that legcal reads, with the command for each."""
+    if "legcal_table" in found:
+        raise ModelError(
+            f"{path}: the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
+            f"model; write the model of the table with: legcal new {path} -o DIR"
+        )
+    if path.name == DATASET_YAML:
+        raise ModelError(what_a_dataset_is_for(path))
 
 
 def _without_nulls(found: dict[str, Any]) -> dict[str, Any]:
