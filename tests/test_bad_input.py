@@ -14,7 +14,7 @@ from dataset_folder import HEXAPOD, Folder, folder
 from legcal import cli
 from legcal.dataset.folder import load_dataset
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
-from legcal.files.schema import parse_yaml
+from legcal.files.schema import closest, parse_yaml
 from legcal.mechanism.load import load_mechanism
 from legcal.report.files import check_destination, result_folder
 
@@ -121,3 +121,11 @@ def test_a_failure_is_json_where_stdout_takes_it(monkeypatch: pytest.MonkeyPatch
         cli.main()
     assert stop.value.code == 2
     assert json.loads(out.getvalue())["error"]["kind"] == "ModelError"
+
+
+def test_a_hint_at_known_names_is_short() -> None:
+    names = [f"name{k}" for k in range(30)]
+    assert closest("name7", names) == "did you mean 'name7'?"
+    assert closest("zzz", names) == f"known are: {', '.join(names[:10])} and 20 more"
+    assert closest("zzz", names[:10]) == f"known are: {', '.join(names[:10])}"
+    assert closest("zzz", []) == "known are: none"

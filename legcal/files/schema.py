@@ -25,6 +25,7 @@ from legcal.errors import DatasetError
 
 MAX_BYTES = 4_000_000
 MAX_NODES = 100_000  # aliases let a small file stand for a tree without bound
+_MOST_NAMES = 10  # that a hint lists
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 
 _NEEDED = {
@@ -252,10 +253,15 @@ def describe(value: object) -> str:
 
 
 def closest(word: str, known: Iterable[str]) -> str:
-    """Return a hint at the known word most like a given one, or the known words."""
+    """Return a hint at the known word most like a given one, or the known words, ten at most."""
     names = list(known)
     near = difflib.get_close_matches(word, names, n=1)
-    return f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(names) or 'none'}"
+    if near:
+        return f"did you mean '{near[0]}'?"
+    more = len(names) - _MOST_NAMES
+    shown = names[:_MOST_NAMES]
+    rest = f" and {more} more" if more > 0 else ""
+    return f"known are: {', '.join(shown) or 'none'}{rest}"
 
 
 def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: str) -> str:
