@@ -222,7 +222,7 @@ def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
     text = mechanism.urdf_path.read_text()
     text = re.sub(r'(<link name="leg1_\w+">)<visual>.*</visual>', r"\1", text)
     mechanism.urdf_path.write_text(text)
-    hidden, singular = legcal.identifiability(
+    *_, hidden, singular = legcal.identifiability(
         legcal.load_mechanism(mechanism.yaml_path), [mechanism.leg_names]
     ).notes
     assert hidden.startswith("The model has no <visual> cylinder along leg 1:")

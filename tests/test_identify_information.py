@@ -44,6 +44,8 @@ def random_session(seed: int, n_legs: int = 4, n_views: int = 2) -> Session:
         radius=rng.uniform(0.01, 0.05, n_legs),
         R=R[None],
         t=t[None],
+        R_reached=R[None],
+        t_reached=t[None],
         view=np.arange(n_views),
         pose=np.zeros(n_views, dtype=np.intp),
         seen=rng.random((n_views, n_legs)) < 0.7,
@@ -156,13 +158,15 @@ def test_elimination_keeps_what_is_said_whatever_the_own_unknowns_do(
 ) -> None:
     """Against projection on what the own unknowns cannot explain."""
     rng = np.random.default_rng(seed)
-    own = rng.normal(size=(3, rows, rank)) @ rng.normal(size=(3, rank, 4))
+    left = np.linalg.qr(rng.normal(size=(3, rows, min(rows, rank))))[0]
+    right = np.linalg.qr(rng.normal(size=(3, 4, min(rows, rank))))[0]
+    own = left * rng.uniform(0.5, 2.0, left.shape[2]) @ np.swapaxes(right, 1, 2)
     shared = rng.normal(size=(3, rows, 5))
     found = eliminate(np.concatenate([own, shared], axis=2), 4)
     expected = np.zeros((5, 5))
     for N, J in zip(own, shared, strict=True):
-        left = J - N @ np.linalg.pinv(N, rcond=1e-10) @ J
-        expected += left.T @ left
+        rest = J - N @ np.linalg.pinv(N, rcond=1e-10) @ J
+        expected += rest.T @ rest
     np.testing.assert_allclose(found.T @ found, expected, atol=1e-9)
     upper = compress(found)
     np.testing.assert_allclose(upper.T @ upper, expected, atol=1e-9)

@@ -155,6 +155,13 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
     assert sum(s.of for s in found.steps[2:] if s.criteria == "default") == found.full.of
 
 
+def test_what_moves_the_platform_is_judged_at_more_poses_than_one_image_shows() -> None:
+    mechanism = model("hexapod")
+    found = identifiability(mechanism, [mechanism.leg_names], images=1)
+    assert not found.identifiable
+    assert not any(direction.harmless for direction in found.full.weak)
+
+
 def test_fewer_camera_positions_have_to_show_more_legs_of_a_hexapod() -> None:
     found = identifiability(model("hexapod"))
     assert found.recommendation is not None

@@ -190,10 +190,13 @@ def _judge(
     enough = staged.complete and full.complete
     notes = []
     if analysis.motion.why_not:
-        notes.append(
-            f"Platform errors are not predicted: {len(mechanism.motors)} motors do not determine "
-            f"the pose of a platform with mobility {mechanism.mobility}."
-        )
+        why = "the machine is singular at poses inside its travel"
+        if not mechanism.is_determined:
+            why = (
+                f"{len(mechanism.motors)} motors do not determine the pose of a platform with "
+                f"mobility {mechanism.mobility}"
+            )
+        notes.append(f"Platform errors are not predicted: {why}.")
     notes += _machine_notes(mechanism)
     return Identifiability(
         spatial=mechanism.spatial,

@@ -26,6 +26,7 @@ from legcal.mechanism.parametrization import (
 SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
 _PERTURBATION = 1e-6  # of the mean leg length, and [rad]
+REACHED = 20  # poses, at least, over which errors of the platform are judged
 THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg length
 
 
@@ -52,8 +53,9 @@ def planned_session(
     home = mechanism.T_base_Rb.inv() * mechanism.home * mechanism.T_platform_Re
     legs, length, rng = machine_near(mechanism, home)
     A, B = joints_at(legs, home)
+    n_poses = images * len(views)
     R, t = random_poses(
-        legs, mechanism.frame_legs, home, travel_of(mechanism), images * max(len(views), 1), rng
+        legs, mechanism.frame_legs, home, travel_of(mechanism), max(n_poses, REACHED), rng
     )
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
@@ -64,10 +66,12 @@ def planned_session(
         frame_legs=mechanism.frame_legs,
         parametrization=parametrization_of(mechanism),
         radius=radii(mechanism.legs, length),
-        R=R,
-        t=t,
+        R=R[:n_poses],
+        t=t[:n_poses],
+        R_reached=R,
+        t_reached=t,
         view=np.repeat(np.arange(len(views)), images),
-        pose=np.arange(images * len(views)),
+        pose=np.arange(n_poses),
         seen=seen,
         camera=default_cameras(A, B, views, mechanism.spatial, rng),
         focal=np.full(len(views), FOCAL_PX),

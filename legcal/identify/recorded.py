@@ -7,7 +7,7 @@ import numpy as np
 from legcal.dataset.folder import Dataset
 from legcal.geometry.types import Array
 from legcal.identify.cameras import default_cameras
-from legcal.identify.planned import joints_at, machine_near, radii, travel_of
+from legcal.identify.planned import REACHED, joints_at, machine_near, radii, travel_of
 from legcal.identify.poses import random_poses
 from legcal.identify.session import Session
 from legcal.mechanism.kinematics import forward_kinematics_many
@@ -40,6 +40,13 @@ def recorded_session(dataset: Dataset) -> Session:
     else:
         travel = travel_of(mechanism)
         R, t = random_poses(legs, mechanism.frame_legs, home, travel, m.n_poses, rng)
+    parametrization = parametrization_of(mechanism)
+    R_reached, t_reached = R, t
+    if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
+        more = random_poses(
+            legs, mechanism.frame_legs, home, travel_of(mechanism), REACHED - len(t), rng
+        )
+        R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
     seen = np.array(
@@ -55,10 +62,12 @@ def recorded_session(dataset: Dataset) -> Session:
         leg_names=mechanism.leg_names,
         legs=legs,
         frame_legs=mechanism.frame_legs,
-        parametrization=parametrization_of(mechanism),
+        parametrization=parametrization,
         radius=radii(mechanism.legs, length),
         R=R,
         t=t,
+        R_reached=R_reached,
+        t_reached=t_reached,
         view=np.searchsorted(used, m.view),
         pose=m.pose,
         seen=seen,

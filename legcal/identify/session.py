@@ -34,6 +34,8 @@ class Session:
         Radius of the cylinder that is seen of each leg [m].
     R, t : (k, 3, 3) and (k, 3) array
         Platform poses: rotation and position [m] of R_e in R_b.
+    R_reached, t_reached : (w, 3, 3) and (w, 3) array
+        Poses over which errors of the platform are judged: those above, and more if they are few.
     view, pose : (n_images,) array of int
         The view and the pose of each image.
     seen : (n_views, n_legs) array of bool
@@ -53,6 +55,8 @@ class Session:
     radius: Array
     R: Array
     t: Array
+    R_reached: Array
+    t_reached: Array
     view: IntArray
     pose: IntArray
     seen: BoolArray

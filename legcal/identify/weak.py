@@ -87,7 +87,7 @@ class Ranks:
 
 
 class PlatformMotion:
-    """How the platform moves with the parameters, over the poses of a session."""
+    """How the platform moves with the parameters, over the poses that a session reaches."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -95,7 +95,11 @@ class PlatformMotion:
         self.why_not = ""
         try:
             moved = pose_sensitivity(
-                session.legs, session.parametrization, session.frame_legs, session.R, session.t
+                session.legs,
+                session.parametrization,
+                session.frame_legs,
+                session.R_reached,
+                session.t_reached,
             )
         except NotIdentifiable as error:
             self.why_not = str(error)
