@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layouts import Layout, write_machine
-from machines import MACHINES, of_types
+from machines import MACHINES, of_types, ring
 
 import legcal
 from legcal.errors import DidNotConverge
 from legcal.identify.cameras import default_cameras
 from legcal.identify.planned import planned_session
-from legcal.identify.poses import random_poses
+from legcal.identify.poses import _Closing, random_poses
 from legcal.mechanism.equations import linearize
 from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import Demand
+from legcal.mechanism.leg_geometry import Demand, LegGeometry
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries
 
@@ -77,6 +77,19 @@ def test_more_motors_than_freedoms_are_followed(tmp_path: Path) -> None:
     assert (mechanism.mobility, len(mechanism.motors)) == (6, 7)
     found = legcal.identifiability(mechanism, [mechanism.leg_names] * 2)
     assert (found.full.rank, found.full.of) == (37, 37)
+
+
+def test_the_motors_that_draw_their_lengths_stand_far_from_each_other() -> None:
+    angles = [15.0 * j for j in range(24)]
+    A, B = ring(angles, 0.3), ring([a + 30.0 * (-1) ** j for j, a in enumerate(angles)], 0.15)
+    legs = [LegGeometry("S", "S", LegKind.ACTUATED, a, b, 0.0) for a, b in zip(A, B, strict=True)]
+    closing = _Closing(legs, (0, 8, 16))
+    R, t = np.eye(3)[None], np.array([[0.0, 0.0, 0.4]])
+    lengths = closing.lengths(R, t)
+    all_of_them = np.linalg.cond(closing.system(R, t, lengths)[1][0])
+    closing.drive(R, t)
+    assert len(closing.driven) == 6
+    assert np.linalg.cond(closing.system(R, t, lengths)[1][0]) < 2.0 * all_of_them
 
 
 def test_a_machine_that_cannot_reach_its_travel_is_refused() -> None:

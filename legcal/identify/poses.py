@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.equations import linearize
+from legcal.mechanism.equations import demanded
 from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import Demand, LegGeometry
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.sensitivity import freedoms
 
 _STEPS = 5  # from home to a pose, so that no pose jumps to another assembly mode
@@ -102,15 +103,21 @@ class _Closing:
         self.driven = {j for j, leg in enumerate(legs) if leg.kind is LegKind.ACTUATED}
 
     def drive(self, R: Array, t: Array) -> None:
-        """Let only motors that are independent at a pose draw their lengths; others follow."""
-        everyone, self.driven = sorted(self.driven), set()
-        rank = self.rank(R, t)
-        for j in everyone:
-            self.driven.add(j)
-            if self.rank(R, t) == rank:
-                self.driven.remove(j)
-            else:
-                rank += 1
+        """Let only motors that are independent at a pose draw their lengths; others follow.
+
+        Those are taken that say most beside each other, of what the other demands leave open.
+        """
+        motors, rank = sorted(self.driven), self.rank(R, t)
+        self.driven = set()
+        count = rank - self.rank(R, t)
+        if count < len(motors):
+            size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
+            rows = [demanded(self.legs[j], R, t).by_pose[0, 0, self.columns] for j in motors]
+            held = self.system(R, t, None)[1][0] / size
+            left = np.eye(len(size)) - np.linalg.pinv(held, rcond=_RANK) @ held
+            order = qr((np.array(rows) / size @ left).T, mode="r", pivoting=True)[1]
+            motors = [motors[k] for k in order[:count]]
+        self.driven = set(motors)
 
     def rank(self, R: Array, t: Array) -> int:
         """Return the number of independent equations at a pose."""
@@ -127,19 +134,14 @@ class _Closing:
         """Return residuals (k, m), derivatives (k, m, f); without lengths motors are free."""
         values, slopes = [np.zeros((len(t), 0))], [np.zeros((len(t), 0, 6))]
         for j, leg in enumerate(self.legs):
-            found = linearize(leg, R, t)
-            length = found.values[:, :1] + leg.q0
-            for i, demand in enumerate(found.demands):
-                value, slope = found.values[:, i : i + 1], found.by_pose[:, i : i + 1]
-                if demand is not Demand.LENGTH:
-                    values.append(value * length)
-                    slopes.append(slope * length[..., None])
-                elif leg.kind is LegKind.CONSTANT:
-                    values.append(value)
-                    slopes.append(slope)
-                elif j in self.driven and wanted is not None:
-                    values.append(length - wanted[:, j : j + 1])
-                    slopes.append(slope)
+            found = demanded(leg, R, t)
+            value, slope = found.values, found.by_pose
+            if leg.kind is LegKind.ACTUATED and j in self.driven and wanted is not None:
+                value[:, 0] += leg.q0 - wanted[:, j]
+            elif leg.kind is LegKind.ACTUATED:
+                value, slope = value[:, 1:], slope[:, 1:]
+            values.append(value)
+            slopes.append(slope)
         return np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)[:, :, self.columns]
 
     def close(
