@@ -7,6 +7,7 @@ from mechanism_formats import mjcf, write_format
 
 from legcal import load_mechanism
 from legcal.errors import LegcalError, ModelError, OutOfClass
+from legcal.mechanism.sources.read import read_source
 
 HEXAPOD = load_mechanism("hexapod")
 MJCF = mjcf(HEXAPOD, "bodies")
@@ -101,6 +102,17 @@ def test_mjcf_without_closures_is_no_parallel_mechanism(tmp_path: Path) -> None:
     assert "an MJCF file without <connect> or <weld>" in _problems(path, OutOfClass)[0]
     path.write_text(MJCF.replace("<connect ", '<connect active="false" '))
     assert "without <connect> or <weld>" in _problems(path, OutOfClass)[0]
+
+
+def test_messages_name_what_the_format_has(tmp_path: Path) -> None:
+    between = '<connect body1="leg1_end" body2="leg2_tube"'
+    old = '<connect body1="leg1_end" body2="leg1_seat"'
+    (problem,) = _mjcf_problems(tmp_path, old, between, kind=OutOfClass)
+    assert problem.endswith("; check <equality> and that the root is the base.")
+    source = read_source(write_format(HEXAPOD, "gepetto", tmp_path / "gepetto"))
+    for key in ("write legcal.home.", "correct legcal.base or legcal.platform."):
+        assert "add a block legcal with" in source.in_its_words(key)
+    assert read_source("hexapod").in_its_words("write legcal.home.") == "write legcal.home."
 
 
 def test_two_mechanisms_in_one_file_are_refused(tmp_path: Path) -> None:

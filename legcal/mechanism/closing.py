@@ -69,14 +69,18 @@ def close_at(
 
 
 def close_near(
-    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None = None
+    mechanism: Mechanism,
+    T_base_platform: RigidTransform,
+    start: Array | None = None,
+    restarts: int = RESTARTS,
 ) -> Array:
     """Return the closed configuration nearest to a pose that meets the demands but for rounding.
 
     Parameters, exceptions and result are those of :func:`close_at`, but the platform is let go
-    at the end: it moves by what the axes of the model are off, or not at all.
+    at the end: it moves by what the axes of the model are off, or not at all. ``restarts`` is how
+    often legs that do not close start from other angles.
     """
-    configuration, residual = _posture(mechanism, T_base_platform, start, NEAR)
+    configuration, residual = _posture(mechanism, T_base_platform, start, NEAR, restarts)
     if np.abs(residual).max(initial=0.0) >= CLOSED:
         everything = np.ones(mechanism.chain.nv, dtype=np.bool_)
         configuration, residual = _levenberg_marquardt(
@@ -111,7 +115,11 @@ def slider_columns(mechanism: Mechanism, legs: tuple[int, ...]) -> tuple[list[in
 
 
 def _posture(
-    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None, astray: float
+    mechanism: Mechanism,
+    T_base_platform: RigidTransform,
+    start: Array | None,
+    astray: float,
+    restarts: int = RESTARTS,
 ) -> tuple[Array, Array]:
     """Return joint angles of all legs with the platform held and sliders set, and what is open.
 
@@ -124,7 +132,7 @@ def _posture(
     held = partial(_equations, mechanism, T_base_platform, min(1.0, float(lengths.mean())))
     rng = np.random.default_rng(20020701)
     residual = np.zeros(0)
-    for _ in range(RESTARTS):
+    for _ in range(restarts):
         configuration, residual = _levenberg_marquardt(mechanism, held, configuration, free)
         if np.abs(residual).max(initial=0.0) < NEAR:
             break
@@ -147,18 +155,28 @@ def _check(
     off = _off(mechanism, T_base_platform, configuration)
     if np.abs(residual).max(initial=0.0) >= CLOSED:
         problem = f"{worst_closure(mechanism, residual)}, needed less than 1e-12 m"
-    elif off > astray:
-        problem = f"the platform went {off:.3g} (m or rad) away, needed a pose that the legs allow"
+    elif max(off) > astray:
+        problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
     else:
         return
     raise _not_closed(mechanism, T_base_platform, problem)
 
 
-def _off(mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array) -> float:
-    """Return how far the platform is from where it should be [m or rad]."""
+def _off(
+    mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array
+) -> tuple[float, float]:
+    """Return how far the platform is from where it should be [m], and how far turned [rad]."""
     R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
     matrix = T_base_platform.as_matrix()
-    return float(max(np.abs(R - matrix[:3, :3]).max(), np.abs(t - matrix[:3, 3]).max()))
+    chord = float(np.linalg.norm(R - matrix[:3, :3]))  # of small turns as good as of large ones
+    turn = 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
+    return float(np.linalg.norm(t - matrix[:3, 3])), turn
+
+
+def _away(off: tuple[float, float]) -> str:
+    """Return a distance and a turn in words, without the one that is rounding beside the other."""
+    said = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
+    return " and ".join(text for text, x in zip(said, off, strict=True) if x > 1e-6 * max(off))
 
 
 def _not_closed(
@@ -187,12 +205,12 @@ def _placed(
             T_base_platform,
         )
         off = _off(mechanism, T_base_platform, configuration)
-        if off > astray:
+        if max(off) > astray:
             raise _not_closed(
                 mechanism,
                 T_base_platform,
-                f"the virtual joint '{mechanism.platform_joint}' leaves it {off:.3g} (m or rad) "
-                "away, needed a joint that reaches it",
+                f"the virtual joint '{mechanism.platform_joint}' leaves it {_away(off)} away, "
+                "needed a joint that reaches it",
             )
     q = readings_at(mechanism, T_base_platform)
     sliding = tuple(j for j, leg in enumerate(mechanism.legs) if leg.prismatic is not None)

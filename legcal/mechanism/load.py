@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import ModelError
+from legcal.errors import LegcalError, ModelError
 from legcal.files.motion import MotionEntry
 from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism import agreement, virtual_joint
@@ -49,6 +49,15 @@ def load_mechanism(model: str | Path) -> Mechanism:
         If the mechanism is not one that the method covers.
     """
     source = read_source(model)
+    try:
+        return _load(source)
+    except LegcalError as error:
+        said = [source.in_its_words(problem) for problem in error.problems]
+        raise type(error)(said) from error
+
+
+def _load(source: Source) -> Mechanism:
+    """Return the mechanism of a source."""
     file, urdf = source.file, source.urdf
     agreement.check_names(file, urdf, source.path)
     pairs = sorted(zip(file.closed_loop, file.type, strict=True))  # sums depend on their order
@@ -71,7 +80,7 @@ def load_mechanism(model: str | Path) -> Mechanism:
     mechanism = replace(mechanism, mobility=mobility(mechanism))
     check_equations(mechanism)
     proposed = proposal_notes(file.legcal, mechanism)
-    found = diagnose(mechanism, home_is_given=block.home is not None)
+    found = map(source.in_its_words, diagnose(mechanism, home_is_given=block.home is not None))
     return replace(mechanism, diagnostics=(*source.notes, *proposed, *found))
 
 

@@ -206,12 +206,13 @@ def check_closes(mechanism: Mechanism) -> None:
     """
     found = forward_kinematics(mechanism, inverse_kinematics(mechanism, mechanism.home))
     away = mechanism.home.inv() * found
-    off = max(float(np.linalg.norm(away.translation)), float(away.rotation.magnitude()))
-    if not off <= CLOSES:
+    shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
+    if not max(shift, turn) <= CLOSES:
         raise DidNotConverge(
-            f"{mechanism.yaml_path}: the mechanism does not close at home: found a pose {off:.2g} "
-            f"m or rad away from it at its own readings, needed at most {CLOSES:.0e}; check "
-            "legcal.home."
+            f"{mechanism.yaml_path}: the mechanism does not close at home: found a pose "
+            f"{1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it at its own "
+            f"readings, needed at most {1e3 * CLOSES:.0e} mm and {np.degrees(CLOSES):.0e} deg; "
+            "check legcal.home."
         )
 
 

@@ -12,6 +12,18 @@ from legcal.mechanism.sources.source import Source
 from legcal.mechanism.sources.stand_ins import check_stand_ins, replace_stand_ins
 from legcal.mechanism.urdf import Urdf, parse_urdf, read_urdf
 
+_NO_BLOCK = (
+    ("legcal.home could not be used", "the pose that the file draws could not be used"),
+    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("write legcal.home", "add a block legcal with home"),
+    ("correct legcal.home", "add a block legcal with another home"),
+    ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
+    ("correct legcal.base or legcal.platform", "add a block legcal with another base or platform"),
+    (", legcal.base and legcal.platform", ", or add a block legcal with another base and platform"),
+    ("write legcal.base, legcal.platform and legcal.legs",
+     "add a block legcal with base, platform and legs"),
+)  # fmt: skip
+
 
 def read_yaml_source(path: Path) -> Source:
     """Return a mechanism from its YAML and the URDF that it names.
@@ -30,7 +42,7 @@ def read_yaml_source(path: Path) -> Source:
     )
     check_stand_ins(file, urdf, path)
     if not file.joint_name:
-        return Source(path, file, urdf)
+        return Source(path, file, urdf, words=_NO_BLOCK if block is None else ())
     return _converted(path, file, urdf)
 
 
@@ -54,4 +66,5 @@ def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
                 "for another joint (joint_name), needed another joint of that leg; name its "
                 "prismatic joint."
             )
-    return Source(path, file.model_copy(update=changes), completed, True)
+    words = _NO_BLOCK if file.legcal is None else ()
+    return Source(path, file.model_copy(update=changes), completed, True, words=words)

@@ -20,12 +20,13 @@ from legcal.mechanism.sources.loops import Loop, LoopKind, close_loop
 from legcal.mechanism.sources.mjcf_bodies import read_bodies
 from legcal.mechanism.sources.mjcf_tree import WORLD, MjcfTree
 from legcal.mechanism.sources.mjcf_values import Values, own_attributes
-from legcal.mechanism.sources.source import Source
+from legcal.mechanism.sources.source import DRAWING, Source
 from legcal.mechanism.urdf import Urdf, parse_urdf
 from legcal.mechanism.urdf_checks import Problems
 
 MOST_PARTS = 5000
 _COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
+_WORDS = (("closed_loop", "<equality>"), ("the root of the URDF", "<worldbody>"), *DRAWING)
 _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
 
 
@@ -66,7 +67,8 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     left_out = f"Free bodies that touch no loop were left out: {', '.join(dropped)}."
     values_there = {name: x for name, x in tree.references.items() if name in urdf.joints}
     file = MechanismFile(closed_loop=frames, type=[kind for _, kind in pairs], name_mot=motors)
-    return Source(path, file, urdf, True, (left_out,) * bool(dropped), values_there)
+    notes = (left_out,) * bool(dropped)
+    return Source(path, file, urdf, True, notes, values_there, words=_WORDS)
 
 
 def closing_joints(root: etree._Element, tree: MjcfTree) -> Iterator[Loop]:

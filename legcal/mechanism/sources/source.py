@@ -1,6 +1,6 @@
 """What every format of mechanism is read as: a tree, the closures that close it, its motors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,6 +8,15 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.urdf import Urdf
+
+DRAWING = (
+    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("write legcal.home", "draw the machine nearer to closed"),
+    ("legcal.home", "the pose that the file draws"),
+    (", legcal.base and legcal.platform", " and that the root is the base"),
+    ("legcal.base or legcal.platform", "the joints between them"),
+    ("write legcal.", "write a mechanism YAML with legcal."),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,3 +50,10 @@ class Source:
     notes: tuple[str, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
     poses: Mapping[str, RigidTransform] | None = None
+    words: Sequence[tuple[str, str]] = ()
+
+    def in_its_words(self, problem: str) -> str:
+        """Return a message that names keys of the YAML in the words of this format."""
+        for key, word in self.words:
+            problem = problem.replace(key, word)
+        return problem

@@ -18,7 +18,7 @@ from legcal.mechanism.robot_xml import parse_robot
 from legcal.mechanism.schema import MechanismFile
 from legcal.mechanism.sources.loops import Loop, LoopKind, close_loop
 from legcal.mechanism.sources.reference import reference_poses
-from legcal.mechanism.sources.source import Source
+from legcal.mechanism.sources.source import DRAWING, Source
 from legcal.mechanism.sources.tree_text import TreeText
 from legcal.mechanism.urdf import LOOP_TAGS, Urdf, checked_tree, parse_urdf
 from legcal.mechanism.urdf_checks import Problems, number_list
@@ -29,6 +29,7 @@ KINDS: dict[str, LoopKind] = {
     **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
     "universal": "universal",
 }
+_WORDS = (("closed_loop", "<loop_joint> or <constraint>"), *DRAWING)
 
 
 def has_loops(robot: etree._Element) -> bool:
@@ -69,7 +70,8 @@ def read_loop_source(path: Path, content: bytes) -> Source:
         type=[kind for _, kind in pairs],
         name_mot=motors,
     )
-    return Source(path, file, parse_urdf(path, written, travel_needed=False), True, tuple(notes))
+    urdf = parse_urdf(path, written, travel_needed=False)
+    return Source(path, file, urdf, True, tuple(notes), words=_WORDS)
 
 
 def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
