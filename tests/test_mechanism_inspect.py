@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,25 @@ def test_motors_that_are_too_many_or_hold_nothing_are_noted(
     told = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
     assert len(told) == len(notes)
     assert all(note in text for note, text in zip(notes, told, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("hidden", "note"),
+    [
+        ("1", "leg 'leg1' has no <visual> cylinder along its axis: it cannot be seen"),
+        ("[1-3]", "legs leg1, leg2, leg3 have no <visual> cylinder along their axes: they cannot"),
+    ],
+)
+def test_legs_that_cannot_be_seen_are_told_in_one_note(
+    tmp_path: Path, hidden: str, note: str
+) -> None:
+    asked = Family("3-RPS", "mm", 300.0, 150.0, 400.0)
+    mechanism = create_model(describe_family(asked), tmp_path).mechanism
+    text = mechanism.urdf_path.read_text()
+    text = re.sub(rf'(<link name="leg{hidden}_\w+">)<visual>.*</visual>', r"\1", text)
+    mechanism.urdf_path.write_text(text)
+    (found,) = describe(load_mechanism(mechanism.yaml_path))["diagnostics"]
+    assert found.startswith(note)
 
 
 def test_the_table_shows_axes_and_twists_where_they_are_parameters() -> None:

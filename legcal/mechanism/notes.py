@@ -28,12 +28,7 @@ def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
                 f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
                 f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
             )
-        if not leg.cylinders:
-            notes.append(
-                f"leg '{leg.name}' has no <visual> cylinder along its axis: it cannot be seen in "
-                "images; add one with its radius."
-            )
-    return (*notes, *_motor_notes(mechanism), *_spin_notes(mechanism))
+    return (*notes, *_unseen_notes(mechanism), *_motor_notes(mechanism), *_spin_notes(mechanism))
 
 
 def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[str, ...]:
@@ -65,6 +60,19 @@ def singular_note(mechanism: Mechanism) -> str | None:
         f"(singularity measure {measure:.1g}, needed above {REGULAR:g}); correct legcal.home, or "
         "the joints if they make similar figures on base and platform."
     )
+
+
+def _unseen_notes(mechanism: Mechanism) -> list[str]:
+    """Return which legs show no cylinder."""
+    unseen = [leg.name for leg in mechanism.legs if not leg.cylinders]
+    if not unseen:
+        return []
+    if len(unseen) == 1:
+        who, add = f"leg '{unseen[0]}' has no <visual> cylinder along its axis: it", "add one"
+    else:
+        who = f"legs {', '.join(unseen)} have no <visual> cylinder along their axes: they"
+        add = "add one to each"
+    return [f"{who} cannot be seen in images; {add} with its radius."]
 
 
 def _motor_notes(mechanism: Mechanism) -> list[str]:
