@@ -54,6 +54,10 @@ def _mjcf_problems(
         (CONNECT, '<connect site1="a" site2="b"/>', "names the site 'a' as site1, which is not"),
         (CONNECT, CONNECT + '<joint joint1="leg1_prismatic" joint2="leg2_prismatic"/>',
          "couples <joint> coordinates, which is not followed"),
+        (CONNECT, CONNECT + '<conect body1="leg1_end"/>', "no constraint that legcal knows"),
+        ("<worldbody>", '<worldbody><bdy name="x"/>', "is no element of a body"),
+        ("<worldbody>", '<worldbody><geom type="cilinder"/>', "type 'cilinder', needed one of pla"),
+        (MOTOR, MOTOR + "<motor/>", "names no joint; name the slide"),
         (MOTOR, '<position joint="leg1"/>', "names the joint 'leg1', which is not in the file"),
         (MOTOR, '<motor tendon="t"/>', "drives by tendon, which is no joint with a reading"),
         (MOTOR, '<motor joint="platform_free"/>', "measures the free joint 'platform_free'"),
@@ -147,6 +151,14 @@ def test_free_bodies_lights_and_meshes_of_a_scene_are_left_out(tmp_path: Path) -
     assert mechanism.n_legs == 6
     assert any("Free bodies that touch no loop were left out: 'ball'" in note
                for note in mechanism.diagnostics)  # fmt: skip
+
+
+def test_what_moves_no_joint_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "machine.xml"
+    more = '<worldbody><camera name="c"/><light/><geom type="box" size="1 1 1"/><!-- x -->'
+    text = MJCF.replace("<worldbody>", more)
+    path.write_text(text.replace(MOTOR, f'{MOTOR}<adhesion body="platform"/>'))
+    assert load_mechanism(path).leg_names == HEXAPOD.leg_names
 
 
 def test_slides_without_a_range_are_noted(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """A mechanism as MuJoCo's MJCF writes it: bodies with joints, closed by equality constraints.
 
 ``<connect>`` makes a ``3d`` closure and ``<weld>`` a ``6d`` one; actuators and ``<jointpos>``
-sensors on slides tell the motors. What only a simulation needs is left alone.
+sensors on slides tell the motors. What only a simulation needs is left alone: cameras, lights,
+inertias, plugins, adhesion, and geoms other than cylinders and capsules. An element of a body, a
+constraint or a geom type that MJCF does not have is refused, since it may be a misspelt one.
 """
 
 from collections.abc import Iterator
@@ -82,6 +84,11 @@ def closing_joints(root: etree._Element, tree: MjcfTree) -> Iterator[Loop]:
         if element.tag in _COUPLINGS:
             problems.add(
                 element, f"couples <{element.tag}> coordinates, which is not followed",
+                "close loops with <connect> and <weld> alone",
+            )  # fmt: skip
+        elif element.tag not in ("connect", "weld"):
+            problems.add(
+                element, "is no constraint that legcal knows",
                 "close loops with <connect> and <weld> alone",
             )  # fmt: skip
         if element.tag not in ("connect", "weld"):
@@ -179,6 +186,10 @@ def _motors(root: etree._Element, tree: MjcfTree) -> list[str]:
                 element, f"drives by {other[0]}, which is no joint with a reading",
                 "drive the slide of each leg itself",
             )  # fmt: skip
+        if name is None and not other and not _drives_no_leg(element):
+            problems.add(
+                element, "names no joint", "name the slide that it drives or measures as joint"
+            )
         if name is None:
             continue
         kind = tree.joints.get(name)
@@ -195,6 +206,11 @@ def _motors(root: etree._Element, tree: MjcfTree) -> list[str]:
         elif kind == "slide" or element.tag != "jointpos":
             motors[name] = None
     return list(motors)
+
+
+def _drives_no_leg(element: etree._Element) -> bool:
+    """Say whether an actuator acts on something else than joints: suction of a body, a plugin."""
+    return element.tag == "plugin" or element.get("body") is not None
 
 
 def _without_loose_bodies(

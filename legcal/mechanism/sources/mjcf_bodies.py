@@ -12,6 +12,8 @@ from legcal.mechanism.sources.mjcf_tree import WORLD, MjcfTree, Place, unused
 from legcal.mechanism.sources.mjcf_values import Values, own_attributes, z_onto
 from legcal.mechanism.sources.tree_text import EYE, TextCylinder
 
+_LEFT_ALONE = ("inertial", "camera", "light", "plugin", "site")
+_GEOMS = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 _NOT_READ = ("include", "composite", "flexcomp", "attach", "replicate")
 
 
@@ -80,6 +82,8 @@ def _contents(tree: MjcfTree, element: etree._Element, place: Place) -> _Content
                 found.cylinders.append(cylinder)
         elif part.tag == "site" and part.get("name"):
             _site(tree, part, where)
+        elif isinstance(part.tag, str) and part.tag not in (*_LEFT_ALONE, *_NOT_READ):
+            tree.values.problems.add(part, "is no element of a body", "correct or remove it")
     return found
 
 
@@ -130,7 +134,12 @@ def _cylinder(tree: MjcfTree, element: etree._Element, place: Place) -> TextCyli
     """Return the cylinder of a geom that is a cylinder or a capsule, else None."""
     values = tree.values
     attributes = values.attributes(element, place.childclass)
-    if attributes.get("type", "sphere") not in ("cylinder", "capsule") or "mesh" in attributes:
+    kind = attributes.get("type", "sphere")
+    if kind not in _GEOMS:
+        values.problems.add(
+            element, f"has the type '{kind}', needed one of {', '.join(_GEOMS)}", "correct it"
+        )
+    if kind not in ("cylinder", "capsule") or "mesh" in attributes:
         return None
     size = values.numbers(element, attributes, "size", (1, 2, 3))
     ends = values.numbers(element, attributes, "fromto", (6,))
