@@ -25,6 +25,7 @@ PLANAR = {"type": "3-RPR", "home": {"xyz": [0, 0, 440], "rpy_deg": [0, 0, 30]}}
         ({"unit": None}, r"unit could not be read: found no such key"),
         ({"unit": "cm"}, r"unit could not be read: found 'cm', needed 'm' or 'mm'"),
         ({"legcal_table": 2}, r"legcal_table could not be read: found 2, needed 1"),
+        ({"legcal_table": True}, r"legcal_table could not be used: found true, needed 1"),
         ({"colour": "red"}, r"colour could not be used: found an unknown key"),
         ({"ofsets": 380}, r"ofsets could not be used: .* did you mean 'offsets'"),
         ({"name": "a/b"}, r"name could not be used: found 'a/b', needed letters, digits"),
@@ -178,6 +179,14 @@ def test_what_a_csv_cannot_say(tmp_path: Path, text: str, unit: str | None, mess
     path.write_text(text.format(h=header, r=row))
     with pytest.raises(ModelError, match=message):
         read_table(path, unit)
+
+
+def test_a_csv_whose_file_name_is_no_name_asks_for_one(tmp_path: Path) -> None:
+    path = tmp_path / "my machine (2).csv"
+    path.write_text("type,base_x,base_y,platform_x,platform_y\n" + "SS,1,2,3,4\nSS,5,6,7,8\n")
+    with pytest.raises(ModelError, match=r"found 'my machine \(2\)', needed letters.* --name NAME"):
+        read_table(path, "mm")
+    assert read_table(path, "mm", "mine").name == "mine"
 
 
 def test_a_unit_may_be_told_beside_the_table(tmp_path: Path) -> None:

@@ -129,3 +129,8 @@ def test_a_hint_at_known_names_is_short() -> None:
     assert closest("zzz", names) == f"known are: {', '.join(names[:10])} and 20 more"
     assert closest("zzz", names[:10]) == f"known are: {', '.join(names[:10])}"
     assert closest("zzz", []) == "known are: none"
+
+
+def test_numbers_to_the_base_sixty_are_texts() -> None:
+    found = parse_yaml(b"a: 6:25\nb: [1:30.5, 7]\nc: '1:2'\n", Path("x.yaml"), "file")
+    assert found == {"a": "6:25", "b": ["1:30.5", 7], "c": "1:2"}

@@ -46,6 +46,12 @@ def read_table(path: Path, unit: str | None = None, name: str | None = None) -> 
         if path.suffix.lower() == ".csv":
             found = read_columns(path, unit)
             found["name"] = name or found["name"]
+            if not schema.is_plain_name(found["name"]) and name is None:
+                raise DatasetError(
+                    f"{path}: the model could not be named after the file: found "
+                    f"{schema.describe(found['name'])}, needed letters, digits, '-', '_' and '.'; "
+                    "give it a name with --name NAME."
+                )
         else:
             found = schema.parse_yaml(schema.read_text(path, WHAT), path, WHAT)
             found = {key: value for key, value in found.items() if value is not None}

@@ -143,7 +143,7 @@ class HomeEntry(schema.FileSchema):
 class TableFile(schema.FileSchema):
     """A table in YAML. All lengths are in ``unit``; directions have no length."""
 
-    legcal_table: Literal[1]
+    legcal_table: schema.Version
     name: schema.PlainName
     unit: Literal["m", "mm"]
     type: Annotated[str | None, BeforeValidator(_type)] = None

@@ -1,11 +1,11 @@
 """The schema of ``dataset.yaml``."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, field_validator
 
 from legcal.files.motion import MotionEntry
-from legcal.files.schema import FileSchema, Name, Number
+from legcal.files.schema import FileSchema, Name, Number, Version
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
 
@@ -29,7 +29,7 @@ class ViewEntry(FileSchema):
 class DatasetEntry(FileSchema):
     """The whole of ``dataset.yaml``."""
 
-    legcal_dataset: Literal[1]
+    legcal_dataset: Version
     mechanism: str
     measurements: str
     encoder_sigma: Annotated[Number, Field(gt=0.0)]

@@ -7,7 +7,7 @@ import reprlib
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import (
@@ -69,6 +69,14 @@ def plain_name(name: object) -> object:
     return name
 
 
+def _no_truth(value: object) -> object:
+    """Refuse true, which Python takes for one."""
+    if isinstance(value, bool):
+        raise ValueError(f"found {str(value).lower()}, needed 1; correct the value.")
+    return value
+
+
+Version = Annotated[Literal[1], BeforeValidator(_no_truth)]
 Name = Annotated[str, AfterValidator(_one_plain_line)]
 PlainName = Annotated[str, BeforeValidator(plain_name)]
 Number = Annotated[float, Strict()]  # true is not one, nor is text
@@ -86,7 +94,7 @@ class FileSchema(BaseModel):
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML in which keys are text, repeated keys are refused and 2e-6 is a number."""
+    """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is none."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -102,6 +110,9 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        is_number = node.tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+        if is_number and ":" in node.value:  # YAML 1.1 takes it for 385, to the base 60
+            node.tag = "tag:yaml.org,2002:str"
         try:
             return super().construct_object(node, deep)
         except (ValueError, LookupError, AttributeError, TypeError) as error:
