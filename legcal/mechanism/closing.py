@@ -31,7 +31,10 @@ def readings_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
 
 
 def close_at(
-    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None = None
+    mechanism: Mechanism,
+    T_base_platform: RigidTransform,
+    start: Array | None = None,
+    restarts: int = RESTARTS,
 ) -> Array:
     """Return the configuration that closes every loop with the platform held at a pose.
 
@@ -47,6 +50,8 @@ def close_at(
         Pose of the platform link; it must meet what the legs demand.
     start : (nq,) array, optional
         Where the joint angles start; zero without it.
+    restarts : int
+        How often legs that do not close start from other angles.
 
     Returns
     -------
@@ -58,7 +63,7 @@ def close_at(
     DidNotConverge
         If a leg does not close, naming its closure and the distance left.
     """
-    configuration, residual = _posture(mechanism, T_base_platform, start, EXACT)
+    configuration, residual = _posture(mechanism, T_base_platform, start, EXACT, restarts)
     if np.abs(residual).max(initial=0.0) >= CLOSED:
         held = partial(_equations, mechanism, T_base_platform, 1.0)
         configuration, residual = _levenberg_marquardt(
@@ -77,8 +82,7 @@ def close_near(
     """Return the closed configuration nearest to a pose that meets the demands but for rounding.
 
     Parameters, exceptions and result are those of :func:`close_at`, but the platform is let go
-    at the end: it moves by what the axes of the model are off, or not at all. ``restarts`` is how
-    often legs that do not close start from other angles.
+    at the end: it moves by what the axes of the model are off, or not at all.
     """
     configuration, residual = _posture(mechanism, T_base_platform, start, NEAR, restarts)
     if np.abs(residual).max(initial=0.0) >= CLOSED:

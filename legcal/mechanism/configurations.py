@@ -26,6 +26,8 @@ NEARER = 1.3 * 0.8 ** np.arange(TRIES)  # how far from home draws go, at most al
 REGULAR = 0.1  # of the singularity measure at home: nobody works nearer to a singularity
 SHORTEST = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
 WALK = 6  # steps of a random walk between two configurations
+ON_THE_CHAIN = 7  # draws of eight, where following is quick
+HOPELESS = 20  # configurations in vain, if they are the first
 STRIDE = 0.15  # [rad], and of a leg length
 INSIDE = 1e-12  # [m]
 
@@ -98,18 +100,28 @@ def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Ite
     lower, upper = np.array([leg.travel for leg in motors]).T
     home = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
     least = REGULAR * singularity(mechanism, mechanism.home)
-    for _ in range(count):
-        for nearer in NEARER:
+    drawn = 0
+    for turn in range(count):
+        if turn == HOPELESS and not drawn:
+            return
+        for tries, nearer in enumerate(NEARER):
             q = chance.uniform(lower, upper)
             if nearer < 1.0:
                 q = np.clip(home + nearer * (q - home), lower, upper)
             try:
-                reached = follow(mechanism, mechanism.home_configuration, q, shortest=SHORTEST)
+                reached = follow(
+                    mechanism,
+                    mechanism.home_configuration,
+                    q,
+                    shortest=SHORTEST,
+                    on_the_chain=tries % (ON_THE_CHAIN + 1) < ON_THE_CHAIN,
+                )
             except DidNotConverge:  # the legs cannot have these lengths at the same time
                 continue
             if _outside(mechanism, reached).any():
                 continue
             if singularity(mechanism, platform_pose(mechanism, reached)) >= least:
+                drawn += 1
                 yield reached
                 break
 

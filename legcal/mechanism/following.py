@@ -5,23 +5,28 @@ is trusted only where its steps contract from the first on and the legs' equatio
 of their determinant; else the way is halved, and the next step starts from what was reached.
 Where the Jacobian of the closures hardly changes on the way there is no room for a singularity, and
 no need to look at the determinant; where the equations are not square there is no other way.
+Where the joints of the chain stop Newton the platform itself is followed, and the chain is closed
+where it arrives.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.closing import CLOSED, platform_pose, slider_columns, worst_closure
+from legcal.mechanism.closing import CLOSED, close_at, close_near, platform_pose, slider_columns
+from legcal.mechanism.demands import is_constrained
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.pose_following import follow_pose, hardly_changes, walk
 from legcal.mechanism.singularity import side
 
 NEWTON_STEPS = 12
 SHORTEST = 1.0 / 4096.0  # of the way from known readings to the wanted ones
 CONTRACTION = 0.5  # of the step before; of 1 rad or 1 m for the first
-SURE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity between J0 and J1
+RESTARTS = 3  # of legs that do not close where the platform arrived
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +34,6 @@ class _Reached:
     """Where Newton ended: the configuration, the linearised closures, and how the steps went."""
 
     configuration: Array
-    residual: Array
     jacobian: Array
     contracts: bool
 
@@ -40,6 +44,7 @@ def follow(
     readings: Array,
     which: str = "",
     shortest: float = SHORTEST,
+    on_the_chain: bool = False,
 ) -> Array:
     """Return the closed configuration at readings, followed from a closed one.
 
@@ -55,6 +60,9 @@ def follow(
         Which readings they are, for the message.
     shortest : float
         The shortest part of the way that is tried.
+    on_the_chain : bool
+        Whether to stop where the joints of the chain stop Newton: soon, but in a place that
+        depends on the spanning tree.
 
     Returns
     -------
@@ -71,32 +79,65 @@ def follow(
     first = configuration[q_columns]
     known = mechanism.chain.linearize(configuration)[1][:, free]
     here: float | None = None
-    done, step = 0.0, 1.0
-    while done < 1.0:
-        wanted = min(done + step, 1.0)
+
+    def attempt(part: float) -> bool:
+        nonlocal configuration, known, here
         trial = configuration.copy()
-        trial[q_columns] = readings if wanted == 1.0 else first + wanted * (readings - first)
+        trial[q_columns] = readings if part == 1.0 else first + part * (readings - first)
         reached = _newton(mechanism, trial, free)
-        accepted = reached.contracts and not _flipped(mechanism, reached.configuration)
-        if accepted and not _hardly_changes(known, reached.jacobian):
+        if not reached.contracts or _flipped(mechanism, reached.configuration):
+            return False
+        if not hardly_changes(known, reached.jacobian):
             if here is None:
                 here = side(mechanism, platform_pose(mechanism, configuration))
             there = side(mechanism, platform_pose(mechanism, reached.configuration))
-            accepted = here == there != 0.0  # not square: only ways on which little changes
-        if accepted:
-            configuration, known = reached.configuration, reached.jacobian
-            done, step = wanted, 2.0 * step
-        else:
-            step *= 0.5
-            if step < shortest:
-                raise DidNotConverge(
-                    f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: "
-                    f"at {100 * done:.1f} % of the way from the starting pose "
-                    f"{worst_closure(mechanism, reached.residual)} or the mechanism is singular, "
-                    "needed closure to 1e-12 m on a regular path; check the readings and "
-                    "legcal.home."
-                )
-    return configuration
+            if not here == there != 0.0:  # not square: only ways on which little changes
+                return False
+        configuration, known = reached.configuration, reached.jacobian
+        return True
+
+    done = walk(attempt, shortest)
+    if done == 1.0:
+        return configuration
+    T = platform_pose(mechanism, configuration)
+    part = 0.0
+    if not on_the_chain:
+        T, part = follow_pose(mechanism, T, configuration[q_columns], readings, shortest)
+    if part < 1.0:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: at "
+            f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
+            "legs meet no more or the mechanism is singular, needed a regular path; check the "
+            "readings and legcal.home."
+        )
+    closed = _closed(mechanism, T, configuration, readings, free)
+    if closed is None:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: found a "
+            "platform pose at which the legs have the right lengths, but joints that do not turn "
+            "so far, needed a closed chain; write spherical joints with three revolutes at right "
+            "angles, or cut them with 3d."
+        )
+    return closed
+
+
+def _closed(
+    mechanism: Mechanism, T: RigidTransform, start: Array, readings: Array, free: IntArray
+) -> Array | None:
+    """Return the closed configuration at readings whose pose is known, None if joints forbid it.
+
+    The platform is let go only where axes that are a little off leave no other way.
+    """
+    for close in (close_at, close_near) if is_constrained(mechanism) else (close_at,):
+        try:
+            trial = close(mechanism, T, start, RESTARTS)
+        except DidNotConverge:
+            continue
+        trial[slider_columns(mechanism, mechanism.motors)[0]] = readings
+        exact = _newton(mechanism, trial, free)
+        if exact.contracts:
+            return exact.configuration
+    return None
 
 
 def _newton(mechanism: Mechanism, configuration: Array, free: IntArray) -> _Reached:
@@ -109,17 +150,17 @@ def _newton(mechanism: Mechanism, configuration: Array, free: IntArray) -> _Reac
         J = jacobian[:, free]
         worst = float(np.abs(residual).max())
         if worst < 0.01 * CLOSED:
-            return _Reached(configuration, residual, J, True)
+            return _Reached(configuration, J, True)
         change = _solve(J, residual)
         size = float(np.abs(change).max())
         if size > CONTRACTION * previous:
-            return _Reached(configuration, residual, J, worst < CLOSED)
+            return _Reached(configuration, J, worst < CLOSED)
         previous = size
         step[free] = -change
         configuration = chain.integrate(configuration, step)
     residual, jacobian = chain.linearize(configuration)
     closed = float(np.abs(residual).max()) < CLOSED
-    return _Reached(configuration, residual, jacobian[:, free], closed)
+    return _Reached(configuration, jacobian[:, free], closed)
 
 
 def _solve(jacobian: Array, residual: Array) -> Array:
@@ -132,22 +173,6 @@ def _solve(jacobian: Array, residual: Array) -> Array:
         if np.abs(change).max() < 1.0:
             return np.asarray(change)
     return np.asarray(np.linalg.lstsq(jacobian, residual, rcond=1e-10)[0])
-
-
-def _hardly_changes(known: Array, jacobian: Array) -> bool:
-    """Say whether two Jacobians differ too little for one of smaller rank between them."""
-    difference = jacobian - known
-    if known.shape[0] == known.shape[1]:
-        try:
-            change = np.linalg.solve(known, difference)
-        except np.linalg.LinAlgError:
-            change = np.full_like(known, np.inf)
-        if float(np.abs(change).sum(axis=1).max()) < SURE:
-            return True
-    left, values, right = np.linalg.svd(known, full_matrices=False)
-    rank = int(np.sum(values > 1e-6 * values[0]))
-    change = (left[:, :rank].T @ difference @ right[:rank].T) / values[:rank, None]
-    return float(np.linalg.norm(change, 2)) < SURE
 
 
 def _flipped(mechanism: Mechanism, configuration: Array) -> bool:

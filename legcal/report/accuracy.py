@@ -25,6 +25,7 @@ from legcal.mechanism.platform import platform_in_base, pose_differences
 N_RANDOM_POSES = 100
 _SEED = 20020721
 _ROUNDS = 20  # of drawing again what the reference does not reach
+_HOPELESS = 20  # poses that it does not reach, if they are the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +182,11 @@ def _random_poses(
     rng = np.random.default_rng(_SEED)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
-    for _ in range(_ROUNDS):
-        drawn = random_configurations(mechanism, N_RANDOM_POSES - len(poses), rng)
+    for turn in range(_ROUNDS):
+        if turn > 0 and not poses:
+            break
+        count = N_RANDOM_POSES - len(poses) if turn > 0 else _HOPELESS
+        drawn = random_configurations(mechanism, count, rng)
         for q, T in zip(drawn.readings, drawn.poses, strict=True):
             try:
                 reference_poses.append(forward_kinematics(reference, q))
