@@ -6,12 +6,12 @@ joints except the slider are at zero at home, with the z axis of every frame alo
 """
 
 import numpy as np
-import yaml
 
 from legcal.authoring.assembled import Assembled, AssembledLeg
 from legcal.geometry.frames import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.yaml_text import mechanism_yaml
 
 TURN = (-3.15, 3.15)  # [rad]
 VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
@@ -35,27 +35,22 @@ def urdf_text(machine: Assembled) -> str:
 
 def yaml_text(machine: Assembled) -> str:
     """Return the mechanism YAML of a machine: closures, motors, legs and home."""
-    home = {"xyz": list(machine.home.xyz), "quat_xyzw": list(machine.home.quat_xyzw)}
-    document = {
-        "closed_loop": [[f"{leg.name}_end", f"{leg.name}_seat"] for leg in machine.legs],
-        "type": ["3d" if leg.type.has_sphere else "6d" for leg in machine.legs],
-        "name_mot": [
-            f"{leg.name}_prismatic" for leg in machine.legs if leg.kind is LegKind.ACTUATED
+    return mechanism_yaml(
+        [
+            (f"{leg.name}_end", f"{leg.name}_seat", "3d" if leg.type.has_sphere else "6d")
+            for leg in machine.legs
         ],
-        "joint_name": [],
-        "joint_type": [],
-        "legcal": {
-            "version": 1,
+        [f"{leg.name}_prismatic" for leg in machine.legs if leg.kind is LegKind.ACTUATED],
+        {
             "urdf": f"../urdf/{machine.name}.urdf",
             "base": "base",
             "platform": "platform",
             "platform_joint": "platform_free",
             "base_frame": list(machine.base_frame),
-            "home": home,
+            "home": {"xyz": list(machine.home.xyz), "quat_xyzw": list(machine.home.quat_xyzw)},
             "legs": {leg.name: _joint_of(leg) for leg in machine.legs},
         },
-    }
-    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=False))
+    )
 
 
 def _hangs_from_base(leg: AssembledLeg) -> bool:

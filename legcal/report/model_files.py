@@ -5,9 +5,6 @@ The block ``legcal`` is complete in them, home included, also where it was propo
 
 import os
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from legcal.errors import OutOfResources, UsageError
 from legcal.files.atomic import write_atomically
@@ -15,6 +12,7 @@ from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism.files import FOLDER_YAML
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.yaml_text import mechanism_yaml
 
 
 def mechanism_text(mechanism: Mechanism, urdf: str) -> str:
@@ -27,15 +25,10 @@ def mechanism_text(mechanism: Mechanism, urdf: str) -> str:
     urdf : str
         The path of its URDF, relative to the YAML.
     """
-    closures = mechanism.chain.closures
-    document: dict[str, Any] = {
-        "closed_loop": [[closure.frame_1, closure.frame_2] for closure in closures],
-        "type": [closure.kind for closure in closures],
-        "name_mot": [str(leg.prismatic) for leg in mechanism.legs if leg.kind is LegKind.ACTUATED],
-        "joint_name": [],
-        "joint_type": [],
-        "legcal": {
-            "version": 1,
+    return mechanism_yaml(
+        [(c.frame_1, c.frame_2, c.kind) for c in mechanism.chain.closures],
+        [str(leg.prismatic) for leg in mechanism.legs if leg.kind is LegKind.ACTUATED],
+        {
             "urdf": urdf,
             "base": mechanism.base,
             "platform": mechanism.platform,
@@ -44,9 +37,6 @@ def mechanism_text(mechanism: Mechanism, urdf: str) -> str:
             "home": motion_to_xyz_quat(mechanism.home),
             "legs": {leg.name: _joint_of(mechanism, j) for j, leg in enumerate(mechanism.legs)},
         },
-    }
-    return str(
-        yaml.safe_dump(document, sort_keys=False, default_flow_style=False, allow_unicode=True)
     )
 
 

@@ -53,9 +53,6 @@ class Place:
 
 def unused(tree: MjcfTree, name: str) -> str:
     """Return a name that nothing in the file has, and take it."""
-    number, found = 1, name
-    while found in tree.taken or found in tree.text.links or found in tree.text.joints:
-        number += 1
-        found = f"{name}_{number}"
+    found = tree.text.unused(name, tree.taken)
     tree.taken.add(found)
     return found

@@ -1,5 +1,6 @@
 """A URDF written from links and joints, for formats that are not URDF."""
 
+from collections.abc import Set
 from dataclasses import dataclass, field
 from html import escape
 from math import pi
@@ -35,9 +36,9 @@ class TreeText:
     links: dict[str, str] = field(default_factory=dict)
     joints: dict[str, str] = field(default_factory=dict)
 
-    def unused(self, name: str) -> str:
+    def unused(self, name: str, others: Set[str] = frozenset()) -> str:
         """Return a name that no link and no joint has yet: the given one, or it with a number."""
-        taken = self.links.keys() | self.joints.keys()
+        taken = self.links.keys() | self.joints.keys() | others
         number, found = 1, name
         while found in taken:
             number += 1
