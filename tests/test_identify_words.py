@@ -2,7 +2,13 @@
 
 import pytest
 
-from legcal.identify.words import describe_direction, joined, leg_labels, legs_in_words
+from legcal.identify.words import (
+    describe_direction,
+    joined,
+    leg_labels,
+    legs_in_words,
+    views_in_words,
+)
 
 LEGS = ("leg1", "leg2", "leg3", "leg4")
 
@@ -35,9 +41,11 @@ def test_directions_are_named_as_people_say_them(parameters: tuple[str, ...], wo
     assert describe_direction(parameters, LEGS) == words
 
 
-def test_legs_are_numbers_where_all_names_have_one() -> None:
+def test_legs_are_numbers_where_their_names_have_one() -> None:
     assert leg_labels(("leg1", "Leg_2")) == {"leg1": "1", "Leg_2": "2"}
-    assert leg_labels(("leg1", "centre")) == {"leg1": "leg1", "centre": "centre"}
+    assert leg_labels(("leg1", "centre")) == {"leg1": "1", "centre": "centre"}
+    assert leg_labels(("leg1", "1")) == {"leg1": "leg1", "1": "1"}
+    assert legs_in_words((0, 1), ("leg3", "centre")) == "legs 3 and centre"
     assert legs_in_words((0, 2, 3), LEGS) == "legs 1, 3 and 4"
     assert legs_in_words((1,), LEGS) == "leg 2"
     assert joined([]) == ""
@@ -47,3 +55,8 @@ def test_names_of_legs_may_contain_dots_and_each_other() -> None:
     legs = ("a", "a.b", "centre")
     assert describe_direction(("a.b.base.x",), legs) == "x of base joint a.b"
     assert describe_direction(("a.base.x",), legs) == "x of base joint a"
+
+
+def test_equal_views_are_one_from_several_places() -> None:
+    assert views_in_words(["1,2", "1,2"]) == "1,2 from two places"
+    assert views_in_words(["1,2", "2,3", "1,2", "1,2"]) == "1,2 from three places; 2,3"

@@ -17,7 +17,7 @@ from legcal.identify.ranks import Analysis, missing, scattered
 from legcal.identify.recommend import Recommendation
 from legcal.identify.session import Session
 from legcal.identify.weak import WeakDirection, undetermined
-from legcal.identify.words import joined, legs_in_words
+from legcal.identify.words import joined, legs_in_words, views_in_words
 
 _MOST_OF_A_KIND = 2
 _MOST_TRIED = 8  # of a kind
@@ -76,8 +76,10 @@ def find_remedies(analysis: Analysis, replanning: Replanning | None) -> tuple[Re
     Returns
     -------
     tuple of Remedy
-        Only what raises a rank: what is enough, or what helps where nothing is.
+        Only what raises a rank: what determines everything, else what is enough for the platform,
+        else what helps.
     """
+    n_parameters = len(analysis.session.unit)
     before = _score(analysis)
     kinds: list[Iterable[tuple[str, Callable[[], _Score]]]] = [
         _more_images(analysis, replanning),
@@ -86,11 +88,10 @@ def find_remedies(analysis: Analysis, replanning: Replanning | None) -> tuple[Re
         _board(analysis),
         _known_parameters(analysis),
     ]
-    found = [_try_kind(kind, before, len(analysis.session.unit)) for kind in kinds]
-    enough = tuple(r for kind in found for r in kind if r.enough)
-    if enough:
-        return enough
-    return tuple(r for kind in found for r in kind) + _other_views(analysis, replanning)
+    found = tuple(r for kind in kinds for r in _try_kind(kind, before, n_parameters))
+    enough = tuple(r for r in found if r.enough) or _other_views(analysis, replanning)
+    everything = tuple(r for r in enough if r.staged_rank == r.full_rank == n_parameters)
+    return everything or enough or found
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def _other_views(analysis: Analysis, replanning: Replanning | None) -> tuple[Rem
     names = analysis.session.leg_names
     views = [legs_in_words([names.index(n) for n in view], names) for view in sets[0].views]
     n_p = len(analysis.session.unit)
-    return (Remedy(f"choose these views instead: {'; '.join(views)}", n_p, n_p, True),)
+    return (Remedy(f"choose these views instead: {views_in_words(views)}", n_p, n_p, True),)
 
 
 def _more(analysis: Analysis, session: Session, poses: IntArray) -> _Score:

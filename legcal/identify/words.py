@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 
 _MOST_GROUPS = 4  # of joints in one direction
+_TIMES = {2: "two", 3: "three", 4: "four"}
 _NOUN = {
     "base": ("base joint", "base joints"),
     "platform": ("platform joint", "platform joints"),
@@ -25,12 +26,22 @@ def joined(words: Sequence[str]) -> str:
 
 
 def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
-    """Return what to call each leg after the word leg: its number where all names have one."""
+    """Return what to call each leg after the word leg: its number where its name is one."""
     numbers = [re.fullmatch(r"[Ll]eg[_-]?(\d+)", name) for name in leg_names]
-    return {
-        name: match.group(1) if match and all(numbers) else name
+    labels = {
+        name: match.group(1) if match else name
         for name, match in zip(leg_names, numbers, strict=True)
     }
+    return labels if len(set(labels.values())) == len(labels) else {name: name for name in labels}
+
+
+def views_in_words(views: Sequence[str]) -> str:
+    """Return views one after the other, equal ones once: ``1,2,3 from two places``."""
+    said = []
+    for view in dict.fromkeys(views):
+        times = list(views).count(view)
+        said.append(view if times == 1 else f"{view} from {_TIMES.get(times, times)} places")
+    return "; ".join(said)
 
 
 def legs_in_words(legs: Sequence[int], leg_names: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from legcal.identify.analysis import Identifiability
 from legcal.identify.weak import Ranks, WeakDirection
-from legcal.identify.words import joined, leg_labels, legs_in_words
+from legcal.identify.words import joined, leg_labels, legs_in_words, views_in_words
 
 _CONDITIONS = {
     "eq12": "base joints and axes (12)",
@@ -26,6 +26,10 @@ _STEPS = {
     "offsets": "3 offsets and lengths (14)",
     "platform_joints": "4 platform joints, axes (16-19)",
 }
+_LEGEND = (
+    "as printed: the rank with the equations of the paper as it prints them\n"
+    "known length law: a leg with a reading (length = reading + offset), or constant"
+)
 _MOST_WEAK = 6  # directions shown
 _FAR, _HALF_TURN = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
@@ -41,7 +45,7 @@ def identify_table(report: Identifiability) -> RenderableType:
     parts: list[RenderableType] = [_heading(report), Text()]
     if report.recommendation is not None:
         parts += [_recommendation(report), Text()]
-    parts += [_conditions(report), Text(), _ranks(report)]
+    parts += [_conditions(report), Text(), _ranks(report), Text(_LEGEND, style="dim")]
     tables = [("step by step", report.staged), ("everything at once", report.full)]
     if _directions(report.staged) == _directions(report.full):
         tables = [("step by step or at once", report.full)]
@@ -73,7 +77,7 @@ def _recommendation(report: Identifiability) -> RenderableType:
     table = _plain_table("smallest sets of views that suffice", "legs each", "sigma \\[mm]")
     for found in report.recommendation:
         number = len(found.views)
-        views = "; ".join(",".join(labels[name] for name in view) for view in found.views)
+        views = views_in_words([",".join(labels[name] for name in view) for view in found.views])
         sigma = "" if found.platform_sigma is None else f"{1e3 * found.platform_sigma.dX_m:.2g}"
         judged = "  *" if found.views == report.views else ""
         table.add_row(
