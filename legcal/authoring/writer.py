@@ -8,29 +8,29 @@ joints except the slider are at zero at home, with the z axis of every frame alo
 import numpy as np
 
 from legcal.authoring.assembled import Assembled, AssembledLeg
-from legcal.geometry.frames import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.sources.tree_text import TreeText, along, limit, place, visual
 from legcal.mechanism.yaml_text import mechanism_yaml
 
 TURN = (-3.15, 3.15)  # [rad]
 VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
-_AXES = {"x": "1.0 0.0 0.0", "y": "0.0 1.0 0.0", "z": "0.0 0.0 1.0"}
+_AXES = {letter: along(axis) for letter, axis in zip("xyz", np.eye(3), strict=True)}
 
 
 def urdf_text(machine: Assembled) -> str:
     """Return the URDF of a machine: all its geometry."""
-    tree = _Tree()
+    tree = TreeText()
     tree.link("base")
     tree.link("platform")
     if machine.planar:
         height = np.array([0.0, 0.0, machine.T_base_platform.translation[2]])
-        tree.joint("platform_free", "planar", "base", "platform", height, None, axis="z")
+        _joint(tree, "platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
     else:
-        tree.joint("platform_free", "floating", "base", "platform")
+        _joint(tree, "platform_free", "floating", ("base", "platform"))
     for leg in machine.legs:
         _Branch(tree, machine, leg).write()
-    return tree.text(machine.name)
+    return tree.robot(machine.name).decode()
 
 
 def yaml_text(machine: Assembled) -> str:
@@ -65,62 +65,24 @@ def _joint_of(leg: AssembledLeg) -> str:
     return f"{leg.name}_prismatic"
 
 
-class _Tree:
-    """Links and joints in the order in which they are told."""
-
-    def __init__(self) -> None:
-        self._links: dict[str, list[str]] = {}
-        self._joints: list[str] = []
-
-    def link(self, name: str) -> None:
-        self._links[name] = []
-
-    def cylinder(self, link: str, radius: float, start: float, end: float) -> None:
-        """Show a cylinder along the z axis of a link."""
-        self._links[link].append(
-            f'<visual><origin xyz="0 0 {0.5 * (start + end)!r}" rpy="0 0 0"/><geometry>'
-            f'<cylinder radius="{radius!r}" length="{abs(end - start)!r}"/></geometry></visual>'
-        )
-
-    def joint(
-        self,
-        name: str,
-        kind: str,
-        parent: str,
-        child: str,
-        xyz: Array | None = None,
-        rotation: Array | None = None,
-        axis: str | None = None,
-        limits: tuple[float, float] | None = None,
-    ) -> None:
-        """Connect two links; without numbers their frames coincide."""
-        place = _numbers(np.zeros(3) if xyz is None else xyz)
-        angles = _numbers(np.zeros(3) if rotation is None else roll_pitch_yaw(rotation))
-        text = (
-            f'  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-            f'<origin xyz="{place}" rpy="{angles}"/>'
-        )
-        if axis is not None:
-            text += f'<axis xyz="{_AXES[axis]}"/>'
-        if limits is not None:
-            lower, upper = (float(x) for x in limits)
-            text += f'<limit lower="{lower!r}" upper="{upper!r}" effort="1000" velocity="1"/>'
-        self._joints.append(text + "</joint>")
-
-    def text(self, name: str) -> str:
-        """Return the file."""
-        lines = ['<?xml version="1.0" encoding="utf-8"?>', f'<robot name="{name}">']
-        for link, shown in self._links.items():
-            inside = "".join(shown)
-            end = f">{inside}</link>" if shown else "/>"
-            lines.append(f'  <link name="{link}"{end}')
-        return "\n".join([*lines, *self._joints, "</robot>", ""])
+def _joint(
+    tree: TreeText,
+    name: str,
+    kind: str,
+    links: tuple[str, str],
+    xyz: Array | None = None,
+    rotation: Array | None = None,
+    moving: str = "",
+) -> None:
+    """Connect two links; without numbers their frames coincide."""
+    at = place(np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation)
+    tree.connect(name, kind, links, at + moving)
 
 
 class _Branch:
     """One leg, from the link that it hangs from to the frames that close its loop."""
 
-    def __init__(self, tree: _Tree, machine: Assembled, leg: AssembledLeg) -> None:
+    def __init__(self, tree: TreeText, machine: Assembled, leg: AssembledLeg) -> None:
         self._tree, self._leg = tree, leg
         self._from_base = _hangs_from_base(leg)
         self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
@@ -183,14 +145,10 @@ class _Branch:
         end, seat = f"{leg.name}_end", f"{leg.name}_seat"
         tree.link(end)
         tree.link(seat)
-        tree.joint(f"{end}_frame", "fixed", self._link, end, self._along)
-        if not self._from_base:
-            tree.joint(f"{seat}_frame", "fixed", "base", seat, leg.A_base)
-        elif leg.type.has_sphere:
-            tree.joint(f"{seat}_frame", "fixed", "platform", seat, leg.B_platform)
-        else:
-            turned = self._R_base_platform.T @ R
-            tree.joint(f"{seat}_frame", "fixed", "platform", seat, leg.B_platform, turned)
+        _joint(tree, f"{end}_frame", "fixed", (self._link, end), self._along)
+        carrier, at = ("platform", leg.B_platform) if self._from_base else ("base", leg.A_base)
+        turned = None if leg.type.has_sphere else self._R_base_platform.T @ R
+        _joint(tree, f"{seat}_frame", "fixed", (carrier, seat), at, turned)
 
     def _turn(self, joint: str, at: Array | None, rotation: Array | None, axis: str) -> None:
         """Add a revolute."""
@@ -209,7 +167,8 @@ class _Branch:
     ) -> None:
         """Add a joint and go on from its child."""
         self._tree.link(child)
-        self._tree.joint(joint, kind, self._link, child, at, rotation, axis, limits)
+        moving = _AXES[axis] + limit(limits)
+        _joint(self._tree, joint, kind, (self._link, child), at, rotation, moving)
         self._link, self._along = child, np.zeros(3)
 
     def _half(self, *, near: bool) -> None:
@@ -219,17 +178,14 @@ class _Branch:
         if radius is None:
             return
         if leg.kind is LegKind.CONSTANT:
-            self._tree.cylinder(self._link, radius, 0.0, leg.q0)
-            return
-        length = VISIBLE * leg.shortest_shown
-        self._tree.cylinder(self._link, radius, 0.0, length if near else -length)
+            length = end = leg.q0
+        else:
+            length = VISIBLE * leg.shortest_shown
+            end = length if near else -length
+        at = f'<origin xyz="0 0 {0.5 * end!r}" rpy="0 0 0"/>'
+        self._tree.show(self._link, visual(at, radius, length))
 
 
 def _unit(vector: Array) -> Array:
     """Return a vector of length one."""
     return np.asarray(vector / np.linalg.norm(vector))
-
-
-def _numbers(values: Array) -> str:
-    """Return numbers so that they are read back exactly, rounding noise of zero as zero."""
-    return " ".join(repr(float(x) + 0.0 if abs(x) > 1e-15 else 0.0) for x in values)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from html import escape
 from math import pi
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.frames import roll_pitch_yaw
@@ -47,11 +48,12 @@ class TreeText:
 
     def link(self, name: str, cylinders: tuple[TextCylinder, ...] = ()) -> None:
         """Add a link with its visible cylinders."""
-        visuals = "".join(
-            f"<visual>{origin(c.T_link_cylinder)}<geometry>"
-            f'<cylinder radius="{c.radius!r}" length="{c.length!r}"/></geometry></visual>'
-            for c in cylinders
+        self.show(
+            name, "".join(visual(origin(c.T_link_cylinder), c.radius, c.length) for c in cylinders)
         )
+
+    def show(self, name: str, visuals: str) -> None:
+        """Add a link, or write it anew where it stands, with its visuals."""
         inside = f">{visuals}</link>" if visuals else "/>"
         self.links[name] = f"  <link name={_quoted(name)}{inside}"
 
@@ -68,10 +70,15 @@ class TreeText:
         """Add a joint; ``axis`` and ``limits`` [rad] or [m] are those of a moving one."""
         moving = ""
         if axis is not None:
-            moving = f'<axis xyz="{_numbers(axis)}"/>' + limit(limits)
+            moving = along(axis) + limit(limits)
+        self.connect(name, kind, (parent, child), origin(T_parent_origin) + moving)
+
+    def connect(self, name: str, kind: str, links: tuple[str, str], inside: str) -> None:
+        """Add a joint between parent and child with its elements, the origin first."""
+        parent, child = (_quoted(link) for link in links)
         self.joints[name] = (
-            f'  <joint name={_quoted(name)} type="{kind}"><parent link={_quoted(parent)}/>'
-            f"<child link={_quoted(child)}/>{origin(T_parent_origin)}{moving}</joint>"
+            f'  <joint name={_quoted(name)} type="{kind}"><parent link={parent}/>'
+            f"<child link={child}/>{inside}</joint>"
         )
 
     def body(self) -> str:
@@ -86,19 +93,37 @@ class TreeText:
 
 def origin(T_parent_origin: RigidTransform) -> str:
     """Return the ``<origin>`` of a rigid motion [m, rad]."""
-    rpy = roll_pitch_yaw(T_parent_origin.rotation.as_matrix())
-    return f'<origin xyz="{_numbers(T_parent_origin.translation)}" rpy="{_numbers(rpy)}"/>'
+    return place(np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix())
+
+
+def place(xyz: Array, rotation: Array) -> str:
+    """Return the ``<origin>`` at a point [m] with a rotation matrix."""
+    return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(roll_pitch_yaw(rotation))}"/>'
+
+
+def along(axis: Array) -> str:
+    """Return the ``<axis>`` of a joint."""
+    return f'<axis xyz="{_numbers(axis)}"/>'
+
+
+def visual(at: str, radius: float, length: float) -> str:
+    """Return the ``<visual>`` of a cylinder at an ``<origin>``."""
+    shape = f'<cylinder radius="{radius!r}" length="{length!r}"/>'
+    return f"<visual>{at}<geometry>{shape}</geometry></visual>"
 
 
 def limit(limits: tuple[float, float] | None) -> str:
     """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
-    ends = "" if limits is None else f'lower="{limits[0]!r}" upper="{limits[1]!r}" '
+    ends = ""
+    if limits is not None:
+        lower, upper = (float(x) for x in limits)
+        ends = f'lower="{lower!r}" upper="{upper!r}" '
     return f'<limit {ends}effort="1000" velocity="1"/>'
 
 
 def _numbers(values: Array) -> str:
-    """Return numbers with all their digits."""
-    return " ".join(repr(float(x) + 0.0) for x in values)
+    """Return numbers so that they are read back exactly, rounding noise of zero as zero."""
+    return " ".join(repr(float(x)) if abs(x) > 1e-15 else "0.0" for x in values)
 
 
 def _quoted(text: str) -> str:
