@@ -334,6 +334,22 @@ def test_a_cylinder_too_thick_or_too_thin_for_its_leg_is_refused(
     assert "needed 0.0002 to 0.5 of the length" in str(caught.value)
 
 
+@pytest.mark.parametrize("scale", [1e11, 1e3, 1e-12])
+def test_without_a_home_sizes_beyond_reason_are_asked_about_at_once(
+    scale: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if scale > 1.0:  # no home is looked for
+        monkeypatch.delattr("legcal.mechanism.load.closed_home")
+    machine = geometry()
+    A, B, q0 = scale * machine.A, scale * machine.B, scale * machine.q0
+    scaled = Geometry(A, B, q0, machine.home, (0.0, 0.15 * scale))
+    path = write_hexapod(tmp_path, None, scaled)
+    text = path.read_text()
+    path.write_text(text[: text.index("  home:")] + text[text.index("  legs:") :])
+    with pytest.raises(ModelError, match=r"needed (at most|1 mm to) \d+ m; write all lengths"):
+        load_mechanism(path)
+
+
 def test_travel_in_millimetres_is_refused(tmp_path: Path) -> None:
     machine = geometry()
     machine = Geometry(machine.A, machine.B, machine.q0, machine.home, (-5.0, 155.0))

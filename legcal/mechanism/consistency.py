@@ -11,6 +11,9 @@ from legcal.mechanism.leg import LONGEST, SHORTEST, THICKEST, THINNEST, LegKind
 from legcal.mechanism.leg_geometry import Demand, geometry_of
 from legcal.mechanism.mobility import CONFIGURATIONS, generic_configurations
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.urdf import Urdf
+
+FARTHEST = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
 
 _FOUND = {
     Demand.BASE_AXIS: "its revolute axis at the base {0:.3g} deg from perpendicular to the leg",
@@ -83,6 +86,45 @@ def check_across(mechanism: Mechanism) -> None:
             )
     if problems:
         raise OutOfClass(problems)
+
+
+def check_origins(urdf: Urdf) -> None:
+    """Check that no joint is so far out that rounding hides how joints lie to each other.
+
+    Raises
+    ------
+    ModelError
+        If an origin is more than 10 km away from the parent link.
+    """
+    for joint in urdf.joints.values():
+        away = float(np.linalg.norm(joint.T_parent_origin.translation))
+        if away > FARTHEST:
+            raise ModelError(
+                f"{urdf.path}: the lengths could not be used: found the origin of joint "
+                f"'{joint.name}' {away:.4g} m away from its parent link, needed at most "
+                f"{FARTHEST:g} m; write all lengths in metres (are they millimetres?)."
+            )
+
+
+def check_spread(mechanism: Mechanism) -> None:
+    """Check that the joints are as near each other as metres put them, before home is looked for.
+
+    Raises
+    ------
+    ModelError
+        If the joints of base or platform lie more than 20 m apart.
+    """
+    sizes = {
+        "the joints on the base": float(np.linalg.norm(np.ptp(mechanism.A_base, axis=0))),
+        "the joints on the platform": float(np.linalg.norm(np.ptp(mechanism.B_platform, axis=0))),
+    }
+    for name, size in sizes.items():
+        if size > LONGEST:
+            raise ModelError(
+                f"{mechanism.urdf_path}: the lengths could not be used: found {name} {size:.4g} m "
+                f"apart, needed at most {LONGEST:g} m; write all lengths in metres (are they "
+                "millimetres?)."
+            )
 
 
 def check_unit(mechanism: Mechanism) -> None:

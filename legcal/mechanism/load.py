@@ -13,7 +13,13 @@ from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism import agreement, virtual_joint
 from legcal.mechanism.bodies import rigid_bodies
 from legcal.mechanism.chain import ClosedChain, Closure
-from legcal.mechanism.consistency import check_across, check_equations, check_unit
+from legcal.mechanism.consistency import (
+    check_across,
+    check_equations,
+    check_origins,
+    check_spread,
+    check_unit,
+)
 from legcal.mechanism.cylinders import visual_cylinders, with_cylinders
 from legcal.mechanism.heights import at_visible_heights
 from legcal.mechanism.home import closed_home
@@ -59,6 +65,7 @@ def load_mechanism(model: str | Path) -> Mechanism:
 def _load(source: Source) -> Mechanism:
     """Return the mechanism of a source."""
     file, urdf = source.file, source.urdf
+    check_origins(urdf)
     agreement.check_names(file, urdf, source.path)
     pairs = sorted(zip(file.closed_loop, file.type, strict=True))  # sums depend on their order
     closures = [Closure("3d" if kind == "3d" else "6d", one, two) for (one, two), kind in pairs]
@@ -69,7 +76,9 @@ def _load(source: Source) -> Mechanism:
         block = block.model_copy(update={"home": drawn})
     mechanism = _assemble(source, block, closures)
     given = mechanism.home if block.home is not None else None
-    if given is not None:
+    if given is None:
+        check_spread(mechanism)  # before a home of kilometres is looked for
+    else:
         check_unit(mechanism)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
         check_home_travel(mechanism)
