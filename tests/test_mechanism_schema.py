@@ -57,6 +57,7 @@ def _with(old: str, new: str) -> str:
         ("  - leg1\n", "  - leg3\n", "found the leg 'leg3' more than once"),
         ("  - leg1\n", "  - leg1\n  - leg2\n", "legcal.base_frame"),
         ("0.38274", ".nan", "legcal.home.xyz.2"),
+        ("version: 1", "version: true", "legcal.version could not be used: found true, needed 1"),
         ("0.38274", ".inf", "needed a finite number"),
         ("0.38274", "high", "needed a number"),
         ("0.951057", "0.7", "found a quaternion of norm 0.765"),

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -20,7 +20,7 @@ class LegcalBlock(schema.FileSchema):
     What is missing is proposed, see :mod:`legcal.mechanism.proposal`.
     """
 
-    version: Literal[1]
+    version: schema.Version
     urdf: str | None = None
     base: str
     platform: str
