@@ -115,8 +115,9 @@ def follow(
         raise DidNotConverge(
             f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: found a "
             "platform pose at which the legs have the right lengths, but joints that do not turn "
-            "so far, needed a closed chain; write spherical joints with three revolutes at right "
-            "angles, or cut them with 3d."
+            "so far, needed a closed chain; give the joints of the legs axes at right angles (of "
+            "three revolutes, and of a universal joint and its leg), which turn anywhere, or cut "
+            "spherical joints with 3d."
         )
     return closed
 

@@ -1,0 +1,134 @@
+"""The same machine gives the same poses far from home, whatever its spanning tree."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layouts import Layout, LegLayout, write_machine
+from machines import of_types
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array
+from legcal.mechanism.closing import slider_columns
+from legcal.mechanism.configurations import random_configurations
+from legcal.mechanism.following import SHORTEST, follow
+from legcal.mechanism.kinematics import forward_kinematics, forward_kinematics_many
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.pose_following import follow_pose, walk
+from legcal.mechanism.singularity import side
+from legcal.report import accuracy
+
+
+def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
+    """Return a layout whose spherical joints turn anywhere, with the same axes in every tree."""
+    return Layout(
+        tuple(
+            LegLayout(seed=10 * seed + j, flip_axes=True, hung=hung, sphere=sphere)
+            for j in range(6)
+        )
+    )
+
+
+def _stops_on_the_chain(mechanism: Mechanism, readings: Array) -> bool:
+    start = mechanism.home_configuration
+    try:
+        follow(mechanism, start, readings[list(mechanism.motors)], on_the_chain=True)
+    except DidNotConverge:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("hung", ["base", "platform"])
+@pytest.mark.parametrize(
+    ("leg_type", "seed", "stops"), [("US", 1, True), ("US", 6, True), ("SU", 6, True),
+                                    ("SU", 1, False), ("SS", 2, False)]
+)  # fmt: skip
+def test_random_readings_give_the_same_poses_in_every_tree(
+    leg_type: str, seed: int, stops: bool, hung: str, tmp_path: Path
+) -> None:
+    machine = of_types([leg_type] * 6, seed=seed)
+    cut = load_mechanism(write_machine(tmp_path / "cut", machine, _square(seed)))
+    layout = _square(seed, hung=hung, sphere=False)
+    other = load_mechanism(write_machine(tmp_path / "other", machine, layout))
+    drawn = random_configurations(cut, 20, 1)
+    for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        found = forward_kinematics(other, q)
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
+    assert stops == any(_stops_on_the_chain(other, q) for q in drawn.readings)
+
+
+def test_where_the_chain_stops_it_is_closed_at_the_readings(tmp_path: Path) -> None:
+    machine = of_types(["US"] * 6, seed=1)
+    cut = load_mechanism(write_machine(tmp_path / "cut", machine, _square(1)))
+    other = load_mechanism(write_machine(tmp_path / "other", machine, _square(1, sphere=False)))
+    columns = slider_columns(other, other.motors)[0]
+    for q in random_configurations(cut, 20, 1).readings:
+        if _stops_on_the_chain(other, q):
+            closed = follow(other, other.home_configuration, q)
+            assert np.abs(other.chain.residual(closed)).max() < 1e-12
+            np.testing.assert_allclose(closed[columns], q, rtol=0.0, atol=1e-12)
+
+
+def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
+    machine = of_types(["US"] * 6, seed=1)
+    cut = load_mechanism(write_machine(tmp_path / "cut", machine, Layout()))
+    skew = Layout(tuple(LegLayout(sphere=False, seed=10 + j) for j in range(6)))
+    other = load_mechanism(write_machine(tmp_path / "other", machine, skew))
+    readings = random_configurations(cut, 20, 1).readings
+    with pytest.raises(DidNotConverge, match=r"joints that do not turn so far, .* right angles"):
+        forward_kinematics_many(other, readings)
+
+
+@pytest.mark.parametrize(
+    "name", ["3-rpr", "3-rps", "3-spr", "3-upu", "tricept", "hexapod-rod", "hexapod-strut"]
+)
+def test_the_platform_alone_goes_where_the_chain_goes(name: str) -> None:
+    mechanism = load_mechanism(name)
+    motors = list(mechanism.motors)
+    first = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
+    drawn = random_configurations(mechanism, 5, 3)
+    for q, T in zip(drawn.readings, drawn.poses, strict=True):
+        found, part = follow_pose(mechanism, mechanism.home, first, q[motors], SHORTEST)
+        assert part == 1.0
+        np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
+
+
+def test_the_platform_alone_crosses_no_singularity() -> None:
+    mechanism = load_mechanism("nategh-agheli")
+    motors = list(mechanism.motors)
+    first = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
+    lower, upper = np.array([mechanism.legs[j].travel for j in motors]).T
+    rng = np.random.default_rng(1)
+    parts = []
+    for _ in range(10):
+        last = rng.uniform(lower, upper)
+        T, part = follow_pose(mechanism, mechanism.home, first, last, 1.0 / 64.0)
+        assert side(mechanism, T) == side(mechanism, mechanism.home)
+        parts.append(part)
+    assert min(parts) < 1.0
+
+
+def test_a_way_is_walked_in_halved_steps_up_to_what_is_in_the_way() -> None:
+    tried: list[float] = []
+
+    def attempt(part: float) -> bool:
+        tried.append(part)
+        return part <= 0.6
+
+    assert walk(attempt, 0.01) == pytest.approx(0.6, abs=0.02)
+    assert tried[:3] == [1.0, 0.5, 1.0]
+    assert walk(lambda _: True, 0.01, 0.3) == 1.0
+
+
+def test_machines_that_share_no_reading_are_given_up_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def never(*_: object) -> None:
+        tried.append(1)
+        raise DidNotConverge("not there")
+
+    monkeypatch.setattr(accuracy, "forward_kinematics", never)
+    with pytest.raises(DidNotConverge, match="only 0 of 100 random poses"):
+        accuracy.evaluate("hexapod", "hexapod")
+    assert len(tried) == 20
