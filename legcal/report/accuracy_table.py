@@ -31,7 +31,7 @@ def accuracy_table(evaluation: Evaluation) -> RenderableType:
 def _headline(evaluation: Evaluation) -> str:
     dX, dE = 1e3 * evaluation.displacement, np.degrees(evaluation.rotation)
     if len(dX) == 0:
-        return "Parameters only: mobility and motors differ in number, readings give no pose."
+        return "Parameters only: readings do not give one pose where mobility and motors differ."
     return (
         f"Platform error over {len(dX)} poses: displacement {dX.mean():.4f} mm "
         f"(max {dX.max():.4f}), orientation {dE.mean():.4f} deg (max {dE.max():.4f})"
