@@ -76,7 +76,7 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
     skew = Layout(tuple(LegLayout(sphere=False, seed=10 + j) for j in range(6)))
     other = load_mechanism(write_machine(tmp_path / "other", machine, skew))
     readings = random_configurations(cut, 20, 1).readings
-    with pytest.raises(DidNotConverge, match=r"joints that do not turn so far, .* right angles"):
+    with pytest.raises(DidNotConverge, match=r"joints that were not closed there, .* right angles"):
         forward_kinematics_many(other, readings)
 
 
@@ -131,4 +131,4 @@ def test_machines_that_share_no_reading_are_given_up_early(monkeypatch: pytest.M
     monkeypatch.setattr(accuracy, "forward_kinematics", never)
     with pytest.raises(DidNotConverge, match="only 0 of 100 random poses"):
         accuracy.evaluate("hexapod", "hexapod")
-    assert len(tried) == 20
+    assert len(tried) == 10

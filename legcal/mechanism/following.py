@@ -26,7 +26,8 @@ from legcal.mechanism.singularity import side
 NEWTON_STEPS = 12
 SHORTEST = 1.0 / 4096.0  # of the way from known readings to the wanted ones
 CONTRACTION = 0.5  # of the step before; of 1 rad or 1 m for the first
-RESTARTS = 3  # of legs that do not close where the platform arrived
+FRESH = 6  # starts from other angles of all legs there
+RESTARTS = 2  # of legs that do not close where the platform arrived
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,10 +115,10 @@ def follow(
     if closed is None:
         raise DidNotConverge(
             f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: found a "
-            "platform pose at which the legs have the right lengths, but joints that do not turn "
-            "so far, needed a closed chain; give the joints of the legs axes at right angles (of "
-            "three revolutes, and of a universal joint and its leg), which turn anywhere, or cut "
-            "spherical joints with 3d."
+            "platform pose at which the legs have the right lengths, but joints that were not "
+            "closed there, needed a closed chain; give the joints of the legs axes at right angles "
+            "(of three revolutes, and of a universal joint and its leg), which turn anywhere, or "
+            "cut spherical joints with 3d."
         )
     return closed
 
@@ -129,9 +130,14 @@ def _closed(
 
     The platform is let go only where axes that are a little off leave no other way.
     """
-    for close in (close_at, close_near) if is_constrained(mechanism) else (close_at,):
+    rng = np.random.default_rng(1965)
+    angles = mechanism.chain.rotation_columns()
+    step = np.zeros((1 + FRESH, mechanism.chain.nv))
+    step[1:, angles] = rng.uniform(-np.pi, np.pi, (FRESH, mechanism.chain.nv))[:, angles]
+    closes = [close_at] * len(step) + [close_near] * is_constrained(mechanism)
+    for close, turn in zip(closes, [*step, step[0]], strict=False):
         try:
-            trial = close(mechanism, T, start, RESTARTS)
+            trial = close(mechanism, T, mechanism.chain.integrate(start, turn), RESTARTS)
         except DidNotConverge:
             continue
         trial[slider_columns(mechanism, mechanism.motors)[0]] = readings

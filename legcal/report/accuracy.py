@@ -25,7 +25,7 @@ from legcal.mechanism.platform import platform_in_base, pose_differences
 N_RANDOM_POSES = 100
 _SEED = 20020721
 _ROUNDS = 20  # of drawing again what the reference does not reach
-_HOPELESS = 20  # poses that it does not reach, if they are the first
+_HOPELESS = 10  # poses that it does not reach, if they are the first
 
 
 @dataclass(frozen=True, eq=False)
