@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from legcal.errors import OutOfClass
+from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array
 from legcal.mechanism.bodies import Connection
 from legcal.mechanism.leg import PlatformLetter
@@ -81,10 +82,9 @@ class Axis:
 
     def distance(self, point: Array) -> float:
         """Return how far a point is from the axis, or from the centre of a sphere [m]."""
-        between = point - self.point
-        if self.direction is not None:
-            between = between - (between @ self.direction) * self.direction
-        return float(np.linalg.norm(between))
+        if self.direction is None:
+            return float(np.linalg.norm(point - self.point))
+        return float(distance_to_line(point, self.direction, self.point))
 
     def foot(self, point: Array) -> Array:
         """Return the point of the axis that is nearest to a point [m]."""
