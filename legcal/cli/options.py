@@ -1,0 +1,16 @@
+"""Arguments and options that several commands share."""
+
+from typing import Annotated
+
+import typer
+
+ModelArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="MODEL",
+        help="A mechanism YAML, a URDF, an MJCF file, a robot.yaml folder or a shipped name.",
+    ),
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")
+]
