@@ -19,16 +19,17 @@ from legcal.errors import LegcalError
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
-from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.observe import OutlineNoise
 from legcal.simulation.poses import extreme_poses, platform_error
 from legcal.simulation.session import simulate_session
+from legcal.simulation.table_noise import TableNoise
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import run_steps
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
     "outlines, 0.001 px a point, 300 points": OutlineNoise(1e-3, 300),
     "Table 1 in degrees, 3 images a pose": TableNoise(),
-    "Table 1 in radians, 3 images a pose": TableNoise(psi=0.05, theta=0.06),
+    "Table 1 in radians, 3 images a pose": TableNoise.in_radians(),
     "outlines, 0.1 px a point, 300 points": OutlineNoise(0.1, 300),
     "outlines, 0.05 px at the ends": OutlineNoise(0.25, 100),
     "outlines, 0.2 px at the ends": OutlineNoise(1.0, 100),

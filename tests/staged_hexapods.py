@@ -9,8 +9,9 @@ from legcal.geometry.types import Array
 from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
-from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.observe import OutlineNoise
 from legcal.simulation.session import SimulatedSession, simulate_session
+from legcal.simulation.table_noise import TableNoise
 
 
 @cache

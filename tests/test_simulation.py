@@ -6,13 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from staged_hexapods import exact_session, noisy_session
 
-from legcal.errors import DidNotConverge, NotVisible
+from legcal.errors import DidNotConverge
 from legcal.geometry.lines import moment
 from legcal.simulation.cameras import cameras_around, look_at, sample_camera
 from legcal.simulation.machine import hexapod, perturb
-from legcal.simulation.observe import OutlineNoise, TableNoise, observe_axes, shifted_outlines
+from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.poses import extreme_poses, follow, leg_vectors, platform_error, solve_pose
 from legcal.simulation.session import simulate_session
+from legcal.simulation.table_noise import TableNoise
 
 
 @given(seed=st.integers(0, 10**6))
@@ -83,30 +84,6 @@ def test_a_shift_of_an_outline_in_pixels_is_the_offset_that_the_camera_measures(
     h, _ = shifted_outlines(camera, outlines.h, outlines.ends, np.array([0.3, -0.2]))
     offset = camera.line_offset(h[:, None], camera.undistort(outlines.ends))
     assert np.allclose(offset, [-0.3, 0.2], atol=2e-3)
-
-
-def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
-    u = np.tile([0.2, -0.95, 0.24], (4000, 1))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    A = np.tile([0.1, 0.2, 0.9], (4000, 1))
-    noise = TableNoise()
-    u_hat, M_hat, _, _ = observe_axes(u, A, noise, np.random.default_rng(0))
-    exact = observe_axes(u, A, noise, None)
-    _, M, basis, covariance = (part[0] for part in exact)
-    beta = (M_hat - M) @ basis.T
-    alpha = (u_hat / (u_hat @ u[0])[:, None]) @ basis.T
-    found = np.cov(np.hstack([alpha, beta]).T)
-    scale = np.sqrt(np.diag(covariance))
-    assert np.allclose(
-        found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.1
-    )
-    assert np.isclose(np.rad2deg(noise.psi), 0.05)
-
-
-def test_table_1_does_not_exist_for_a_leg_parallel_to_the_image_x_axis() -> None:
-    u, A = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.1, 0.9]])
-    with pytest.raises(NotVisible, match="parallel to the image x axis"):
-        observe_axes(u, A, TableNoise(), None)
 
 
 def test_the_covariance_of_an_outline_is_that_of_a_line_fitted_to_white_points() -> None:

@@ -13,9 +13,10 @@ from legcal.geometry.types import IntArray
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations.leg_axes import LegAxes, axes_from_outlines
 from legcal.simulation.machine import Machine
-from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
+from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.poses import extreme_poses, platform_error
 from legcal.simulation.session import SimulatedSession
+from legcal.simulation.table_noise import TableNoise
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import StagedResult, run_steps
 

@@ -1,4 +1,4 @@
-"""What simulated cameras see: outlines with noise in pixels, or axes with the noise of Table 1."""
+"""What simulated cameras see: outlines with noise in pixels."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, IntArray
-from legcal.observations.leg_axes import LegAxes
 from legcal.observations.outlines import Outlines
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON, outlines_of_axis, point_with_zero_y
+from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
 
 @dataclass(frozen=True)
@@ -36,29 +34,6 @@ class OutlineNoise:
         t = np.linspace(0.0, 1.0, self.n_points)
         design = np.stack([1.0 - t, t], axis=-1)
         return np.asarray(self.sigma_px**2 * np.linalg.inv(design.T @ design))
-
-
-@dataclass(frozen=True)
-class TableNoise:
-    """The noise of Table 1, on the direction of an axis and on the point M_LS = (x, 0, z).
-
-    The paper prints the angles in radians; its results fit degrees only, so the default reads
-    them as degrees. ``TableNoise(psi=0.05, theta=0.06)`` is the table to the letter. The
-    Euler angles are read as turns about the camera's x axis (psi: tilt) and z axis (theta:
-    in the image).
-
-    Attributes
-    ----------
-    psi, theta : float
-        Standard deviations of the angles [rad].
-    x, z : float
-        Standard deviations of the coordinates of M_LS [m].
-    """
-
-    psi: float = float(np.deg2rad(0.05))
-    theta: float = float(np.deg2rad(0.06))
-    x: float = 0.05e-3
-    z: float = 0.10e-3
 
 
 def exact_outlines(
@@ -137,26 +112,6 @@ def observe_outlines(
     return shifted_outlines(camera, h, ends, offsets)
 
 
-def observe_axes(
-    u: Array, A: Array, noise: TableNoise, rng: np.random.Generator | None
-) -> tuple[Array, Array, Array, Array]:
-    """Return u, M_LS, basis and covariance of legs through A with the noise of Table 1."""
-    M = point_with_zero_y(u, A)
-    sigma = np.array([noise.psi, noise.theta, noise.x, noise.z])
-    if rng is not None:
-        error = rng.normal(size=(len(u), 4)) * sigma
-        turn = error[:, [0]] * np.array([1.0, 0.0, 0.0]) + error[:, [1]] * np.array([0.0, 0.0, 1.0])
-        u = u + np.cross(turn, u)
-        u = u / np.linalg.norm(u, axis=-1, keepdims=True)
-        M = M + error[:, [2, 3]] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    basis = normal_basis(u)
-    map_ = np.zeros((len(u), 4, 4))
-    for column, axis in enumerate(np.eye(3)[[0, 2]]):
-        map_[:, :2, column] = np.einsum("nia,na->ni", basis, np.cross(axis, u))
-        map_[:, 2:, 2 + column] = basis @ axis
-    return u, M, basis, map_ @ np.diag(sigma**2) @ np.swapaxes(map_, -1, -2)
-
-
 def outline_table(
     rows: Sequence[int],
     seen: Sequence[IntArray],
@@ -181,13 +136,3 @@ def outline_table(
         reason=("",) * n,
         source=("detected",) * n,
     )
-
-
-def axis_table(
-    rows: Sequence[int], seen: Sequence[IntArray], axes: Sequence[tuple[Array, ...]]
-) -> LegAxes:
-    """Return the table of axes of images: by row, then leg."""
-    row = np.concatenate([np.full(len(s), r) for r, s in zip(rows, seen, strict=True)])
-    u, M, basis, covariance = (np.concatenate(part) for part in zip(*axes, strict=True))
-    leg = np.concatenate(list(seen)).astype(np.intp)
-    return LegAxes(row.astype(np.intp), leg, u, M, basis, covariance)

@@ -16,13 +16,11 @@ from legcal.simulation.cameras import Viewpoint
 from legcal.simulation.machine import Machine
 from legcal.simulation.observe import (
     OutlineNoise,
-    TableNoise,
-    axis_table,
-    observe_axes,
     observe_outlines,
     outline_table,
 )
 from legcal.simulation.poses import extreme_poses, leg_vectors
+from legcal.simulation.table_noise import TableNoise, observe_images
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +131,7 @@ def _observe(
         for r in rows
     ]
     if isinstance(noise, TableNoise):
-        observed = [observe_axes(u, A, noise, rng) for u, A, _, _ in legs]
-        return None, axis_table(rows, seen, observed)
+        return None, observe_images(rows, seen, [(u, A) for u, A, _, _ in legs], noise, rng)
     images = [
         observe_outlines(viewpoints[measurements.view[r]].camera, legs[r], noise, rng) for r in rows
     ]

@@ -1,0 +1,111 @@
+"""Axes with the noise of Table 1: the angles as they are defined, the spread as it is claimed."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from legcal.errors import NotVisible
+from legcal.geometry.lines import distance_to_line
+from legcal.geometry.types import Array, IntArray
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.table_axes import axes_of_table, table_of_axes
+from legcal.simulation.table_noise import TableNoise, observe_axes
+from legcal.vision.euler import angles_of_direction, direction_derivative, direction_of_angles
+
+
+def _indices(n: int) -> tuple[IntArray, IntArray]:
+    return np.arange(n, dtype=np.intp), np.zeros(n, dtype=np.intp)
+
+
+def _random_lines(n: int, seed: int = 0) -> tuple[Array, Array]:
+    """Return n directions well away from the plane y = 0, and points before the camera."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(n, 3))
+    u[:, 1] = np.copysign(0.3 + np.abs(u[:, 1]), u[:, 1])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, rng.uniform([-0.3, -0.3, 0.6], [0.3, 0.3, 1.2], (n, 3))
+
+
+def test_the_axis_is_the_y_axis_turned_by_psi_about_x_and_then_by_theta_about_z() -> None:
+    rng = np.random.default_rng(0)
+    psi, theta = rng.uniform(-1.5, 1.5, 50), rng.uniform(-3.1, 3.1, 50)
+    turns = Rotation.from_euler("xz", np.stack([psi, theta], axis=-1))
+    u = direction_of_angles(psi, theta)
+    assert np.allclose(u, turns.apply([0.0, 1.0, 0.0]), atol=1e-15)
+    assert np.allclose(angles_of_direction(u), (psi, theta), atol=1e-14)
+
+
+def test_psi_is_towards_the_camera_and_theta_in_the_image() -> None:
+    psi, theta = angles_of_direction(np.array([[0.0, 0.8, 0.6], [0.6, 0.8, 0.0], [0.0, -1.0, 0.0]]))
+    assert np.allclose(psi, [np.arcsin(0.6), 0.0, 0.0])
+    assert np.allclose(theta[:2], [0.0, -np.arcsin(0.6)])
+    assert np.isclose(abs(theta[2]), np.pi)  # against the y axis: either way round
+
+
+def test_the_derivative_of_the_direction_is_that_of_finite_differences() -> None:
+    rng = np.random.default_rng(1)
+    psi, theta = rng.uniform(-1.5, 1.5, 20), rng.uniform(-3.1, 3.1, 20)
+    step = 1e-6
+    by_psi = direction_of_angles(psi + step, theta) - direction_of_angles(psi - step, theta)
+    by_theta = direction_of_angles(psi, theta + step) - direction_of_angles(psi, theta - step)
+    found = np.stack([by_psi, by_theta], axis=-1) / (2.0 * step)
+    assert np.allclose(direction_derivative(psi, theta), found, atol=1e-9)
+
+
+def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
+    n = 4000
+    u = np.tile([0.2, -0.95, 0.24], (n, 1))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    A = np.tile([0.1, 0.2, 0.9], (n, 1))
+    noise = TableNoise()
+    axes = observe_axes(*_indices(n), u, A, noise, np.random.default_rng(0))
+    exact = observe_axes(*_indices(n), u, A, noise, None)
+    M, basis, covariance = exact.M[0], exact.basis[0], exact.covariance[0]
+    beta = (axes.M - M) @ basis.T
+    alpha = (axes.u / (axes.u @ u[0])[:, None]) @ basis.T
+    found = np.cov(np.hstack([alpha, beta]).T)
+    scale = np.sqrt(np.diag(covariance))
+    assert np.allclose(
+        found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.1
+    )
+
+
+def test_the_angles_of_table_1_are_degrees_unless_radians_are_asked_for() -> None:
+    assert np.allclose(np.rad2deg(TableNoise().sigmas[:2]), [0.05, 0.06])
+    assert np.allclose(TableNoise.in_radians().sigmas[:2], [0.05, 0.06])
+    assert np.allclose(TableNoise().sigmas[2:], TableNoise.in_radians().sigmas[2:])
+
+
+def test_axes_without_noise_are_the_lines_that_they_were_made_of() -> None:
+    u, A = _random_lines(30)
+    axes = observe_axes(*_indices(30), u, A, TableNoise(), None)
+    assert np.allclose(axes.u, u, atol=1e-15)
+    assert np.allclose(axes.M[:, 1], 0.0)
+    assert np.allclose(distance_to_line(A, axes.u, axes.M), 0.0, atol=1e-14)
+
+
+def test_angles_and_points_come_back_from_axes_wherever_their_points_lie() -> None:
+    u, A = _random_lines(30)
+    axes = observe_axes(*_indices(30), u, A, TableNoise(), np.random.default_rng(2))
+    shift = np.linspace(-0.4, 0.4, 30)
+    move = np.tile(np.eye(4), (30, 1, 1))
+    move[:, 2, 0] = move[:, 3, 1] = shift  # a tilt moves the line where it is looked at
+    moved = LegAxes(
+        axes.row,
+        axes.leg,
+        axes.u,
+        axes.M + shift[:, None] * axes.u,
+        axes.basis,
+        move @ axes.covariance @ np.swapaxes(move, -1, -2),
+    )
+    values, sigmas = table_of_axes(moved)
+    assert np.allclose(sigmas, TableNoise().sigmas, rtol=1e-9)
+    again = axes_of_table(axes.row, axes.leg, values, sigmas)
+    assert np.allclose(again.u, axes.u, atol=1e-15)
+    assert np.allclose(again.M, axes.M, atol=1e-15)
+
+
+def test_table_1_does_not_exist_for_a_leg_parallel_to_the_image_x_axis() -> None:
+    u, A = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.1, 0.9]])
+    with pytest.raises(NotVisible, match="parallel to the image x axis"):
+        observe_axes(*_indices(1), u, A, TableNoise(), None)
