@@ -32,6 +32,7 @@ from legcal.detection.observe import (
     detection_settings,
     doubtful_rows,
     given_outlines,
+    scene_at_poses,
 )
 from legcal.detection.workers import Run, worker_pool
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible, OutOfClass
@@ -218,11 +219,7 @@ def _refuse_other_legs(mechanism: Mechanism) -> None:
 
 def _nominal_scene(work: _Workpiece) -> Scene:
     """Return where the nominal model and the readings put the legs."""
-    B_base = np.array([T.apply(work.mechanism.B_platform) for T in work.nominal_poses])
-    A_base = np.broadcast_to(work.mechanism.A_base, B_base.shape)
-    at_row = work.measurements.pose
-    hints = tuple(view.T_base_camera for view in work.measurements.views)
-    return Scene(A_base[at_row], B_base[at_row], hints)
+    return scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
 
 
 def _fitted_scene(work: _Workpiece, solution: Solution) -> Scene:

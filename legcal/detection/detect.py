@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.detection.align import align_camera
 from legcal.detection.outline import OUTSIDE, PartOutlines, outline_parts
-from legcal.detection.picture import reduce, to_grey
+from legcal.detection.picture import Grey, reduce, to_grey
 from legcal.detection.prediction import PredictedLeg, predict_legs
 from legcal.detection.strips import Strips, find_strips, reduction
 from legcal.detection.workers import Run, in_turn
@@ -28,6 +28,11 @@ from legcal.vision.camera import Camera
 Load = Callable[[int], Image]
 _Candidates = tuple[PredictedLeg, Strips, float]
 Progress = Callable[[int], None]
+Method = Callable[
+    [Grey, Camera, Sequence[PredictedLeg], Sequence[str], BoolArray, Array], list[PartOutlines]
+]
+"""Finds the outlines of all parts in one image, as :func:`legcal.detection.outline.outline_parts`
+does."""
 
 ROUGH_POSITION, ROUGH_ANGLE = 0.02, np.deg2rad(2.0)  # of T_base_camera [m, rad]
 JOINT_ERROR = 4e-3  # of predicted joint centres: the nominal model's joints and platform pose [m]
@@ -118,6 +123,7 @@ def detect_outlines(
     pixel_error: float = PIXEL_ERROR,
     progress: Progress | None = None,
     run: Run = in_turn,
+    method: Method = outline_parts,
 ) -> Outlines:
     """Find and measure the outlines of all legs, near where aligned cameras should see them.
 
@@ -135,6 +141,8 @@ def detect_outlines(
         How far the predicted joint centres may be off [m]; 0 after a fit.
     pixel_error : float
         How far outlines may be off besides [px].
+    method : callable
+        How the outlines of an image are found and measured; it travels to worker processes.
 
     Returns
     -------
@@ -143,7 +151,7 @@ def detect_outlines(
         platform; what was not found or cannot be trusted is rejected with the reason.
     """
     guide = _Guide(load, measurements, A_base, B_base, cylinders, T_base_camera, wanted)
-    search = partial(_search_outlines, guide, tuple(leg_names), joint_error, pixel_error)
+    search = partial(_search_outlines, guide, method, tuple(leg_names), joint_error, pixel_error)
     rows = _rows_with_images(measurements)
     found = []
     for row, parts in zip(rows, run(search, rows), strict=True):
@@ -182,7 +190,12 @@ def _search_strips(guide: _Guide, joint_error: float, row: int) -> list[_Candida
 
 
 def _search_outlines(
-    guide: _Guide, leg_names: tuple[str, ...], joint_error: float, pixel_error: float, row: int
+    guide: _Guide,
+    method: Method,
+    leg_names: tuple[str, ...],
+    joint_error: float,
+    pixel_error: float,
+    row: int,
 ) -> list[PartOutlines]:
     """Find and measure the outlines of all wanted legs of an image."""
     camera, view, legs = guide.legs(row)
@@ -191,7 +204,7 @@ def _search_outlines(
     for leg in legs:
         window[leg.leg] = pixel_error + joint_error * _pixels_per_metre(leg)
     grey = to_grey(guide.load(row))
-    found = outline_parts(grey, camera, legs, leg_names, wanted, window)
+    found = method(grey, camera, legs, leg_names, wanted, window)
     missing = set(np.flatnonzero(wanted).tolist()) - {leg.leg for leg in legs}
     cylinders = guide.cylinders
     found.extend(_outside(leg, cylinders[leg]) for leg in missing if len(cylinders[leg]))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 
@@ -20,10 +20,11 @@ from legcal.detection.detect import (
     JOINT_ERROR,
     PIXEL_ERROR,
     Load,
+    Method,
     align_views,
     detect_outlines,
 )
-from legcal.detection.outline import OUTSIDE
+from legcal.detection.outline import OUTSIDE, outline_parts
 from legcal.detection.workers import Run
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -68,6 +69,26 @@ class Scene:
     A_base: Array
     B_base: Array
     T_base_camera: tuple[RigidTransform | None, ...]
+
+
+def scene_at_poses(
+    mechanism: Mechanism, measurements: Measurements, T_base_platform: Sequence[RigidTransform]
+) -> Scene:
+    """Return where a model has the legs of every row, with the rough cameras of the views.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The model.
+    measurements : Measurements
+        All rows.
+    T_base_platform : sequence of RigidTransform, length n_poses
+        The platform at every pose.
+    """
+    B_base = np.array([T.apply(mechanism.B_platform) for T in T_base_platform])
+    A_base = np.broadcast_to(mechanism.A_base, B_base.shape)
+    hints = tuple(view.T_base_camera for view in measurements.views)
+    return Scene(A_base[measurements.pose], B_base[measurements.pose], hints)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +194,16 @@ def align(photographs: Photographs, scene: Scene, report: Report) -> Scene:
 
 
 def detect(
-    photographs: Photographs, scene: Scene, report: Report, *, near_fit: bool = False
+    photographs: Photographs,
+    scene: Scene,
+    report: Report,
+    *,
+    near_fit: bool = False,
+    method: Method = outline_parts,
+    stage: str = "Measuring outlines",
 ) -> Outlines:
     """Return all outlines: those searched for near the scene, and those kept."""
-    stage = "Measuring outlines again" if near_fit else "Measuring outlines"
+    stage = f"{stage} again" if near_fit else stage
     found = detect_outlines(
         photographs.load,
         photographs.searched,
@@ -187,6 +214,7 @@ def detect(
         photographs.wanted,
         photographs.mechanism.leg_names,
         run=photographs.run,
+        method=method,
         progress=_counted(report, stage, len(photographs.detect)),
         joint_error=0.0 if near_fit else JOINT_ERROR,
         pixel_error=NEAR_FIT_PX if near_fit else PIXEL_ERROR,

@@ -54,14 +54,28 @@ class PartOutlines:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    """A part on its way: where it is predicted, and where its edges were found."""
+class FoundPart:
+    """A part on its way: where it is predicted, and where its edges were found to a pixel.
+
+    Attributes
+    ----------
+    leg, piece : PredictedLeg, Piece
+        The leg and its part.
+    band : Band
+        The frame along the part.
+    predicted : (2, 2) array
+        Predicted offsets of edge 1 and 2 at both ends of the band [px].
+    hidden : (n_blocks,) array of bool
+        Which of the :func:`legcal.detection.pairs.block_positions` other legs hide.
+    pair : Pair
+        The edges.
+    """
 
     leg: PredictedLeg
     piece: Piece
     band: Band
-    predicted: Array  # (2, 2) offsets of edge 1 and 2 at both ends of the band
-    hidden: BoolArray  # of the block positions
+    predicted: Array
+    hidden: BoolArray
     pair: Pair
 
     @property
@@ -71,7 +85,31 @@ class _Part:
 
     @property
     def half_width(self) -> float:
+        """Half of the width that the edges have in the middle [px]."""
         return float(0.5 * np.mean(self.pair.v[1] - self.pair.v[0]))
+
+    def outlines(
+        self, camera: Camera, lines: Sequence[tuple[Array, Array, Array] | None]
+    ) -> PartOutlines:
+        """Return the outlines with these lines, not judged yet.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+        lines : sequence of two tuples or None
+            Of edge 1 and edge 2: offsets (2,) at both ends of the band [px], where the used piece
+            begins and ends (2,) as fractions of the band, covariance (2, 2) there [px^2].
+        """
+        result = _rejected(self.leg, self.piece, "")
+        for i, line in enumerate(lines):
+            if line is None:
+                continue
+            v, place, result.covariance[i] = line
+            offset = v[0] + (v[1] - v[0]) * place
+            result.h[i] = self.band.line(*v)
+            result.ends[i] = camera.distort(self.band.points(place * self.band.length, offset))
+        return result
 
 
 def outline_parts(
@@ -104,20 +142,46 @@ def outline_parts(
     list of PartOutlines
         One for every part of every wanted leg, found or not, from base to platform.
     """
-    results: list[PartOutlines] = []
-    parts: list[_Part] = []
+    parts, results = find_parts(grey, camera, legs, names, wanted, window)
+    if parts:
+        results.extend(_measure(grey, camera, parts))
+    return sorted(results, key=lambda result: result.leg)
+
+
+def find_parts(
+    grey: Grey,
+    camera: Camera,
+    legs: Sequence[PredictedLeg],
+    names: Sequence[str],
+    wanted: BoolArray,
+    window: Array,
+) -> tuple[list[FoundPart], list[PartOutlines]]:
+    """Find the edges of all parts in one image to about a pixel.
+
+    Parameters
+    ----------
+    grey, camera, legs, names, wanted, window
+        As for :func:`outline_parts`.
+
+    Returns
+    -------
+    parts : list of FoundPart
+        The parts to measure.
+    rejected : list of PartOutlines
+        The others, with the reason.
+    """
+    parts: list[FoundPart] = []
+    rejected: list[PartOutlines] = []
     for leg in legs:
         if not wanted[leg.leg]:
             continue
         for piece, h in zip(leg.pieces, leg.outlines, strict=True):
             found = _find(grey, camera, legs, names, leg, piece, h, float(window[leg.leg]))
             if isinstance(found, str):
-                results.append(_rejected(leg, piece, found))
+                rejected.append(_rejected(leg, piece, found))
             else:
                 parts.append(found)
-    if parts:
-        results.extend(_measure(grey, camera, parts))
-    return sorted(results, key=lambda result: result.leg)
+    return parts, rejected
 
 
 def _find(
@@ -129,7 +193,7 @@ def _find(
     piece: Piece,
     h: Array,
     window: float,
-) -> _Part | str:
+) -> FoundPart | str:
     """Find the pair of edges of a part, or say why not."""
     band = band_of_leg(camera, leg.A_camera, leg.B_camera, piece.start, piece.end)
     if band is None:
@@ -150,7 +214,7 @@ def _find(
     pair = find_pair(grey, camera, band, predicted, ~free, window)
     if pair is None:
         return "no convincing pair of edges"
-    return _Part(leg, piece, band, predicted, ~free, pair)
+    return FoundPart(leg, piece, band, predicted, ~free, pair)
 
 
 def _in_front(
@@ -167,7 +231,7 @@ def _in_front(
     return np.stack(front)
 
 
-def _measure(grey: Grey, camera: Camera, parts: Sequence[_Part]) -> list[PartOutlines]:
+def _measure(grey: Grey, camera: Camera, parts: Sequence[FoundPart]) -> list[PartOutlines]:
     """Measure and judge the outlines of parts whose edges are known to a pixel."""
     edges = [
         Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
@@ -182,19 +246,17 @@ def _measure(grey: Grey, camera: Camera, parts: Sequence[_Part]) -> list[PartOut
 
 
 def _judge(
-    camera: Camera, part: _Part, one: MeasuredEdge | None, two: MeasuredEdge | None
+    camera: Camera, part: FoundPart, one: MeasuredEdge | None, two: MeasuredEdge | None
 ) -> PartOutlines:
     """Turn the measured edges of a part into outlines with verdicts."""
-    result = _rejected(part.leg, part.piece, "")
-    for i, edge in enumerate((one, two)):
-        if edge is None:
-            continue
-        place = np.array([edge.line.first, edge.line.last])
-        offset = edge.v[0] + (edge.v[1] - edge.v[0]) * place
-        result.h[i] = part.band.line(*edge.v)
-        result.ends[i] = camera.distort(part.band.points(place * part.band.length, offset))
-        result.covariance[i] = edge.covariance
-    return replace(result, reasons=verdicts(part.pair, part.width, part.band.length, (one, two)))
+    lines = [
+        None
+        if edge is None
+        else (edge.v, np.array([edge.line.first, edge.line.last]), edge.covariance)
+        for edge in (one, two)
+    ]
+    reasons = verdicts(part.pair, part.width, part.band.length, (one, two))
+    return replace(part.outlines(camera, lines), reasons=reasons)
 
 
 def _rejected(leg: PredictedLeg, piece: Piece, reason: str) -> PartOutlines:
