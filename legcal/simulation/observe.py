@@ -9,8 +9,8 @@ import numpy as np
 
 from legcal.geometry.types import Array, IntArray
 from legcal.observations.outlines import Outlines
+from legcal.simulation.silhouette import silhouette
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,10 @@ def exact_outlines(
     ends : (n, 2, 2, 2) array
         Ends of both edges, the first nearer to the base [px].
     """
-    h = outlines_of_axis(u, M, radius)
+    h, offsets = silhouette(u, M, radius)
     parts = np.array([margin, 1.0 - margin])
     axis_points = M[:, None] + (length[:, None] * parts)[..., None] * u[:, None]
-    touching = axis_points[:, None] - (radius[:, None] * EPSILON)[..., None, None] * h[:, :, None]
-    return h, camera.project(touching)
+    return h, camera.project(axis_points[:, None] + offsets[:, :, None])
 
 
 def shifted_outlines(camera: Camera, h: Array, ends: Array, offsets: Array) -> tuple[Array, Array]:
