@@ -19,8 +19,8 @@ from legcal.simulation.observe import (
     observe_outlines,
     outline_table,
 )
-from legcal.simulation.poses import extreme_poses, leg_vectors
-from legcal.simulation.table_noise import TableNoise, observe_images
+from legcal.simulation.poses import extreme_poses, leg_vectors_of_poses
+from legcal.simulation.table_noise import TableNoise, observe_axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +59,7 @@ def simulate_session(
     noise: OutlineNoise | TableNoise,
     noisy: bool = True,
     sigma_q: float = 2e-6,
+    uniform_readings: bool = False,
     n_poses: int = 15,
     n_images: int = 1,
     share_poses: bool = False,
@@ -79,6 +80,8 @@ def simulate_session(
         False leaves observations, readings and rough camera poses exact; the covariances stay.
     sigma_q : float
         Standard deviation of the readings [m].
+    uniform_readings : bool
+        Errors of readings are uniform (of that standard deviation) instead of normal.
     n_poses : int
         Platform poses for each view.
     n_images : int
@@ -95,12 +98,10 @@ def simulate_session(
     view = np.repeat(np.arange(n_views), n_poses * n_images)
     pose = np.repeat(np.arange(n_views * n_poses), n_images)
     pose = (pose % n_poses if share_poses else pose).astype(np.intp)
-    lengths = np.stack(
-        [np.linalg.norm(leg_vectors(machine.parameters, T), axis=-1) for T in T_Rb_Re]
-    )
-    q = (lengths - machine.parameters.offsets) * machine.sign
+    legs = leg_vectors_of_poses(machine.parameters, RigidTransform.concatenate(list(T_Rb_Re)))
+    q = (np.linalg.norm(legs, axis=-1) - machine.parameters.offsets) * machine.sign
     if noisy:
-        q = q + rng.normal(scale=sigma_q, size=q.shape)
+        q = q + _reading_errors(rng, sigma_q, q.shape, uniform=uniform_readings)
     measurements = Measurements(
         views=tuple(_view(i, v, machine, rng if noisy else None) for i, v in enumerate(viewpoints)),
         image=("",) * len(view),
@@ -115,6 +116,16 @@ def simulate_session(
     return SimulatedSession(measurements, outlines, axes, machine, tuple(viewpoints), T_Rb_Re)
 
 
+def _reading_errors(
+    rng: np.random.Generator, sigma: float, shape: tuple[int, ...], *, uniform: bool
+) -> Array:
+    """Return errors of readings with a given standard deviation [m]."""
+    if uniform:
+        half_width = np.sqrt(3.0) * sigma
+        return rng.uniform(-half_width, half_width, shape)
+    return rng.normal(scale=sigma, size=shape)
+
+
 def _observe(
     machine: Machine,
     viewpoints: Sequence[Viewpoint],
@@ -123,33 +134,38 @@ def _observe(
     noise: OutlineNoise | TableNoise,
     rng: np.random.Generator | None,
 ) -> tuple[Outlines | None, LegAxes]:
-    """Return what all images show."""
-    rows = range(measurements.n_rows)
+    """Return what all images show; those of one view stand together."""
+    poses = RigidTransform.concatenate(list(T_Rb_Re))
     seen = [np.array(viewpoints[v].legs, dtype=np.intp) for v in measurements.view]
     legs = [
-        _legs_in_camera(machine, viewpoints[measurements.view[r]], T_Rb_Re[measurements.pose[r]])
-        for r in rows
+        _legs_in_camera(machine, viewpoint, poses[measurements.pose[measurements.view == v]])
+        for v, viewpoint in enumerate(viewpoints)
     ]
     if isinstance(noise, TableNoise):
-        return None, observe_images(rows, seen, [(u, A) for u, A, _, _ in legs], noise, rng)
+        row = np.repeat(np.arange(len(seen)), [len(s) for s in seen])
+        u, A, _, _ = (np.concatenate(part) for part in zip(*legs, strict=True))
+        return None, observe_axes(row, np.concatenate(seen), u, A, noise, rng)
     images = [
-        observe_outlines(viewpoints[measurements.view[r]].camera, legs[r], noise, rng) for r in rows
+        observe_outlines(viewpoint.camera, of_view, noise, rng)
+        for viewpoint, of_view in zip(viewpoints, legs, strict=True)
     ]
     h, ends = zip(*images, strict=True)
-    outlines = outline_table(rows, seen, h, ends, machine.parts, noise)
+    outlines = outline_table(range(len(seen)), seen, h, ends, machine.parts, noise)
     return outlines, axes_from_outlines(outlines, measurements, machine.radius_of_part())
 
 
 def _legs_in_camera(
     machine: Machine, viewpoint: Viewpoint, T_Rb_Re: RigidTransform
 ) -> tuple[Array, Array, Array, Array]:
-    """Return u, A (camera frame), length and radius of the legs that a camera sees."""
+    """Return u, A (camera frame), length and radius of the legs in images, by image, then leg."""
     seen = list(viewpoint.legs)
-    legs = leg_vectors(machine.parameters, T_Rb_Re)[seen]
+    legs = leg_vectors_of_poses(machine.parameters, T_Rb_Re)[:, seen].reshape(-1, 3)
     length = np.linalg.norm(legs, axis=-1)
     T_camera_Rb = viewpoint.T_Rb_camera.inv()
     u = T_camera_Rb.rotation.apply(legs / length[:, None])
-    return u, T_camera_Rb.apply(machine.parameters.base_joints[seen]), length, machine.radius[seen]
+    A = T_camera_Rb.apply(machine.parameters.base_joints[seen])
+    n_images = len(T_Rb_Re)
+    return u, np.tile(A, (n_images, 1)), length, np.tile(machine.radius[seen], n_images)
 
 
 def _view(
