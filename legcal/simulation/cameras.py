@@ -12,6 +12,7 @@ from legcal.geometry.types import Array
 from legcal.simulation.machine import Machine
 from legcal.vision.camera import Camera
 
+UPWARD = np.array([0.0, 0.0, 1.0])
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
 
 
@@ -86,15 +87,19 @@ def cameras_around(
     return tuple(viewpoints)
 
 
-def look_at(position: Array, target: Array, roll: float = 0.0) -> RigidTransform:
+def look_at(
+    position: Array, target: Array, roll: float = 0.0, *, up: Array = UPWARD
+) -> RigidTransform:
     """Return the pose of a camera that looks at a point, with its y axis down.
 
     Parameters
     ----------
     position, target : (3,) array
-        The camera centre and the point on its optical axis, in a frame L with z up [m].
+        The camera centre and the point on its optical axis, in a frame L [m].
     roll : float
         Turn about the optical axis [rad].
+    up : (3,) array
+        The direction in L that is up in the image; not along the optical axis.
 
     Returns
     -------
@@ -102,7 +107,7 @@ def look_at(position: Array, target: Array, roll: float = 0.0) -> RigidTransform
         T_L_camera.
     """
     z = (target - position) / np.linalg.norm(target - position)
-    x = np.cross(z, [0.0, 0.0, 1.0])
+    x = np.cross(z, up)
     x /= np.linalg.norm(x)
     upright = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
     return RigidTransform.from_components(position, upright * Rotation.from_euler("z", roll))

@@ -1,0 +1,131 @@
+"""Where cameras stand around a machine of any class, so that they see its legs well.
+
+Each camera has a sector around the machine, in the plane normal to the direction from base to
+platform (or to the plane of motion), and tries directions at several heights there. It takes the
+one from which most of the legs are seen, and longest in the image, over poses spread through the
+motion. It stands as near as the whole space that the machine moves in stays in the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array
+from legcal.mechanism.model import Mechanism
+from legcal.simulation.cameras import look_at
+from legcal.simulation.scene import Scene
+from legcal.simulation.visibility import field_of_view, legs_in_image
+from legcal.vision.camera import Camera
+
+_TURNS = (-0.35, -0.15, 0.0, 0.15, 0.35)  # within its sector, in sectors of a right angle at most
+_LIFTS = (0.1, 0.25, 0.45, 0.7, 0.95, 1.2)  # [rad] above the plane across the machine
+_LIFTS_PLANAR = (0.8, 1.0, 1.15, 1.3)  # [rad] above the plane of motion
+_TRIED = 5  # poses at which directions are judged
+_SAMPLES = 32  # points of a leg in that
+_ROLL = 0.08  # [rad] by which cameras are not upright
+_FURTHER = 0.08  # of the least distance, by which cameras stand further away
+_MARGIN = 0.06  # of the image that stays free at each side
+_BEHIND = 0.3  # machine sizes that lie between the camera and the machine, at least
+
+
+def places_around(
+    mechanism: Mechanism,
+    scenes: Sequence[Scene],
+    cameras: Sequence[Camera],
+    rng: np.random.Generator,
+) -> tuple[RigidTransform, ...]:
+    """Return where cameras stand.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The true machine.
+    scenes : sequence of Scene
+        The machine in the poses that the cameras are to see.
+    cameras : sequence of Camera
+        The camera of each view.
+    rng : numpy.random.Generator
+        Source of the first sector, of roll and distance.
+
+    Returns
+    -------
+    tuple of RigidTransform
+        T_base_camera.
+    """
+    reached = _reached(scenes)
+    tried = [scenes[i] for i in np.unique(np.linspace(0, len(scenes) - 1, _TRIED).astype(int))]
+    up = _up(mechanism, scenes)
+    sector = 2.0 * np.pi / len(cameras)
+    first = rng.uniform(0.0, 2.0 * np.pi)
+    lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
+    found = []
+    for v, camera in enumerate(cameras):
+        roll, further = rng.uniform(-_ROLL, _ROLL), 1.0 + _FURTHER * rng.random()
+        candidates = [
+            _place(
+                _direction(up, first + v * sector + turn, lift), up, roll, further, reached, camera
+            )
+            for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
+            for lift in lifts
+        ]
+        scores = [_score(mechanism, tried, camera, T) for T in candidates]
+        found.append(candidates[int(np.argmax(scores))])
+    return tuple(found)
+
+
+def _up(mechanism: Mechanism, scenes: Sequence[Scene]) -> Array:
+    """Return the direction from base to platform, or the normal of the plane of motion."""
+    if mechanism.base_normal is not None:
+        return mechanism.base_normal
+    across = np.mean([scene.B.mean(axis=0) - scene.A.mean(axis=0) for scene in scenes], axis=0)
+    size = float(np.linalg.norm(across))
+    reach = float(np.ptp(scenes[0].A, axis=0).max())
+    return np.asarray(across / size) if size > 1e-3 * reach else np.array([0.0, 0.0, 1.0])
+
+
+def _direction(up: Array, turn: float, lift: float) -> Array:
+    """Return the unit direction at an angle around *up* and a height [rad]."""
+    x, y = normal_basis(up)
+    level = np.cos(turn) * x + np.sin(turn) * y
+    return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
+
+
+def _reached(scenes: Sequence[Scene]) -> Array:
+    """Return points (n, 3) around everything that is seen of a machine in all of its poses."""
+    points = np.concatenate([part for s in scenes for part in (s.caster.mesh.vertices, s.A, s.B)])
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:  # all of them in a plane
+        return np.asarray(points)
+
+
+def _place(
+    toward: Array, up: Array, roll: float, further: float, points: Array, camera: Camera
+) -> RigidTransform:
+    """Return the pose of a camera in a direction from which all points are in the image."""
+    target = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    turned = look_at(target + toward, target, roll, up=up)
+    p = turned.rotation.inv().apply(points - target)
+    low, high = field_of_view(camera)
+    low, high = (1.0 - 2.0 * _MARGIN) * low, (1.0 - 2.0 * _MARGIN) * high
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    needed = [np.max(p[:, :2] / limit - p[:, 2:]) for limit in (low, high)]
+    distance = further * float(max(*needed, _BEHIND * size - p[:, 2].min()))
+    return look_at(target + distance * toward, target, roll, up=up)
+
+
+def _score(
+    mechanism: Mechanism, scenes: Sequence[Scene], camera: Camera, T: RigidTransform
+) -> float:
+    """Return the mean length in the image [px] of all legs, those hidden counted as nothing."""
+    views = [
+        view
+        for scene in scenes
+        for view in legs_in_image(mechanism.legs, scene, camera, T, samples=_SAMPLES)
+    ]
+    return float(np.mean([view.length_px if view.is_seen else 0.0 for view in views]))

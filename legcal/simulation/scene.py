@@ -1,0 +1,133 @@
+"""A machine in one pose as viewing rays meet it: triangles, hit by embree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.model import Mechanism
+from legcal.simulation.motion import SimulatedPoses
+from legcal.simulation.shapes import Box, Cylinder, Shape, Sphere
+from legcal.simulation.solids import PlacedSolid, Solid, link_poses, placed
+
+_SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
+_SUBDIVISIONS = 3  # of an icosahedron that stands for a sphere
+_FLAT = 1e-3  # thickness of joint centres that lie in a plane, of their size
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A machine in one pose.
+
+    Attributes
+    ----------
+    A, B : (n_legs, 3) array
+        Joint centres in the base link [m].
+    solids : tuple of PlacedSolid
+        What is seen of it, in the base link.
+    caster : trimesh.ray.ray_pyembree.RayMeshIntersector
+        Its triangles.
+    """
+
+    A: Array
+    B: Array
+    solids: tuple[PlacedSolid, ...]
+    caster: Any
+
+    def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
+        """Return which points something stands before, seen from a centre.
+
+        Parameters
+        ----------
+        centre : (3,) array
+            The camera centre in the base link [m].
+        points : (n, 3) array
+            Points in the base link [m].
+        margin : (n,) array
+            What is hit this near to a point, or behind it, does not hide it [m].
+        """
+        ray = points - centre
+        distance = np.linalg.norm(ray, axis=-1)
+        ray = ray / distance[:, None]
+        hits, index, _ = self.caster.intersects_location(
+            np.broadcast_to(centre, ray.shape), ray, multiple_hits=False
+        )
+        hidden = np.zeros(len(points), dtype=np.bool_)
+        reached = np.linalg.norm(np.reshape(hits, (-1, 3)) - centre, axis=-1)
+        hidden[index] = reached < distance[index] - margin[index]
+        return hidden
+
+    def encloses(self, centre: Array) -> bool:
+        """Say whether a point (3,) is in a solid, or between the joints of the machine."""
+        if any(
+            _is_in(shape.solid.shape, shape.T_base_solid.inv().apply(centre))
+            for shape in self.solids
+        ):
+            return True
+        joints = np.concatenate([self.A, self.B])
+        size = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
+        if len(joints) < 5 or size[2] < _FLAT * size[0]:
+            return False
+        from scipy.spatial import Delaunay
+
+        return bool(Delaunay(joints).find_simplex(centre) >= 0)
+
+
+def scenes_of(
+    mechanism: Mechanism, solids: Sequence[Solid], poses: SimulatedPoses
+) -> tuple[Scene, ...]:
+    """Return a machine in every pose.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The true machine.
+    solids : sequence of Solid
+        What is seen of it.
+    poses : SimulatedPoses
+        Its poses.
+    """
+    meshes = [_triangles(solid.shape) for solid in solids]
+    faces, first = [], 0
+    for mesh in meshes:
+        faces.append(mesh.faces + first)
+        first += len(mesh.vertices)
+    stacked = np.concatenate(faces)
+    scenes = []
+    for configuration, T in zip(poses.configurations, poses.T_base_platform, strict=True):
+        here = placed(solids, link_poses(mechanism, configuration))
+        vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
+        whole = trimesh.Trimesh(np.concatenate(vertices), stacked, process=False)
+        B = np.asarray(T.apply(mechanism.B_platform))
+        scenes.append(Scene(mechanism.A_base, B, here, RayMeshIntersector(whole)))
+    return tuple(scenes)
+
+
+def _triangles(shape: Shape) -> Any:
+    """Return a shape as triangles."""
+    if isinstance(shape, Cylinder):
+        return trimesh.creation.cylinder(shape.radius, shape.length, sections=_SECTIONS)
+    if isinstance(shape, Sphere):
+        return trimesh.creation.icosphere(_SUBDIVISIONS, shape.radius)
+    if isinstance(shape, Box):
+        return trimesh.creation.box(shape.size)
+    return trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+
+
+def _is_in(shape: Shape, point: Array) -> bool:
+    """Say whether a point (3,) in the frame of a shape is inside it."""
+    if isinstance(shape, Cylinder):
+        beside = np.hypot(point[0], point[1]) < shape.radius
+        return bool(beside and abs(point[2]) < 0.5 * shape.length)
+    if isinstance(shape, Sphere):
+        return bool(np.linalg.norm(point) < shape.radius)
+    if isinstance(shape, Box):
+        return bool(np.all(np.abs(point) < 0.5 * np.asarray(shape.size)))
+    mesh = _triangles(shape)
+    return bool(mesh.is_watertight and mesh.contains(point[None])[0])
