@@ -11,7 +11,7 @@ from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import uncertainty
 from legcal.refinement.inputs import inputs_of
 from legcal.refinement.legs import FittedLegs
-from legcal.refinement.loss import efficiency, width_to_k
+from legcal.refinement.loss import width_to_k
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import Linearization, information, linearize
 from legcal.refinement.problem import FitProblem
@@ -35,12 +35,13 @@ def assemble_solution(
     claimed, k = problem.outlines.covariance, width_to_k(settings.loss_width)
     whitening = fit.noise.whitening(claimed, fit.accepted)
     linear = linearize(problem, fit.state, whitening)
-    normal = information(problem, linear, efficiency(k))
+    normal = information(problem, linear, k)
     shared = shared_errors(problem, linear, normal, whitening)
     known = uncertainty(problem, normal, names, machine_size(fit.state), shared.covariance)
     offsets = offsets_of(problem, fit.state)
     used = offsets[fit.accepted]
     n_residuals = used.size + len(problem.readings) + len(problem.radius_prior.mean)
+    n_residuals += linear.axis_r.size
     parts = problem.layout.parts
     return Solution(
         parameters=fit.state.parameters,
@@ -54,7 +55,8 @@ def assemble_solution(
         cost=comparable_cost(problem, fit.state, settings),
         chi2=_chi2(linear),
         dof=n_residuals - problem.layout.size,
-        rms_px=float(np.sqrt(np.mean(used**2))) if used.size else 0.0,
+        rms_px=float(np.sqrt(np.mean(used**2))) if used.size else None,
+        rms_axes=float(np.sqrt(np.mean(linear.axis_r**2))) if linear.axis_r.size else None,
         noise=fit.noise,
         shared_bias_px=shared.bias_px,
         shared_tilt_px=shared.tilt_px,
@@ -70,12 +72,12 @@ def machine_size(state: State) -> float:
 
 
 def _chi2(linear: Linearization) -> float:
-    parts = (linear.outline_r, linear.encoder_r, linear.prior_r)
+    parts = (linear.outline_r, linear.encoder_r, linear.prior_r, linear.axis_r)
     return float(sum(np.sum(part**2) for part in parts))
 
 
 def comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:
-    """Return the robust cost of all outlines with their claimed covariances."""
+    """Return the robust cost of all observations with their claimed covariances."""
     whitening = NoiseModel().whitening(problem.outlines.covariance)
     inputs = inputs_of(problem, state, whitening, width_to_k(settings.loss_width))
     zero = ca.DM.zeros(problem.layout.size)

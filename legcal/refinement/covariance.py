@@ -176,8 +176,11 @@ def check_counts(problem: FitProblem, n_images: int) -> None:
     """
     equations = problem.n_equations + len(problem.radius_prior.mean)
     if equations < problem.layout.size:
+        seen = f"{len(problem.outlines)} outlines"
+        if len(problem.axes):
+            seen = f"{len(problem.axes)} axes" + f", {seen}" * bool(len(problem.outlines))
         raise NotIdentifiable(
-            f"The fit is not determined: {n_images} images with {len(problem.outlines)} outlines "
+            f"The fit is not determined: {n_images} images with {seen} "
             f"and {len(problem.readings)} readings give {equations} equations for "
             f"{problem.layout.size} unknowns; add images."
         )

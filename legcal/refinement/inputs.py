@@ -21,12 +21,12 @@ def inputs_of(problem: FitProblem, state: State, whitening: Array, k: float) -> 
     whitening : (n_outlines, 2, 2) array
         Lower triangular T of each outline: T C T^T = 1 [1/px]; zero leaves an outline out.
     k : float
-        Narrowness of the robust loss on outlines.
+        Narrowness of the robust loss on outlines and axes.
 
     Returns
     -------
     tuple of array
-        (n_outlines, 48), (n_readings, 22) and (n_radii, 3).
+        (n_outlines, 48), (n_readings, 22), (n_radii, 3) and (n_axes, 50).
     """
     o, e, prior = problem.outlines, problem.readings, problem.radius_prior
     camera = _frames(state.R_camera, state.t_camera)
@@ -61,7 +61,21 @@ def inputs_of(problem: FitProblem, state: State, whitening: Array, k: float) -> 
     of_prior = np.column_stack(
         [state.radii - prior.mean, 1.0 / prior.sigma, np.zeros(len(prior.mean))]
     )
-    return of_outlines, of_readings, of_prior
+    a = problem.axes
+    row, column = np.triu_indices(4)
+    of_axes = np.column_stack(
+        [
+            state.base_joints[a.leg],
+            state.platform_joints[a.leg],
+            camera[a.view],
+            pose[a.pose],
+            a.M,
+            a.basis.reshape(-1, 6),
+            a.whitening[:, column, row],  # the lower triangle, column by column
+            np.full(len(a), k),
+        ]
+    )
+    return of_outlines, of_readings, of_prior, of_axes
 
 
 def parameter_of(inputs: tuple[Array, ...]) -> Array:

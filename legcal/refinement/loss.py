@@ -7,6 +7,7 @@ plain least squares for k = 0. No residual, however wrong, pulls with more than 
 
 from dataclasses import dataclass
 from functools import cache
+from math import gamma
 
 import casadi as ca
 import numpy as np
@@ -53,16 +54,17 @@ def curvature(r: Array, k: float) -> Array:
     )
 
 
-def efficiency(k: float) -> float:
-    """Return the information that the loss keeps of two Gaussian residuals, 1 for k = 0.
+def efficiency(k: float, m: int = 2) -> float:
+    """Return the information that the loss keeps of m Gaussian residuals, 1 for k = 0.
 
     E[psi']^2 / E[psi^2], the factor of the asymptotic covariance of an M-estimator.
     """
     node, weight = np.polynomial.laguerre.laggauss(60)
-    s = 2.0 * node  # the squared norm of two unit Gaussians is exponential with mean 2
+    weight = weight * node ** (0.5 * m - 1.0) / gamma(0.5 * m)
+    s = 2.0 * node  # the squared norm of m unit Gaussians has the density s^(m/2-1) exp(-s/2)
     w = weights(s, k)
-    slope = w - 0.5 * k * s * w**3
-    return float((weight @ slope) ** 2 / (weight @ (w**2 * s / 2.0)))
+    slope = w - k * s * w**3 / m
+    return float((weight @ slope) ** 2 / (weight @ (w**2 * s / m)))
 
 
 @cache

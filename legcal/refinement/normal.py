@@ -14,9 +14,9 @@ import numpy as np
 
 from legcal.geometry.types import Array, IntArray
 from legcal.refinement.inputs import evaluate_jacobian, inputs_of
-from legcal.refinement.loss import curvature, weights
+from legcal.refinement.loss import curvature, efficiency, weights
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.residuals import encoder_residual, outline_residual
+from legcal.refinement.residuals import axis_residual, encoder_residual, outline_residual
 from legcal.refinement.state import State
 
 _RANGE = 1e-13  # eigenvalues below this part of the largest are rounding
@@ -32,6 +32,7 @@ class Linearization:
     encoder_r, encoder_J : (n, 1) and (n, 1, 13) array
     prior_r, prior_J : (n,) array
         Residuals of the prior, and their derivatives by their own unknown.
+    axis_r, axis_J : (n, 4) and (n, 4, 18) array
     """
 
     outline_r: Array
@@ -40,6 +41,8 @@ class Linearization:
     encoder_J: Array
     prior_r: Array
     prior_J: Array
+    axis_r: Array
+    axis_J: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +80,14 @@ class NormalEquations:
 
 def linearize(problem: FitProblem, state: State, whitening: Array) -> Linearization:
     """Return residuals and Jacobians of all measurements at a state."""
-    of_outlines, of_readings, _ = inputs_of(problem, state, whitening, 0.0)
+    of_outlines, of_readings, _, of_axes = inputs_of(problem, state, whitening, 0.0)
     prior = problem.radius_prior
     return Linearization(
         *evaluate_jacobian(outline_residual(), of_outlines),
         *evaluate_jacobian(encoder_residual(), of_readings),
         (state.radii - prior.mean) / prior.sigma,
         1e-3 / prior.sigma,
+        *evaluate_jacobian(axis_residual(), of_axes),
     )
 
 
@@ -95,41 +99,39 @@ def normal_equations(problem: FitProblem, linear: Linearization, k: float) -> No
     problem : FitProblem
     linear : Linearization
     k : float
-        Narrowness of the loss on outlines, 0 for plain least squares.
+        Narrowness of the loss on outlines and axes, 0 for plain least squares.
 
     Returns
     -------
     NormalEquations
     """
-    r, J = linear.outline_r, linear.outline_J
-    w = weights(np.sum(r**2, axis=-1), k)
-    MJ = curvature(r, k) @ J
-    return _assembled(
-        problem,
-        linear,
-        np.swapaxes(J, -1, -2) @ MJ,
-        np.einsum("nri,nr,n->ni", J, r, w),
+    outlines, axes = (
+        _robust_blocks(r, J, k)
+        for r, J in ((linear.outline_r, linear.outline_J), (linear.axis_r, linear.axis_J))
     )
+    return _assembled(problem, linear, outlines, axes)
 
 
-def information(problem: FitProblem, linear: Linearization, keeps: float) -> NormalEquations:
+def information(problem: FitProblem, linear: Linearization, k: float) -> NormalEquations:
     """Return the normal equations whose inverse is the covariance of the unknowns.
 
     Parameters
     ----------
     problem : FitProblem
     linear : Linearization
-    keeps : float
-        The part of the outlines' information that the robust loss keeps
-        (:func:`legcal.refinement.loss.efficiency`).
+    k : float
+        Narrowness of the loss, which does not keep all information of outlines and axes
+        (:func:`legcal.refinement.loss.efficiency`); 0 for what the data hold.
 
     Returns
     -------
     NormalEquations
     """
-    J = linear.outline_J
-    blocks = keeps * (np.swapaxes(J, -1, -2) @ J)
-    return _assembled(problem, linear, blocks, np.zeros(J.shape[::2]))
+    outlines, axes = (
+        (efficiency(k, J.shape[1]) * (np.swapaxes(J, -1, -2) @ J), np.zeros(J.shape[::2]))
+        for J in (linear.outline_J, linear.axis_J)
+    )
+    return _assembled(problem, linear, outlines, axes)
 
 
 def inverse_on_range(S: Array) -> Array:
@@ -146,8 +148,18 @@ def inverse_on_range(S: Array) -> Array:
     return np.asarray((scaled * inverse[..., None, :]) @ np.swapaxes(scaled, -1, -2))
 
 
+def _robust_blocks(r: Array, J: Array, k: float) -> tuple[Array, Array]:
+    """Return each measurement's share in the normal matrix and in the gradient."""
+    w = weights(np.sum(r**2, axis=-1), k)
+    MJ = curvature(r, k) @ J
+    return np.swapaxes(J, -1, -2) @ MJ, np.einsum("nri,nr,n->ni", J, r, w)
+
+
 def _assembled(
-    problem: FitProblem, linear: Linearization, outline_blocks: Array, outline_gradients: Array
+    problem: FitProblem,
+    linear: Linearization,
+    outlines: tuple[Array, Array],
+    axes: tuple[Array, Array],
 ) -> NormalEquations:
     """Sum the blocks of all measurements into the blocks of the normal equations."""
     layout, n_poses = problem.layout, len(problem.layout.pose)
@@ -158,13 +170,14 @@ def _assembled(
     g_kept, g_pose = np.zeros(n_kept + 1), np.zeros((n_poses, 6))
     J = linear.encoder_J
     kinds = [
-        (problem.outline_index, problem.outlines.pose, outline_blocks, outline_gradients),
+        (problem.outline_index, problem.outlines.pose, *outlines),
         (
             problem.encoder_index,
             problem.readings.pose,
             np.swapaxes(J, -1, -2) @ J,
             np.einsum("nri,nr->ni", J, linear.encoder_r),
         ),
+        (problem.axis_index, problem.axes.pose, *axes),
     ]
     for index, pose, blocks, gradients in kinds:
         m = index.shape[1] - 6

@@ -15,8 +15,10 @@ import numpy as np
 from legcal.geometry.types import Array, IntArray
 from legcal.refinement.loss import LossFunctions, robust_loss
 from legcal.refinement.observed import ObservedOutlines, Readings
+from legcal.refinement.observed_axes import ObservedAxes
 from legcal.refinement.residuals import (
     Residual,
+    axis_residual,
     encoder_residual,
     outline_residual,
     prior_residual,
@@ -63,10 +65,11 @@ class FitProblem:
     outlines : ObservedOutlines
     readings : Readings
     radius_prior : Prior
+    axes : ObservedAxes
     solver : casadi.Function
         IPOPT on the whole problem; its parameter is that of
         :func:`legcal.refinement.inputs.parameter_of`.
-    outline_index, encoder_index : (n, 19) and (n, 13) array of int
+    outline_index, encoder_index, axis_index : (n, 19), (n, 13) and (n, 18) array of int
         Positions in x of the unknowns of each measurement; ``layout.size`` where fixed.
     cost, gradient, hessian : casadi.Function
         Of (x, parameter): the robust cost, its gradient and the upper triangle of its
@@ -77,8 +80,10 @@ class FitProblem:
     outlines: ObservedOutlines
     readings: Readings
     radius_prior: Prior
+    axes: ObservedAxes
     outline_index: IntArray
     encoder_index: IntArray
+    axis_index: IntArray
     cost: ca.Function
     gradient: ca.Function
     hessian: ca.Function
@@ -87,7 +92,7 @@ class FitProblem:
     @property
     def n_equations(self) -> int:
         """Number of residuals, priors left out."""
-        return 2 * len(self.outlines) + len(self.readings)
+        return 2 * len(self.outlines) + len(self.readings) + 4 * len(self.axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +110,7 @@ def build_problem(
     outlines: ObservedOutlines,
     readings: Readings,
     radius_prior: Prior,
+    axes: ObservedAxes,
     max_iterations: int = 100,
 ) -> FitProblem:
     """Build the fit of everything.
@@ -117,6 +123,7 @@ def build_problem(
     readings : Readings
     radius_prior : Prior
         Prior on the radii.
+    axes : ObservedAxes
     max_iterations : int
         Limit for IPOPT.
 
@@ -141,10 +148,19 @@ def build_problem(
             layout.pose[readings.pose],
         ]
     )
+    axis_index = np.column_stack(
+        [
+            layout.base[axes.leg],
+            layout.platform[axes.leg],
+            layout.camera[axes.view],
+            layout.pose[axes.pose],
+        ]
+    )
     kinds = [
         (outline_residual(), outline_index),
         (encoder_residual(), encoder_index),
         (prior_residual(), radius_prior.position[:, None]),
+        (axis_residual(), axis_index),
     ]
     x = ca.MX.sym("x", layout.size)
     terms = []
@@ -166,8 +182,10 @@ def build_problem(
         outlines,
         readings,
         radius_prior,
+        axes,
         outline_index,
         encoder_index,
+        axis_index,
         cost_function,
         gradient_function,
         hessian_function,

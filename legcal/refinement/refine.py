@@ -1,4 +1,4 @@
-"""One fit of everything: all outlines in pixels and all readings, at once.
+"""One fit of everything: all outlines in pixels, or measured axes, and all readings, at once.
 
 A wide robust loss first, so that wrong outlines cannot bend the way; then rounds in which the
 noise of outlines is estimated, outlines that disagree are rejected, and the rest is fitted again.
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
+from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.refinement.assembly import (
@@ -26,6 +27,7 @@ from legcal.refinement.legs import FittedLegs
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import information, linearize
 from legcal.refinement.observed import has_offset, observed_outlines, readings
+from legcal.refinement.observed_axes import observed_axes
 from legcal.refinement.problem import FitProblem, Prior, build_problem
 from legcal.refinement.rounds import first_minimum, fit_in_rounds
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
@@ -42,26 +44,29 @@ def build_fit(
     measurements: Measurements,
     outlines: Outlines,
     settings: RefinementSettings = DEFAULT_SETTINGS,
+    *,
+    axes: LegAxes | None = None,
 ) -> FitProblem:
-    """Build the fit of everything without solving it.
+    """Build the fit of everything without solving it; arguments as in :func:`refine`.
 
     Raises
     ------
     NotIdentifiable
         If there are fewer equations than unknowns.
     DatasetError
-        If an outline cannot be used.
+        If an outline or an axis cannot be used.
     """
     observed = observed_outlines(outlines, measurements, legs)
+    lines = observed_axes(axes, measurements, legs)
     encoders = readings(measurements, legs)
     seen = np.zeros(len(measurements.views), dtype=np.bool_)
-    seen[observed.view] = True
+    seen[observed.view] = seen[lines.view] = True
     layout = lay_out(
         legs.frame_legs, has_offset(measurements), observed.parts, seen, measurements.n_poses
     )
     mean = np.array([legs.radii[part] for part in observed.parts])
     prior = Prior(layout.radius, mean, settings.radius_sigma * mean)
-    problem = build_problem(layout, observed, encoders, prior, settings.max_iterations)
+    problem = build_problem(layout, observed, encoders, prior, lines, settings.max_iterations)
     check_counts(problem, measurements.n_rows)
     return problem
 
@@ -72,6 +77,8 @@ def refine(
     outlines: Outlines,
     start: Start,
     settings: RefinementSettings = DEFAULT_SETTINGS,
+    *,
+    axes: LegAxes | None = None,
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii to all data at once.
 
@@ -87,6 +94,9 @@ def refine(
         Starting values.
     settings : RefinementSettings
         Choices of the fit.
+    axes : LegAxes, optional
+        Measured axes, beside outlines or instead of them (give
+        :func:`legcal.observations.sets.no_outlines`). Their covariances are taken as they are.
 
     Returns
     -------
@@ -97,11 +107,22 @@ def refine(
     NotIdentifiable
         If the data do not determine the parameters.
     DidNotConverge
-        If the solver stops early, or most outlines disagree with what it found.
+        If the solver stops early, or most outlines or axes disagree with what it found.
     DatasetError
-        If an outline cannot be used.
+        If an outline or an axis cannot be used.
     """
-    problem = build_fit(legs, measurements, outlines, settings)
+    problem = build_fit(legs, measurements, outlines, settings, axes=axes)
+    return solve_fit(problem, legs, outlines, start, settings)
+
+
+def solve_fit(
+    problem: FitProblem,
+    legs: FittedLegs,
+    outlines: Outlines,
+    start: Start,
+    settings: RefinementSettings = DEFAULT_SETTINGS,
+) -> Solution:
+    """Solve a fit that :func:`build_fit` built; otherwise the same as :func:`refine`."""
     candidate = _candidate(problem, legs, start, settings)
     return _refined(problem, legs, outlines, candidate, settings)
 
@@ -112,6 +133,8 @@ def refine_from_best(
     outlines: Outlines,
     starts: Sequence[Start],
     settings: RefinementSettings = DEFAULT_SETTINGS,
+    *,
+    axes: LegAxes | None = None,
 ) -> Solution:
     """Fit everything from several starts and keep the lowest cost.
 
@@ -124,7 +147,7 @@ def refine_from_best(
     NotIdentifiable, DidNotConverge
         If no start leads to a fit.
     """
-    problem = build_fit(legs, measurements, outlines, settings)
+    problem = build_fit(legs, measurements, outlines, settings, axes=axes)
     candidates: list[_Candidate] = []
     notes: list[str] = []
     failures: list[LegcalError] = []
@@ -198,7 +221,7 @@ def _refined(
 def _refuse_undetermined(problem: FitProblem, legs: FittedLegs, state: State) -> None:
     """Raise NotIdentifiable if that is why there is no minimum to converge to."""
     linear = linearize(problem, state, NoiseModel().whitening(problem.outlines.covariance))
-    normal = information(problem, linear, 1.0)
+    normal = information(problem, linear, 0.0)
     uncertainty(problem, normal, estimated_names(problem, legs), machine_size(state))
 
 

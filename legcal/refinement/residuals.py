@@ -112,6 +112,34 @@ def outline_residual() -> Residual:
 
 
 @cache
+def axis_residual() -> Residual:
+    """Return how far a leg's predicted axis is from a measured one, whitened.
+
+    It is T times (alpha1, alpha2, beta1, beta2). The measured axis passes through M along e1 x e2.
+    alpha is the predicted direction in e1 and e2, over its part along the axis; beta is where
+    the predicted axis meets the plane through M with these directions, from M.
+
+    local (18): A, B, camera (w, t), platform pose (w, t). data (50): their references (3, 3, 12,
+    12), M, e1, e2; the lower triangle of the whitening T, column by column, and k.
+    """
+    local, data = ca.SX.sym("local", 18), ca.SX.sym("data", 50)
+    A = data[0:3] + UNIT * local[0:3]
+    B = data[3:6] + UNIT * local[3:6]
+    R_camera, t_camera = moved_frame(local[6:12], data[6:18])
+    R_pose, t_pose = moved_frame(local[12:18], data[18:30])
+    A_camera = R_camera @ A + t_camera
+    leg = R_camera @ (R_pose @ B + t_pose) + t_camera - A_camera
+    M, e1, e2 = data[30:33], data[33:36], data[36:39]
+    basis = ca.horzcat(e1, e2).T
+    slope = leg / ca.dot(ca.cross(e1, e2), leg)
+    to_A = A_camera - M
+    beta = basis @ (to_A - slope * ca.dot(ca.cross(e1, e2), to_A))
+    T = ca.SX(ca.Sparsity.lower(4), data[39:49])
+    whitened = T @ ca.vertcat(basis @ slope, beta)
+    return Residual("axis", 18, 50, 4, ca.Function("axis", [local, data], [whitened]))
+
+
+@cache
 def encoder_residual() -> Residual:
     """Return the whitened closure of a leg, (|R B + t - A| - sign q - q0) / sigma_q.
 

@@ -19,6 +19,9 @@ class RefinementSettings:
         Rounds, at most, until the rejected outlines stay the same.
     noise_rounds : int
         Rounds of noise estimation after that.
+    axis_disagreement : float
+        Whitened distance of an axis beyond which it disagrees; a fit in which most do is
+        refused. Sigmas that are too small by less are told by chi2 alone.
     largest_rms_px : float
         Root mean square of the offsets of accepted outlines beyond which a fit is refused [px].
     max_iterations : int
@@ -30,6 +33,7 @@ class RefinementSettings:
     rejection: float = 4.5
     rejection_rounds: int = 6
     noise_rounds: int = 2
+    axis_disagreement: float = 20.0
     largest_rms_px: float = 3.0
     max_iterations: int = 100
 

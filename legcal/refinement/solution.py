@@ -22,7 +22,7 @@ class Solution:
     parameters : KinematicParameters
         Joints in R_b and R_e, and offsets [m].
     T_camera_Rb : tuple of RigidTransform
-        Camera poses, one a view. A view without outlines keeps that of the start.
+        Camera poses, one a view. A view that shows nothing keeps that of the start.
     T_Rb_Re : tuple of RigidTransform
         Platform poses.
     radii : dict
@@ -37,14 +37,17 @@ class Solution:
     weak : tuple of WeakDirection
         The directions known worst, worst first.
     cost : float
-        Robust cost over all outlines that came in, rejected ones too, with their claimed
+        Robust cost over all observations that came in, rejected ones too, with their claimed
         covariances: comparable between fits of the same data.
     chi2 : float
-        Sum of the squared whitened residuals of used outlines, readings and priors.
+        Sum of the squared whitened residuals of used outlines, axes, readings and priors.
     dof : int
         Their number, less the unknowns.
-    rms_px : float
-        Root mean square of the offsets of used outlines [px].
+    rms_px : float or None
+        Root mean square of the offsets of used outlines [px]; None if there are none.
+    rms_axes : float or None
+        Root mean square of the residuals of measured axes, over their claimed standard
+        deviations; None if there are none.
     noise : NoiseModel
         The estimated errors of outlines; ``noise.bias_px`` is tau.
     shared_bias_px, shared_tilt_px : float
@@ -71,7 +74,8 @@ class Solution:
     cost: float
     chi2: float
     dof: int
-    rms_px: float
+    rms_px: float | None
+    rms_axes: float | None
     noise: NoiseModel
     shared_bias_px: float
     shared_tilt_px: float

@@ -166,5 +166,5 @@ def _length_errors(
 
 def _arrays(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
     """Return rotation matrices and translations of motions."""
-    R = np.array([T.rotation.as_matrix() for T in motions]).reshape(-1, 3, 3)
-    return R, np.array([T.translation for T in motions]).reshape(-1, 3)
+    T = np.array([T.as_matrix() for T in motions]).reshape(-1, 4, 4)
+    return T[:, :3, :3].copy(), T[:, :3, 3].copy()

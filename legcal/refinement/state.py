@@ -31,7 +31,7 @@ class Layout:
     radius : (n_radii,) array of int
         Radii, one for each of ``parts``.
     camera : (n_views, 6) array of int
-        Rotation and translation of each camera; cameras without outlines are no unknowns.
+        Rotation and translation of each camera; cameras that show nothing are no unknowns.
     pose : (n_poses, 6) array of int
         Rotation and translation of each platform pose.
     parts : tuple of (int, str)
@@ -79,7 +79,7 @@ def lay_out(
     parts : sequence of (int, str)
         Leg index and part of each radius.
     camera_is_seen : (n_views,) array of bool
-        Which views have outlines.
+        Which views have outlines or axes.
     n_poses : int
         Number of platform poses.
 
@@ -185,7 +185,7 @@ def turned(R: Array, w: Array) -> Array:
 
 def motions(R: Array, t: Array) -> tuple[RigidTransform, ...]:
     """Return rigid motions of rotation matrices (n, 3, 3) and translations (n, 3) [m]."""
-    return tuple(
-        RigidTransform.from_components(translation, Rotation.from_matrix(rotation))
-        for rotation, translation in zip(R, t, strict=True)
-    )
+    if len(R) == 0:
+        return ()
+    together = RigidTransform.from_components(t, Rotation.from_matrix(R))
+    return tuple(together[i] for i in range(len(R)))
