@@ -155,41 +155,59 @@ def join_axes(axes: LegAxes, group: IntArray) -> LegAxes:
         Joined axes, ordered by group and then by leg; ``row`` is the first of each.
     """
     keys = np.stack([group, axes.leg], axis=1)
-    distinct, which = np.unique(keys, axis=0, return_inverse=True)
-    members = [np.flatnonzero(which.ravel() == k) for k in range(len(distinct))]
-    joined = [_join(axes, m) for m in members]
-    u, M, basis, covariance = (np.array(part) for part in zip(*joined, strict=True))
-    first = np.array([m[0] for m in members], dtype=np.intp)
+    _, first, which, count = np.unique(
+        keys, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    u, M, basis, covariance = (
+        part[first] for part in (axes.u, axes.M, axes.basis, axes.covariance)
+    )
+    several = np.flatnonzero(count > 1)
+    if len(several):
+        members = np.flatnonzero(count[which.ravel()] > 1)
+        line = np.searchsorted(several, which.ravel()[members])
+        u[several], M[several], basis[several], covariance[several] = _joined(
+            axes, first[several], members, line
+        )
     return LegAxes(axes.row[first], axes.leg[first], u, M, basis, covariance)
 
 
-def _join(axes: LegAxes, members: IntArray) -> tuple[Array, Array, Array, Array]:
-    """Return u, M, basis and covariance of the weighted mean of observations of one line."""
-    i = members[0]
-    u, M, basis = axes.u[i], axes.M[i], axes.basis[i]
-    if len(members) == 1:
-        return u, M, basis, axes.covariance[i]
-    information: Array = np.zeros((4, 4))
-    weighted: Array = np.zeros(4)
-    for k in members:
-        # The other line at the height of M, written in this basis.
-        u_k = axes.u[k] / (axes.u[k] @ u)
-        shift = u @ (M - axes.M[k])
-        value = np.concatenate([basis @ u_k, basis @ (axes.M[k] + shift * u_k - M)])
-        turn = basis @ axes.basis[k].T
-        move = np.block([[turn, np.zeros((2, 2))], [shift * turn, turn]])
-        weight = np.linalg.inv(move @ axes.covariance[k] @ move.T)
-        information += weight
-        weighted += weight @ value
-    covariance = np.linalg.inv(information)
-    alpha, beta = np.split(covariance @ weighted, 2)
-    u_new = u + basis.T @ alpha
-    u_new = np.asarray(u_new / np.linalg.norm(u_new))
-    M_new = np.asarray(M + basis.T @ beta)
+def _joined(
+    axes: LegAxes, first: IntArray, members: IntArray, line: IntArray
+) -> tuple[Array, Array, Array, Array]:
+    """Return u, M, basis and covariance of the weighted mean of the observations of each line.
+
+    Parameters
+    ----------
+    axes : LegAxes
+    first : (m,) array of int
+        The first observation of each line, in whose basis the mean is taken.
+    members, line : (n,) array of int
+        Observations, and the line that each of them shows.
+    """
+    u, M, basis = axes.u[first], axes.M[first], axes.basis[first]
+    E = basis[line]
+    # Each observation at the height of the first one's M, written in its basis.
+    slope = axes.u[members] / np.sum(axes.u[members] * u[line], axis=-1, keepdims=True)
+    shift = np.sum(u[line] * (M[line] - axes.M[members]), axis=-1)
+    point = axes.M[members] + shift[:, None] * slope - M[line]
+    value = np.concatenate([E @ slope[..., None], E @ point[..., None]], axis=1)
+    turn = E @ np.swapaxes(axes.basis[members], -1, -2)
+    move = np.zeros((len(line), 4, 4))
+    move[:, :2, :2] = move[:, 2:, 2:] = turn
+    move[:, 2:, :2] = shift[:, None, None] * turn
+    weight = np.linalg.inv(move @ axes.covariance[members] @ np.swapaxes(move, -1, -2))
+    information, weighted = np.zeros((len(first), 4, 4)), np.zeros((len(first), 4, 1))
+    np.add.at(information, line, weight)
+    np.add.at(weighted, line, weight @ value)
+    covariance: Array = np.linalg.inv(information)
+    change = (covariance @ weighted)[..., 0]
+    u += np.einsum("nia,ni->na", basis, change[:, :2])
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    M += np.einsum("nia,ni->na", basis, change[:, 2:])
     # Carry e1 along so that the covariance keeps its meaning.
-    e1 = basis[0] - u_new * (u_new @ basis[0])
-    e1 /= np.linalg.norm(e1)
-    return u_new, M_new, np.array([e1, np.cross(u_new, e1)]), np.asarray(covariance)
+    e1 = basis[:, 0] - u * np.sum(u * basis[:, 0], axis=-1, keepdims=True)
+    e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
+    return u, M, np.stack([e1, np.cross(u, e1)], axis=1), covariance
 
 
 def _pairs(outlines: Outlines) -> IntArray:
