@@ -9,31 +9,59 @@ looked at again.
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from legcal.errors import OutOfResources, UsageError
 from legcal.files.atomic import TEMPORARY_SUFFIX, temporary_folder
 
-RESULT_NAME = "result.json"
-RESULT_KEY = "legcal_result"
+
+@dataclass(frozen=True)
+class OutputKind:
+    """A kind of output folder.
+
+    Attributes
+    ----------
+    noun : str
+        What the folder holds.
+    marker, key : str
+        The JSON document that legcal leaves in such a folder, and a key in it.
+    """
+
+    noun: str
+    marker: str
+    key: str
+
+    def is_in(self, folder: Path) -> bool:
+        """Say whether a folder holds an output of this kind that legcal wrote."""
+        try:
+            found = json.loads((folder / self.marker).read_bytes())
+        except (OSError, ValueError, RecursionError):
+            return False
+        return isinstance(found, dict) and self.key in found
 
 
-def check_destination(destination: Path) -> None:
-    """Refuse an output folder that holds something else than an earlier result.
+RESULT = OutputKind("result", "result.json", "legcal_result")
+
+
+def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
+    """Refuse an output folder that holds something else than an earlier output of its kind.
 
     Parameters
     ----------
     destination : Path
         The output folder; it need not exist.
+    kind : OutputKind
+        What it is to hold.
 
     Raises
     ------
     UsageError
-        If it is a file, holds files but no result of legcal, or cannot be written to.
+        If it is a file, holds files but nothing of this kind, or cannot be written to.
     """
-    start = f"{destination}: the result could not be written: found"
+    start = f"{destination}: the {kind.noun} could not be written: found"
     try:
         os.lstat(destination)
     except (FileNotFoundError, NotADirectoryError):
@@ -49,10 +77,10 @@ def check_destination(destination: Path) -> None:
         raise UsageError(
             f"{start} a file of that name, needed a folder; give another output folder."
         )
-    if destination.is_dir() and _holds_files(destination) and not _is_result(destination):
+    if destination.is_dir() and holds_files(destination) and not kind.is_in(destination):
         raise UsageError(
-            f"{start} a folder with other files and no {RESULT_NAME} of legcal, needed a new or "
-            "empty folder or that of an earlier result; give another output folder."
+            f"{start} a folder with other files and no {kind.marker} of legcal, needed a new or "
+            f"empty folder or that of an earlier {kind.noun}; give another output folder."
         )
     target = destination if destination.is_dir() else _existing_parent(destination)
     if not _is_writable(target):
@@ -63,7 +91,9 @@ def check_destination(destination: Path) -> None:
 
 
 @contextmanager
-def result_folder(destination: Path) -> Iterator[Path]:
+def result_folder(
+    destination: Path, kind: OutputKind = RESULT, stale: Iterable[Path] = ()
+) -> Iterator[Path]:
     """Give a temporary folder whose files become the result when the block ends well.
 
     An earlier result is replaced file by file; other files beside it are kept. If the block or
@@ -73,6 +103,10 @@ def result_folder(destination: Path) -> Iterator[Path]:
     ----------
     destination : Path
         The output folder; it and its parents are created at the end.
+    kind : OutputKind
+        What it is to hold.
+    stale : iterable of Path
+        Files of an earlier output, relative to the folder, that go where they are not replaced.
 
     Yields
     ------
@@ -86,7 +120,7 @@ def result_folder(destination: Path) -> Iterator[Path]:
     OutOfResources
         If the files cannot be written, as on a full disk.
     """
-    check_destination(destination)
+    check_destination(destination, kind)
     try:
         with temporary_folder(_workshop(destination), destination.name) as temporary:
             new = temporary / "new"
@@ -94,14 +128,14 @@ def result_folder(destination: Path) -> Iterator[Path]:
             yield new
             destination.parent.mkdir(parents=True, exist_ok=True)
             if destination.exists():
-                _replace_files(new, destination, temporary / "old")
+                _replace_files(new, destination, temporary / "old", stale)
             else:
                 os.rename(new, destination)
     except OSError as error:
         raise OutOfResources(
-            f"{destination}: the result could not be written: found '{error.strerror}', needed a "
-            "folder that takes its files; free some space or give another output folder; nothing "
-            "was written."
+            f"{destination}: the {kind.noun} could not be written: found '{error.strerror}', "
+            "needed a folder that takes its files; free some space or give another output folder; "
+            "nothing was written."
         ) from error
 
 
@@ -123,7 +157,7 @@ def _is_writable(folder: Path) -> bool:
     return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
 
 
-def _holds_files(folder: Path) -> bool:
+def holds_files(folder: Path) -> bool:
     """Say whether a folder holds more than what killed runs left behind."""
     return any(not path.name.endswith(TEMPORARY_SUFFIX) for path in folder.iterdir())
 
@@ -136,19 +170,11 @@ def _existing_parent(destination: Path) -> Path:
     return Path(destination.absolute().anchor)
 
 
-def _is_result(folder: Path) -> bool:
-    """Say whether a folder holds a result that legcal wrote."""
-    try:
-        found = json.loads((folder / RESULT_NAME).read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(found, dict) and RESULT_KEY in found
-
-
-def _replace_files(new: Path, destination: Path, old: Path) -> None:
+def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:
     """Move files into a folder; if that is interrupted, put back what was there."""
     names = [path.relative_to(new) for path in sorted(new.rglob("*")) if path.is_file()]
-    kept = [name for name in names if (destination / name).exists()]
+    gone = [name for name in stale if name not in names and (destination / name).is_file()]
+    kept = [name for name in names if (destination / name).exists()] + gone
     for name in kept:
         (old / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(destination / name, old / name)
@@ -156,8 +182,10 @@ def _replace_files(new: Path, destination: Path, old: Path) -> None:
         for name in names:
             (destination / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(new / name, destination / name)
+        for name in gone:
+            os.unlink(destination / name)
     except BaseException:
-        for name in names:
+        for name in [*names, *gone]:
             with suppress(FileNotFoundError):
                 if name in kept:
                     os.replace(old / name, destination / name)
