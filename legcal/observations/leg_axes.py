@@ -199,7 +199,7 @@ def _joined(
     information, weighted = np.zeros((len(first), 4, 4)), np.zeros((len(first), 4, 1))
     np.add.at(information, line, weight)
     np.add.at(weighted, line, weight @ value)
-    covariance: Array = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     change = (covariance @ weighted)[..., 0]
     u += np.einsum("nia,ni->na", basis, change[:, :2])
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
