@@ -24,7 +24,7 @@ LAYERS = (
     "pipeline",
     "cli",
 )
-SIMULATED = {"simulation"}  # what knows the truth
+SIMULATED = {"simulation", "studies"}  # what knows the truth
 
 
 @cache

@@ -1,0 +1,1 @@
+"""Monte Carlo studies: what is claimed, measured on simulated machines whose truth is known."""

@@ -1,0 +1,203 @@
+"""The one Monte Carlo runner: all cores, resumable, the same results however it is run.
+
+Run i has child i of the study's seed, whatever the number of runs and of processes. Every run
+goes to the checkpoint as it comes; the summary reads them back in the order of their numbers, one
+at a time, so that neither the order nor memory depends on how they were computed.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from legcal.errors import DidNotConverge, OutOfResources, UsageError
+from legcal.files.atomic import TEMPORARY_SUFFIX, write_atomically
+from legcal.progress import Report, no_progress
+from legcal.studies.checkpoint import CHECKPOINT_NAME, Checkpoint, header, open_checkpoint
+from legcal.studies.study import Record, Study, Summary
+from legcal.studies.workers import lines_of_runs
+
+DOCUMENT_NAME = "study.json"
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResult:
+    """A finished study.
+
+    Attributes
+    ----------
+    study : str
+        Its name.
+    settings : dict
+        Its settings.
+    seed, n_runs : int
+        Seed and number of runs.
+    failures : dict of str to int
+        How many runs failed as a whole, by kind of error.
+    summary : Summary
+        What the others found.
+    """
+
+    study: str
+    settings: dict[str, Any]
+    seed: int
+    n_runs: int
+    failures: dict[str, int]
+    summary: Summary
+
+    def document(self) -> dict[str, Any]:
+        """Return the document that ``legcal study --json`` prints."""
+        return {
+            **self.summary.document(),
+            "study": self.study,
+            "settings": self.settings,
+            "seed": self.seed,
+            "runs": self.n_runs,
+            "failures": self.failures,
+        }
+
+
+def run_study(
+    study: Study,
+    n_runs: int,
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    output: Path | None = None,
+    progress: Report = no_progress,
+) -> StudyResult:
+    """Run a study, or what is missing of it.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    n_runs : int
+        Number of runs.
+    seed : int
+        Seed of the study.
+    workers : int
+        Number of processes.
+    output : Path, optional
+        Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
+        the same study is continued; more runs than before are added to those that are there.
+    progress : callable
+        Told how many runs are done.
+
+    Returns
+    -------
+    StudyResult
+
+    Raises
+    ------
+    UsageError
+        If a number makes no sense, or the folder holds something else than this study.
+    DidNotConverge
+        If every run failed.
+    OutOfResources
+        If a file cannot be written or a process is ended from outside.
+    """
+    _check_numbers(n_runs, seed, workers)
+    stage = f"Study {study.name}"
+    with _folder(output) as folder:
+        path = folder / CHECKPOINT_NAME
+        with open_checkpoint(path, header(study.name, study.settings, seed)) as checkpoint:
+            missing = [run for run in range(n_runs) if run not in checkpoint.offsets]
+            done = n_runs - len(missing)
+            progress(stage, done, n_runs)
+            for lines in lines_of_runs(study, seed, missing, workers):
+                checkpoint.append(lines)
+                done += len(lines)
+                progress(stage, done, n_runs)
+            result = _result(study, seed, n_runs, checkpoint)
+        if output is not None:
+            _write(result, folder)
+    return result
+
+
+def _result(study: Study, seed: int, n_runs: int, checkpoint: Checkpoint) -> StudyResult:
+    """Return what all runs found."""
+    failures: Counter[str] = Counter()
+    first: list[str] = []
+
+    def records() -> Iterator[Record]:
+        for line in checkpoint.lines(n_runs):
+            if "record" in line:
+                yield line["record"]
+            else:
+                failures[line["failure"]["kind"]] += 1
+                first.append(line["failure"]["message"])
+                del first[1:]
+
+    summary = study.summary(records())
+    if failures.total() == n_runs:
+        raise DidNotConverge(
+            f"The study {study.name} found nothing: all of its {n_runs} runs failed, needed one "
+            f"that does not; the first one says: {first[0]}"
+        )
+    return StudyResult(study.name, study.settings, seed, n_runs, dict(failures), summary)
+
+
+def _write(result: StudyResult, folder: Path) -> None:
+    """Write the document and the figures."""
+    document = json.dumps(result.document(), indent=1, allow_nan=False).encode() + b"\n"
+    try:
+        for name, content in {**result.summary.files(), DOCUMENT_NAME: document}.items():
+            write_atomically(folder / name, content)
+    except OSError as error:
+        raise OutOfResources(
+            f"{folder}: the result of the study could not be written: found '{error.strerror}', "
+            "needed a folder that takes its files; free some space and start the same command "
+            "again; all runs are kept."
+        ) from error
+
+
+@contextmanager
+def _folder(output: Path | None) -> Iterator[Path]:
+    """Give the output folder, or one that is removed in the end."""
+    if output is None:
+        with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
+            yield Path(folder)
+        return
+    _check_folder(output)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            f"{output}: the study could not be written: found '{error.strerror}', needed a path "
+            "that can be created; give another output folder."
+        ) from error
+    yield output
+
+
+def _check_folder(output: Path) -> None:
+    """Refuse a path that holds something else than a study."""
+    start = f"{output}: the study could not be written: found"
+    if output.exists() and not output.is_dir():
+        raise UsageError(
+            f"{start} a file of that name, needed a folder; give another output folder."
+        )
+    if not output.is_dir() or (output / CHECKPOINT_NAME).is_file():
+        return
+    others = [path for path in output.iterdir() if not path.name.endswith(TEMPORARY_SUFFIX)]
+    if others:
+        raise UsageError(
+            f"{start} a folder with other files and no {CHECKPOINT_NAME} of a study, needed a new "
+            "or empty folder or that of the same study; give another output folder."
+        )
+
+
+def _check_numbers(n_runs: int, seed: int, workers: int) -> None:
+    """Refuse numbers that make no sense."""
+    for name, found, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", workers, 1)):
+        if found < least:
+            raise UsageError(
+                f"The study could not be run: found {name} = {found}, needed {least} or more; "
+                "give another number."
+            )

@@ -1,0 +1,219 @@
+"""The Monte Carlo runner: the same results however it is run, and nothing lost."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_studies import Draws, Mistaken
+
+from legcal.errors import DidNotConverge, UsageError
+from legcal.studies.checkpoint import CHECKPOINT_NAME
+from legcal.studies.runner import DOCUMENT_NAME, run_study
+from legcal.studies.workers import child_seed
+
+PROGRAM = Path(__file__).with_name("toy_studies.py")
+
+
+def _lines(folder: Path) -> list[bytes]:
+    path = folder / CHECKPOINT_NAME
+    return path.read_bytes().splitlines(keepends=True) if path.exists() else []
+
+
+def test_results_depend_neither_on_the_number_of_processes_nor_on_their_order() -> None:
+    study = Draws(seconds=0.002)
+    results = [run_study(study, 40, seed=3, workers=n).document() for n in (1, 2, 3)]
+    assert results[0] == results[1] == results[2]
+    assert results[0]["n"] == 40
+
+
+def test_the_seed_of_a_run_is_the_child_of_that_number_however_many_there_are() -> None:
+    for run, spawned in enumerate(np.random.SeedSequence(5).spawn(7)):
+        assert np.array_equal(child_seed(5, run).generate_state(4), spawned.generate_state(4))
+
+
+def test_more_runs_are_added_to_those_that_are_there(tmp_path: Path) -> None:
+    few = run_study(Draws(), 10, output=tmp_path / "out").document()
+    begun = _lines(tmp_path / "out")
+    more = run_study(Draws(), 25, output=tmp_path / "out").document()
+    assert _lines(tmp_path / "out")[: len(begun)] == begun
+    assert more == run_study(Draws(), 25).document()
+    assert run_study(Draws(), 10, output=tmp_path / "out").document() == few
+    assert json.loads((tmp_path / "out" / DOCUMENT_NAME).read_bytes()) == few
+    assert (tmp_path / "out" / "total.txt").read_text() == str(few["total"])
+
+
+def test_progress_counts_runs_up_to_all_of_them() -> None:
+    told: list[tuple[str, int, int]] = []
+    run_study(Draws(), 30, progress=lambda *now: told.append(now))
+    assert [done for _, done, _ in told] == sorted(done for _, done, _ in told)
+    assert told[0] == ("Study draws", 0, 30)
+    assert told[-1] == ("Study draws", 30, 30)
+
+
+def test_failed_runs_are_recorded_and_counted(tmp_path: Path) -> None:
+    study = Draws(fails_above=0.5)
+    result = run_study(study, 40, workers=2, output=tmp_path / "out")
+    document = result.document()
+    assert document["failures"] == {"DidNotConverge": 40 - document["n"]}
+    assert 0 < document["n"] < 40
+    failed = [line for line in _lines(tmp_path / "out") if b"failure" in line]
+    assert len(failed) == 40 - document["n"]
+    again = run_study(study, 40, output=tmp_path / "out")
+    assert again.document() == document
+
+
+def test_a_study_of_failures_only_says_why() -> None:
+    with pytest.raises(DidNotConverge, match=r"all of its 5 runs failed.*The draw is"):
+        run_study(Draws(fails_above=-np.inf), 5)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_mistake_in_a_study_is_no_failed_run(workers: int) -> None:
+    with pytest.raises(ZeroDivisionError):
+        run_study(Mistaken(), 4, workers=workers)
+
+
+@pytest.mark.parametrize(
+    "rest", [b'{"run":11,"rec', b'{"run":11,"record":{"x":1.0}}', b"\0\0\0\0\n"]
+)
+def test_a_half_written_last_line_is_done_again(tmp_path: Path, rest: bytes) -> None:
+    run_study(Draws(), 11, output=tmp_path)
+    with open(tmp_path / CHECKPOINT_NAME, "ab") as file:
+        file.write(rest)
+    assert run_study(Draws(), 20, output=tmp_path).document() == run_study(Draws(), 20).document()
+    assert len(_lines(tmp_path)) == 21
+
+
+def test_a_checkpoint_that_was_hardly_begun_is_begun_again(tmp_path: Path) -> None:
+    expected = run_study(Draws(), 3, output=tmp_path).document()
+    path = tmp_path / CHECKPOINT_NAME
+    path.write_bytes(path.read_bytes()[:17])
+    assert run_study(Draws(), 3, output=tmp_path).document() == expected
+
+
+def test_a_damaged_line_inside_is_refused(tmp_path: Path) -> None:
+    run_study(Draws(), 5, output=tmp_path)
+    lines = _lines(tmp_path)
+    lines[2] = lines[2][:9] + b"\n"
+    (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join(lines))
+    with pytest.raises(UsageError, match="found line 3 damaged"):
+        run_study(Draws(), 5, output=tmp_path)
+    assert _lines(tmp_path) == lines
+
+
+@pytest.mark.parametrize(
+    ("study", "seed", "message"),
+    [
+        (Draws("others"), 0, "found the checkpoint of the study 'draws', needed one of 'others'"),
+        (Draws(scale=2.0), 0, r"other settings \(scale 1.0 instead of 2.0\)"),
+        (Draws(fails_above=1.0), 0, r"other settings \(fails.above null instead of 1.0\)"),
+        (Draws(), 1, r"other settings \(seed 0 instead of 1\)"),
+    ],
+)
+def test_a_checkpoint_of_another_study_is_refused_and_kept(
+    tmp_path: Path, study: Draws, seed: int, message: str
+) -> None:
+    run_study(Draws(), 5, output=tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(UsageError, match=message):
+        run_study(study, 5, seed=seed, output=tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="a folder with other files"):
+        run_study(Draws(), 5, output=tmp_path)
+    with pytest.raises(UsageError, match="a file of that name"):
+        run_study(Draws(), 5, output=tmp_path / "notes.txt")
+    with pytest.raises(UsageError, match="could not be written"):
+        run_study(Draws(), 5, output=tmp_path / "notes.txt" / "below")
+    (tmp_path / CHECKPOINT_NAME).write_text("mine\n")
+    with pytest.raises(UsageError, match="no checkpoint of legcal"):
+        run_study(Draws(), 5, output=tmp_path)
+    assert (tmp_path / CHECKPOINT_NAME).read_text() == "mine\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"notes.txt", CHECKPOINT_NAME}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"n_runs": 0}, "runs = 0, needed 1 or more"),
+        ({"n_runs": 1, "seed": -1}, "seed = -1, needed 0 or more"),
+        ({"n_runs": 1, "workers": 0}, "workers = 0, needed 1 or more"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(numbers: dict[str, int], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        run_study(
+            Draws(),
+            numbers["n_runs"],
+            seed=numbers.get("seed", 0),
+            workers=numbers.get("workers", 1),
+        )
+
+
+@contextmanager
+def _running(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Give a process that runs a study of 400 runs, some of which are done."""
+    process = subprocess.Popen(
+        [sys.executable, str(PROGRAM), str(folder)], stderr=subprocess.PIPE, start_new_session=True
+    )
+    try:
+        end = time.monotonic() + 60.0
+        while len(_lines(folder)) < 20:
+            assert process.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        assert process.stderr is not None
+        process.stderr.close()
+
+
+def _processes_of(group: int) -> list[str]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it ended meanwhile
+            continue
+        if int(fields[2]) == group and fields[0] != "Z":
+            found.append(stat.parent.name)
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
+def test_a_killed_study_leaves_no_process_and_is_continued(tmp_path: Path) -> None:
+    with _running(tmp_path) as process:
+        with pytest.raises(UsageError, match="another process writes this checkpoint"):
+            run_study(Draws(), 400, output=tmp_path)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        end = time.monotonic() + 10.0
+        while _processes_of(process.pid):
+            assert time.monotonic() < end
+            time.sleep(0.1)
+    n_done = len(_lines(tmp_path))
+    assert 20 <= n_done < 401
+    assert run_study(Draws(), 400, output=tmp_path).document() == run_study(Draws(), 400).document()
+
+
+def test_ctrl_c_stops_all_processes_without_a_word_of_theirs(tmp_path: Path) -> None:
+    with _running(tmp_path) as process:
+        os.killpg(process.pid, signal.SIGINT)
+        _, told = process.communicate(timeout=20.0)
+    tracebacks = [line for line in told.decode().splitlines() if line.startswith("Traceback")]
+    assert len(tracebacks) == 1  # that of the program itself, which lets the interrupt pass
+    assert told.decode().splitlines()[-1].startswith("KeyboardInterrupt")
+    assert len(_lines(tmp_path)) < 401
