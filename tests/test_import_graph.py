@@ -20,6 +20,7 @@ LAYERS = (
     "refinement",
     "identify",
     "calibration",
+    "repeatability",
     "report",
     "pipeline",
     "cli",

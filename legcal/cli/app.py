@@ -17,6 +17,7 @@ from legcal.cli.evaluate import evaluate
 from legcal.cli.identify import identify
 from legcal.cli.inspect import inspect
 from legcal.cli.new import new
+from legcal.cli.noise import noise
 from legcal.cli.output import print_failure
 from legcal.errors import LegcalError
 from legcal.signals import stopped_by_signals
@@ -52,7 +53,7 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-for command in (inspect, identify, calibrate, evaluate, new):
+for command in (inspect, identify, calibrate, evaluate, new, noise):
     app.command()(command)
 
 

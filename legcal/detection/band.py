@@ -43,6 +43,11 @@ class Band:
         along = self.origin + t[..., None] * (self.along / self.scale)
         return np.asarray(along + v[..., None] * (self.normal / self.scale))
 
+    def coordinates(self, xy: Array) -> tuple[Array, Array]:
+        """Return t and v [px] of points (..., 2) of the sensor plane, both (...)."""
+        from_origin = self.scale * (xy - self.origin)
+        return np.asarray(from_origin @ self.along), np.asarray(from_origin @ self.normal)
+
     def offsets(self, h: Array, t: Array) -> Array:
         """Return the coordinate v of lines h (..., 3) of eq (2) at t (...) [px]."""
         on_axis = self.points(t, np.zeros(()))

@@ -21,6 +21,7 @@ from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 
 OUTSIDE = "outside the image"  # a reason
+HIDDEN = "hidden by"  # the beginning of one
 MARGIN = 4.0  # beside a leg in front [px]
 NARROWEST = 5.0  # [px]
 
@@ -210,7 +211,7 @@ def _find(
     free = np.all(front < 0, axis=0)
     if np.mean(free) * band.length < least:
         values, counts = np.unique(front[front >= 0], return_counts=True)
-        return f"hidden by {names[values[np.argmax(counts)]]}"
+        return f"{HIDDEN} {names[values[np.argmax(counts)]]}"
     pair = find_pair(grey, camera, band, predicted, ~free, window)
     if pair is None:
         return "no convincing pair of edges"
