@@ -41,8 +41,8 @@ METHODS: dict[str, tuple[Method, str]] = {
 OUTLINE = "outline"  # the spread of outlines, beside the QUANTITIES of axes
 BIAS = (
     "Repeats show what differs between images of one pose, not the bias that they share: an edge "
-    "that light, blur or rounding to whole pixels displaces in all of them shows no spread. What the "
-    "detector claims allows for such bias, so that a ratio below one is expected of it."
+    "that light, blur or rounding to whole pixels displaces in all of them shows no spread. What "
+    "the detector claims allows for such bias, so that a ratio below one is expected of it."
 )
 
 
