@@ -1,0 +1,91 @@
+"""Axes of a simulated hexapod with known errors, for the tests of the fit of axes."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from legcal.geometry.types import Array
+from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.measurements import Measurements
+from legcal.observations.table_axes import axes_of_table, table_of_axes
+from legcal.refinement.legs import FittedLegs
+from legcal.refinement.start import Start, start_from
+from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
+from legcal.simulation.machine import hexapod, perturb
+from legcal.simulation.session import simulate_session
+from legcal.simulation.table_noise import TableNoise
+
+
+@dataclass(frozen=True, eq=False)
+class AxesSession:
+    """Exact axes, the readings and the truth behind them."""
+
+    legs: FittedLegs
+    measurements: Measurements
+    axes: LegAxes
+    truth: Start
+
+    def noisy(self, seed: int) -> tuple[Measurements, LegAxes]:
+        """Return readings and axes with the errors that they claim."""
+        rng, m = np.random.default_rng(seed), self.measurements
+        error = rng.normal(scale=m.sigma_q, size=(m.n_poses, len(self.legs.names)))
+        values, sigmas = table_of_axes(self.axes)
+        values += sigmas * rng.normal(size=values.shape)
+        axes = axes_of_table(self.axes.row, self.axes.leg, values, sigmas)
+        return replace(m, q=m.q + error[m.pose]), axes
+
+    def start(self, seed: int = 7, joints: float = 0.002) -> Start:
+        """Return a start that is wrong by so much in every parameter [m]; cameras by 1 degree."""
+        rng = np.random.default_rng(seed)
+        xi = to_vector(self.truth.parameters, self.legs.frame_legs)
+        xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
+        cameras = [
+            view.T_base_camera.inv()
+            for view in self.measurements.views
+            if view.T_base_camera is not None
+        ]
+        return start_from(
+            from_vector(xi, self.legs.n_legs, self.legs.frame_legs),
+            self.measurements,
+            self.legs,
+            cameras,
+            self.truth.T_Rb_Re,
+            "nominal",
+        )
+
+    def errors(self, parameters: KinematicParameters) -> Array:
+        """Return the errors of the free parameters [m]."""
+        frame_legs = self.legs.frame_legs
+        return to_vector(parameters, frame_legs) - to_vector(self.truth.parameters, frame_legs)
+
+
+@cache
+def axes_session(
+    n_poses: int = 8,
+    n_images: int = 1,
+    *,
+    coplanar: bool = False,
+    legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
+) -> AxesSession:
+    """Return a session of a hexapod 2 mm off its drawing, seen with the noise of Table 1."""
+    rng = np.random.default_rng(3)
+    machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
+    cameras = cameras_around(machine, rng, legs=legs)
+    session = simulate_session(
+        machine, cameras, rng, noise=TableNoise(), noisy=False, n_poses=n_poses, n_images=n_images
+    )
+    # Rough camera poses, about 1 degree and 1 cm wrong.
+    rough = simulate_session(machine, cameras, rng, noise=TableNoise(), n_poses=1).measurements
+    return AxesSession(
+        FittedLegs(machine.leg_names, machine.sign, machine.frame_legs, {}),
+        replace(session.measurements, views=rough.views),
+        session.axes,
+        Start(
+            machine.parameters,
+            tuple(camera.T_Rb_camera.inv() for camera in cameras),
+            session.T_Rb_Re,
+            "truth",
+        ),
+    )
