@@ -14,14 +14,15 @@ from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.report.leg_origins import moved_origins
 from legcal.report.urdf import (
-    calibrated_origins,
+    calibrated_legs,
     check_closes,
     reload_and_check,
     write_calibrated_urdf,
     write_calibrated_yaml,
 )
-from legcal.report.urdf_patch import patch_origins
+from legcal.report.urdf_patch import Origin, patch_origins
 
 ORIGIN = re.compile(rb"""(<origin\b[^>]*?\bxyz\s*=\s*["'])([^"']*)(["'])""")
 
@@ -39,7 +40,7 @@ def _written(mechanism: Mechanism, parameters: KinematicParameters, folder: Path
     return reload_and_check(folder / "calibrated.yaml")
 
 
-@pytest.mark.parametrize("name", [name for name in LAYOUTS if not LAYOUTS[name].carried])
+@pytest.mark.parametrize("name", LAYOUTS)
 def test_what_is_written_is_what_is_read_again(name: str, tmp_path: Path) -> None:
     nominal = load_mechanism(write_hexapod(tmp_path / "nominal", LAYOUTS[name]))
     machine = moved(geometry())
@@ -71,7 +72,7 @@ def test_only_the_intended_numbers_differ(tmp_path: Path) -> None:
     _written(nominal, wanted.parameters, tmp_path)
     before, after = SHIPPED_URDF.read_bytes(), (tmp_path / "calibrated.urdf").read_bytes()
     assert ORIGIN.sub(rb"\1\3", before) == ORIGIN.sub(rb"\1\3", after)
-    joints = set(calibrated_origins(nominal, wanted.parameters))
+    joints = set(moved_origins(nominal, calibrated_legs(nominal, wanted.parameters)))
     assert len(joints) == 18
     for old, new in zip(before.split(b"\n"), after.split(b"\n"), strict=True):
         name = re.search(rb'<joint name="([^"]*)"', old)
@@ -129,19 +130,44 @@ def test_an_origin_that_is_not_written_is_added() -> None:
         b'<robot name="r"><joint name="a" type="fixed"><parent link="x > y"/></joint>'
         b"<joint name='b' note='1 > 0' type='fixed'><origin rpy='0 0 1'/></joint></robot>"
     )
-    patched = patch_origins(content, {"a": np.array([0.1, 0.2, 1 / 3]), "b": np.zeros(3)})
+    origins = {"a": Origin(np.array([0.1, 0.2, 1 / 3])), "b": Origin(np.zeros(3))}
+    patched = patch_origins(content, origins)
     assert patched == (
         b'<robot name="r"><joint name="a" type="fixed"><origin xyz="0.1 0.2 0.3333333333333333"/>'
         b"<parent link=\"x > y\"/></joint><joint name='b' note='1 > 0' type='fixed'>"
         b"<origin xyz=\"0.0 0.0 0.0\" rpy='0 0 1'/></joint></robot>"
     )
     with pytest.raises(ModelError, match="found no joint 'c'"):
-        patch_origins(content, {"c": np.zeros(3)})
+        patch_origins(content, {"c": Origin(np.zeros(3))})
 
 
-def test_a_platform_that_hangs_on_a_leg_cannot_be_written(tmp_path: Path) -> None:
-    nominal = load_mechanism(write_hexapod(tmp_path, Layout(hung="base", carried=True)))
-    with pytest.raises(OutOfClass, match="leg 'leg1' could not be written"):
+def test_angles_are_written_beside_positions_and_alone() -> None:
+    content = (
+        b'<robot name="r"><joint name="a" type="fixed"><parent link="x"/></joint>'
+        b'<joint name="b" type="fixed"><origin/></joint>'
+        b"<joint name='c' type='fixed'><origin rpy='0 0 1' xyz='1 2 3'/></joint></robot>"
+    )
+    turn, place = np.array([0.5, 0.0, -1.0]), np.array([1.0, 0.0, 2.0])
+    origins = {"a": Origin(place, turn), "b": Origin(place, turn), "c": Origin(rpy=turn)}
+    assert patch_origins(content, origins) == (
+        b'<robot name="r"><joint name="a" type="fixed">'
+        b'<origin xyz="1.0 0.0 2.0" rpy="0.5 0.0 -1.0"/><parent link="x"/></joint>'
+        b'<joint name="b" type="fixed"><origin xyz="1.0 0.0 2.0" rpy="0.5 0.0 -1.0"/></joint>'
+        b"<joint name='c' type='fixed'><origin rpy='0.5 0.0 -1.0' xyz='1 2 3'/></joint></robot>"
+    )
+
+
+def test_a_platform_that_a_leg_carries_needs_a_link_of_its_own(tmp_path: Path) -> None:
+    path = write_hexapod(tmp_path, Layout(hung="base", carried=True))
+    urdf = path.with_suffix(".urdf")
+    extra = (
+        '<link name="camera"/><joint name="camera_mount" type="fixed">'
+        '<parent link="CARRIER"/><child link="camera"/></joint></robot>'
+    )
+    carrier = load_mechanism(path).urdf.joints["platform_carried"].parent
+    urdf.write_text(urdf.read_text().replace("</robot>", extra.replace("CARRIER", carrier)))
+    nominal = load_mechanism(path)
+    with pytest.raises(OutOfClass, match="leg 'leg1' could not be written: found that joint"):
         write_calibrated_urdf(nominal, nominal.parameters, tmp_path / "calibrated.urdf")
     assert not (tmp_path / "calibrated.urdf").exists()
 

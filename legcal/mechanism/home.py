@@ -98,16 +98,27 @@ def closed_home(mechanism: Mechanism, home: RigidTransform | None) -> tuple[Rigi
     return platform_pose(mechanism, configuration) if constrained else settled, configuration
 
 
-def settle(mechanism: Mechanism, T: RigidTransform) -> tuple[RigidTransform, str | None]:
+def settle(
+    mechanism: Mechanism, T: RigidTransform, furthest: float = FURTHEST
+) -> tuple[RigidTransform, str | None]:
     """Return the nearest pose that meets every constraint, and what is in the way if none is near.
 
     Gauss-Newton steps of least norm on the constraints, angles counted at a mean leg's length.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+    T : RigidTransform
+        T_base_platform where the search starts.
+    furthest : float
+        By how much constraints may be missed there, in leg lengths.
     """
     if not is_constrained(mechanism):
         return T, None
     first = constraints_at(mechanism, T)
     scale = leg_scale(mechanism, T)
-    if np.abs(first.values).max() > FURTHEST * scale:
+    if np.abs(first.values).max() > furthest * scale:
         return T, first.worst()
     demands, best = first, np.abs(first.values).max()
     for _ in range(20):

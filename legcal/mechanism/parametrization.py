@@ -72,6 +72,32 @@ def geometries(mechanism: Mechanism) -> tuple[LegGeometry, ...]:
     )
 
 
+def in_links(mechanism: Mechanism, legs: Sequence[LegGeometry]) -> tuple[LegGeometry, ...]:
+    """Return legs in R_b and R_e as they stand in the links, the frames on their nominal places.
+
+    The inverse of :func:`geometries` where the legs are those of the mechanism.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine whose R_b and R_e are taken.
+    legs : sequence of LegGeometry
+        Its legs, or others like them, in R_b and R_e.
+    """
+    T_base, T_platform = mechanism.T_base_Rb, mechanism.T_platform_Re
+    return tuple(
+        replace(
+            leg,
+            A=np.asarray(T_base.apply(leg.A)),
+            B=np.asarray(T_platform.apply(leg.B)),
+            base_axis=_turned(T_base, leg.base_axis),
+            platform_axis=_turned(T_platform, leg.platform_axis),
+            twist=twist_after(leg, T_platform.rotation),
+        )
+        for leg in legs
+    )
+
+
 def twist_after(leg: LegGeometry, turn: Rotation) -> float | None:
     """Return the twist of a leg after its platform axis has been turned, and what is tied to it.
 

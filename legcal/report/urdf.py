@@ -1,31 +1,30 @@
 """The calibrated URDF: the nominal file with new numbers at the joints, and nothing else changed.
 
 Where R_b stands in the base link and R_e in the platform link cannot be observed, so that both are
-laid on their nominal places. A joint centre moves with the origin of the joint, or of the fixed
-joint under a closure's frame, that ties the leg to base or platform; the offset moves with
-the slider's origin along its axis.
+laid on their nominal places.
 """
 
 import json
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from legcal.errors import DidNotConverge, OutOfClass
-from legcal.geometry.types import Array
-from legcal.mechanism.axes import Step
-from legcal.mechanism.bodies import Bodies, frame_link, rigid_bodies
+from legcal.errors import DidNotConverge
+from legcal.geometry.frames import roll_pitch_yaw
 from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.parametrization import geometries
 from legcal.mechanism.sources.read import XML_SUFFIXES
-from legcal.mechanism.urdf import UrdfJoint
+from legcal.report.leg_origins import moved_origins
 from legcal.report.model_files import mechanism_text
-from legcal.report.urdf_patch import patch_origins, same_point
+from legcal.report.urdf_patch import Origin, patch_origins, same_point
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
 CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
@@ -34,17 +33,56 @@ CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
 def write_calibrated_urdf(
     mechanism: Mechanism, parameters: KinematicParameters, destination: Path
 ) -> None:
-    """Write the mechanism's URDF with calibrated joint centres and offsets.
-
-    Loading it again gives these parameters to 1e-12 m, with R_b and R_e where they were. Radii
-    are not written: they absorb the bias of edges.
+    """Write the mechanism's URDF with calibrated joint centres, offsets and constant lengths.
 
     Parameters
     ----------
     mechanism : Mechanism
         The nominal mechanism, as loaded.
     parameters : KinematicParameters
-        Joint centres in R_b and R_e and offsets [m], in the order of ``mechanism.legs``.
+        Joint centres in R_b and R_e, offsets and lengths [m], in the order of ``mechanism.legs``;
+        an offset that is NaN stays nominal. So do axes and twists.
+    destination : Path
+        The file to write.
+
+    Raises
+    ------
+    OutOfClass
+        As :func:`write_urdf`.
+    """
+    write_urdf(mechanism, calibrated_legs(mechanism, parameters), destination)
+
+
+def calibrated_legs(
+    mechanism: Mechanism, parameters: KinematicParameters
+) -> tuple[LegGeometry, ...]:
+    """Return the legs of a mechanism with calibrated joint centres, offsets and lengths."""
+    return tuple(
+        replace(leg, A=A, B=B, q0=leg.q0 if np.isnan(offset) else float(offset))
+        for leg, A, B, offset in zip(
+            geometries(mechanism),
+            parameters.base_joints,
+            parameters.platform_joints,
+            parameters.offsets,
+            strict=True,
+        )
+    )
+
+
+def write_urdf(mechanism: Mechanism, legs: Sequence[LegGeometry], destination: Path) -> None:
+    """Write the mechanism's URDF with other numbers of its legs, of whatever class.
+
+    Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
+    Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
+    or axes the mechanism may close elsewhere.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal mechanism, as loaded.
+    legs : sequence of LegGeometry
+        The legs in R_b and R_e, in the order of ``mechanism.legs``. B of a leg that is fixed
+        to the platform is where the platform link's origin has its foot on the leg.
     destination : Path
         The file to write.
 
@@ -53,93 +91,16 @@ def write_calibrated_urdf(
     OutOfClass
         If the tree ties a leg to base or platform where no origin moves that leg alone.
     """
-    origins = calibrated_origins(mechanism, parameters)
-    changed = {
-        joint: xyz
-        for joint, xyz in origins.items()
-        if not same_point(xyz, np.asarray(mechanism.urdf.joints[joint].T_parent_origin.translation))
-    }
+    changed: dict[str, Origin] = {}
+    for name, moved in moved_origins(mechanism, legs).items():
+        before, after = mechanism.urdf.joints[name].T_parent_origin, moved.T_parent_origin
+        xyz, rpy = np.asarray(after.translation), None
+        if moved.is_turned:
+            rpy = roll_pitch_yaw(after.rotation.as_matrix())
+        stays = same_point(xyz, np.asarray(before.translation))
+        if rpy is not None or not stays:
+            changed[name] = Origin(None if stays else xyz, rpy)
     destination.write_bytes(patch_origins(mechanism.urdf.content, changed))
-
-
-def calibrated_origins(mechanism: Mechanism, parameters: KinematicParameters) -> dict[str, Array]:
-    """Return the new origin of every joint that carries a parameter, in its parent link [m]."""
-    fixed = rigid_bodies(mechanism.urdf, (), mechanism.platform_joint)
-    A_base = mechanism.T_base_Rb.apply(parameters.base_joints)
-    B_platform = mechanism.T_platform_Re.apply(parameters.platform_joints)
-    origins: dict[str, Array] = {}
-    for j, (leg, chain) in enumerate(zip(mechanism.legs, mechanism.leg_chains, strict=True)):
-        shifts = (
-            (chain.steps[0], chain.steps[0].near, mechanism.base, A_base[j] - leg.A_base),
-            (
-                chain.steps[-1],
-                chain.steps[-1].far,
-                mechanism.platform,
-                B_platform[j] - leg.B_platform,
-            ),
-        )
-        for step, side, link, shift in shifts:
-            joint = _tie(mechanism, fixed, step, side, link, leg.name)
-            parent = fixed.T_body_link[joint.parent].rotation
-            turned = parent.inv().apply(fixed.T_body_link[link].rotation.apply(shift))
-            origins[joint.name] = np.asarray(joint.T_parent_origin.translation) + turned
-        growth = float(parameters.offsets[j]) - leg.q0
-        if leg.kind is LegKind.ACTUATED:
-            slider = mechanism.urdf.joints[str(leg.prismatic)]
-            axis = slider.T_parent_origin.rotation.apply(slider.axis)
-            origin = np.asarray(slider.T_parent_origin.translation)
-            origins[slider.name] = origin + leg.sign * growth * axis
-        elif leg.kind is LegKind.CONSTANT and abs(growth) > 0.0:
-            raise OutOfClass(
-                f"{mechanism.urdf_path}: the length of leg '{leg.name}' could not be written: "
-                "found a leg of constant length, needed one with a slider; keep its length."
-            )
-    return origins
-
-
-def _tie(
-    mechanism: Mechanism, fixed: Bodies, step: Step, side: int, link: str, leg: str
-) -> UrdfJoint:
-    """Return the joint whose origin moves the end of a leg on base or platform, and only that."""
-    urdf, connection = mechanism.urdf, step.connection
-    ours = fixed.body_of[link]
-    if connection.closure is not None:
-        closure = mechanism.chain.closures[connection.closure]
-        return _carrier(mechanism, (closure.frame_1, closure.frame_2)[side], leg)
-    joint = urdf.joints[str(connection.joint)]
-    at = joint.parent if side == 0 else joint.child
-    if fixed.body_of[at] == ours and side == 0:
-        return joint
-    if fixed.body_of[at] != ours:
-        for closure in mechanism.chain.closures:
-            frames = (closure.frame_1, closure.frame_2)
-            bodies = [fixed.body_of[frame_link(urdf, frame)] for frame in frames]
-            if closure.kind == "6d" and set(bodies) == {ours, fixed.body_of[at]}:
-                return _carrier(mechanism, frames[bodies.index(ours)], leg)
-    raise OutOfClass(
-        f"{mechanism.urdf_path}: leg '{leg}' could not be written: found that joint "
-        f"'{joint.name}' carries the link '{link}' itself, needed legs that hang from base or "
-        "platform, or are closed on them; let a virtual floating joint carry the platform."
-    )
-
-
-def _carrier(mechanism: Mechanism, frame: str, leg: str) -> UrdfJoint:
-    """Return the fixed joint under a closure's frame, which must carry nothing else."""
-    urdf = mechanism.urdf
-    link = frame_link(urdf, frame)
-    above = [joint for joint in urdf.joints.values() if joint.child == link]
-    below = [joint for joint in urdf.joints.values() if joint.parent == link]
-    uses = sum(
-        link in (frame_link(urdf, c.frame_1), frame_link(urdf, c.frame_2))
-        for c in mechanism.chain.closures
-    )
-    if len(above) == 1 and not above[0].moves and not below and uses == 1:
-        return above[0]
-    raise OutOfClass(
-        f"{mechanism.urdf_path}: leg '{leg}' could not be written: found the closure frame "
-        f"'{frame}' on a link that carries other things too, needed a link of its own on a fixed "
-        "joint; add one at the joint centre."
-    )
 
 
 def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: str) -> None:

@@ -10,20 +10,31 @@ import numpy as np
 from legcal.errors import ModelError
 from legcal.geometry.types import Array
 
-_XYZ = re.compile(rb"""(?<=\s)xyz\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_ATTRIBUTES = {
+    name: re.compile(rb"""(?<=\s)%s\s*=\s*(?:"([^"]*)"|'([^']*)')""" % name.encode())
+    for name in ("xyz", "rpy")
+}
 
 
-@dataclass(frozen=True)
-class OriginSpan:
-    """Where the origin of a joint stands in the file, as byte offsets.
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What is written into the origin of a joint.
 
     Attributes
     ----------
-    start, end : int
-        What a new value replaces: the value of ``xyz``, or nothing where it is not written.
-    before, after : bytes
-        What goes around the value.
+    xyz : (3,) array or None
+        Position in the parent link [m]; None where it stays as it is.
+    rpy : (3,) array or None
+        Angles about fixed x, y, z [rad]; None where they stay as they are.
     """
+
+    xyz: Array | None = None
+    rpy: Array | None = None
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Where a value stands in the file, or is to stand, as byte offsets."""
 
     start: int
     end: int
@@ -31,8 +42,8 @@ class OriginSpan:
     after: bytes = b""
 
 
-def patch_origins(content: bytes, origins: Mapping[str, Array]) -> bytes:
-    """Return a URDF with the ``xyz`` of some joint origins changed.
+def patch_origins(content: bytes, origins: Mapping[str, Origin]) -> bytes:
+    """Return a URDF with some joint origins changed.
 
     Values are written with 17 significant digits where they need them. The tags, quotes, comments,
     white space and line ends of the file are not touched.
@@ -41,35 +52,36 @@ def patch_origins(content: bytes, origins: Mapping[str, Array]) -> bytes:
     ----------
     content : bytes
         A checked URDF.
-    origins : mapping of str to (3,) array
-        New origins by joint name, in the parent link [m].
+    origins : mapping of str to Origin
+        New origins by joint name.
 
     Raises
     ------
     ModelError
         If the file has no such joint.
     """
-    spans = origin_spans(content)
-    missing = sorted(set(origins) - set(spans))
+    tags = _origin_tags(content)
+    missing = sorted(set(origins) - set(tags))
     if missing:
         raise ModelError(
             f"The URDF could not be changed: found no joint '{missing[0]}', needed the joints of "
             "the mechanism; give the URDF that was loaded."
         )
-    changes = sorted(
-        ((spans[joint], xyz) for joint, xyz in origins.items()), key=lambda c: c[0].start
-    )
+    changes = [
+        change
+        for joint, origin in origins.items()
+        for change in _changes(content, tags[joint], origin)
+    ]
     pieces, at = [], 0
-    for span, xyz in changes:
-        value = " ".join(repr(float(x)) for x in xyz).encode()
+    for span, value in sorted(changes, key=lambda change: change[0].start):
         pieces += [content[at : span.start], span.before, value, span.after]
         at = span.end
     return b"".join([*pieces, content[at:]])
 
 
-def origin_spans(content: bytes) -> dict[str, OriginSpan]:
-    """Return where the origin of every joint of a URDF is, or would be, written."""
-    spans: dict[str, OriginSpan] = {}
+def _origin_tags(content: bytes) -> dict[str, tuple[int, bool]]:
+    """Return where the origin of every joint of a URDF stands, or would, and whether it does."""
+    tags: dict[str, tuple[int, bool]] = {}
     path: list[str] = []
     joint: list[str] = []
     parser = expat.ParserCreate()
@@ -79,9 +91,9 @@ def origin_spans(content: bytes) -> dict[str, OriginSpan]:
             joint[:] = [attributes["name"]]
             at = _tag_end(content, parser.CurrentByteIndex)
             if content[at - 2 : at] != b"/>":
-                spans[joint[0]] = OriginSpan(at, at, b'<origin xyz="', b'"/>')
+                tags[joint[0]] = at, False
         elif path == ["robot", "joint"] and tag == "origin":
-            spans[joint[0]] = _span_in_tag(content, parser.CurrentByteIndex)
+            tags[joint[0]] = parser.CurrentByteIndex, True
         path.append(tag)
 
     def end(_tag: str) -> None:
@@ -90,7 +102,23 @@ def origin_spans(content: bytes) -> dict[str, OriginSpan]:
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.Parse(content, True)
-    return spans
+    return tags
+
+
+def _changes(content: bytes, tag: tuple[int, bool], origin: Origin) -> list[tuple[_Span, bytes]]:
+    """Return the values that change in an origin, in the order in which they are written."""
+    at, is_written = tag
+    values = [
+        (name, " ".join(repr(float(x)) for x in value).encode())
+        for name, value in (("xyz", origin.xyz), ("rpy", origin.rpy))
+        if value is not None
+    ]
+    if is_written:
+        return [(_span_in_tag(content, at, name), value) for name, value in values]
+    if not values:
+        return []
+    written = b" ".join(b'%s="%s"' % (name.encode(), value) for name, value in values)
+    return [(_Span(at, at, b"<origin ", b"/>"), written)]
 
 
 def same_point(one: Array, two: Array) -> bool:
@@ -112,12 +140,12 @@ def _tag_end(content: bytes, start: int) -> int:
     return len(content)
 
 
-def _span_in_tag(content: bytes, start: int) -> OriginSpan:
-    """Return the span of ``xyz`` in an origin tag, or where to write it."""
+def _span_in_tag(content: bytes, start: int, name: str) -> _Span:
+    """Return the span of an attribute's value in an origin tag, or where to write it."""
     tag = content[start : _tag_end(content, start)]
-    found = _XYZ.search(tag)
+    found = _ATTRIBUTES[name].search(tag)
     if found is None:
         at = start + len(b"<origin")
-        return OriginSpan(at, at, b' xyz="', b'"')
+        return _Span(at, at, b' %s="' % name.encode(), b'"')
     group = 1 if found.group(1) is not None else 2
-    return OriginSpan(start + found.start(group), start + found.end(group))
+    return _Span(start + found.start(group), start + found.end(group))

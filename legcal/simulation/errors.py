@@ -1,9 +1,28 @@
-"""Errors by which a true machine differs from its nominal model (section 4.3)."""
+"""Errors by which a true machine differs from its nominal model (section 4.3).
+
+They are errors of the parameters: R_b and R_e stay where they are, and what their definition makes
+zero stays zero.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from legcal.errors import UsageError
+from legcal.files.schema import closest
+from legcal.geometry.types import Array
+from legcal.identify.planned import moved_legs
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import geometries, parametrization_of
+
+LARGEST = 1.0  # [m] or [rad]
 
 
 class Distribution(StrEnum):
@@ -47,7 +66,7 @@ class ParameterErrors:
     twists : Spread
         Of the angles that legs without an S joint keep [rad].
     coplanar : bool
-        Whether joint centres stay in the plane that they are nominally in.
+        Whether joint centres keep their heights, their z in R_b and R_e: what is coplanar stays so.
     """
 
     base_joints: Spread = Spread()
@@ -57,3 +76,144 @@ class ParameterErrors:
     axes: Spread = Spread()
     twists: Spread = Spread()
     coplanar: bool = False
+
+
+KINDS = {
+    "joints": ("base_joints", "platform_joints"),
+    "base-joints": ("base_joints",),
+    "platform-joints": ("platform_joints",),
+    "offsets": ("offsets",),
+    "lengths": ("lengths",),
+    "axes": ("axes",),
+    "twists": ("twists",),
+}
+_FIELDS = {
+    "base": "base_joints",
+    "platform": "platform_joints",
+    "offset": "offsets",
+    "length": "lengths",
+    "base_axis": "axes",
+    "platform_axis": "axes",
+    "twist": "twists",
+}
+
+
+def parse_errors(words: Sequence[str], start: ParameterErrors | None = None) -> ParameterErrors:
+    """Return errors from words such as ``joints=0.002`` or ``axes=normal:0.001``.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Kind, equals sign, and size [m] or [rad], uniform unless ``normal:`` stands before it. Later
+        ones win.
+    start : ParameterErrors, optional
+        What holds for kinds that are not named; no errors without it.
+
+    Raises
+    ------
+    UsageError
+        With one sentence for each word that is malformed, of an unknown kind, negative or beyond
+        reason.
+    """
+    found, problems = start or ParameterErrors(), []
+    for word in words:
+        kind, _, text = word.partition("=")
+        distribution, _, number = text.rpartition(":")
+        said = f"The errors '{word}' could not be used: found"
+        size = _number(number)
+        if kind not in KINDS:
+            problems.append(f"{said} the kind '{kind}', needed {', '.join(KINDS)}; "
+                            f"{closest(kind, list(KINDS))}")  # fmt: skip
+        elif distribution not in ("", *Distribution):
+            problems.append(
+                f"{said} the distribution '{distribution}', needed uniform or normal; write "
+                f"{kind}=normal:0.001 or {kind}=0.001."
+            )
+        elif size is None:
+            problems.append(
+                f"{said} the size '{number}', needed a number from 0 to {LARGEST:g} m or rad; "
+                f"write {kind}=0.001."
+            )
+        else:
+            spread = Spread(size, Distribution(distribution or Distribution.UNIFORM))
+            changes: dict[str, Any] = dict.fromkeys(KINDS[kind], spread)
+            found = replace(found, **changes)
+    if problems:
+        raise UsageError(problems)
+    return found
+
+
+def draw_errors(
+    nominal: Mechanism, errors: ParameterErrors, rng: np.random.Generator
+) -> tuple[LegGeometry, ...]:
+    """Return the legs of a machine with drawn errors, in R_b and R_e.
+
+    Every parameter of the class takes its chance in the same order, however large its error is:
+    errors of one kind do not depend on those of another.
+
+    Parameters
+    ----------
+    nominal : Mechanism
+        The nominal model.
+    errors : ParameterErrors
+        How large the errors are.
+    rng : numpy.random.Generator
+        Source of the errors.
+
+    Raises
+    ------
+    UsageError
+        If an error is negative, not finite or beyond reason.
+    """
+    _check(errors)
+    found, legs = parametrization_of(nominal, twists=True), geometries(nominal)
+    uniform, normal = rng.uniform(-1.0, 1.0, len(found)), rng.normal(size=len(found))
+    step = np.zeros(len(found))
+    for i, name in enumerate(found.names):
+        spread = _spread(errors, name)
+        unit = normal if spread.distribution is Distribution.NORMAL else uniform
+        step[i] = spread.size * unit[i]
+    moved = moved_legs(legs, found.place, step)
+    origin = np.asarray(nominal.T_platform_Re.inv().translation)
+    return tuple(_footed(leg, origin) for leg in moved)
+
+
+def _spread(errors: ParameterErrors, name: str) -> Spread:
+    """Return how large the error of a parameter is, by its name."""
+    _, kind, *more = name.split(".")
+    if errors.coplanar and kind in ("base", "platform") and more == ["z"]:
+        return Spread()
+    found: Spread = getattr(errors, _FIELDS[kind])
+    return found
+
+
+def _footed(leg: LegGeometry, origin: Array) -> LegGeometry:
+    """Return a leg, B where the platform link's origin has its foot if the leg is fixed to it."""
+    if leg.platform_joint != "" or leg.platform_axis is None:
+        return leg
+    along = float((origin - leg.B) @ leg.platform_axis)
+    q0 = leg.q0 + along
+    return replace(leg, B=leg.B + along * leg.platform_axis, q0=q0)
+
+
+def _check(errors: ParameterErrors) -> None:
+    """Refuse sizes that are no sizes."""
+    problems = []
+    for kind in dict.fromkeys(_FIELDS.values()):
+        size = getattr(errors, kind).size
+        if not (math.isfinite(size) and 0.0 <= size <= LARGEST):
+            problems.append(
+                f"The errors of {kind.replace('_', ' ')} could not be drawn: found a size of "
+                f"{size:g}, needed 0 to {LARGEST:g} m or rad; correct it."
+            )
+    if problems:
+        raise UsageError(problems)
+
+
+def _number(text: str) -> float | None:
+    """Return a size, None where the text is none."""
+    try:
+        size = float(text)
+    except ValueError:
+        return None
+    return size if math.isfinite(size) and 0.0 <= size <= LARGEST else None

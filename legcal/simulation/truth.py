@@ -1,19 +1,38 @@
-"""The true machine: the nominal model with drawn errors, written as a model of its own."""
+"""The true machine: the nominal model with drawn errors, written as a model of its own.
+
+With other rods, axes or twists the machine closes elsewhere than the nominal one: its home is the
+closed pose nearest to the nominal home.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
+from legcal.errors import DidNotConverge, ModelError, OutOfClass
+from legcal.mechanism.home import settle
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.simulation.errors import ParameterErrors
+from legcal.mechanism.parametrization import in_links
+from legcal.report.model_files import mechanism_text, model_name
+from legcal.report.urdf import check_closes, write_urdf
+from legcal.simulation.errors import ParameterErrors, draw_errors
+
+DRAWS = 20
+FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the true legs demand
 
 
 def write_true_model(
     nominal: Mechanism, errors: ParameterErrors, rng: np.random.Generator, folder: Path
 ) -> Mechanism:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine with errors, and load it.
+
+    Errors with which the machine does not close, or closes into another mechanism, are drawn again.
 
     Parameters
     ----------
@@ -35,5 +54,89 @@ def write_true_model(
     ------
     ModelError
         If no machine with such errors closes.
+    OutOfClass
+        If the tree of the URDF does not let its legs move one by one.
     """
-    raise NotImplementedError
+    problem = ""
+    for _ in range(DRAWS):
+        legs = draw_errors(nominal, errors, rng)
+        home, problem = _home(nominal, legs)
+        if home is None:
+            continue
+        path = write_model_with(nominal, legs, home, folder)
+        try:
+            true = load_mechanism(path)
+            if true.is_determined:
+                check_closes(true)
+        except (ModelError, OutOfClass, DidNotConverge) as error:
+            problem = error.problems[0]
+            continue
+        if _class_of(true) == _class_of(nominal):
+            return true
+        problem = "another mechanism, whose platform has other freedoms"
+    for path in _places(nominal, folder):
+        path.unlink(missing_ok=True)
+    raise ModelError(
+        f"{nominal.yaml_path}: no true machine could be made: found that none of {DRAWS} draws of "
+        f"errors closes as the nominal model does ({problem.rstrip('.')}), needed one; give "
+        "smaller errors, or none of the axes and lengths that close the loops."
+    )
+
+
+def write_model_with(
+    nominal: Mechanism, legs: Sequence[LegGeometry], home: RigidTransform, folder: Path
+) -> Path:
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism with other numbers.
+
+    Parameters
+    ----------
+    nominal : Mechanism
+        The nominal model.
+    legs : sequence of LegGeometry
+        The legs in R_b and R_e, see :func:`legcal.report.urdf.write_urdf`.
+    home : RigidTransform
+        T_base_platform of a pose in which they close.
+    folder : Path
+        The folder that gets ``models`` and ``urdf``.
+
+    Returns
+    -------
+    Path
+        The YAML.
+    """
+    yaml_path, urdf_path = _places(nominal, folder)
+    for path in (yaml_path, urdf_path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_urdf(nominal, legs, urdf_path)
+    text = mechanism_text(replace(nominal, home=home), f"../urdf/{urdf_path.name}")
+    yaml_path.write_text(text, encoding="utf-8")
+    return yaml_path
+
+
+def _places(nominal: Mechanism, folder: Path) -> tuple[Path, Path]:
+    """Return where the files of the true model stand."""
+    name = model_name(nominal)
+    return folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
+
+
+def _home(nominal: Mechanism, legs: Sequence[LegGeometry]) -> tuple[RigidTransform | None, str]:
+    """Return the closed pose nearest to the nominal home, or None and what is in the way."""
+    moved = tuple(
+        replace(
+            leg,
+            A_base=wanted.A,
+            B_platform=wanted.B,
+            q0=wanted.q0,
+            base_axis=wanted.base_axis,
+            platform_axis=wanted.platform_axis,
+            twist=wanted.twist,
+        )
+        for leg, wanted in zip(nominal.legs, in_links(nominal, legs), strict=True)
+    )
+    home, problem = settle(replace(nominal, legs=moved), nominal.home, FURTHEST)
+    return (None, problem) if problem is not None else (home, "")
+
+
+def _class_of(mechanism: Mechanism) -> tuple[object, ...]:
+    """Return what a machine is, whatever its numbers are."""
+    return mechanism.spatial, mechanism.mobility, tuple(leg.type for leg in mechanism.legs)
