@@ -13,7 +13,6 @@ from legcal.stages.least_squares import (
     Term,
     jacobian_of,
     residuals_of,
-    term_of_all,
 )
 from legcal.stages.motion import moved, moved_points, register_groups, register_points
 from legcal.stages.solve import solve_least_squares
@@ -30,7 +29,10 @@ def _line(outlier: float, robust: bool) -> LeastSquares:
 
 
 def _problem(name: str, x: ca.SX, residuals: ca.SX, start: list[float]) -> LeastSquares:
-    return LeastSquares(name, (term_of_all(x, residuals),), np.array(start))
+    function = ca.Function("all", [x], [residuals])
+    return LeastSquares(
+        name, (Term(function, np.arange(len(start))[None, :], ()),), np.array(start)
+    )
 
 
 def test_a_linear_problem_is_solved_exactly_with_the_covariance_of_linear_algebra() -> None:

@@ -6,7 +6,9 @@ gives the joint centres in R_b, and where each camera stood.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, combinations_with_replacement
 
 import casadi as ca
@@ -23,7 +25,7 @@ from legcal.stages.free_joints import (
     n_free_coordinates,
 )
 from legcal.stages.joints_in_camera import JointsInCamera
-from legcal.stages.least_squares import LeastSquares, Term, term_of_all
+from legcal.stages.least_squares import LeastSquares, Term
 from legcal.stages.motion import moved, register_points, whitener
 from legcal.stages.nominal import Criteria, NominalMechanism
 from legcal.stages.residuals import centre_in_camera, distance_of_joints
@@ -156,21 +158,42 @@ def build_rigid(
 
 def build_scalar_products(mechanism: NominalMechanism, joints: JointsInCamera) -> LeastSquares:
     """Build the criterion C_1 of (9): scalar products do not depend on the frame."""
-    x = ca.SX.sym("A", n_free_coordinates(mechanism))
-    A = ca.vertcat(x, 0.0)[joint_positions(mechanism).ravel().tolist()]
-    A = ca.reshape(A, 3, mechanism.n_legs)
-    residuals = []
-    for A_camera, located in zip(joints.A_camera, joints.located, strict=True):
-        pairs = list(combinations(np.flatnonzero(located).tolist(), 2))  # the set V of (8)
-        for (j, g), (m, n) in combinations_with_replacement(pairs, 2):
-            in_camera = float((A_camera[g] - A_camera[j]) @ (A_camera[n] - A_camera[m]))
-            residuals.append(ca.dot(A[:, g] - A[:, j], A[:, n] - A[:, m]) - in_camera)
+    positions = joint_positions(mechanism)
+    legs = tuple(tuple(np.flatnonzero(located).tolist()) for located in joints.located)
+    seen = [
+        (A[g] - A[j]) @ (A[n] - A[m])
+        for A, of_view in zip(joints.A_camera, legs, strict=True)
+        for (j, g), (m, n) in _pairs_of_vectors(of_view)
+    ]
+    function = _scalar_products(tuple(positions.ravel().tolist()), legs)
+    index = np.arange(n_free_coordinates(mechanism))[None, :]
     return LeastSquares(
         "The base joints in the base frame (eq 9)",
-        (term_of_all(x, ca.vertcat(*residuals)),),
+        (Term(function, index, (np.array(seen)[None, :],)),),
         free_values(mechanism, mechanism.parameters.base_joints),
         exact_hessian=True,
     )
+
+
+@lru_cache(maxsize=4)
+def _scalar_products(positions: tuple[int, ...], legs: tuple[tuple[int, ...], ...]) -> ca.Function:
+    """Return (A; products seen) -> the scalar products of (9) of all views, less those seen."""
+    x = ca.SX.sym("A", max(positions) + 1)
+    A = ca.reshape(ca.vertcat(x, 0.0)[list(positions)], 3, len(positions) // 3)
+    products = [
+        ca.dot(A[:, g] - A[:, j], A[:, n] - A[:, m])
+        for of_view in legs
+        for (j, g), (m, n) in _pairs_of_vectors(of_view)
+    ]
+    seen = ca.SX.sym("seen", len(products))
+    return ca.Function("products", [x, seen], [ca.vertcat(*products) - seen])
+
+
+def _pairs_of_vectors(
+    legs: tuple[int, ...],
+) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Return the pairs of the set V of (8) in one view, a vector with itself included."""
+    return combinations_with_replacement(combinations(legs, 2), 2)
 
 
 def _distances(mechanism: NominalMechanism, joints: JointsInCamera, views: IntArray) -> Term:

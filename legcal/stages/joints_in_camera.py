@@ -85,54 +85,95 @@ def locate_joints_in_cameras(
     A_camera = np.zeros((n_views, n_legs, 3))
     covariance = np.zeros((n_views, n_legs, 3, 3))
     located = np.zeros((n_views, n_legs), dtype=np.bool_)
-    diagnostics = []
-    view = measurements.view[axes.row]
-    for v, j in np.ndindex(n_views, n_legs):
-        here = np.flatnonzero((view == v) & (axes.leg == j))
-        if len(here) == 0:
-            continue
-        where = f"leg {mechanism.leg_names[j]} in view {measurements.views[v].name}"
-        information = plain_information(axes, here)
-        reason = _too_few_directions(information, len(here))
-        if not reason:
-            A, C = nearest_point(information)
-            if criteria == "default":
-                A, C = weighted_point(axes, here, A)
-                reason = _too_uncertain(A, C)
-        if reason:
-            diagnostics.append(f"The base joint of {where} was left out: {reason}.")
-            continue
-        A_camera[v, j], covariance[v, j], located[v, j] = A, C, True
+    key = measurements.view[axes.row] * n_legs + axes.leg
+    views, legs = np.divmod(np.unique(key), n_legs)
+    bundles = _Bundles.of(key)
+    information = plain_information(axes, bundles)
+    counts = bundles.counts.tolist()
+    reasons = [_too_few_directions(*told) for told in zip(information[0], counts, strict=True)]
+    clear = np.array([not reason for reason in reasons], dtype=np.bool_)
+    A, C = nearest_points((information[0][clear], information[1][clear]))
+    if criteria == "default" and clear.any():
+        A, C = weighted_points(axes, bundles.some(clear), A)
+        for k, i in enumerate(np.flatnonzero(clear)):
+            reasons[i] = _too_uncertain(A[k], C[k])
+    found = np.array([not reason for reason in reasons], dtype=np.bool_)
+    v, j = views[found], legs[found]
+    A_camera[v, j], covariance[v, j], located[v, j] = A[found[clear]], C[found[clear]], True
+    diagnostics = [
+        f"The base joint of leg {mechanism.leg_names[int(j)]} in view "
+        f"{measurements.views[int(v)].name} was left out: {reason}."
+        for v, j, reason in zip(views, legs, reasons, strict=True)
+        if reason
+    ]
     _check_every_leg(mechanism, located, diagnostics)
     return JointsInCamera(A_camera, located, covariance, tuple(diagnostics))
 
 
-def plain_information(axes: LegAxes, here: IntArray) -> tuple[Array, Array]:
-    """Return the normal equations of (6), (3, 3) and (3,): the sum of I - u u' and of its M."""
-    u, M = axes.u[here], axes.M[here]
+@dataclass(frozen=True, eq=False)
+class _Bundles:
+    """Axes in bundles, each of one leg in one view, whose axes meet in one point.
+
+    ``rows`` (k,) are the axes, bundle by bundle, and ``counts`` how many each bundle has.
+    """
+
+    rows: IntArray
+    counts: IntArray
+
+    @classmethod
+    def of(cls, key: IntArray) -> _Bundles:
+        """Return the bundles of axes with equal keys, by key."""
+        return cls(np.argsort(key, kind="stable"), np.unique(key, return_counts=True)[1])
+
+    @property
+    def bundle(self) -> IntArray:
+        """The bundle of each of ``rows``, (k,)."""
+        return np.repeat(np.arange(len(self.counts)), self.counts)
+
+    def some(self, wanted: BoolArray) -> _Bundles:
+        """Return some of the bundles."""
+        return _Bundles(self.rows[wanted[self.bundle]], self.counts[wanted])
+
+    def total(self, values: Array) -> Array:
+        """Return the sum over each bundle of values of ``rows``."""
+        return np.asarray(np.add.reduceat(values, np.cumsum(self.counts) - self.counts))
+
+    def median(self, values: Array) -> Array:
+        """Return the median over each bundle of values (k,) of ``rows``."""
+        ordered = values[np.lexsort((values, self.bundle))]
+        first = np.cumsum(self.counts) - self.counts
+        low, high = first + (self.counts - 1) // 2, first + self.counts // 2
+        return np.asarray(0.5 * (ordered[low] + ordered[high]))
+
+
+def plain_information(axes: LegAxes, bundles: _Bundles) -> tuple[Array, Array]:
+    """Return the normal equations of (6), (n, 3, 3) and (n, 3): sums of I - u u' and of its M."""
+    u, M = axes.u[bundles.rows], axes.M[bundles.rows]
     normal = np.eye(3) - u[:, :, None] * u[:, None, :]
-    return normal.sum(axis=0), np.einsum("kij,kj->i", normal, M)
+    return bundles.total(normal), bundles.total(np.einsum("kij,kj->ki", normal, M))
 
 
-def nearest_point(information: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return the least-squares point A and the inverse of its normal matrix."""
+def nearest_points(information: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return the least-squares points A (n, 3) and the inverses of their normal matrices."""
     inverse = np.asarray(np.linalg.inv(information[0]))
-    return np.asarray(inverse @ information[1]), inverse
+    return np.asarray((inverse @ information[1][..., None])[..., 0]), inverse
 
 
-def weighted_point(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Array]:
-    """Return the point nearest to axes in units of their covariances, and its covariance."""
+def weighted_points(axes: LegAxes, bundles: _Bundles, A: Array) -> tuple[Array, Array]:
+    """Return the points nearest to axes in units of their covariances, and their covariances."""
+    E, M = axes.basis[bundles.rows], axes.M[bundles.rows]
+    across, bundle = np.swapaxes(E, -1, -2), bundles.bundle
+    C = np.zeros((len(A), 3, 3))
     for _ in range(_REWEIGHTINGS):
-        residual, spread = miss(axes, here, A)
+        residual, spread = miss(axes, bundles.rows, A[bundle])
         weight = np.linalg.inv(spread)
         chi = np.sqrt(np.einsum("ki,kij,kj->k", residual, weight, residual))
-        limit = max(_OUTLIER * float(np.median(chi)), _NO_NOISE)
+        limit = np.maximum(_OUTLIER * bundles.median(chi), _NO_NOISE)[bundle]
         weight = weight / (1.0 + (chi / limit) ** 2)[:, None, None]
-        E = axes.basis[here]
-        normal = np.einsum("kia,kij,kjb->ab", E, weight, E)
-        right = np.einsum("kia,kij,kjb,kb->a", E, weight, E, axes.M[here])
-        A, covariance = nearest_point((normal, right))
-    return A, covariance
+        normal = across @ weight @ E
+        right = (normal @ M[..., None])[..., 0]
+        A, C = nearest_points((bundles.total(normal), bundles.total(right)))
+    return A, C
 
 
 def miss(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Array]:
@@ -155,13 +196,15 @@ def miss(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Array]:
     arm = A - axes.M[here]
     residual = np.einsum("kia,ka->ki", axes.basis[here], arm)
     s = np.sum(arm * axes.u[here], axis=-1)
-    at_point = np.concatenate([s[:, None, None] * np.eye(2), np.tile(np.eye(2), (len(s), 1, 1))], 2)
-    return residual, at_point @ axes.covariance[here] @ np.swapaxes(at_point, 1, 2)
+    C, s = axes.covariance[here], s[:, None, None]
+    mixed = C[:, :2, 2:]
+    spread = s**2 * C[:, :2, :2] + s * (mixed + np.swapaxes(mixed, 1, 2)) + C[:, 2:, 2:]
+    return residual, spread
 
 
-def _too_few_directions(information: tuple[Array, Array], n_images: int) -> str:
+def _too_few_directions(information: Array, n_images: int) -> str:
     """Return why (6) has no single solution, or an empty string."""
-    smallest = float(np.linalg.eigvalsh(information[0])[0])
+    smallest = float(np.linalg.eigvalsh(information)[0])
     if smallest > _SAME_DIRECTION * n_images:
         return ""
     if n_images == 1:

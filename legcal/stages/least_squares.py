@@ -3,12 +3,15 @@
 A residual depends on a few unknowns and on what one observation saw. Each kind is written once,
 as a small function (:mod:`legcal.stages.residuals`), and a step lists for every observation
 which unknowns it has. Residuals and their sparse Jacobian follow from that, at a cost that
-grows with the number of observations and no faster.
+grows with the number of observations and no faster. What was observed are parameters of both, so
+that they serve all problems of one :class:`Structure`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -46,6 +49,36 @@ class Term:
         return int(self.function.size1_out(0))
 
 
+@dataclass(frozen=True)
+class Structure:
+    """What problems of one kind share: which unknowns each observation has, and how.
+
+    Attributes
+    ----------
+    n_unknowns : int
+        Number of unknowns.
+    terms : tuple
+        Of each term the function, the shape and the bytes of its index, and the shapes of what
+        one observation saw.
+    exact_hessian : bool
+        As of the problem.
+    """
+
+    n_unknowns: int
+    terms: tuple[tuple[ca.Function, tuple[int, ...], bytes, tuple[tuple[int, int], ...]], ...]
+    exact_hessian: bool
+
+    @property
+    def n_residuals(self) -> int:
+        """Number of residuals."""
+        return sum(function.size1_out(0) * shape[0] for function, shape, _, _ in self.terms)
+
+    @property
+    def n_observed(self) -> int:
+        """Number of parameters."""
+        return sum(n * a * b for _, (n, _), _, seen in self.terms for a, b in seen)
+
+
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
     """Half the sum of squared residuals, to be minimised from a start.
@@ -79,6 +112,32 @@ class LeastSquares:
         return sum(term.n_rows * len(term.index) for term in self.terms)
 
     @property
+    def structure(self) -> Structure:
+        """What it shares with problems that saw other numbers."""
+        terms = [
+            (
+                term.function,
+                term.index.shape,
+                np.ascontiguousarray(term.index, dtype=np.int64).tobytes(),
+                tuple(_shape(values) for values in term.observed),
+            )
+            for term in self.terms
+            if len(term.index)
+        ]
+        return Structure(len(self.start), tuple(terms), self.exact_hessian)
+
+    @property
+    def observed(self) -> Array:
+        """What all observations saw, as one vector: the parameters of the structure."""
+        parts = [
+            _side_by_side(values).ravel(order="F")
+            for term in self.terms
+            if len(term.index)
+            for values in term.observed
+        ]
+        return np.concatenate([np.zeros(0), *parts])
+
+    @property
     def block(self) -> IntArray:
         """Number of the observation that each residual belongs to, (m,); -1 where not robust."""
         blocks, n_blocks = [], 0
@@ -89,52 +148,87 @@ class LeastSquares:
         return np.concatenate(blocks)
 
 
-def term_of_all(x: ca.SX, residuals: ca.SX) -> Term:
-    """Return residuals that may all depend on all unknowns, as a single observation."""
-    function = ca.Function("all", [x], [residuals])
-    return Term(function, np.arange(x.numel())[None, :], ())
-
-
 def residuals_of(problem: LeastSquares) -> ca.Function:
     """Return the function x -> residuals of all terms, (m,)."""
     x = ca.MX.sym("x", len(problem.start))
-    found = [ca.vec(_mapped(term.function, term, x)) for term in problem.terms if len(term.index)]
-    return ca.Function("residuals", [x], [ca.vertcat(ca.MX(0, 1), *found)])
+    of_structure = structure_residuals(problem.structure)
+    return ca.Function("residuals", [x], [of_structure(x, ca.DM(problem.observed))])
 
 
 def jacobian_of(problem: LeastSquares) -> ca.Function:
     """Return the function x -> sparse Jacobian of the residuals, (m, n)."""
-    n_unknowns = len(problem.start)
-    x = ca.MX.sym("x", n_unknowns)
+    x = ca.MX.sym("x", len(problem.start))
+    of_structure = structure_jacobian(problem.structure)
+    return ca.Function("jacobian", [x], [of_structure(x, ca.DM(problem.observed))])
+
+
+def structure_residuals(structure: Structure) -> ca.Function:
+    """Return the function (x, observed) -> residuals of all terms, (m,)."""
+    x, seen = _symbols(structure)
+    found = [
+        ca.vec(_mapped(function, index, x, observed))
+        for (function, _, _, _), index, observed in _terms(structure, seen)
+    ]
+    return ca.Function("residuals", [x, seen], [ca.vertcat(ca.MX(0, 1), *found)])
+
+
+def structure_jacobian(structure: Structure) -> ca.Function:
+    """Return the function (x, observed) -> sparse Jacobian of the residuals, (m, n)."""
+    n_unknowns = structure.n_unknowns
+    x, seen = _symbols(structure)
     values, n_before = [ca.MX(0, 1)], 0
     rows, columns = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
-    for term in problem.terms:
-        n, n_local = term.index.shape
-        if n == 0:
-            continue
-        values.append(ca.vec(_mapped(_derivative(term.function), term, x)))
+    for (function, _, _, _), index, observed in _terms(structure, seen):
+        n, n_local = index.shape
+        n_rows = int(function.size1_out(0))
+        values.append(ca.vec(_mapped(_derivative(function), index, x, observed)))
         # CasADi stores columns: of one observation all residuals by its first unknown come first.
-        of_observation = np.arange(n * term.n_rows).reshape(n, 1, term.n_rows)
+        of_observation = np.arange(n * n_rows).reshape(n, 1, n_rows)
         rows.append(n_before + np.repeat(of_observation, n_local, axis=1).ravel())
-        columns.append(np.repeat(term.index.ravel(), term.n_rows))
-        n_before += n * term.n_rows
+        columns.append(np.repeat(index.ravel(), n_rows))
+        n_before += n * n_rows
     row, column = np.concatenate(rows), np.concatenate(columns)
     order = np.lexsort((row, column))
     order = order[column[order] >= 0]
     first = np.searchsorted(column[order], np.arange(n_unknowns + 1))
     pattern = ca.Sparsity(n_before, n_unknowns, first.tolist(), row[order].tolist())
     jacobian = ca.MX(pattern, ca.vertcat(*values)[order.tolist()])
-    return ca.Function("jacobian", [x], [jacobian])
+    return ca.Function("jacobian", [x, seen], [jacobian])
 
 
-def _mapped(function: ca.Function, term: Term, x: ca.MX) -> ca.MX:
+def _symbols(structure: Structure) -> tuple[ca.MX, ca.MX]:
+    """Return the unknowns and the parameters of a structure."""
+    return ca.MX.sym("x", structure.n_unknowns), ca.MX.sym("observed", structure.n_observed)
+
+
+def _terms(
+    structure: Structure, seen: ca.MX
+) -> Iterator[tuple[tuple[ca.Function, tuple[int, ...], bytes, Any], IntArray, list[ca.MX]]]:
+    """Return each term with its index and its part of the parameters, observations side by side."""
+    place = 0
+    for term in structure.terms:
+        _, shape, index, shapes = term
+        observed = []
+        for a, b in shapes:
+            size = shape[0] * a * b
+            observed.append(ca.reshape(seen[place : place + size], a, shape[0] * b))
+            place += size
+        yield term, np.frombuffer(index, dtype=np.int64).reshape(shape), observed
+
+
+def _mapped(function: ca.Function, index: IntArray, x: ca.MX, observed: list[ca.MX]) -> ca.MX:
     """Return a function of (local, *observed) for all observations of a term, side by side."""
-    n, n_local = term.index.shape
-    place = np.where(term.index >= 0, term.index, x.numel())
+    n, n_local = index.shape
+    place = np.where(index >= 0, index, x.numel())
     local = ca.reshape(ca.vertcat(x, 0.0)[place.ravel().tolist()], n_local, n)
-    observed = [ca.DM(_side_by_side(values)) for values in term.observed]
     mapped: ca.MX = function.map(n)(local, *observed)
     return mapped
+
+
+def _shape(values: Array) -> tuple[int, int]:
+    """Return the shape of what one observation saw, as a matrix."""
+    rows, columns = (*values.shape[1:], 1, 1)[:2]
+    return rows, columns
 
 
 def _side_by_side(values: Array) -> Array:

@@ -1,12 +1,14 @@
 """Least squares with IPOPT: the one place of steps 2, 3 and 4.
 
-A step builds its problem; this module scales the unknowns, hands IPOPT the sparse Gauss-Newton
+A step builds its problem; this module keeps what problems of one structure share, as those of many
+simulated sessions do, scales the unknowns, hands IPOPT the sparse Gauss-Newton
 Hessian J'J (or leaves it the exact one) and refuses an answer that did not converge.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -15,13 +17,19 @@ from scipy.sparse import csc_array, diags_array
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, IntArray
-from legcal.stages.least_squares import LeastSquares, jacobian_of, residuals_of
+from legcal.stages.least_squares import (
+    LeastSquares,
+    Structure,
+    structure_jacobian,
+    structure_residuals,
+)
 from legcal.stages.solution import Solution, column_scale
 
 _REWEIGHTINGS = 4
 _OUTLIER = 4.0  # an observation this many times the median has half its weight
 _SETTLED = 0.01  # change of a weight that no longer matters
 _NO_NOISE = 1e-3  # standard deviations: smaller residuals are rounding, and nobody's fault
+_KEPT = 8  # structures: those of one run of the steps, with either criteria
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
     "calc_lam_p": False,
@@ -59,9 +67,10 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
     DidNotConverge
         If IPOPT does not report success.
     """
-    built = _build(problem)
+    built = _built(problem.structure)
+    scale = _scale(problem, built)
     root_weight = np.ones(problem.n_residuals)
-    solution = _solve(problem, built, np.zeros(len(problem.start)), root_weight)
+    solution = _solve(problem, built, scale, np.zeros(len(problem.start)), root_weight)
     block = problem.block
     if np.all(block < 0):
         return solution
@@ -71,46 +80,62 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
         if np.max(np.abs(new - root_weight)) < _SETTLED:
             break
         root_weight = new
-        solution = _solve(problem, built, (solution.x - problem.start) / built.scale, root_weight)
+        z = (solution.x - problem.start) / scale
+        solution = _solve(problem, built, scale, z, root_weight)
         n_iterations += solution.n_iterations
     return replace(solution, n_iterations=n_iterations)
 
 
 @dataclass(frozen=True, eq=False)
 class _Built:
-    """A problem in scaled unknowns, ready to be solved with different weights."""
+    """All problems of one structure in scaled unknowns, ready to be solved.
+
+    The parameters of the solver are square roots of weights, start, scale and what was observed.
+    """
 
     solver: ca.Function
     residuals: ca.Function
     jacobian: ca.Function
-    scale: Array
 
 
-def _build(problem: LeastSquares) -> _Built:
-    """Return the problem as IPOPT takes it; the square roots of the weights are its parameters."""
-    residuals, jacobian = residuals_of(problem), jacobian_of(problem)
-    scale = column_scale(_sparse(jacobian(problem.start)))
-    if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
-        scale = np.full_like(scale, scale.min())
-    z, p = ca.MX.sym("z", len(problem.start)), ca.MX.sym("p", problem.n_residuals)
-    x = problem.start + scale * z
-    weighted = p * residuals(x)
-    slope = ca.diag(p) @ jacobian(x) @ ca.MX(ca.diag(ca.DM(scale)))
+@lru_cache(maxsize=_KEPT)
+def _built(structure: Structure) -> _Built:
+    """Return the problems of a structure as IPOPT takes them."""
+    residuals, jacobian = structure_residuals(structure), structure_jacobian(structure)
+    n, m = structure.n_unknowns, structure.n_residuals
+    z, p = ca.MX.sym("z", n), ca.MX.sym("p", m + 2 * n + structure.n_observed)
+    root_weight, start, scale = p[:m], p[m : m + n], p[m + n : m + 2 * n]
+    observed = p[m + 2 * n :]
+    x = start + scale * z
+    weighted = root_weight * residuals(x, observed)
+    slope = ca.diag(root_weight) @ jacobian(x, observed) @ ca.diag(scale)
     cost = 0.5 * ca.sumsqr(weighted)
     gradient = ca.densify(ca.mtimes(slope.T, weighted))  # IPOPT reads it as full
     options: dict[str, Any] = dict(_OPTIONS)
     options["grad_f"] = ca.Function(
         "nlp_grad_f", [z, p], [cost, gradient], ["x", "p"], ["f", "grad_f_x"]
     )
-    if not problem.exact_hessian:
+    if not structure.exact_hessian:
         options["hess_lag"] = _gauss_newton(z, p, slope)
     nlp: dict[str, Any] = {"x": z, "p": p, "f": cost}
-    return _Built(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian, scale)
+    return _Built(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian)
 
 
-def _solve(problem: LeastSquares, built: _Built, z: Array, root_weight: Array) -> Solution:
+def _scale(problem: LeastSquares, built: _Built) -> Array:
+    """Return the unit of each unknown: what one residual unit shows at the start."""
+    scale = column_scale(_sparse(built.jacobian(problem.start, problem.observed)))
+    if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
+        scale = np.full_like(scale, scale.min())
+    return scale
+
+
+def _solve(
+    problem: LeastSquares, built: _Built, scale: Array, z: Array, root_weight: Array
+) -> Solution:
     """Return the solution for given weights, or refuse."""
-    found = np.asarray(built.solver(x0=z, p=root_weight)["x"].full()).ravel()
+    observed = problem.observed
+    parameter = np.concatenate([root_weight, problem.start, scale, observed])
+    found = np.asarray(built.solver(x0=z, p=parameter)["x"].full()).ravel()
     stats = built.solver.stats()
     if not stats["success"]:
         raise DidNotConverge(
@@ -118,11 +143,11 @@ def _solve(problem: LeastSquares, built: _Built, z: Array, root_weight: Array) -
             f"iterations with {stats['return_status']}, needed Solve_Succeeded; check the "
             "nominal model and the observations, or reject the ones with large residuals."
         )
-    x = problem.start + built.scale * found
+    x = problem.start + scale * found
     return Solution(
         x=x,
-        residuals=root_weight * np.asarray(built.residuals(x).full()).ravel(),
-        jacobian=csc_array(diags_array(root_weight) @ _sparse(built.jacobian(x))),
+        residuals=root_weight * np.asarray(built.residuals(x, observed).full()).ravel(),
+        jacobian=csc_array(diags_array(root_weight) @ _sparse(built.jacobian(x, observed))),
         n_shared=len(x) if problem.n_shared is None else problem.n_shared,
         n_iterations=int(stats["iter_count"]),
         status=str(stats["return_status"]),
