@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 from legcal.errors import DatasetError
@@ -37,3 +38,46 @@ def read_lines(path: Path, what: str) -> list[Line]:
             "in UTF-8; save it again as CSV."
         ) from error
     return [(number, cells) for number, cells in lines if any(cells)]
+
+
+def read_named_rows(
+    path: Path, what: str, columns: Sequence[str], remedy: str, problems: list[str]
+) -> list[tuple[str, dict[str, str]]]:
+    """Return the rows of a CSV file by column name, each with its place for messages.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    what : str
+        What the file is, for messages.
+    columns : sequence of str
+        The names in its header, in any order.
+    remedy : str
+        What to do about another header.
+    problems : list of str
+        Takes one sentence for each row that is not complete; such rows are left out.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read or has other columns.
+    """
+    lines = read_lines(path, what)
+    header = lines[0][1] if lines else []
+    if sorted(header) != sorted(columns):
+        raise DatasetError(
+            f"{path}, header: the columns could not be used: found {','.join(header) or 'none'}, "
+            f"needed {','.join(columns)}; {remedy}."
+        )
+    rows = []
+    for row, (line, cells) in enumerate(lines[1:], start=1):
+        where = f"{path}, row {row} (line {line})"
+        if len(cells) == len(header):
+            rows.append((where, dict(zip(header, cells, strict=True))))
+        else:
+            problems.append(
+                f"{where}: the row could not be used: found {len(cells)} cells, needed "
+                f"{len(header)}; complete or remove the row."
+            )
+    return rows

@@ -46,7 +46,29 @@ def place_of(
     legs: Sequence[Leg],
 ) -> tuple[tuple[int, int], list[str]]:
     """Return image row and leg of an outline, and the names among its cells that are unknown."""
-    start = "the outline could not be used: found"
+    (row, leg), unknown = place_in_measurements(
+        where, cells, places, [leg.name for leg in legs], "outline"
+    )
+    if leg >= 0:
+        parts = [cylinder.link for cylinder in legs[leg].cylinders]
+        if cells["part"] not in parts:
+            unknown.append(
+                f"{where}, column part: the outline could not be used: found the unknown part "
+                f"{describe(cells['part'])}, needed a link with a cylinder of {cells['leg']}; "
+                f"{closest(cells['part'], parts)}"
+            )
+    return (row, leg), unknown
+
+
+def place_in_measurements(
+    where: str,
+    cells: Mapping[str, str],
+    places: Mapping[tuple[str, str], int],
+    leg_names: Sequence[str],
+    thing: str,
+) -> tuple[tuple[int, int], list[str]]:
+    """Return image row and leg that a table's row names, -1 where unknown, and what is unknown."""
+    start = f"the {thing} could not be used: found"
     unknown = []
     view, image = cells["view"], cells["image"]
     views = dict.fromkeys(v for v, _ in places)
@@ -60,20 +82,12 @@ def place_of(
             f"{where}, column image: {start} {describe(image)}, needed an image of view {view} in "
             f"the measurements; {closest(image, [i for v, i in places if v == view])}"
         )
-    leg_names = [leg.name for leg in legs]
-    leg = leg_names.index(cells["leg"]) if cells["leg"] in leg_names else -1
+    leg = list(leg_names).index(cells["leg"]) if cells["leg"] in leg_names else -1
     if leg < 0:
         unknown.append(
             f"{where}, column leg: {start} the unknown leg {describe(cells['leg'])}, needed a leg "
             f"of the mechanism; {closest(cells['leg'], leg_names)}"
         )
-    else:
-        parts = [cylinder.link for cylinder in legs[leg].cylinders]
-        if cells["part"] not in parts:
-            unknown.append(
-                f"{where}, column part: {start} the unknown part {describe(cells['part'])}, needed "
-                f"a link with a cylinder of {cells['leg']}; {closest(cells['part'], parts)}"
-            )
     return (places.get((view, image), -1), leg), unknown
 
 
@@ -88,7 +102,7 @@ def parse_row(
         if cells[name] not in allowed
     ]
     used = cells["verdict"] == "used"
-    numbers = [_number(cells[name]) for name in NUMBERS]
+    numbers = [number_in(cells[name]) for name in NUMBERS]
     wrong += [
         f"{where}, column {name}: the outline could not be used: found "
         f"{describe(cells[name]) if cells[name] else 'an empty cell'}, needed a finite number; "
@@ -116,7 +130,7 @@ def parse_row(
     )
 
 
-def _number(text: str) -> float:
+def number_in(text: str) -> float:
     """Return the number in a cell, NaN if there is none."""
     try:
         return float(text) if "_" not in text else math.nan

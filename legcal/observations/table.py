@@ -16,7 +16,7 @@ import numpy as np
 
 from legcal.errors import DatasetError
 from legcal.files.atomic import write_atomically
-from legcal.files.csv_file import read_lines
+from legcal.files.csv_file import read_named_rows
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import Leg
 from legcal.observations.measurements import Measurements
@@ -55,6 +55,13 @@ def row_names(measurements: Measurements) -> tuple[str, ...]:
         for i, label in zip(blank, labels, strict=True):
             names[i] = label
     return tuple(names)
+
+
+def rows_by_name(measurements: Measurements) -> dict[tuple[str, str], int]:
+    """Return the row of the measurements for each view and name in the image column."""
+    names = row_names(measurements)
+    views = [measurements.views[v].name for v in measurements.view.tolist()]
+    return {place: row for row, place in enumerate(zip(views, names, strict=True))}
 
 
 def write_observations(
@@ -147,15 +154,11 @@ def read_observations(
         With one sentence for each thing that is wrong, naming row and column.
     """
     problems: list[str] = []
-    places = {
-        (measurements.views[v].name, name): row
-        for row, (v, name) in enumerate(
-            zip(measurements.view, row_names(measurements), strict=True)
-        )
-    }
+    places = rows_by_name(measurements)
     found: list[OutlineRow] = []
     first: dict[tuple[int, int, str, int], str] = {}
-    for where, cells in _read_rows(path, problems):
+    remedy = "delete the file to have it written again"
+    for where, cells in read_named_rows(path, "table of observations", COLUMNS, remedy, problems):
         place, unknown = place_of(where, cells, places, legs)
         if unknown and skip_stale and cells["source"] == "detected":
             continue
@@ -177,28 +180,6 @@ def read_observations(
     if problems:
         raise DatasetError(problems)
     return outlines
-
-
-def _read_rows(path: Path, problems: list[str]) -> list[tuple[str, dict[str, str]]]:
-    """Return the rows of the table that are complete, each with its place."""
-    lines = read_lines(path, "table of observations")
-    header = lines[0][1] if lines else []
-    if sorted(header) != sorted(COLUMNS):
-        raise DatasetError(
-            f"{path}, header: the columns could not be used: found {','.join(header) or 'none'}, "
-            f"needed {','.join(COLUMNS)}; delete the file to have it written again."
-        )
-    rows = []
-    for row, (line, cells) in enumerate(lines[1:], start=1):
-        where = f"{path}, row {row} (line {line})"
-        if len(cells) == len(header):
-            rows.append((where, dict(zip(header, cells, strict=True))))
-        else:
-            problems.append(
-                f"{where}: the row could not be used: found {len(cells)} cells, needed "
-                f"{len(header)}; complete or remove the row."
-            )
-    return rows
 
 
 def _rays(outlines: Outlines, measurements: Measurements) -> Array:

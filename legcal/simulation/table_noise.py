@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,29 +79,3 @@ def observe_axes(
     if rng is not None:
         values += rng.normal(size=values.shape) * noise.sigmas
     return axes_of_table(row, leg, values, np.broadcast_to(noise.sigmas, values.shape))
-
-
-def observe_images(
-    rows: Sequence[int],
-    seen: Sequence[IntArray],
-    lines: Sequence[tuple[Array, Array]],
-    noise: TableNoise,
-    rng: np.random.Generator | None,
-) -> LegAxes:
-    """Return the axes that images show, by image and then by leg.
-
-    Parameters
-    ----------
-    rows : sequence of int
-        Index of each image.
-    seen : sequence of (k,) array of int
-        The legs that each image shows.
-    lines : sequence of ((k, 3) array, (k, 3) array)
-        u and a point of each of these legs in the frame of the camera [m].
-    noise, rng
-        As in :func:`observe_axes`.
-    """
-    row = np.concatenate([np.full(len(s), r) for r, s in zip(rows, seen, strict=True)])
-    u, A = (np.concatenate(part) for part in zip(*lines, strict=True))
-    leg = np.concatenate(list(seen)).astype(np.intp)
-    return observe_axes(row.astype(np.intp), leg, u, A, noise, rng)

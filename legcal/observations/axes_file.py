@@ -1,0 +1,156 @@
+"""The table ``axes.csv``: axes of legs as the paper states them, instead of images and outlines.
+
+One row an axis: view, image and leg, named as in ``observations.csv``; the Euler angles
+psi and theta (:mod:`legcal.vision.euler`) and the point M_LS = (x, 0, z) in the camera frame; their
+standard deviations, which are taken for true. Angles in radians, lengths in metres.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from legcal.errors import DatasetError
+from legcal.files.atomic import write_atomically
+from legcal.files.csv_file import read_named_rows
+from legcal.files.schema import describe
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.measurements import Measurements
+from legcal.observations.row import number_in, place_in_measurements
+from legcal.observations.table import row_names, rows_by_name
+from legcal.observations.table_axes import axes_of_table, table_of_axes
+
+VALUES = ("psi", "theta", "x", "z")
+SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
+COLUMNS = ("view", "image", "leg", *VALUES, *SIGMAS)
+
+LARGEST_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
+ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
+SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
+LEAST_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
+
+
+def write_axes(
+    path: Path, axes: LegAxes, measurements: Measurements, leg_names: Sequence[str]
+) -> None:
+    """Write axes, the file complete or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        ``axes.csv``.
+    axes : LegAxes
+        What to write. Correlations between angles and point are left out.
+    measurements : Measurements
+        The rows they belong to, in the order of the file.
+    leg_names : sequence of str
+        The legs of the mechanism.
+
+    Raises
+    ------
+    NotVisible
+        If an axis has no point M_LS.
+    OSError
+        If the file cannot be written.
+    """
+    write_atomically(path, format_axes(axes, measurements, leg_names).encode())
+
+
+def format_axes(axes: LegAxes, measurements: Measurements, leg_names: Sequence[str]) -> str:
+    """Return the text of ``axes.csv``; arguments as in :func:`write_axes`."""
+    names = row_names(measurements)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    numbers = np.hstack(table_of_axes(axes)).tolist()
+    for row, leg, cells in zip(axes.row.tolist(), axes.leg.tolist(), numbers, strict=True):
+        view = measurements.views[measurements.view[row]].name
+        writer.writerow([view, names[row], leg_names[leg], *(repr(x) for x in cells)])
+    return text.getvalue()
+
+
+def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) -> LegAxes:
+    """Read ``axes.csv``.
+
+    Parameters
+    ----------
+    path : Path
+        The table.
+    leg_names : sequence of str
+        The legs of the mechanism.
+    measurements : Measurements
+        The rows that axes belong to, in the order of the file.
+
+    Returns
+    -------
+    LegAxes
+        In the order of the file.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong, naming row and column.
+    """
+    problems: list[str] = []
+    rows = read_named_rows(path, "table of axes", COLUMNS, "correct the header", problems)
+    if not problems and not rows:
+        problems.append(
+            f"{path}: the axes could not be used: found no row, needed the axes of the legs in "
+            "every image; add them, or delete the file to have images searched."
+        )
+    places = rows_by_name(measurements)
+    first: dict[tuple[int, int], str] = {}
+    numbers = []
+    for where, cells in rows:
+        place, unknown = place_in_measurements(where, cells, places, leg_names, "axis")
+        found, wrong = _numbers(where, cells)
+        problems += [*unknown, *wrong]
+        numbers.append(found)
+        earlier = where if unknown else first.setdefault(place, where)
+        if earlier != where:
+            problems.append(
+                f"{where}: the axis could not be used: found the same image and leg in "
+                f"{earlier.rsplit(', ', 1)[-1]}, needed it once; remove one of them."
+            )
+    if problems:
+        raise DatasetError(problems)
+    row, leg = np.array(list(first), dtype=np.intp).T
+    table = np.array(numbers)
+    return axes_of_table(row, leg, table[:, :4], table[:, 4:])
+
+
+def _numbers(where: str, cells: Mapping[str, str]) -> tuple[list[float], list[str]]:
+    """Return the eight numbers of a row, and what is wrong with them."""
+    found = {name: number_in(cells[name]) for name in (*VALUES, *SIGMAS)}
+    start = "the axis could not be used: found"
+    problems = [
+        f"{where}, column {name}: {start} "
+        f"{describe(cells[name]) if cells[name] else 'an empty cell'}, needed a finite number; "
+        "correct it or remove the row."
+        for name, x in found.items()
+        if not math.isfinite(x)
+    ]
+    problems += [
+        f"{where}, column {name}: {start} {found[name]:g}, needed an angle from {-limit:.4f} to "
+        f"{limit:.4f} rad; write radians, not degrees."
+        for name, limit in LARGEST_ANGLE.items()
+        if abs(found[name]) > limit + ANGLE_ROUNDING
+    ]
+    least, most = SIGMA_RANGE
+    problems += [
+        f"{where}, column {name}: {start} {found[name]:g}, needed a standard deviation from "
+        f"{least:g} to {most:g}; give it in {'rad' if name in SIGMAS[:2] else 'm'}."
+        for name in SIGMAS
+        if math.isfinite(found[name]) and not least <= found[name] <= most
+    ]
+    upright = math.cos(found["psi"]) * math.cos(found["theta"]) if not problems else 1.0
+    if abs(upright) < LEAST_UPRIGHT:
+        problems.append(
+            f"{where}, columns psi, theta: {start} an axis parallel to the plane of the camera's x "
+            "and z axes, needed one that crosses it: the point (x, 0, z) does not exist; remove "
+            "the row, or give outlines instead."
+        )
+    return list(found.values()), problems
