@@ -89,7 +89,7 @@ def random_configurations(
         )
     return Configurations(
         np.array(found).reshape(count, mechanism.chain.nq),
-        np.array([_joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
+        np.array([joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
         [platform_pose(mechanism, c) for c in found],
     )
 
@@ -118,7 +118,7 @@ def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Ite
                 )
             except DidNotConverge:  # the legs cannot have these lengths at the same time
                 continue
-            if _outside(mechanism, reached).any():
+            if beyond_travel(mechanism, reached).any():
                 continue
             if singularity(mechanism, platform_pose(mechanism, reached)) >= least:
                 drawn += 1
@@ -131,13 +131,13 @@ def _wandered(mechanism: Mechanism, count: int, chance: np.random.Generator) -> 
     here = mechanism.home_configuration
     for _ in range(count):
         for _ in range(TRIES):
-            here = _strolled(mechanism, here, chance)
-            if not _outside(mechanism, here).any():
+            here = strolled(mechanism, here, chance)
+            if not beyond_travel(mechanism, here).any():
                 yield here
                 break
 
 
-def _strolled(mechanism: Mechanism, here: Array, chance: np.random.Generator) -> Array:
+def strolled(mechanism: Mechanism, here: Array, chance: np.random.Generator) -> Array:
     """Return a closed configuration a few steps away, no further outside the travel."""
     for _ in range(WALK):
         motions = free_motions(mechanism, here)
@@ -145,12 +145,12 @@ def _strolled(mechanism: Mechanism, here: Array, chance: np.random.Generator) ->
         there = project(mechanism, mechanism.chain.integrate(here, STRIDE * motions @ weights))
         if there is None:
             continue
-        if not np.any(_outside(mechanism, there) & ~_outside(mechanism, here)):
+        if not np.any(beyond_travel(mechanism, there) & ~beyond_travel(mechanism, here)):
             here = there
     return here
 
 
-def _joint_values(mechanism: Mechanism, configuration: Array) -> Array:
+def joint_values(mechanism: Mechanism, configuration: Array) -> Array:
     """Return the joint value of every leg at a configuration, zero for rods, (n_legs,) [m]."""
     values = np.zeros(mechanism.n_legs)
     sliding = [j for j, leg in enumerate(mechanism.legs) if leg.kind is not LegKind.CONSTANT]
@@ -158,9 +158,9 @@ def _joint_values(mechanism: Mechanism, configuration: Array) -> Array:
     return values
 
 
-def _outside(mechanism: Mechanism, configuration: Array) -> BoolArray:
+def beyond_travel(mechanism: Mechanism, configuration: Array) -> BoolArray:
     """Return which legs are outside their travel, or flipped, (n_legs,)."""
-    values = _joint_values(mechanism, configuration)
+    values = joint_values(mechanism, configuration)
     lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
     outside = (values < lower - INSIDE) | (values > upper + INSIDE)
     return np.asarray(outside | (mechanism.sign * values + mechanism.q0 <= 0.0))

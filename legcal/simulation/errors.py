@@ -7,15 +7,12 @@ zero stays zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 
 from legcal.errors import UsageError
-from legcal.files.schema import closest
 from legcal.geometry.types import Array
 from legcal.identify.planned import moved_legs
 from legcal.mechanism.leg_geometry import LegGeometry
@@ -78,15 +75,6 @@ class ParameterErrors:
     coplanar: bool = False
 
 
-KINDS = {
-    "joints": ("base_joints", "platform_joints"),
-    "base-joints": ("base_joints",),
-    "platform-joints": ("platform_joints",),
-    "offsets": ("offsets",),
-    "lengths": ("lengths",),
-    "axes": ("axes",),
-    "twists": ("twists",),
-}
 _FIELDS = {
     "base": "base_joints",
     "platform": "platform_joints",
@@ -96,51 +84,6 @@ _FIELDS = {
     "platform_axis": "axes",
     "twist": "twists",
 }
-
-
-def parse_errors(words: Sequence[str], start: ParameterErrors | None = None) -> ParameterErrors:
-    """Return errors from words such as ``joints=0.002`` or ``axes=normal:0.001``.
-
-    Parameters
-    ----------
-    words : sequence of str
-        Kind, equals sign, and size [m] or [rad], uniform unless ``normal:`` stands before it. Later
-        ones win.
-    start : ParameterErrors, optional
-        What holds for kinds that are not named; no errors without it.
-
-    Raises
-    ------
-    UsageError
-        With one sentence for each word that is malformed, of an unknown kind, negative or beyond
-        reason.
-    """
-    found, problems = start or ParameterErrors(), []
-    for word in words:
-        kind, _, text = word.partition("=")
-        distribution, _, number = text.rpartition(":")
-        said = f"The errors '{word}' could not be used: found"
-        size = _number(number)
-        if kind not in KINDS:
-            problems.append(f"{said} the kind '{kind}', needed {', '.join(KINDS)}; "
-                            f"{closest(kind, list(KINDS))}")  # fmt: skip
-        elif distribution not in ("", *Distribution):
-            problems.append(
-                f"{said} the distribution '{distribution}', needed uniform or normal; write "
-                f"{kind}=normal:0.001 or {kind}=0.001."
-            )
-        elif size is None:
-            problems.append(
-                f"{said} the size '{number}', needed a number from 0 to {LARGEST:g} m or rad; "
-                f"write {kind}=0.001."
-            )
-        else:
-            spread = Spread(size, Distribution(distribution or Distribution.UNIFORM))
-            changes: dict[str, Any] = dict.fromkeys(KINDS[kind], spread)
-            found = replace(found, **changes)
-    if problems:
-        raise UsageError(problems)
-    return found
 
 
 def draw_errors(
@@ -208,12 +151,3 @@ def _check(errors: ParameterErrors) -> None:
             )
     if problems:
         raise UsageError(problems)
-
-
-def _number(text: str) -> float | None:
-    """Return a size, None where the text is none."""
-    try:
-        size = float(text)
-    except ValueError:
-        return None
-    return size if math.isfinite(size) and 0.0 <= size <= LARGEST else None

@@ -1,4 +1,9 @@
-"""Poses in which a simulated machine is photographed (section 4.3)."""
+"""Poses in which a simulated machine is photographed (section 4.3).
+
+They are reached from home without crossing a singularity, with every joint inside its limits and no
+leg through another. Extreme ones have every motor near an end of its travel; where the legs cannot
+have such lengths at the same time, they go as far that way as they can.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +14,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.errors import DatasetError, DidNotConverge, UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
+from legcal.mechanism.closing import platform_pose, slider_columns
+from legcal.mechanism.configurations import joint_values
+from legcal.mechanism.following import follow
 from legcal.mechanism.model import Mechanism
+from legcal.simulation.admission import Admission
+from legcal.simulation.draws import Draws
+from legcal.simulation.readings_file import read_readings
+
+HOPELESS = 5  # poses in vain, if they are the first
 
 
 class Sampling(StrEnum):
@@ -60,7 +73,8 @@ def draw_poses(
     rng : numpy.random.Generator
         Source of the poses.
     sampling : Sampling
-        How they are drawn.
+        How they are drawn. Where the motors do not determine the pose the machine takes a random
+        walk in either case.
 
     Returns
     -------
@@ -70,13 +84,38 @@ def draw_poses(
     ------
     DidNotConverge
         If too few poses are reached.
+    ModelError
+        If a joint is outside its limits at home already.
+    UsageError
+        If there is no pose to draw, or no such sampling.
     """
-    found = random_configurations(mechanism, n_poses, rng)
-    return SimulatedPoses(found.configurations, found.readings, tuple(found.poses))
+    if n_poses < 1 or sampling not in list(Sampling):
+        raise UsageError(
+            f"Poses could not be drawn: found {n_poses} poses and the sampling '{sampling}', "
+            f"needed at least one pose and {' or '.join(Sampling)}; choose them."
+        )
+    draws = Draws(mechanism, rng, extreme=Sampling(sampling) is Sampling.EXTREME)
+    found: list[Array] = []
+    for turn in range(n_poses):
+        configuration = draws.next()
+        if configuration is not None:
+            found.append(configuration)
+        elif turn - len(found) >= HOPELESS - 1:
+            break
+    if len(found) < n_poses:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
+            f"the machine reaches in {draws.problems.total() + len(found)} draws "
+            f"({draws.said()}), needed all; check legcal.home and the limits of the joints, or "
+            "give poses."
+        )
+    return _poses(mechanism, found)
 
 
 def given_poses(mechanism: Mechanism, path: Path) -> SimulatedPoses:
-    """Return the poses at readings that a CSV gives: actuated joints in its header, [m] below.
+    """Return the poses at the readings of a CSV: actuated joints in its header, [m] below.
+
+    Each is followed from the nearest one that is reached already, or from home.
 
     Parameters
     ----------
@@ -88,10 +127,52 @@ def given_poses(mechanism: Mechanism, path: Path) -> SimulatedPoses:
     Returns
     -------
     SimulatedPoses
+        In the order of the rows.
 
     Raises
     ------
     DatasetError
-        If the file is malformed, or a row is outside the travel or not reached.
+        If the file is malformed or has readings outside the travel, or if the machine cannot
+        stand at those of a row; one sentence for each.
+    UsageError
+        If readings do not tell the pose of this machine.
+    ModelError
+        If a joint is outside its limits at home already.
     """
-    raise NotImplementedError
+    if not mechanism.is_determined:
+        raise UsageError(
+            f"{path}: poses could not be given: found a machine of {mechanism.mobility} freedoms "
+            f"and {len(mechanism.motors)} motors, needed one whose readings tell its pose; let "
+            "poses be drawn."
+        )
+    given = read_readings(path, mechanism)
+    admission, problems = Admission(mechanism), []
+    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
+    reached = [mechanism.home_configuration]
+    for where, row in zip(given.where, given.readings, strict=True):
+        nearest = int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))
+        try:
+            configuration = follow(mechanism, reached[nearest], row)
+        except DidNotConverge:
+            problem: str | None = "legs that cannot have these lengths at the same time"
+        else:
+            problem = admission.problem(configuration, of_motors=False)
+            known.append(row)
+            reached.append(configuration)
+        if problem is not None:
+            problems.append(
+                f"{where}: the pose could not be used: found {problem} there, needed a pose that "
+                "the machine reaches from home; correct or remove the row."
+            )
+    if problems:
+        raise DatasetError(problems)
+    return _poses(mechanism, reached[1:])
+
+
+def _poses(mechanism: Mechanism, configurations: list[Array]) -> SimulatedPoses:
+    """Return closed configurations as poses."""
+    return SimulatedPoses(
+        np.array(configurations),
+        np.array([joint_values(mechanism, c) for c in configurations]),
+        tuple(platform_pose(mechanism, c) for c in configurations),
+    )
