@@ -31,6 +31,8 @@ class Material:
         How much darker the surface is where it is seen edge-on, 0 to 1: the scattered light is
         times 1 - limb (1 - cos), with the angle between the normal and the line of sight. On a
         cylinder the cosine grows like the square root of the depth inside the outline.
+    texture : float
+        Standard deviation of a mottled pattern on it, as a part of the albedo.
     tint : tuple of float
         Factors of red, green, blue; used in pictures in colour only.
     """
@@ -39,6 +41,7 @@ class Material:
     specular: float = 0.1
     shininess: float = 20.0
     limb: float = 0.3
+    texture: float = 0.0
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 

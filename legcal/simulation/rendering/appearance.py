@@ -1,0 +1,170 @@
+"""How a simulated photograph looks: light, surroundings, lens and sensor."""
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Literal, Self
+
+from legcal.errors import UsageError
+
+SAMPLES = (13, 21, 34, 55, 89, 144)  # Fibonacci numbers: the lattices of a pixel's rays
+
+
+@dataclass(frozen=True)
+class Light:
+    """A round lamp.
+
+    Attributes
+    ----------
+    direction : tuple of float
+        Where it stands, seen from the middle of the machine, in the base frame.
+    distance : float
+        How far from there, in radii of the machine.
+    strength : float
+        Radiance of a white surface that faces it at the middle of the machine; 1 is full scale.
+    radius : float
+        Its size in radii of the machine: soft shadows, 0 for hard ones.
+    shadows : bool
+        Whether solids cast shadows of it.
+    """
+
+    direction: tuple[float, float, float]
+    distance: float = 4.0
+    strength: float = 0.8
+    radius: float = 0.15
+    shadows: bool = True
+
+
+WORKSHOP_LIGHTS = (
+    Light(direction=(0.5, -0.8, 1.1), strength=0.75),
+    Light(direction=(-0.9, -0.2, 0.5), strength=0.22, shadows=False),
+)
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """How a photograph looks. The defaults are a workshop; :meth:`clean` is flat light.
+
+    Attributes
+    ----------
+    lights : tuple of Light
+        The lamps.
+    ambient : float
+        Radiance of a white surface by light from everywhere, a little more from above.
+    shadows : bool
+        Whether any shadows are cast.
+    limb, specular, texture : float
+        Factors on what the materials say: darkening towards grazing incidence, highlights and
+        reflections, and mottled patterns. Zero leaves them out.
+    background : float
+        Mean radiance behind everything; 1 is full scale.
+    background_contrast : float
+        How much the background varies, as a part of its mean; 0 for a plain one.
+    clutter : int
+        Rods, boxes and balls around and behind the machine.
+    cables : int
+        Thin cylinders that hang in front of the machine.
+    table : bool
+        Whether the machine stands on a table.
+    exposure : float
+        Factor on all radiance before it saturates at full scale.
+    blur : float
+        Standard deviation of the lens's Gaussian blur [px].
+    gamma : float
+        Grey levels are radiance to the power 1 / gamma; 1 is linear.
+    electrons : float
+        Electrons of a pixel at full scale, which fixes the shot noise; infinite for none.
+    read_noise : float
+        Standard deviation of the noise in the dark [electrons].
+    bits : {8, 16}
+        Bits of a pixel.
+    colour : bool
+        Blue, green, red as OpenCV has them instead of grey.
+    samples : int
+        Rays of each pixel that an edge may cross: 13, 21, 34, 55, 89 or 144.
+
+    Raises
+    ------
+    UsageError
+        If a number makes no sense.
+    """
+
+    lights: tuple[Light, ...] = WORKSHOP_LIGHTS
+    ambient: float = 0.16
+    shadows: bool = True
+    limb: float = 1.0
+    specular: float = 1.0
+    texture: float = 1.0
+    background: float = 0.06
+    background_contrast: float = 0.5
+    clutter: int = 15
+    cables: int = 0
+    table: bool = True
+    exposure: float = 1.0
+    blur: float = 0.5
+    gamma: float = 2.2
+    electrons: float = 12_000.0
+    read_noise: float = 12.0
+    bits: Literal[8, 16] = 8
+    colour: bool = False
+    samples: int = 34
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not isinstance(value, bool | tuple):
+                _check_number(field.name, value)
+        _check_choice("bits", self.bits, (8, 16))
+        _check_choice("samples", self.samples, SAMPLES)
+        for light in self.lights:
+            if not (math.hypot(*light.direction) > 0.0 and 0.0 < light.distance < 1e6):
+                raise UsageError(
+                    f"The light could not be placed: found direction {light.direction} and "
+                    f"distance {light.distance:g}, needed a direction and a distance above 0; "
+                    "correct them."
+                )
+            if not (light.strength >= 0.0 and light.radius >= 0.0):
+                raise UsageError(
+                    f"The light could not shine: found strength {light.strength:g} and radius "
+                    f"{light.radius:g}, needed numbers of at least 0; correct them."
+                )
+
+    @classmethod
+    def clean(cls, **changes: object) -> Self:
+        """Return flat light on a dark plain background, without blur or noise, linear, 16 bit.
+
+        Every surface has one grey level, its albedo, so that outlines are edges between two
+        constants. Keyword arguments replace any of it.
+        """
+        plain = cls(
+            lights=(), ambient=1.0, shadows=False, limb=0.0, specular=0.0, texture=0.0,
+            background=0.02, background_contrast=0.0, clutter=0, table=False,
+            blur=0.0, gamma=1.0, electrons=math.inf, read_noise=0.0, bits=16,
+        )  # fmt: skip
+        return replace(plain, **changes)  # type: ignore[arg-type]
+
+
+_POSITIVE = ("exposure", "gamma", "electrons")
+_MOST = {
+    "blur": 20.0, "gamma": 10.0, "clutter": 500.0, "cables": 100.0, "limb": 1.0, "texture": 10.0,
+    "electrons": math.inf,
+}  # fmt: skip
+
+
+def _check_number(name: str, value: float) -> None:
+    """Refuse a number that makes no sense."""
+    most = _MOST.get(name, 1e6)
+    least = "above" if name in _POSITIVE else "of at least"
+    if not 0.0 <= value <= most or (name in _POSITIVE and value == 0.0):
+        raise UsageError(
+            f"The appearance could not be used: found {name} = {value:g}, needed a number {least} "
+            f"0 and at most {most:g}; correct it."
+        )
+
+
+def _check_choice(name: str, value: int, choices: tuple[int, ...]) -> None:
+    """Refuse a value that is not one of a few."""
+    if value not in choices:
+        raise UsageError(
+            f"The appearance could not be used: found {name} = {value}, needed one of "
+            f"{', '.join(map(str, choices))}; choose one."
+        )

@@ -1,0 +1,213 @@
+"""Solids painted into a picture: one ray a pixel inside surfaces, many where edges are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from legcal.geometry.types import BoolArray, IntArray
+from legcal.simulation.rendering.footprint import footprint
+from legcal.simulation.rendering.intersect import intersect
+from legcal.simulation.rendering.rays import PixelRays, Single
+from legcal.simulation.rendering.shading import Lighting, Shaded, shade
+from legcal.simulation.rendering.shadows import Occluders, seen_of_lamp
+from legcal.simulation.rendering.solid_in_view import SolidInView
+from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
+
+_TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
+_THIN = 3.0  # [px] solids that rays through pixel centres may miss
+_PIXELS = 6144  # on edges, at a time
+_FACES = 8  # that are told apart in the search for edges
+
+
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    """A picture being painted.
+
+    Attributes
+    ----------
+    z : (n,) array
+        Depth of what every pixel's centre shows [m]; infinite for the background.
+    terms : (n_terms, n_channels, n) array
+        Radiance: the sum, or apart what no shadow takes away and the light of each lamp.
+    """
+
+    z: Single
+    terms: Single
+
+
+class Painter:
+    """Paints solids with one light and one camera.
+
+    Parameters
+    ----------
+    rays : PixelRays
+        The camera's rays.
+    light : Lighting
+        The light.
+    samples : int
+        Rays of each pixel on an edge.
+    """
+
+    def __init__(self, rays: PixelRays, light: Lighting, samples: int) -> None:
+        self.rays, self.light, self.samples = rays, light, samples
+
+    def paint(
+        self, canvas: Canvas, solids: Sequence[SolidInView], bystanders: Sequence[SolidInView] = ()
+    ) -> None:
+        """Paint solids over a picture, where they are in front of what it shows.
+
+        Parameters
+        ----------
+        canvas : Canvas
+            The picture; changed in place.
+        solids : sequence of SolidInView
+            What to paint.
+        bystanders : sequence of SolidInView
+            What is not painted but casts shadows.
+        """
+        behind = canvas.z.copy()
+        occluders = Occluders([*solids, *bystanders])
+        feet = [footprint(self.rays, solid) for solid in solids]
+        key, face = self._first_hits(canvas.z, solids, feet)
+        edge = self._edges(key, solids, feet)
+        on_edge = np.flatnonzero(edge)
+        for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
+            inside = foot[(key[foot] // _FACES == i + 1) & ~edge[foot]]
+            if len(inside):
+                x, y = self.rays.x[inside], self.rays.y[inside]
+                shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light)
+                seen = self._seen(shaded, occluders, i)
+                canvas.terms[:, :, inside] = _terms(shaded, seen, len(canvas.terms))
+        del key, face
+        for start in range(0, len(on_edge), _PIXELS):
+            pixels = on_edge[start : start + _PIXELS]
+            self._paint_edge(canvas, pixels, behind[pixels], solids, feet, occluders)
+
+    def _first_hits(
+        self, z: Single, solids: Sequence[SolidInView], feet: Sequence[IntArray]
+    ) -> tuple[NDArray[np.uint16], NDArray[np.int32]]:
+        """Find what every pixel's centre shows: solid and face as a key (0: none of them), face."""
+        key = np.zeros(len(z), dtype=np.uint16)
+        faces = np.zeros(len(z), dtype=np.int32)
+        for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
+            depth, face = intersect(solid, self.rays.x[foot], self.rays.y[foot])
+            closer = np.flatnonzero(depth < z[foot] * np.float32(_TIE))
+            pixels = foot[closer]
+            z[pixels], faces[pixels] = depth[closer], face[closer]
+            key[pixels] = _FACES * (i + 1)
+            if not isinstance(solid.shape, Mesh):
+                key[pixels] += face[closer].astype(np.uint16)
+        return key, faces
+
+    def _edges(
+        self, key: NDArray[np.uint16], solids: Sequence[SolidInView], feet: Sequence[IntArray]
+    ) -> BoolArray:
+        """Return the pixels that an edge of a painted surface may cross."""
+        picture = key.reshape(self.rays.height, self.rays.width)
+        block = np.ones((3, 3), np.uint8)
+        edge = (cv2.dilate(picture, block) != cv2.erode(picture, block)).ravel()
+        per_radian = float(self.rays.camera.K[0, 0])
+        for solid, foot in zip(solids, feet, strict=True):
+            farthest = float(solid.centre[2]) + solid.reach
+            if _thickness(solid) * per_radian < _THIN * farthest:
+                edge[foot] = True
+        return np.asarray(edge, dtype=np.bool_)
+
+    def _paint_edge(
+        self,
+        canvas: Canvas,
+        pixels: IntArray,
+        behind: Single,
+        solids: Sequence[SolidInView],
+        feet: Sequence[IntArray],
+        occluders: Occluders,
+    ) -> None:
+        """Average many rays in each of some pixels; ``behind`` is the depth before painting."""
+        n, S = len(pixels), self.samples
+        X, Y = self.rays.within(pixels, S)
+        Z = np.repeat(behind[:, None], S, axis=1)
+        who = np.zeros((n, S), dtype=np.uint16)
+        faces = np.zeros((n, S), dtype=np.int32)
+        row_of = np.full(len(canvas.z), -1, dtype=np.int32)
+        row_of[pixels] = np.arange(n, dtype=np.int32)
+        touched = []
+        for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
+            low, high = np.searchsorted(foot, (pixels[0], pixels[-1] + 1))
+            rows = row_of[foot[low:high]]
+            rows = rows[rows >= 0]
+            if not len(rows):
+                continue
+            depth, face = intersect(solid, X[rows].ravel(), Y[rows].ravel())
+            closer = depth.reshape(-1, S) < Z[rows] * np.float32(_TIE)
+            r, c = np.nonzero(closer)
+            if not len(r):
+                continue
+            at = rows[r], c
+            Z[at], who[at] = depth.reshape(-1, S)[r, c], i + 1
+            faces[at] = face.reshape(-1, S)[r, c]
+            touched.append((i, rows))
+        n_terms = len(canvas.terms)
+        total = canvas.terms[:, :, pixels] * (np.count_nonzero(who == 0, axis=1) / S).astype(
+            np.float32
+        )
+        for i, rows in touched:
+            r, c = np.nonzero(who[rows] == i + 1)
+            if not len(r):
+                continue
+            at = rows[r], c
+            shaded = shade(solids[i], X[at], Y[at], Z[at], faces[at], self.light)
+            first = np.flatnonzero(np.diff(r, prepend=-1))
+            seen = self._seen(shaded, occluders, i, first)
+            sums = np.add.reduceat(_terms(shaded, seen, n_terms), first, axis=-1)
+            total[:, :, rows[r[first]]] += sums * np.float32(1.0 / S)
+        canvas.terms[:, :, pixels] = total
+
+    def _seen(
+        self, shaded: Shaded, occluders: Occluders, own: int, first: IntArray | None = None
+    ) -> list[Single | None]:
+        """Return the share of each lamp that the points see; None for all of it.
+
+        ``first`` starts groups of points whose shadows are taken from one of them.
+        """
+        found: list[Single | None] = []
+        for lamp, faces in zip(self.light.lamps, shaded.faces_lamp, strict=True):
+            if not lamp.shadows:
+                found.append(None)
+                continue
+            if first is None:
+                seen = np.ones(len(faces), dtype=np.float32)
+                facing = np.flatnonzero(faces)
+                seen[facing] = seen_of_lamp(lamp, shaded.P[:, facing], occluders, own)
+            else:
+                seen = np.ones(len(first), dtype=np.float32)
+                any_faces = np.flatnonzero(np.logical_or.reduceat(faces, first))
+                seen[any_faces] = seen_of_lamp(lamp, shaded.P[:, first[any_faces]], occluders, own)
+                seen = np.repeat(seen, np.diff(first, append=len(faces)))
+            found.append(seen)
+        return found
+
+
+def _terms(shaded: Shaded, seen: Sequence[Single | None], n_terms: int) -> Single:
+    """Return the radiance of points with their shadows, summed if there is one term only."""
+    lit = [
+        light if share is None else light * share
+        for light, share in zip(shaded.of_lamp, seen, strict=True)
+    ]
+    if n_terms == 1:
+        return np.asarray(sum(lit, shaded.fixed)[None])
+    return np.stack([shaded.fixed, *lit])
+
+
+def _thickness(solid: SolidInView) -> float:
+    """Return the least size of a solid [m]."""
+    shape = solid.shape
+    if isinstance(shape, Box):
+        return min(shape.size)
+    if isinstance(shape, Cylinder):
+        return min(2.0 * shape.radius, shape.length)
+    if isinstance(shape, Sphere):
+        return 2.0 * shape.radius
+    return np.inf

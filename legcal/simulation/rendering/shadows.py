@@ -1,0 +1,180 @@
+"""Shadows of round lamps: how much of a lamp is seen from a point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.types import Array, IntArray
+from legcal.simulation.rendering.meshes import is_hidden
+from legcal.simulation.rendering.rays import Single
+from legcal.simulation.rendering.solid_in_view import SolidInView
+from legcal.simulation.shapes import Box, Cylinder, Sphere
+
+_TINY = 1e-12
+_SMALLEST = 1e-5  # [m] half-shadow of a point-like lamp
+_CHUNK = 4096  # points at a time
+_BALLS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Lamp:
+    """A light in the camera frame.
+
+    Attributes
+    ----------
+    position : (3,) array
+        Where it stands [m].
+    power : float
+        Radiance of a white surface that faces it, times its squared distance [m^2].
+    radius : float
+        Its size [m].
+    shadows : bool
+        Whether solids cast shadows of it.
+    """
+
+    position: Array
+    power: float
+    radius: float
+    shadows: bool
+
+
+class Occluders:
+    """Solids that stand between points and lamps, each held by a segment with a distance around it.
+
+    Parameters
+    ----------
+    solids : sequence of SolidInView
+        The solids.
+    """
+
+    def __init__(self, solids: Sequence[SolidInView]) -> None:
+        self.solids = tuple(solids)
+        self._centre = np.array([s.centre for s in solids]).reshape(-1, 3)
+        self._u = np.array([s.R[:, 2] for s in solids]).reshape(-1, 3)
+        self._half = np.zeros(len(solids))
+        self._around = np.array([s.reach for s in solids])
+        for i, solid in enumerate(solids):
+            shape = solid.shape
+            if isinstance(shape, Cylinder) and shape.length > shape.radius:
+                self._half[i], self._around[i] = 0.5 * shape.length, shape.radius
+
+    def between(self, lamp: Lamp, P: Single) -> IntArray:
+        """Return which solids may hide a lamp from any of some points, by balls along the way.
+
+        Parameters
+        ----------
+        lamp : Lamp
+            The lamp.
+        P : (3, n) array
+            Points in the camera frame [m].
+        """
+        low, high = P.min(axis=1).astype(np.float64), P.max(axis=1).astype(np.float64)
+        middle, reach = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+        t = np.linspace(0.0, 1.0, _BALLS)[:, None]
+        way = middle + t * (lamp.position - middle)
+        step = float(np.linalg.norm(lamp.position - middle)) / (_BALLS - 1)
+        radii = reach + t * (lamp.radius - reach) + 0.5 * step
+        away = way[:, None] - self._centre
+        along = np.clip(np.einsum("bsi,si->bs", away, self._u), -self._half, self._half)
+        away -= along[..., None] * self._u
+        near = np.einsum("bsi,bsi->bs", away, away) < (radii + self._around) ** 2
+        return np.flatnonzero(near.any(axis=0))
+
+
+def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: int | None = None) -> Single:
+    """Return the share of a lamp that is seen from points past solids, (n,).
+
+    The half-shadow is that of a straight edge: it goes smoothly from none to all over the
+    apparent size of the lamp. That of a box or a mesh is hard.
+
+    Parameters
+    ----------
+    lamp : Lamp
+        The lamp.
+    P : (3, n) array
+        Points in the camera frame, neighbours near each other [m].
+    occluders : Occluders
+        What may stand between.
+    own : int, optional
+        The solid that the points are on, which does not shade itself.
+    """
+    seen = np.ones(P.shape[1], dtype=np.float32)
+    position = lamp.position.astype(np.float32)[:, None]
+    for start in range(0, P.shape[1], _CHUNK):
+        piece = slice(start, start + _CHUNK)
+        points = P[:, piece]
+        to_lamp = position - points
+        for i in occluders.between(lamp, points):
+            if i != own:
+                seen[piece] *= _past(occluders.solids[i], lamp, points, to_lamp)
+    return seen
+
+
+def _past(solid: SolidInView, lamp: Lamp, P: Single, to_lamp: Single) -> Single:
+    """Return the share of the lamp seen past a solid."""
+    shape = solid.shape
+    if isinstance(shape, Cylinder):
+        return _past_cylinder(solid, shape, lamp, P, to_lamp)
+    if isinstance(shape, Sphere):
+        return _past_sphere(solid, shape, lamp, P, to_lamp)
+    if isinstance(shape, Box):
+        return _past_box(solid, shape, P, to_lamp)
+    return np.float32(1.0) - is_hidden(solid, shape, P, lamp.position)
+
+
+def _past_cylinder(
+    solid: SolidInView, shape: Cylinder, lamp: Lamp, P: Single, to_lamp: Single
+) -> Single:
+    """Return the share of the lamp seen past a cylinder."""
+    ux, uy, uz = solid.R[:, 2].tolist()
+    qx, qy, qz = (P[i] - float(solid.w[i]) for i in range(3))
+    lx, ly, lz = to_lamp
+    s0, ds = qx * ux + qy * uy + qz * uz, lx * ux + ly * uy + lz * uz
+    # The part of the way that lies between the planes of the caps.
+    safe = np.where(np.abs(ds) < _TINY, np.float32(_TINY), ds)
+    t1, t2 = (-0.5 * shape.length - s0) / safe, (0.5 * shape.length - s0) / safe
+    first = np.clip(np.minimum(t1, t2), 0.0, 1.0)
+    last = np.clip(np.maximum(t1, t2), 0.0, 1.0)
+    # Closest approach to the axis there.
+    qx, qy, qz = qx - s0 * ux, qy - s0 * uy, qz - s0 * uz
+    lx, ly, lz = lx - ds * ux, ly - ds * uy, lz - ds * uz
+    l2 = np.maximum(lx * lx + ly * ly + lz * lz, _TINY)
+    t = np.clip(-(qx * lx + qy * ly + qz * lz) / l2, first, last)
+    px, py, pz = qx + t * lx, qy + t * ly, qz + t * lz
+    gap = np.sqrt(px * px + py * py + pz * pz) - shape.radius
+    return np.where(last > first, _half_shadow(gap, t, lamp), np.float32(1.0))
+
+
+def _past_sphere(
+    solid: SolidInView, shape: Sphere, lamp: Lamp, P: Single, to_lamp: Single
+) -> Single:
+    """Return the share of the lamp seen past a sphere."""
+    q = P - solid.w.astype(np.float32)[:, None]
+    l2 = np.maximum(np.einsum("in,in->n", to_lamp, to_lamp), _TINY)
+    t = np.clip(-np.einsum("in,in->n", q, to_lamp) / l2, 0.0, 1.0)
+    q += t * to_lamp
+    gap = np.sqrt(np.einsum("in,in->n", q, q)) - shape.radius
+    return _half_shadow(gap, t, lamp)
+
+
+def _past_box(solid: SolidInView, shape: Box, P: Single, to_lamp: Single) -> Single:
+    """Return the share of the lamp seen past a box: all or nothing."""
+    R = solid.R.T.astype(np.float32)
+    q, l = R @ (P - solid.w.astype(np.float32)[:, None]), R @ to_lamp  # noqa: E741
+    first = np.zeros(P.shape[1], dtype=np.float32)
+    last = np.ones(P.shape[1], dtype=np.float32)
+    for axis in range(3):
+        d = np.where(l[axis] == 0.0, np.float32(_TINY), l[axis])
+        a, b = (-0.5 * shape.size[axis] - q[axis]) / d, (0.5 * shape.size[axis] - q[axis]) / d
+        np.maximum(first, np.minimum(a, b), out=first)
+        np.minimum(last, np.maximum(a, b), out=last)
+    return (first >= last).astype(np.float32)
+
+
+def _half_shadow(gap: Single, t: Single, lamp: Lamp) -> Single:
+    """Return the share of the lamp past an edge: the ray misses it by a gap, t of the way."""
+    width = t * np.float32(lamp.radius) + np.float32(_SMALLEST)
+    # A surface that coincides with the points' own one does not shade it.
+    share = np.clip((gap + np.float32(_SMALLEST)) / width * 0.5 + 0.5, 0.0, 1.0)
+    return np.asarray(share * share * (3.0 - 2.0 * share))
