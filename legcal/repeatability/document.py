@@ -20,8 +20,17 @@ def noise_document(noise: Noise) -> dict[str, Any]:
         "orientations": len(counts),
         "repeats": {"least": min(counts), "most": max(counts)},
         "methods": {method.name: _method(noise, method) for method in noise.methods},
+        "difference": {
+            "all": _difference(noise, None),
+            **{leg.name: _difference(noise, leg.name) for leg in noise.methods[0].legs},
+        },
         "notes": list(noise.notes),
     }
+
+
+def _difference(noise: Noise, leg: str | None) -> dict[str, float] | None:
+    found = noise.difference(leg)
+    return None if found is None else {"mean": found[0], "rms": found[1]}
 
 
 def _method(noise: Noise, method: MethodNoise) -> dict[str, Any]:

@@ -27,9 +27,11 @@ from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.model import Mechanism
 from legcal.observations.canonical_order import canonical_order, reorder_measurements
 from legcal.observations.measurements import Measurements
+from legcal.observations.outlines import Outlines
 from legcal.observations.sets import no_outlines
 from legcal.progress import Report, no_progress
 from legcal.repeatability.canny import canny_parts
+from legcal.repeatability.difference import Difference, outline_differences
 from legcal.repeatability.repeats import Repeats, find_repeats, group_rows
 from legcal.repeatability.samples import LegOrientation, leg_orientations
 from legcal.repeatability.spread import Sample, Spread, pool
@@ -74,7 +76,7 @@ class LegNoise:
     @property
     def without_M_LS(self) -> int:
         """Orientations in which M_LS does not exist."""
-        return sum(o.elevation is not None for o in self.orientations)
+        return sum(o.inclination is not None for o in self.orientations)
 
     def samples(self, quantity: str) -> list[Sample]:
         """Return the samples of one of the ``QUANTITIES`` or of the outlines."""
@@ -121,6 +123,8 @@ class Noise:
         The images that repeat each other.
     methods : tuple of MethodNoise
         Both methods.
+    differences : tuple of Difference
+        How far Canny's outlines lie outside the detector's.
     notes : tuple of str
         What else a reader should know.
     """
@@ -130,7 +134,15 @@ class Noise:
     pose_labels: tuple[str, ...]
     repeats: tuple[Repeats, ...]
     methods: tuple[MethodNoise, ...]
+    differences: tuple[Difference, ...]
     notes: tuple[str, ...]
+
+    def difference(self, leg: str | None = None) -> tuple[float, float] | None:
+        """Return mean and rms of the differences of a leg, or of all [px]; None without any."""
+        outward = [d.outward for d in self.differences if leg in (None, d.leg)]
+        if not outward:
+            return None
+        return float(np.mean(outward)), float(np.sqrt(np.mean(np.square(outward))))
 
 
 def measure_noise(
@@ -170,7 +182,7 @@ def measure_noise(
     load = dataset.image_reader(order.rows.tolist())
     poses = forward_kinematics_many(mechanism, measurements.q[measurements.first_rows])
     scene = scene_at_poses(mechanism, measurements, poses)
-    methods = []
+    outlines: dict[str, Outlines] = {}
     with worker_pool(workers) as run:
 
         def photographs(rows: IntArray) -> Photographs:
@@ -181,9 +193,11 @@ def measure_noise(
         )
         repeated = photographs(np.sort(np.concatenate([group.rows for group in repeats])))
         for name, (method, stage) in METHODS.items():
-            outlines = detect(repeated, scene, progress, method=method, stage=stage)
-            found = leg_orientations(outlines, measurements, mechanism.legs, repeats)
-            methods.append(MethodNoise(name, _by_leg(found, mechanism, names)))
+            outlines[name] = detect(repeated, scene, progress, method=method, stage=stage)
+    methods = []
+    for name, found in outlines.items():
+        orientations = leg_orientations(found, measurements, mechanism.legs, repeats)
+        methods.append(MethodNoise(name, _by_leg(orientations, mechanism, names)))
     _refuse_nothing_found(dataset, methods)
     return Noise(
         dataset=dataset,
@@ -191,6 +205,15 @@ def measure_noise(
         pose_labels=measurements.pose_labels,
         repeats=tuple(repeats),
         methods=tuple(methods),
+        differences=tuple(
+            outline_differences(
+                outlines["detector"],
+                outlines["canny"],
+                measurements,
+                repeats,
+                mechanism.leg_names,
+            )
+        ),
         notes=(*dataset.notes, *_notes(measurements, methods)),
     )
 
@@ -240,16 +263,16 @@ def _notes(measurements: Measurements, methods: Sequence[MethodNoise]) -> list[s
 
 def _without_M_LS(measurements: Measurements, method: str, leg: LegNoise) -> list[str]:
     """Return a note on a leg that has no M_LS in some orientations."""
-    without = [o for o in leg.orientations if o.elevation is not None]
+    without = [o for o in leg.orientations if o.inclination is not None]
     if not without:
         return []
     places = {
         f"{measurements.views[o.view].name}/{measurements.pose_labels[o.pose]}" for o in without
     }
-    elevation = np.degrees(min(o.elevation for o in without if o.elevation is not None))
+    inclination = np.degrees(min(o.inclination for o in without if o.inclination is not None))
     return [
         f"{leg.name}: M_LS does not exist for {method} in {len(without)} of "
-        f"{len(leg.orientations)} orientations ({', '.join(sorted(places))}): the leg is nearly "
-        f"parallel to the image x axis, {elevation:.2f} deg from the camera's plane y = 0, and "
-        "its point there would be known ten times worse than its middle."
+        f"{len(leg.orientations)} orientations ({', '.join(sorted(places))}), where its image is "
+        f"parallel to the image x axis within {inclination:.2f} deg: M_LS would slide along it by "
+        "more than its width."
     ]

@@ -17,9 +17,8 @@ from legcal.vision.euler import angles_of_direction
 ANGLES = ("psi", "theta", "angle", "tilt")
 QUANTITIES = ("psi", "theta", "x", "z", "angle", "across", "tilt", "depth")
 OF_M_LS = ("x", "z")
-WORSE = 10.0  # than the middle of the leg, from which on M_LS is said not to exist
-SURELY = 3.0  # standard deviations by which an axis must be inclined to the plane of M_LS
 _STEP = 1e-6  # of derivatives [rad, m]
+_M_LS_ROWS = [QUANTITIES.index(name) for name in OF_M_LS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,20 +31,20 @@ class AxisValues:
         The ``QUANTITIES`` of each, as differences to the first one [rad, m].
     claimed : (n, 8, 8) array
         Their claimed covariances.
-    elevation : (n,) array
-        Angle between each axis and the plane y = 0 of the camera [rad].
+    inclination : (n,) array
+        Angle between the image of each axis and the image x axis [rad].
     has_M_LS : bool
-        False if any of the axes is so nearly parallel to that plane that its M_LS is expected to be
-        known ``WORSE`` times worse than the middle of the leg, or lies at infinity.
+        False if any of the axes is seen so nearly parallel to the image x axis that the place in
+        the image where M_LS is seen has an expected standard deviation above the leg's width.
     """
 
     values: Array
     claimed: Array
-    elevation: Array
+    inclination: Array
     has_M_LS: bool
 
 
-def axis_values(axes: LegAxes, chosen: BoolArray) -> AxisValues:
+def axis_values(axes: LegAxes, chosen: BoolArray, radius: float) -> AxisValues:
     """Return what repeated axes of one leg are in numbers.
 
     Parameters
@@ -54,9 +53,11 @@ def axis_values(axes: LegAxes, chosen: BoolArray) -> AxisValues:
         Axes in camera frames.
     chosen : (n_axes,) array of bool
         The repeats of one leg in one view and pose.
+    radius : float
+        Radius of the leg [m].
     """
     u, M = axes.u[chosen], axes.M[chosen]
-    basis, covariance = axes.basis[chosen], axes.covariance[chosen]
+    basis = axes.basis[chosen]
     values = _values(u, M, u[0], M[0])
     derivative = np.empty((len(u), len(QUANTITIES), 4))
     for k in range(4):
@@ -64,20 +65,22 @@ def axis_values(axes: LegAxes, chosen: BoolArray) -> AxisValues:
         du, dM = (step, np.zeros_like(M)) if k < 2 else (np.zeros_like(u), step)
         up, down = (_values(u + s * du, M + s * dM, u[0], M[0]) for s in (1.0, -1.0))
         derivative[..., k] = (up - down) / (2.0 * _STEP)
-    claimed = derivative @ covariance @ derivative.swapaxes(1, 2)
-    elevation = np.arcsin(np.minimum(np.abs(u[:, 1]), 1.0))
-    return AxisValues(values, claimed, elevation, _has_M_LS(u, basis, covariance, claimed))
+    claimed = derivative @ axes.covariance[chosen] @ derivative.swapaxes(1, 2)
+    normal = np.cross(u, M)
+    inclination = np.arctan2(np.abs(normal[:, 0]), np.abs(normal[:, 1]))
+    return AxisValues(values, claimed, inclination, _has_M_LS(u, M, claimed, radius))
 
 
-def _has_M_LS(u: Array, basis: Array, covariance: Array, claimed: Array) -> bool:
-    """Say whether M_LS is expected to be known about as well as the middle of the leg."""
-    e_y = basis[:, :, 1]
-    sigma_u_y = np.sqrt(np.einsum("ni,nij,nj->n", e_y, covariance[:, :2, :2], e_y))
-    if np.any(np.abs(u[:, 1]) <= np.maximum(SURELY * sigma_u_y, 10.0 * _STEP)):
+def _has_M_LS(u: Array, M: Array, claimed: Array, radius: float) -> bool:
+    """Say whether M_LS is expected to be seen at the same place up to the width of the leg."""
+    if np.any(np.abs(u[:, 1]) < 10.0 * _STEP):
         return False
-    variance = dict(zip(QUANTITIES, np.diagonal(claimed, axis1=1, axis2=2).T, strict=True))
-    middle = variance["across"] + variance["depth"]
-    return bool(np.all(variance["x"] + variance["z"] < WORSE**2 * middle))
+    x, z = _M_LS(u, M)
+    gradient = np.column_stack([1.0 / z, -x / z**2])  # of x / z, where M_LS is seen
+    variance = np.einsum(
+        "ni,nij,nj->n", gradient, claimed[:, _M_LS_ROWS][:, :, _M_LS_ROWS], gradient
+    )
+    return bool(np.all(np.sqrt(variance) < 2.0 * radius / np.linalg.norm(M, axis=1)))
 
 
 def _values(u: Array, M: Array, u_0: Array, M_0: Array) -> Array:

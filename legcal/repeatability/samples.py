@@ -32,8 +32,8 @@ class LegOrientation:
         In how many of them its axis was found.
     quantities : mapping from str to Sample
         Of the axis; empty with fewer than two axes, without x and z where M_LS does not exist.
-    elevation : float or None
-        Smallest angle between the axis and the plane y = 0 of the camera [rad] where M_LS does not
+    inclination : float or None
+        Smallest angle between the image of the leg and the image x axis [rad] where M_LS does not
         exist.
     lines : tuple of Sample
         Of each outline that was found twice: its offsets at both ends [px].
@@ -47,7 +47,7 @@ class LegOrientation:
     images: int
     axes: int
     quantities: Mapping[str, Sample]
-    elevation: float | None
+    inclination: float | None
     lines: tuple[Sample, ...]
     outlines: int
     outlines_found: int
@@ -82,7 +82,7 @@ def leg_orientations(
         dtype=np.bool_,
     )
     return [
-        _orientation(leg, group, outlines, here, axes, measurements)
+        _orientation(leg, legs[leg], group, outlines, here, axes, measurements)
         for group in repeats
         for leg in range(len(legs))
         if np.any(here := shown & (outlines.leg == leg) & np.isin(outlines.row, group.rows))
@@ -90,7 +90,8 @@ def leg_orientations(
 
 
 def _orientation(
-    leg: int,
+    index: int,
+    leg: Leg,
     group: Repeats,
     outlines: Outlines,
     here: BoolArray,
@@ -99,35 +100,37 @@ def _orientation(
 ) -> LegOrientation:
     """Return what repeats say of one leg."""
     quantities: dict[str, Sample] = {}
-    elevation, n_axes = None, 0
+    inclination, n_axes = None, 0
     if axes is not None:
-        chosen = (axes.leg == leg) & np.isin(axes.row, group.rows)
+        chosen = (axes.leg == index) & np.isin(axes.row, group.rows)
         n_axes = int(np.count_nonzero(chosen))
         if n_axes > 1:
-            quantities, elevation = _axis_samples(axes, chosen)
+            quantities, inclination = _axis_samples(axes, chosen, max(leg.radius_of_part.values()))
     return LegOrientation(
-        leg=leg,
+        leg=index,
         view=group.view,
         pose=group.pose,
         images=len(np.unique(outlines.row[here])),
         axes=n_axes,
         quantities=quantities,
-        elevation=elevation,
+        inclination=inclination,
         lines=_line_samples(outlines, here, measurements.views[group.view].camera),
         outlines=int(np.count_nonzero(here)),
         outlines_found=int(np.count_nonzero(here & outlines.used)),
     )
 
 
-def _axis_samples(axes: LegAxes, chosen: BoolArray) -> tuple[dict[str, Sample], float | None]:
-    """Return the samples of an axis, and its elevation if it has no M_LS."""
-    found = axis_values(axes, chosen)
+def _axis_samples(
+    axes: LegAxes, chosen: BoolArray, radius: float
+) -> tuple[dict[str, Sample], float | None]:
+    """Return the samples of an axis, and its inclination if it has no M_LS."""
+    found = axis_values(axes, chosen, radius)
     samples = {
         name: sample_of(found.values[:, [i]], found.claimed[:, [i]][:, :, [i]])
         for i, name in enumerate(QUANTITIES)
         if found.has_M_LS or name not in OF_M_LS
     }
-    return samples, None if found.has_M_LS else float(found.elevation.min())
+    return samples, None if found.has_M_LS else float(found.inclination.min())
 
 
 def _line_samples(outlines: Outlines, here: BoolArray, camera: Camera) -> tuple[Sample, ...]:
