@@ -149,6 +149,25 @@ def follow(machine: Machine, lengths: Array, n_steps: int = 6) -> RigidTransform
     return RigidTransform.from_components(t[0], Rotation.from_matrix(R[0]))
 
 
+def poses_from_home(machine: Machine, lengths: Array) -> tuple[RigidTransform, ...]:
+    """Return the poses with given leg lengths, followed from home.
+
+    Parameters
+    ----------
+    machine : Machine
+        The machine.
+    lengths : (n_poses, n_legs) array
+        Leg lengths [m].
+
+    Returns
+    -------
+    tuple of RigidTransform
+        T_Rb_Re; where it cannot be reached, how far it came.
+    """
+    R, t, _ = _followed(machine, lengths)
+    return tuple(RigidTransform.from_components(t, Rotation.from_matrix(R)))
+
+
 def platform_error(
     machine: Machine, parameters: KinematicParameters, poses: Sequence[RigidTransform]
 ) -> tuple[float, float]:
@@ -228,7 +247,10 @@ def _drawn_poses(
 
 
 def _followed(machine: Machine, lengths: Array, n_steps: int = 6) -> tuple[Array, Array, BoolArray]:
-    """Return R and t of rows of lengths followed from home, and which of them were reached."""
+    """Return R and t of rows of lengths followed from home, and which of them were reached.
+
+    The others stay at the last step that was well.
+    """
     n = len(lengths)
     R = np.tile(machine.home.rotation.as_matrix(), (n, 1, 1))
     t = np.tile(machine.home.translation, (n, 1))
@@ -239,10 +261,12 @@ def _followed(machine: Machine, lengths: Array, n_steps: int = 6) -> tuple[Array
     for part in np.linspace(0.0, 1.0, n_steps + 1)[1:]:
         here = np.flatnonzero(reached)
         wanted = first + part * (lengths[here] - first)
-        R[here], t[here], error = _newton(machine.parameters, wanted, R[here], t[here])
-        J = _jacobian(machine.parameters, R[here], t[here]) / unit
+        R_new, t_new, error = _newton(machine.parameters, wanted, R[here], t[here])
+        J = _jacobian(machine.parameters, R_new, t_new) / unit
         smallest = np.linalg.svd(J, compute_uv=False)[:, -1]
-        reached[here] = (error == 0.0) & (smallest >= _SINGULAR)
+        well = (error == 0.0) & (smallest >= _SINGULAR)
+        R[here[well]], t[here[well]] = R_new[well], t_new[well]
+        reached[here] = well
     return R, t, reached
 
 
@@ -279,6 +303,11 @@ def _legs(parameters: KinematicParameters, R: Array, t: Array) -> tuple[Array, A
     """Return A B and R B of all legs at all poses, both (n_poses, n_legs, 3) [m]."""
     arms = parameters.platform_joints @ np.swapaxes(R, -1, -2)
     return arms + t[..., None, :] - parameters.base_joints, arms
+
+
+def length_jacobian(parameters: KinematicParameters, T_Rb_Re: RigidTransform) -> Array:
+    """Return d lengths / d (translation, rotation vector in R_b) at poses, (n_poses, n_legs, 6)."""
+    return _jacobian(parameters, T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation)
 
 
 def _jacobian(parameters: KinematicParameters, R: Array, t: Array) -> Array:

@@ -110,7 +110,7 @@ def simulate_session(
         q=q[pose],
         sigma_q=sigma_q,
     )
-    outlines, axes = _observe(
+    outlines, axes = observe_session(
         machine, viewpoints, T_Rb_Re, measurements, noise, rng if noisy else None
     )
     return SimulatedSession(measurements, outlines, axes, machine, tuple(viewpoints), T_Rb_Re)
@@ -126,7 +126,7 @@ def _reading_errors(
     return rng.normal(scale=sigma, size=shape)
 
 
-def _observe(
+def observe_session(
     machine: Machine,
     viewpoints: Sequence[Viewpoint],
     T_Rb_Re: Sequence[RigidTransform],
@@ -134,7 +134,10 @@ def _observe(
     noise: OutlineNoise | TableNoise,
     rng: np.random.Generator | None,
 ) -> tuple[Outlines | None, LegAxes]:
-    """Return what all images show; those of one view stand together."""
+    """Return what all images show, as outlines and as axes; exactly that if rng is None.
+
+    Images of one view stand together.
+    """
     poses = RigidTransform.concatenate(list(T_Rb_Re))
     seen = [np.array(viewpoints[v].legs, dtype=np.intp) for v in measurements.view]
     legs = [

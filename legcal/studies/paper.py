@@ -1,0 +1,129 @@
+"""Section 4.3: the paper's own evaluation, a hundred simulated calibrations of a 6-SPU."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import LegcalError
+from legcal.mechanism.parameters import KinematicParameters, to_vector
+from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
+from legcal.simulation.machine import Machine, perturb
+from legcal.simulation.poses import random_poses
+from legcal.simulation.session import SimulatedSession, observe_session, simulate_session
+from legcal.simulation.table_noise import TableNoise
+from legcal.studies.eq20 import PlatformErrors, expected_errors, platform_errors
+from legcal.studies.estimators import ESTIMATORS, bound_covariance
+from legcal.studies.paper_summary import BOUND, INITIAL, PaperSummary, summarize
+from legcal.studies.study import Record
+from legcal.studies.truths import RAISED, coplanar_hexapod, noncoplanar_hexapod
+from legcal.studies.workers import failure_of
+
+MACHINES = {"coplanar": coplanar_hexapod, "noncoplanar": noncoplanar_hexapod}
+
+
+@dataclass(frozen=True)
+class PaperStudy:
+    """The simulation of section 4.3, for coplanar and for non-coplanar joints.
+
+    Attributes
+    ----------
+    noise : TableNoise
+        Noise of the axes; ``TableNoise.in_radians()`` reads Table 1 to the letter.
+    initial_error : float
+        Half width of the uniform errors of the initial parameters [m].
+    reading_error : float
+        Half width of the uniform errors of the readings [m].
+    n_poses, n_images : int
+        Extreme poses of each camera position, and images of each pose.
+    n_checked : int
+        Random poses of eq (20).
+    """
+
+    noise: TableNoise = field(default_factory=TableNoise)
+    initial_error: float = 0.002
+    reading_error: float = 3e-6
+    n_poses: int = 15
+    n_images: int = 3
+    n_checked: int = 10
+
+    @property
+    def name(self) -> str:
+        """Its name on the command line."""
+        return "paper"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Everything that decides a run beside its seed."""
+        return {
+            **asdict(self),
+            "raised": RAISED,
+            "views": [[f"leg{leg + 1}" for leg in legs] for legs in PAPER_VIEWS],
+            "estimators": [*ESTIMATORS, BOUND],
+        }
+
+    def one_run(self, seed: np.random.SeedSequence) -> Record:
+        """Return what every estimator finds on one session of either machine."""
+        seeds = seed.spawn(len(MACHINES))
+        return {
+            name: self._calibrations(truth(), np.random.default_rng(child))
+            for (name, truth), child in zip(MACHINES.items(), seeds, strict=True)
+        }
+
+    def summary(self, records: Iterable[Record]) -> PaperSummary:
+        """Return the means over all runs."""
+        machines = {name: truth() for name, truth in MACHINES.items()}
+        return summarize(records, machines, in_radians=self.noise == TableNoise.in_radians())
+
+    def _calibrations(self, machine: Machine, rng: np.random.Generator) -> Record:
+        """Return the errors of all estimators for one session of a machine."""
+        nominal = perturb(machine, rng, self.initial_error)
+        session = simulate_session(
+            machine,
+            cameras_around(machine, rng),
+            rng,
+            noise=self.noise,
+            sigma_q=self.reading_error / np.sqrt(3.0),
+            uniform_readings=True,
+            n_poses=self.n_poses,
+            n_images=self.n_images,
+        )
+        checked = RigidTransform.concatenate(list(random_poses(machine, self.n_checked, rng)))
+        found = {INITIAL: _errors(machine, nominal.parameters, checked)}
+        for name, estimate in ESTIMATORS.items():
+            try:
+                found[name] = _errors(machine, estimate(session, nominal), checked)
+            except LegcalError as error:
+                found[name] = {"failure": failure_of(error)}
+        found[BOUND] = self._bound(session, checked)
+        return found
+
+    def _bound(self, session: SimulatedSession, checked: RigidTransform) -> Record:
+        """Return the errors to expect at the Cramer-Rao bound."""
+        machine = session.machine
+        _, exact = observe_session(
+            machine, session.viewpoints, session.T_Rb_Re, session.measurements, self.noise, None
+        )
+        covariance = bound_covariance(session, exact)
+        sigma = np.sqrt(np.diagonal(covariance))
+        return _record(expected_errors(machine, covariance, checked), np.sqrt(2.0 / np.pi) * sigma)
+
+
+def _errors(machine: Machine, parameters: KinematicParameters, checked: RigidTransform) -> Record:
+    """Return the errors of eq (20) and those of every parameter, or the failure to compute them."""
+    difference = to_vector(parameters, machine.frame_legs) - to_vector(
+        machine.parameters, machine.frame_legs
+    )
+    try:
+        return _record(platform_errors(machine, parameters, checked), np.abs(difference))
+    except LegcalError as error:
+        return {"failure": failure_of(error)}
+
+
+def _record(errors: PlatformErrors, parameters: np.ndarray[Any, Any]) -> Record:
+    """Return errors as a record [m, rad]."""
+    return {**asdict(errors), "parameters": parameters.tolist()}

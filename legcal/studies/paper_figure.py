@@ -1,0 +1,157 @@
+"""Figure 4 of the paper: mean errors of the thirty parameters as bars, true values as a line.
+
+Drawn twice from the same panels: with Plotly as a page that needs nothing from elsewhere, and with
+Matplotlib as a picture, which needs no browser.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+from legcal.geometry.types import Array
+from legcal.studies.paper_summary import BOUND, Means, PaperSummary
+from legcal.studies.paper_table import JOINTS
+
+_DRAWN = {
+    "literal": "steps as printed",
+    "default": "steps, legcal's criteria",
+    "fit": "one fit of everything",
+}
+_BAR, _LIMIT, _LINE = "#4c78a8", "#e45756", "#555555"
+_LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
+_ERROR_AXIS, _TRUTH_AXIS = "mean error [mm]", "true value [mm]"
+_BARS, _MARKS, _TRUE = "mean error", "expected at the Cramer-Rao bound", "true value (right)"
+
+
+@dataclass(frozen=True, eq=False)
+class _Panel:
+    """One panel: an estimator on a machine [mm]."""
+
+    title: str
+    errors: Array
+    limit: Array
+    truth: Array
+
+
+def figure_as_html(summary: PaperSummary) -> bytes:
+    """Return the figure as one HTML page that works without a network."""
+    import plotly.graph_objects as go
+    from plotly.subplots import make_subplots
+
+    grid, names = _panels(summary), list(map(_label, summary.names))
+    n_rows, n_columns = len(grid), len(grid[0])
+    figure = make_subplots(
+        rows=n_rows,
+        cols=n_columns,
+        specs=[[{"secondary_y": True}] * n_columns] * n_rows,
+        subplot_titles=[panel.title for row in grid for panel in row],
+        vertical_spacing=0.1,
+        horizontal_spacing=0.1,
+    )
+    for i, row in enumerate(grid):
+        for j, panel in enumerate(row):
+            shown = i == j == 0
+            traces = (
+                (go.Bar(x=names, y=panel.errors, name=_BARS, marker_color=_BAR), False),
+                (
+                    go.Scatter(
+                        x=names,
+                        y=panel.limit,
+                        name=_MARKS,
+                        mode="markers",
+                        marker={
+                            "symbol": "line-ew",
+                            "size": 9,
+                            "line": {"width": 2, "color": _LIMIT},
+                        },
+                    ),
+                    False,
+                ),
+                (go.Scatter(x=names, y=panel.truth, name=_TRUE, line={"color": _LINE}), True),
+            )
+            for trace, right in traces:
+                trace.update(showlegend=shown, legendgroup=trace.name)
+                figure.add_trace(trace, row=i + 1, col=j + 1, secondary_y=right)
+            figure.update_yaxes(
+                title_text=_ERROR_AXIS, rangemode="tozero", row=i + 1, col=j + 1, secondary_y=False
+            )
+            figure.update_yaxes(
+                title_text=_TRUTH_AXIS, showgrid=False, row=i + 1, col=j + 1, secondary_y=True
+            )
+    figure.update_xaxes(tickangle=-90, tickfont={"size": 10})
+    figure.update_layout(
+        title=_title(summary), height=360 * n_rows, template="plotly_white", legend_orientation="h"
+    )
+    page: str = figure.to_html(include_plotlyjs=True, include_mathjax=False, div_id="fig4")
+    return page.encode()
+
+
+def figure_as_png(summary: PaperSummary) -> bytes:
+    """Return the figure as a PNG picture."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    grid, names = _panels(summary), list(map(_label, summary.names))
+    n_rows, n_columns = len(grid), len(grid[0])
+    figure = Figure(figsize=(7.0 * n_columns, 2.9 * n_rows + 0.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(n_rows, n_columns, squeeze=False)
+    handles = []
+    for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
+        place = range(len(names))
+        bars = axis.bar(place, panel.errors, color=_BAR, label=_BARS)
+        marks = axis.scatter(
+            place, panel.limit, marker="_", s=60, color=_LIMIT, label=_MARKS, zorder=3
+        )
+        right = axis.twinx()
+        line = right.plot(place, panel.truth, color=_LINE, lw=1.0, marker=".", ms=3, label=_TRUE)
+        axis.set_title(panel.title, fontsize=10)
+        axis.set_xticks(place, names, rotation=90, fontsize=7)
+        axis.set_xlim(-0.7, len(names) - 0.3)
+        axis.set_ylim(bottom=0.0)
+        axis.set_ylabel(_ERROR_AXIS, fontsize=8)
+        right.set_ylabel(_TRUTH_AXIS, fontsize=8)
+        for side in (axis, right):
+            side.tick_params(axis="y", labelsize=8)
+        handles = [bars, marks, *line]
+    figure.suptitle(_title(summary), fontsize=11)
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
+    return content.getvalue()
+
+
+def _panels(summary: PaperSummary) -> list[list[_Panel]]:
+    """Return the panels: a row for each estimator, a column for each machine."""
+    return [[_panel(summary, name, estimator) for name in summary.truths] for estimator in _DRAWN]
+
+
+def _panel(summary: PaperSummary, machine: str, estimator: str) -> _Panel:
+    """Return one panel."""
+    by_name = {means.estimator: means for means in summary.of(machine)}
+    means, limit = by_name[estimator], by_name[BOUND]
+    return _Panel(
+        f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{_failed(means)}",
+        1e3 * means.parameters,
+        1e3 * limit.parameters,
+        1e3 * summary.truths[machine],
+    )
+
+
+def _failed(means: Means) -> str:
+    """Return how many runs are not in the means, if any."""
+    failed = sum(means.failures.values())
+    return f" ({failed} of {means.n + failed} runs failed)" if failed else ""
+
+
+def _title(summary: PaperSummary) -> str:
+    """Return the title of the figure."""
+    n_runs = summary.means[0].n + sum(summary.means[0].failures.values())
+    return f"Fig. 4 of the paper: {len(summary.names)} parameters, means over {n_runs} calibrations"
+
+
+def _label(name: str) -> str:
+    """Return a short label of a parameter: A2x for leg2.base.x."""
+    leg, kind, *axis = name.split(".")
+    return f"{_LETTERS[kind]}{leg.removeprefix('leg')}{''.join(axis)}"
