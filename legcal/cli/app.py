@@ -19,6 +19,8 @@ from legcal.cli.inspect import inspect
 from legcal.cli.new import new
 from legcal.cli.noise import noise
 from legcal.cli.output import print_failure
+from legcal.cli.simulate import simulate
+from legcal.cli.study import study
 from legcal.errors import LegcalError
 from legcal.signals import stopped_by_signals
 from legcal.version import __version__
@@ -53,7 +55,7 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-for command in (inspect, identify, calibrate, evaluate, new, noise):
+for command in (inspect, identify, calibrate, evaluate, new, noise, simulate, study):
     app.command()(command)
 
 

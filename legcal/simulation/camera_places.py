@@ -18,7 +18,7 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.cameras import look_at
-from legcal.simulation.scene import Scene
+from legcal.simulation.posed_machine import PosedMachine
 from legcal.simulation.visibility import field_of_view, legs_in_image
 from legcal.vision.camera import Camera
 
@@ -35,7 +35,7 @@ _BEHIND = 0.3  # machine sizes that lie between the camera and the machine, at l
 
 def places_around(
     mechanism: Mechanism,
-    scenes: Sequence[Scene],
+    machines: Sequence[PosedMachine],
     cameras: Sequence[Camera],
     rng: np.random.Generator,
 ) -> tuple[RigidTransform, ...]:
@@ -45,7 +45,7 @@ def places_around(
     ----------
     mechanism : Mechanism
         The true machine.
-    scenes : sequence of Scene
+    machines : sequence of PosedMachine
         The machine in the poses that the cameras are to see.
     cameras : sequence of Camera
         The camera of each view.
@@ -57,9 +57,9 @@ def places_around(
     tuple of RigidTransform
         T_base_camera.
     """
-    reached = _reached(scenes)
-    tried = [scenes[i] for i in np.unique(np.linspace(0, len(scenes) - 1, _TRIED).astype(int))]
-    up = _up(mechanism, scenes)
+    reached = _reached(machines)
+    tried = [machines[i] for i in np.unique(np.linspace(0, len(machines) - 1, _TRIED).astype(int))]
+    up = _up(mechanism, machines)
     sector = 2.0 * np.pi / len(cameras)
     first = rng.uniform(0.0, 2.0 * np.pi)
     lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
@@ -78,13 +78,15 @@ def places_around(
     return tuple(found)
 
 
-def _up(mechanism: Mechanism, scenes: Sequence[Scene]) -> Array:
+def _up(mechanism: Mechanism, machines: Sequence[PosedMachine]) -> Array:
     """Return the direction from base to platform, or the normal of the plane of motion."""
     if mechanism.base_normal is not None:
         return mechanism.base_normal
-    across = np.mean([scene.B.mean(axis=0) - scene.A.mean(axis=0) for scene in scenes], axis=0)
+    across = np.mean(
+        [machine.B.mean(axis=0) - machine.A.mean(axis=0) for machine in machines], axis=0
+    )
     size = float(np.linalg.norm(across))
-    reach = float(np.ptp(scenes[0].A, axis=0).max())
+    reach = float(np.ptp(machines[0].A, axis=0).max())
     return np.asarray(across / size) if size > 1e-3 * reach else np.array([0.0, 0.0, 1.0])
 
 
@@ -95,9 +97,9 @@ def _direction(up: Array, turn: float, lift: float) -> Array:
     return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
 
 
-def _reached(scenes: Sequence[Scene]) -> Array:
+def _reached(machines: Sequence[PosedMachine]) -> Array:
     """Return points (n, 3) around everything that is seen of a machine in all of its poses."""
-    points = np.concatenate([part for s in scenes for part in (s.caster.mesh.vertices, s.A, s.B)])
+    points = np.concatenate([part for s in machines for part in (s.caster.mesh.vertices, s.A, s.B)])
     try:
         return np.asarray(points[ConvexHull(points).vertices])
     except QhullError:  # all of them in a plane
@@ -120,12 +122,12 @@ def _place(
 
 
 def _score(
-    mechanism: Mechanism, scenes: Sequence[Scene], camera: Camera, T: RigidTransform
+    mechanism: Mechanism, machines: Sequence[PosedMachine], camera: Camera, T: RigidTransform
 ) -> float:
     """Return the mean length in the image [px] of all legs, those hidden counted as nothing."""
     views = [
         view
-        for scene in scenes
-        for view in legs_in_image(mechanism.legs, scene, camera, T, samples=_SAMPLES)
+        for machine in machines
+        for view in legs_in_image(mechanism.legs, machine, camera, T, samples=_SAMPLES)
     ]
     return float(np.mean([view.length_px if view.is_seen else 0.0 for view in views]))

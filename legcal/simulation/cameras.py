@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -39,6 +39,12 @@ def sample_camera() -> Camera:
     """Return a camera of 1024 x 768 pixels without distortion, as of the example hexapod."""
     K = np.array([[1290.3, 0.0, 518.3], [0.0, 1290.3, 379.6], [0.0, 0.0, 1.0]])
     return Camera(K, 1024, 768)
+
+
+def mild_lens() -> Camera:
+    """Return the camera of :func:`sample_camera` behind a lens that distorts a little."""
+    pinhole = sample_camera()
+    return replace(pinhole, distortion=np.array([-0.1, 0.03, 2e-4, -1e-4, 0.0]))
 
 
 def cameras_around(

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.leg import Cylinder, Leg, main_cylinders
-from legcal.simulation.scene import Scene
+from legcal.simulation.posed_machine import PosedMachine
 from legcal.simulation.silhouette import contact_offsets
 from legcal.vision.camera import Camera
 
@@ -88,7 +88,7 @@ class _Skin:
 
 def legs_in_image(
     legs: Sequence[Leg],
-    scene: Scene,
+    machine: PosedMachine,
     camera: Camera,
     T_base_camera: RigidTransform,
     *,
@@ -100,7 +100,7 @@ def legs_in_image(
     ----------
     legs : sequence of Leg
         The legs of the true machine.
-    scene : Scene
+    machine : PosedMachine
         The machine in its pose.
     camera : Camera
         The camera.
@@ -109,13 +109,13 @@ def legs_in_image(
     samples : int
         Points along each leg.
     """
-    length = np.linalg.norm(scene.B - scene.A, axis=-1)
-    u = (scene.B - scene.A) / length[:, None]
+    length = np.linalg.norm(machine.B - machine.A, axis=-1)
+    u = (machine.B - machine.A) / length[:, None]
     skins = [_skin(leg.cylinders, float(L), samples) for leg, L in zip(legs, length, strict=True)]
     s, radius = (np.array([getattr(skin, x) for skin in skins]) for x in ("s", "radius"))
     T_camera_base = T_base_camera.inv()
     u_camera = np.asarray(T_camera_base.rotation.apply(u))
-    A_camera = np.asarray(T_camera_base.apply(scene.A))
+    A_camera = np.asarray(T_camera_base.apply(machine.A))
     axis = A_camera[:, None] + s[..., None] * u_camera[:, None]
     from_axis = np.linalg.norm(np.cross(u_camera, A_camera), axis=-1)
     radius = np.where(from_axis[:, None] > _END_ON * radius, radius, 0.0)
@@ -125,7 +125,7 @@ def legs_in_image(
     beside = axis[:, :, None] + (1.0 + _ASIDE) * offsets
     margin = np.broadcast_to(_IN_FRONT * radius[..., None], tested.shape)
     free = tested.copy()
-    free[tested] = ~scene.hidden(
+    free[tested] = ~machine.hidden(
         T_base_camera.translation, T_base_camera.apply(beside[tested]), margin[tested]
     )
     both = np.all(free, axis=-1)

@@ -22,7 +22,7 @@ _FLAT = 1e-3  # thickness of joint centres that lie in a plane, of their size
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class PosedMachine:
     """A machine in one pose.
 
     Attributes
@@ -79,9 +79,9 @@ class Scene:
         return bool(Delaunay(joints).find_simplex(centre) >= 0)
 
 
-def scenes_of(
+def pose_machine(
     mechanism: Mechanism, solids: Sequence[Solid], poses: SimulatedPoses
-) -> tuple[Scene, ...]:
+) -> tuple[PosedMachine, ...]:
     """Return a machine in every pose.
 
     Parameters
@@ -99,14 +99,14 @@ def scenes_of(
         faces.append(mesh.faces + first)
         first += len(mesh.vertices)
     stacked = np.concatenate(faces)
-    scenes = []
+    machines = []
     for configuration, T in zip(poses.configurations, poses.T_base_platform, strict=True):
         here = placed(solids, link_poses(mechanism, configuration))
         vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
         whole = trimesh.Trimesh(np.concatenate(vertices), stacked, process=False)
         B = np.asarray(T.apply(mechanism.B_platform))
-        scenes.append(Scene(mechanism.A_base, B, here, RayMeshIntersector(whole)))
-    return tuple(scenes)
+        machines.append(PosedMachine(mechanism.A_base, B, here, RayMeshIntersector(whole)))
+    return tuple(machines)
 
 
 def _triangles(shape: Shape) -> Any:

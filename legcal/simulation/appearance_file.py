@@ -1,0 +1,63 @@
+"""The file that says how simulated photographs look: the fields of an appearance, in YAML.
+
+Fields that it does not name keep their defaults::
+
+    blur: 0.8
+    clutter: 30
+    lights:
+      - {direction: [0.5, -0.8, 1.1], strength: 0.9}
+"""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, Field, fields
+from functools import cache
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from pydantic import create_model
+
+from legcal.files.schema import FileSchema, parse_yaml, read_text, validate
+from legcal.simulation.rendering.appearance import Appearance, Light
+
+
+def read_appearance(path: Path) -> Appearance:
+    """Return the appearance that a file describes.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each value that cannot be read.
+    UsageError
+        If a number makes no sense.
+    """
+    found = parse_yaml(read_text(path, "appearance file"), path, "appearance file")
+    entry = validate(_schema(), found, path)
+    values = {name: getattr(entry, name) for name in entry.model_fields_set}
+    if "lights" in values:
+        values["lights"] = tuple(Light(**light.model_dump()) for light in values["lights"])
+    return Appearance(**values)
+
+
+@cache
+def _schema() -> type[FileSchema]:
+    """Return the schema of the file."""
+    light = _schema_of(Light, {})
+    return _schema_of(Appearance, {"lights": tuple[light, ...]})  # type: ignore[valid-type]
+
+
+def _schema_of(described: type[Any], other_types: dict[str, Any]) -> type[FileSchema]:
+    """Return the schema of a dataclass."""
+    types = get_type_hints(described) | other_types
+    columns: dict[str, Any] = {f.name: (types[f.name], _default(f)) for f in fields(described)}
+    return create_model(described.__name__, __base__=FileSchema, **columns)
+
+
+def _default(field: Field[Any]) -> Any:
+    """Return the default of a field, or that it must be given."""
+    return ... if field.default is MISSING else field.default

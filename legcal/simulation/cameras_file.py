@@ -1,0 +1,62 @@
+"""The file that says where simulated cameras stand.
+
+It is the block ``views`` of a dataset::
+
+    views:
+      c1: {T_base_camera: {xyz: [1.0, 0.3, 0.3], quat_xyzw: [0, 0, 0, 1]}, camera: lens.yaml}
+      c2: {T_base_camera: {xyz: [0.0, 1.1, 0.3], quat_xyzw: [0, 0, 0, 1]}}
+
+``camera`` is relative to the file, and may be left out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from scipy.spatial.transform import RigidTransform
+
+from legcal.files.motion import MotionEntry
+from legcal.files.schema import FileSchema, PlainName, parse_yaml, read_text, validate
+from legcal.vision.camera import Camera
+from legcal.vision.camera_file import read_camera
+
+
+class PlaceEntry(FileSchema):
+    """One camera."""
+
+    T_base_camera: MotionEntry
+    camera: str | None = None
+
+
+class CamerasEntry(FileSchema):
+    """The whole file."""
+
+    views: Annotated[dict[PlainName, PlaceEntry], Field(min_length=1)]
+
+
+def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTransform]]:
+    """Return the camera and T_base_camera of every view of a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    camera : Camera
+        The camera of views that name none.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong.
+    """
+    found = parse_yaml(read_text(path, "cameras file"), path, "cameras file")
+    entry = validate(CamerasEntry, found, path)
+    return {
+        name: (
+            camera if view.camera is None else read_camera(path.parent / view.camera),
+            view.T_base_camera.motion(),
+        )
+        for name, view in entry.views.items()
+    }

@@ -1,0 +1,138 @@
+"""What a simulated dataset is made of: the choices, with defaults, and the limits of each."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from legcal.errors import UsageError
+from legcal.simulation.errors import Distribution, ParameterErrors, Spread
+from legcal.simulation.motion import Sampling
+from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.table_noise import TableNoise
+
+_MILLIMETRES = Spread(2e-3)  # as the paper disturbs its machine
+_TENTH_DEGREE = Spread(float(np.deg2rad(0.1)))
+PAPER_ERRORS = ParameterErrors(
+    base_joints=_MILLIMETRES,
+    platform_joints=_MILLIMETRES,
+    offsets=_MILLIMETRES,
+    lengths=_MILLIMETRES,
+    axes=_TENTH_DEGREE,
+    twists=_TENTH_DEGREE,
+)
+PAPER_READINGS = Spread(2e-6, Distribution.NORMAL)
+MOST_IMAGES = 100_000
+
+
+class Level(StrEnum):
+    """What a simulated dataset gives the calibration to work on."""
+
+    AXES = "axes"
+    OUTLINES = "outlines"
+    PHOTOGRAPHS = "photographs"
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """The choices of a simulated dataset.
+
+    Attributes
+    ----------
+    level : Level
+        Axes with the noise of Table 1, outlines with noise in pixels, or photographs.
+    errors : ParameterErrors
+        How the true machine differs from the nominal model.
+    poses : int or Path
+        Number of poses for each view, or a CSV of readings that all views see.
+    sampling : Sampling
+        How poses are drawn.
+    shared_poses : bool
+        Every view sees the same poses (several cameras at once) instead of its own.
+    images : int
+        Images of each pose in each view.
+    views : int or Path
+        Number of cameras around the machine, or a file that says where they stand.
+    camera : Path or None
+        Camera file of all views that name none; None for a camera of 1024 x 768 pixels with
+        slight distortion.
+    hints : bool
+        Say roughly where the cameras stand, and which legs each view shows well.
+    sigma_px : float
+        Standard deviation of each edge point of outlines [px].
+    table : TableNoise
+        Noise of axes.
+    readings : Spread
+        Errors of encoder readings [m].
+    appearance : Appearance
+        How photographs look.
+    seed : int
+        What all chance comes from.
+
+    Raises
+    ------
+    UsageError
+        If a number is out of its limits.
+    """
+
+    level: Level = Level.PHOTOGRAPHS
+    errors: ParameterErrors = PAPER_ERRORS
+    poses: int | Path = 15
+    sampling: Sampling = Sampling.EXTREME
+    shared_poses: bool = False
+    images: int = 1
+    views: int | Path = 3
+    camera: Path | None = None
+    hints: bool = True
+    sigma_px: float = 0.1
+    table: TableNoise = field(default_factory=TableNoise)
+    readings: Spread = PAPER_READINGS
+    appearance: Appearance = field(default_factory=Appearance)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        counts = {"poses": self.poses, "views": self.views, "images": self.images}
+        problems = [
+            f"The dataset could not be simulated: found {count} {name}, needed a whole number from "
+            f"1 to {MOST_IMAGES}; correct it."
+            for name, count in counts.items()
+            if not isinstance(count, Path) and not _is_count(count)
+        ]
+        spreads = {
+            name: getattr(self.errors, name).size
+            for name in ("base_joints", "platform_joints", "offsets", "lengths", "axes", "twists")
+        }
+        noises = {
+            "noise of edge points": self.sigma_px,
+            "noise of readings": self.readings.size,
+            **{f"errors of {name.replace('_', ' ')}": size for name, size in spreads.items()},
+            **{f"noise of {name}": x for name, x in vars(self.table).items()},
+        }
+        problems += [
+            f"The dataset could not be simulated: found {value:g} as the {name}, needed a finite "
+            "number of zero or more; correct it."
+            for name, value in noises.items()
+            if not (math.isfinite(value) and value >= 0.0)
+        ]
+        if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and self.seed >= 0):
+            problems.append(
+                f"The dataset could not be simulated: found the seed {self.seed!r}, needed a whole "
+                "number of zero or more; correct it."
+            )
+        if problems:
+            raise UsageError(problems)
+
+    @property
+    def encoder_sigma(self) -> float:
+        """Standard deviation of a reading [m]."""
+        size = self.readings.size
+        return size if self.readings.distribution is Distribution.NORMAL else size / math.sqrt(3.0)
+
+
+def _is_count(count: object) -> bool:
+    """Say whether something counts images."""
+    return isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= MOST_IMAGES

@@ -1,0 +1,63 @@
+"""What ``legcal simulate`` tells about the dataset that it wrote."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from legcal.simulation.simulate import SimulatedDataset
+
+
+def summary_document(made: SimulatedDataset) -> dict[str, Any]:
+    """Return the document of ``legcal simulate --json``.
+
+    Parameters
+    ----------
+    made : SimulatedDataset
+        The dataset.
+    """
+    views = {}
+    for v, view in enumerate(made.measurements.views):
+        rows = made.measurements.view == v
+        seen = made.seen[rows].sum(axis=0).tolist()
+        legs = dict(zip(made.nominal.leg_names, seen, strict=True))
+        views[view.name] = {"images": int(np.sum(rows)), "legs": legs}
+    return {
+        "dataset": str(made.folder),
+        "level": made.level.value,
+        "mechanism": made.nominal.name,
+        "truth": str(made.truth_path),
+        "images": made.measurements.n_rows,
+        "poses": made.measurements.n_poses,
+        "left_out": made.left_out,
+        "views": views,
+    }
+
+
+def summary_table(made: SimulatedDataset) -> RenderableType:
+    """Return what was simulated as people read it: how many images of a view show each leg."""
+    document = summary_document(made)
+    heading = Text.assemble(
+        (document["mechanism"], "bold"),
+        f": {document['level']}, {document['images']} images of {document['poses']} poses",
+    )
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("view", overflow="fold")
+    table.add_column("images", justify="right")
+    for name in made.nominal.leg_names:
+        table.add_column(Text(name), justify="right")
+    for name, view in document["views"].items():
+        counts = [str(n) for n in view["legs"].values()]
+        table.add_row(Text(name), str(view["images"]), *counts)
+    lines = [
+        "Images of each view that show 40 % of a leg or more in one piece.",
+        *([f"{made.left_out} images show no leg and are left out."] if made.left_out else []),
+        f"\nwritten: {made.folder}",
+        f"the true model: {made.truth_path}",
+        f"calibrate with: legcal calibrate {made.folder} -o OUT",
+    ]
+    return Group(heading, Text(), table, Text(), *(Text(s, overflow="ignore") for s in lines))
