@@ -8,6 +8,8 @@
 5. Photographs in which anything was left in doubt are searched again close to that fit, and 3
    and 4 are repeated.
 
+Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do.
+
 Everything runs in an order of rows, views and legs that does not depend on the files.
 """
 
@@ -44,11 +46,12 @@ from legcal.observations.canonical_order import (
     Order,
     canonical_order,
     inverse,
+    reorder_axes,
     reorder_measurements,
     reorder_outlines,
     restore_outlines,
 )
-from legcal.observations.leg_axes import axes_from_outlines
+from legcal.observations.leg_axes import LegAxes, axes_from_outlines
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import reject_unused_legs
@@ -156,6 +159,7 @@ class _Workpiece:
     fingerprint: str
     mechanism: Mechanism
     measurements: Measurements
+    axes: LegAxes | None
     run: Run
     criteria: Criteria
 
@@ -196,6 +200,7 @@ def _workpiece(dataset: Dataset, run: Run, criteria: Criteria, *, use_cache: boo
         fingerprint=current,
         mechanism=dataset.mechanism.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
+        axes=None if dataset.axes is None else reorder_axes(dataset.axes, order),
         run=run,
         criteria=criteria,
     )
@@ -244,7 +249,9 @@ def _steps_and_fit(
     progress("Four steps", 1, 1)
     progress("Fit of everything", 0, 1)
     starts = _starts(work, outlines, scene, steps)
-    solution = refine_from_best(work.fitted_legs, work.measurements, outlines, starts)
+    solution = refine_from_best(
+        work.fitted_legs, work.measurements, outlines, starts, axes=work.axes
+    )
     progress("Fit of everything", 1, 1)
     return steps, solution
 
@@ -253,7 +260,9 @@ def _four_steps(work: _Workpiece, outlines: Outlines) -> Steps:
     """Return what the four steps give, or why they give nothing: the fit may do without."""
     radii = {part: r for leg in work.mechanism.legs for part, r in leg.radius_of_part.items()}
     try:
-        axes = axes_from_outlines(outlines, work.measurements, radii)
+        axes = work.axes
+        if axes is None:
+            axes = axes_from_outlines(outlines, work.measurements, radii)
         found = run_steps(work.mechanism, axes, work.measurements, criteria=work.criteria)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
@@ -285,7 +294,8 @@ def _cameras(
 ) -> list[RigidTransform]:
     """Return a camera pose for every view, the first choice where there is one."""
     cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
-    needed = set(work.measurements.view[outlines.row[outlines.used]].tolist())
+    shown = outlines.row[outlines.used] if work.axes is None else work.axes.row
+    needed = set(work.measurements.view[shown].tolist())
     problems = [
         f"view {view.name}: its camera could not be placed: found no T_base_camera, and the four "
         f"steps do not locate it ({steps.failure or 'fewer than three base joints are seen'}); "

@@ -109,6 +109,10 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     current : str
         Its :func:`fingerprint`.
     """
+    if dataset.axes is not None:  # they take the place of images
+        none = np.zeros(0, dtype=np.intp)
+        given = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
+        return DetectionPlan(none, no_outlines(), given)
     entry = _read_entry(dataset.folder / CACHE_NAME)
     paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
     has_image = np.array(

@@ -16,6 +16,8 @@ from legcal.geometry.types import Image
 from legcal.mechanism.files import DATASET_YAML, shipped_folders, shipped_names
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
+from legcal.observations.axes_file import read_axes
+from legcal.observations.leg_axes import LegAxes, choose_axes
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
 from legcal.observations.table import read_observations
@@ -24,6 +26,7 @@ from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import image_problem, read_image
 
 OBSERVATIONS_NAME = "observations.csv"
+AXES_NAME = "axes.csv"
 CACHE_NAME = ".legcal-cache.json"
 
 
@@ -47,6 +50,9 @@ class Dataset:
         The rows of ``observations.csv`` if there is one: given, cached or edited.
     notes : tuple of str
         What is odd but allowed.
+    axes : LegAxes or None
+        The rows of ``axes.csv`` if there is one, of the legs that the views use. Images are
+        then not searched, and there are no observations.
     """
 
     folder: Path
@@ -57,6 +63,7 @@ class Dataset:
     measurements: Measurements
     observations: Outlines | None
     notes: tuple[str, ...] = ()
+    axes: LegAxes | None = None
 
     def image_path(self, row: int) -> Path | None:
         """Return the image file of a row; None where only outlines are given."""
@@ -170,6 +177,7 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     measurements, notes = read_measurements(
         table_path, folder, views, mechanism.legs, entry.encoder_sigma
     )
+    axes, left_out = _read_axes(folder, mechanism, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
@@ -178,7 +186,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         mechanism=mechanism,
         measurements=measurements,
         observations=_read_outlines(folder, mechanism, measurements),
-        notes=(*notes, *_unused_views(yaml_path, measurements)),
+        notes=(*notes, *left_out, *_unused_views(yaml_path, measurements)),
+        axes=axes,
     )
     problems = _row_problems(dataset) if check_images else []
     if problems:
@@ -271,6 +280,35 @@ def _read_outlines(
     return read_observations(path, mechanism.legs, measurements, skip_stale=is_own)
 
 
+def _read_axes(
+    folder: Path, mechanism: Mechanism, measurements: Measurements
+) -> tuple[LegAxes | None, list[str]]:
+    """Return the axes beside the dataset, if there are any, and a note about those not used."""
+    path = folder / AXES_NAME
+    if not os.path.exists(path):
+        return None, []
+    if os.path.exists(folder / OBSERVATIONS_NAME):
+        raise DatasetError(
+            f"{folder}: the observations could not be read: found {AXES_NAME} and "
+            f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
+        )
+    axes = read_axes(path, mechanism.leg_names, measurements)
+    views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
+    names = [mechanism.leg_names[leg] for leg in axes.leg.tolist()]
+    wanted = [
+        view.legs is None or name in view.legs for view, name in zip(views, names, strict=True)
+    ]
+    used = np.flatnonzero(wanted)
+    if len(used) == 0:
+        raise DatasetError(
+            f"{path}: the axes could not be used: found only legs that their views leave out, "
+            f"needed the legs that {DATASET_YAML} names; correct its legs or the table."
+        )
+    left_out = len(axes) - len(used)
+    note = f"{path}: {left_out} axes of legs that their views leave out are not used."
+    return choose_axes(axes, used), [note] if left_out else []
+
+
 def _unused_views(path: Path, measurements: Measurements) -> list[str]:
     """Return a note for each view without a row."""
     return [
@@ -281,7 +319,9 @@ def _unused_views(path: Path, measurements: Measurements) -> list[str]:
 
 
 def _row_problems(dataset: Dataset) -> list[str]:
-    """Return the rows that neither an image nor outlines make usable."""
+    """Return the rows that neither an image nor outlines nor axes make usable."""
+    if dataset.axes is not None:
+        return _rows_without_axes(dataset, dataset.axes)
     outlines = dataset.observations
     given = set() if outlines is None else set(outlines.row.tolist())
     problems = []
@@ -297,3 +337,13 @@ def _row_problems(dataset: Dataset) -> list[str]:
             found = dataset.image_problem(row)
             problems += [found] if found else []
     return problems
+
+
+def _rows_without_axes(dataset: Dataset, axes: LegAxes) -> list[str]:
+    """Return the rows of a dataset with a table of axes that it says nothing of."""
+    blank = np.setdiff1d(np.arange(dataset.measurements.n_rows), axes.row).tolist()
+    return [
+        f"{dataset.table_path}, row {row + 1}: the row could not be used: found no axis of it in "
+        f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row."
+        for row in blank
+    ]

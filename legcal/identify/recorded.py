@@ -22,7 +22,8 @@ def recorded_session(dataset: Dataset) -> Session:
     Parameters
     ----------
     dataset : Dataset
-        Every view is taken to show the legs that it names, or all.
+        A view is taken to show the legs that have axes in it; without a table of axes those
+        that it names, or all.
 
     Raises
     ------
@@ -52,6 +53,10 @@ def recorded_session(dataset: Dataset) -> Session:
     seen = np.array(
         [[view.legs is None or name in view.legs for name in mechanism.leg_names] for view in views]
     )
+    if dataset.axes is not None:
+        shown_legs = np.zeros((len(m.views), len(mechanism.leg_names)), dtype=np.bool_)
+        shown_legs[m.view[dataset.axes.row], dataset.axes.leg] = True
+        seen = shown_legs[used]
     A, B = joints_at(legs, home)
     shown = [np.flatnonzero(row).tolist() for row in seen]
     camera = default_cameras(A, B, shown, mechanism.spatial, rng)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry.types import IntArray
+from legcal.observations.leg_axes import LegAxes, choose_axes
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import sort_outlines
@@ -115,6 +116,20 @@ def reorder_outlines(outlines: Outlines, order: Order) -> Outlines:
         outlines, row=inverse(order.rows)[outlines.row], leg=inverse(order.legs)[outlines.leg]
     )
     return sort_outlines(renamed)
+
+
+def reorder_axes(axes: LegAxes, order: Order) -> LegAxes:
+    """Return axes of reordered measurements, sorted by row and leg.
+
+    Parameters
+    ----------
+    axes : LegAxes
+        Axes of the measurements in their original order.
+    order : Order
+        The order given to :func:`reorder_measurements`.
+    """
+    row, leg = inverse(order.rows)[axes.row], inverse(order.legs)[axes.leg]
+    return choose_axes(replace(axes, row=row, leg=leg), np.lexsort([leg, row]))
 
 
 def restore_outlines(outlines: Outlines, order: Order) -> Outlines:

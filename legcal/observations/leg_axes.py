@@ -53,6 +53,12 @@ class LegAxes:
         return len(self.row)
 
 
+def choose_axes(axes: LegAxes, index: IntArray) -> LegAxes:
+    """Return some of the axes, by their indices in a new order."""
+    parts = (axes.u, axes.M, axes.basis, axes.covariance)
+    return LegAxes(axes.row[index], axes.leg[index], *(part[index] for part in parts))
+
+
 def axes_from_outlines(
     outlines: Outlines, measurements: Measurements, radius_of_part: Mapping[str, float]
 ) -> LegAxes:

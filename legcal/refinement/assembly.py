@@ -21,6 +21,8 @@ from legcal.refinement.shared_errors import shared_errors
 from legcal.refinement.solution import Solution
 from legcal.refinement.state import State
 
+_SIGNIFICANT = 5.0  # standard deviations of chi2
+
 
 def assemble_solution(
     problem: FitProblem,
@@ -43,6 +45,7 @@ def assemble_solution(
     n_residuals = used.size + len(problem.readings) + len(problem.radius_prior.mean)
     n_residuals += linear.axis_r.size
     parts = problem.layout.parts
+    chi2, dof = _chi2(linear), n_residuals - problem.layout.size
     return Solution(
         parameters=fit.state.parameters,
         T_camera_Rb=fit.state.T_camera_Rb,
@@ -53,8 +56,8 @@ def assemble_solution(
         sigma=np.sqrt(np.diagonal(known.covariance)),
         weak=known.weak,
         cost=comparable_cost(problem, fit.state, settings),
-        chi2=_chi2(linear),
-        dof=n_residuals - problem.layout.size,
+        chi2=chi2,
+        dof=dof,
         rms_px=float(np.sqrt(np.mean(used**2))) if used.size else None,
         rms_axes=float(np.sqrt(np.mean(linear.axis_r**2))) if linear.axis_r.size else None,
         noise=fit.noise,
@@ -63,6 +66,7 @@ def assemble_solution(
         outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
+        notes=_misfit_of_axes(chi2, dof) if len(problem.axes) else (),
     )
 
 
@@ -74,6 +78,17 @@ def machine_size(state: State) -> float:
 def _chi2(linear: Linearization) -> float:
     parts = (linear.outline_r, linear.encoder_r, linear.prior_r, linear.axis_r)
     return float(sum(np.sum(part**2) for part in parts))
+
+
+def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
+    """Return a note where axes, whose errors are not estimated, are worse than they claim."""
+    if chi2 <= dof + _SIGNIFICANT * np.sqrt(2.0 * dof):
+        return ()
+    return (
+        f"The axes are worse than their standard deviations claim: chi2 is {chi2:.0f} for {dof} "
+        "degrees of freedom, so that the uncertainty of the result is about "
+        f"{np.sqrt(chi2 / max(dof, 1)):.1f} times what is stated; correct them.",
+    )
 
 
 def comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:

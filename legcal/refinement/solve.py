@@ -45,11 +45,14 @@ def solve(problem: FitProblem, state: State, whitening: Array, k: float) -> tupl
     found = solver(x0=ca.DM.zeros(problem.layout.size), p=parameter)
     stats = solver.stats()
     if not stats["success"]:
+        wanted = "outlines of the right edges"
+        if len(problem.axes):
+            wanted = "axes of the right legs, in rad and m"
         raise DidNotConverge(
             "The fit of everything did not converge: IPOPT stopped with "
             f"{stats['return_status']} after {stats['iter_count']} iterations; it needs starting "
-            "values nearer to the truth (joints to 5 mm, cameras to 2 cm and 2 deg) and outlines "
-            "of the right edges; check the camera poses and the readings."
+            f"values nearer to the truth (joints to 5 mm, cameras to 2 cm and 2 deg) and {wanted}; "
+            "check the camera poses and the readings."
         )
     x = np.asarray(found["x"]).ravel()
     return state.moved(x, problem.layout), int(stats["iter_count"])

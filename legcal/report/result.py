@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from legcal.calibration import Calibration
+from legcal.dataset.folder import OBSERVATIONS_NAME
 from legcal.errors import DidNotConverge
 from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism.parameters import KinematicParameters, parameter_names, radius_name, to_vector
@@ -22,8 +23,9 @@ _RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m
 def result_document(calibration: Calibration) -> dict[str, Any]:
     """Return the document of ``result.json``."""
     solution, mechanism = calibration.solution, calibration.dataset.mechanism
-    measurements, outlines = calibration.dataset.measurements, solution.outlines
-    placed = np.unique(measurements.view[outlines.row[outlines.used]]).tolist()
+    measurements, axes = calibration.dataset.measurements, calibration.dataset.axes
+    used = solution.outlines.row[solution.outlines.used] if axes is None else axes.row
+    placed = np.unique(measurements.view[used]).tolist()
     return {
         "legcal_result": 1,
         "status": "converged",
@@ -44,7 +46,12 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
             for v in placed
         },
         "stages": {"staged": _steps(calibration)},
-        "residuals": {"chi2": solution.chi2, "dof": solution.dof, "rms_px": solution.rms_px},
+        "residuals": {
+            "chi2": solution.chi2,
+            "dof": solution.dof,
+            "rms_px": solution.rms_px,
+            "rms_axes": solution.rms_axes,
+        },
         "start": solution.start,
         "platform": {
             "poses": len(calibration.change.displacement),
@@ -71,19 +78,20 @@ def write_result(calibration: Calibration, destination: Path) -> None:
         If the written model does not load as what was computed.
     """
     dataset = calibration.dataset
-    with result_folder(destination) as folder:
+    with result_folder(destination, stale=[Path(OBSERVATIONS_NAME)]) as folder:
         urdf, yaml = folder / "calibrated.urdf", folder / "calibrated.yaml"
         write_calibrated_urdf(dataset.mechanism, calibration.solution.parameters, urdf)
         write_calibrated_yaml(dataset.mechanism, yaml, urdf.name)
         _check_written(yaml, calibration)
         document = json.dumps(result_document(calibration), indent=1, allow_nan=False)
         (folder / "result.json").write_text(document + "\n", encoding="utf-8")
-        write_observations(
-            folder / "observations.csv",
-            calibration.solution.outlines,
-            dataset.measurements,
-            dataset.mechanism.leg_names,
-        )
+        if dataset.axes is None:
+            write_observations(
+                folder / OBSERVATIONS_NAME,
+                calibration.solution.outlines,
+                dataset.measurements,
+                dataset.mechanism.leg_names,
+            )
 
 
 def _check_written(yaml: Path, calibration: Calibration) -> None:

@@ -32,7 +32,7 @@ def summary(calibration: Calibration, output: Path) -> RenderableType:
         )
     lines = [
         *(f"Note: {note}" for note in calibration.notes),
-        _outline_line(calibration),
+        _observation_line(calibration),
         _steps_line(calibration),
         _fit_line(calibration),
         f"Written to {output}.",
@@ -44,7 +44,13 @@ def summary(calibration: Calibration, output: Path) -> RenderableType:
     return Group(table, Text(), *(Text(line) for line in lines), verdict)
 
 
-def _outline_line(calibration: Calibration) -> str:
+def _observation_line(calibration: Calibration) -> str:
+    measurements, axes = calibration.dataset.measurements, calibration.dataset.axes
+    if axes is not None:
+        return (
+            f"Axes: {len(axes)} in {measurements.n_rows} images, taken with the standard "
+            "deviations that their table gives."
+        )
     outlines = calibration.solution.outlines
     reasons = Counter(
         reason.split(",")[0].split(" by ")[0]
@@ -82,7 +88,12 @@ def _apart(calibration: Calibration, parameters: KinematicParameters) -> tuple[f
 
 def _fit_line(calibration: Calibration) -> str:
     solution = calibration.solution
+    residuals = []
+    if solution.rms_px is not None:
+        residuals.append(f"{solution.rms_px:.3f} px rms")
+    if solution.rms_axes is not None:
+        residuals.append(f"axes off by {solution.rms_axes:.3f} of their standard deviations, rms")
     return (
         f"The fit of everything started from the {solution.start} model: chi2 {solution.chi2:.1f} "
-        f"for {solution.dof} degrees of freedom, {solution.rms_px:.3f} px rms."
+        f"for {', '.join([f'{solution.dof} degrees of freedom', *residuals])}."
     )
