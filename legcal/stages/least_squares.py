@@ -62,11 +62,14 @@ class Structure:
         one observation saw.
     exact_hessian : bool
         As of the problem.
+    reweighted : bool
+        Some terms are robust: the problem is solved several times, with other weights.
     """
 
     n_unknowns: int
     terms: tuple[tuple[ca.Function, tuple[int, ...], bytes, tuple[tuple[int, int], ...]], ...]
     exact_hessian: bool
+    reweighted: bool
 
     @property
     def n_residuals(self) -> int:
@@ -124,7 +127,8 @@ class LeastSquares:
             for term in self.terms
             if len(term.index)
         ]
-        return Structure(len(self.start), tuple(terms), self.exact_hessian)
+        reweighted = any(term.robust for term in self.terms if len(term.index))
+        return Structure(len(self.start), tuple(terms), self.exact_hessian, reweighted)
 
     @property
     def observed(self) -> Array:

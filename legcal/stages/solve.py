@@ -117,6 +117,8 @@ def _built(structure: Structure) -> _Built:
     )
     if not structure.exact_hessian:
         options["hess_lag"] = _gauss_newton(z, p, slope)
+    if structure.reweighted:  # more iterations only look for a descent below rounding
+        options["ipopt.acceptable_iter"] = 2
     nlp: dict[str, Any] = {"x": z, "p": p, "f": cost}
     return _Built(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian)
 
