@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.geometry.types import BoolArray, IntArray
+from legcal.simulation.rendering.coarse_shadows import seen_coarsely
 from legcal.simulation.rendering.footprint import footprint
 from legcal.simulation.rendering.intersect import intersect
 from legcal.simulation.rendering.rays import PixelRays, Single
@@ -19,6 +20,7 @@ from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
 _TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
 _THIN = 3.0  # [px] solids that rays through pixel centres may miss
 _PIXELS = 6144  # on edges, at a time
+_LARGE = 20_000  # pixels of a solid from which its shadows are traced coarsely
 _FACES = 8  # that are told apart in the search for edges
 
 
@@ -79,7 +81,7 @@ class Painter:
             if len(inside):
                 x, y = self.rays.x[inside], self.rays.y[inside]
                 shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light)
-                seen = self._seen(shaded, occluders, i)
+                seen = self._seen_inside(shaded, inside, occluders, i)
                 canvas.terms[:, :, inside] = _terms(shaded, seen, len(canvas.terms))
         del key, face
         for start in range(0, len(on_edge), _PIXELS):
@@ -128,65 +130,71 @@ class Painter:
         """Average many rays in each of some pixels; ``behind`` is the depth before painting."""
         n, S = len(pixels), self.samples
         X, Y = self.rays.within(pixels, S)
-        Z = np.repeat(behind[:, None], S, axis=1)
-        who = np.zeros((n, S), dtype=np.uint16)
-        faces = np.zeros((n, S), dtype=np.int32)
+        X, Y = X.ravel(), Y.ravel()
+        Z = np.repeat(behind, S)
+        who = np.zeros(n * S, dtype=np.uint16)
+        faces = np.zeros(n * S, dtype=np.int32)
         row_of = np.full(len(canvas.z), -1, dtype=np.int32)
         row_of[pixels] = np.arange(n, dtype=np.int32)
+        one_pixel = np.arange(S)
         touched = []
         for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
             low, high = np.searchsorted(foot, (pixels[0], pixels[-1] + 1))
             rows = row_of[foot[low:high]]
-            rows = rows[rows >= 0]
-            if not len(rows):
+            here = (rows[rows >= 0, None] * S + one_pixel).ravel()
+            depth, face = intersect(solid, X[here], Y[here])
+            closer = np.flatnonzero(depth < Z[here] * np.float32(_TIE))
+            if len(closer):
+                at = here[closer]
+                Z[at], who[at], faces[at] = depth[closer], i + 1, face[closer]
+                touched.append((i, here))
+        uncovered = np.count_nonzero(who.reshape(n, S) == 0, axis=1) / S
+        total = canvas.terms[:, :, pixels] * uncovered.astype(np.float32)
+        for i, here in touched:
+            at = here[who[here] == i + 1]
+            if not len(at):
                 continue
-            depth, face = intersect(solid, X[rows].ravel(), Y[rows].ravel())
-            closer = depth.reshape(-1, S) < Z[rows] * np.float32(_TIE)
-            r, c = np.nonzero(closer)
-            if not len(r):
-                continue
-            at = rows[r], c
-            Z[at], who[at] = depth.reshape(-1, S)[r, c], i + 1
-            faces[at] = face.reshape(-1, S)[r, c]
-            touched.append((i, rows))
-        n_terms = len(canvas.terms)
-        total = canvas.terms[:, :, pixels] * (np.count_nonzero(who == 0, axis=1) / S).astype(
-            np.float32
-        )
-        for i, rows in touched:
-            r, c = np.nonzero(who[rows] == i + 1)
-            if not len(r):
-                continue
-            at = rows[r], c
             shaded = shade(solids[i], X[at], Y[at], Z[at], faces[at], self.light)
-            first = np.flatnonzero(np.diff(r, prepend=-1))
-            seen = self._seen(shaded, occluders, i, first)
-            sums = np.add.reduceat(_terms(shaded, seen, n_terms), first, axis=-1)
-            total[:, :, rows[r[first]]] += sums * np.float32(1.0 / S)
+            row = at // S
+            first = np.flatnonzero(np.diff(row, prepend=-1))
+            seen = self._seen_on_edge(shaded, first, occluders, i)
+            sums = np.add.reduceat(_terms(shaded, seen, len(canvas.terms)), first, axis=-1)
+            total[:, :, row[first]] += sums * np.float32(1.0 / S)
         canvas.terms[:, :, pixels] = total
 
-    def _seen(
-        self, shaded: Shaded, occluders: Occluders, own: int, first: IntArray | None = None
+    def _seen_inside(
+        self, shaded: Shaded, pixels: IntArray, occluders: Occluders, own: int
     ) -> list[Single | None]:
-        """Return the share of each lamp that the points see; None for all of it.
-
-        ``first`` starts groups of points whose shadows are taken from one of them.
-        """
+        """Return the share of each lamp that pixels of a solid see; None for all of it."""
         found: list[Single | None] = []
         for lamp, faces in zip(self.light.lamps, shaded.faces_lamp, strict=True):
             if not lamp.shadows:
                 found.append(None)
                 continue
-            if first is None:
-                seen = np.ones(len(faces), dtype=np.float32)
-                facing = np.flatnonzero(faces)
-                seen[facing] = seen_of_lamp(lamp, shaded.P[:, facing], occluders, own)
+            seen = np.ones(len(faces), dtype=np.float32)
+            facing = np.flatnonzero(faces)
+            P = shaded.P[:, facing]
+            if len(facing) > _LARGE:
+                seen[facing] = seen_coarsely(lamp, self.rays, pixels[facing], P[2], occluders, own)
             else:
-                seen = np.ones(len(first), dtype=np.float32)
-                any_faces = np.flatnonzero(np.logical_or.reduceat(faces, first))
-                seen[any_faces] = seen_of_lamp(lamp, shaded.P[:, first[any_faces]], occluders, own)
-                seen = np.repeat(seen, np.diff(first, append=len(faces)))
+                seen[facing] = seen_of_lamp(lamp, P, occluders, own)
             found.append(seen)
+        return found
+
+    def _seen_on_edge(
+        self, shaded: Shaded, first: IntArray, occluders: Occluders, own: int
+    ) -> list[Single | None]:
+        """Return the same for rays in groups, one group a pixel, from its first ray."""
+        found: list[Single | None] = []
+        sizes = np.diff(first, append=shaded.P.shape[1])
+        for lamp, faces in zip(self.light.lamps, shaded.faces_lamp, strict=True):
+            if not lamp.shadows:
+                found.append(None)
+                continue
+            lit = np.flatnonzero(np.logical_or.reduceat(faces, first))
+            seen = np.ones(len(first), dtype=np.float32)
+            seen[lit] = seen_of_lamp(lamp, shaded.P[:, first[lit]], occluders, own)
+            found.append(np.repeat(seen, sizes))
         return found
 
 

@@ -56,11 +56,10 @@ class PixelRays:
         samples : int
             A Fibonacci number.
         """
-        lattice_u, lattice_v = _lattice(samples)
         rows, columns = np.divmod(pixels, self.width)
-        shift = _shifts()[rows % _TILE, columns % _TILE]
-        du = (lattice_u + shift[:, :1]) % np.float32(1.0) - np.float32(0.5)
-        dv = (lattice_v + shift[:, 1:]) % np.float32(1.0) - np.float32(0.5)
+        du, dv = _offsets(samples)
+        tile = rows % _TILE * _TILE + columns % _TILE
+        du, dv = du[tile], dv[tile]
         left = np.where(columns > 0, pixels - 1, pixels)
         right = np.where(columns < self.width - 1, pixels + 1, pixels)
         above = np.where(rows > 0, pixels - self.width, pixels)
@@ -71,7 +70,10 @@ class PixelRays:
         for grid in (self.x, self.y):
             along_u = (grid[right] - grid[left])[:, None] / across
             along_v = (grid[below] - grid[above])[:, None] / down
-            points.append(grid[pixels][:, None] + along_u * du + along_v * dv)
+            point = along_u * du
+            point += along_v * dv
+            point += grid[pixels][:, None]
+            points.append(point)
         return points[0], points[1]
 
 
@@ -81,18 +83,14 @@ def pixel_rays(camera: Camera) -> PixelRays:
     return PixelRays(camera)
 
 
-@lru_cache(maxsize=8)
-def _lattice(samples: int) -> tuple[Single, Single]:
-    """Return the Fibonacci lattice of the unit square."""
+@lru_cache(maxsize=4)
+def _offsets(samples: int) -> tuple[Single, Single]:
+    """Return where in each pixel of a tile the rays are, (_TILE * _TILE, samples) [px]."""
     before, now = 1, 1
     while now < samples:
         before, now = now, before + now
     i = np.arange(samples)
-    u, v = (i + 0.5) / samples, (i * before % samples + 0.5) / samples
-    return u.astype(np.float32), v.astype(np.float32)
-
-
-@lru_cache(maxsize=1)
-def _shifts() -> Single:
-    """Return the shift of the lattice in each pixel of a tile."""
-    return np.random.default_rng(0).random((_TILE, _TILE, 2), dtype=np.float32)
+    lattice = np.stack([(i + 0.5) / samples, (i * before % samples + 0.5) / samples])
+    shifts = np.random.default_rng(0).random((2, _TILE * _TILE, 1))
+    u, v = ((lattice[:, None] + shifts) % 1.0 - 0.5).astype(np.float32)
+    return u, v

@@ -3,24 +3,22 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, Image
 from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.coarse_shadows import seen_coarsely
 from legcal.simulation.rendering.paint import Canvas, Painter
 from legcal.simulation.rendering.rays import PixelRays, Single, pixel_rays
 from legcal.simulation.rendering.sensor import develop
 from legcal.simulation.rendering.shading import Lighting
-from legcal.simulation.rendering.shadows import Lamp, Occluders, seen_of_lamp
+from legcal.simulation.rendering.shadows import Lamp, Occluders
 from legcal.simulation.rendering.solid_in_view import SolidInView, in_view
 from legcal.simulation.rendering.surroundings import Surroundings, draw_surroundings
 from legcal.simulation.rendering.texture import background
 from legcal.simulation.solids import PlacedSolid
 from legcal.vision.camera import Camera
-
-_STEP = 4  # [px] of the shadows that the machine casts on its surroundings
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,33 +78,18 @@ class Scene:
 
     def _backdrop(self, solids: Sequence[SolidInView]) -> Single:
         """Return the surroundings with the shadows of solids, (1, n_channels, n)."""
-        terms = self.canvas.terms
+        z, terms = self.canvas.z, self.canvas.terms
         total: Single = terms[0].copy()
         occluders = Occluders(solids)
+        near = np.flatnonzero(np.isfinite(z))
         for lamp, light in zip(self.painter.light.lamps, terms[1:], strict=True):
-            if lamp.shadows:
-                total += light * self._shadow(lamp, occluders)
+            if lamp.shadows and len(near):
+                seen = np.ones_like(z)
+                seen[near] = seen_coarsely(lamp, self.painter.rays, near, z[near], occluders)
+                total += light * seen
             else:
                 total += light
         return np.asarray(total[None])
-
-    def _shadow(self, lamp: Lamp, occluders: Occluders) -> Single:
-        """Return the share of a lamp that the surroundings see past solids, (n,)."""
-        rays = self.painter.rays
-        height, width = rays.height, rays.width
-        rows, columns = (
-            np.minimum(np.arange(0, n, _STEP) + _STEP // 2, n - 1) for n in (height, width)
-        )
-        z, x, y = (
-            a.reshape(height, width)[np.ix_(rows, columns)] for a in (self.canvas.z, rays.x, rays.y)
-        )
-        near = np.isfinite(z)
-        seen = np.ones(z.shape, dtype=np.float32)
-        P = np.stack([x[near] * z[near], y[near] * z[near], z[near]])
-        seen[near] = seen_of_lamp(lamp, P, occluders)
-        size = (len(columns) * _STEP, len(rows) * _STEP)
-        fine = cv2.resize(seen, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
-        return np.asarray(fine, dtype=np.float32).ravel()
 
 
 def prepare_scene(

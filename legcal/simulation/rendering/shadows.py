@@ -13,7 +13,7 @@ from legcal.simulation.shapes import Box, Cylinder, Sphere
 
 _TINY = 1e-12
 _SMALLEST = 1e-5  # [m] half-shadow of a point-like lamp
-_CHUNK = 4096  # points at a time
+_CHUNK = 1024  # points at a time
 _BALLS = 24
 
 
