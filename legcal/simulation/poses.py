@@ -17,6 +17,7 @@ from legcal.simulation.machine import Machine
 
 _ITERATIONS = 30
 _LARGEST_TURN = 0.3  # [rad] in one iteration
+_DAMPING = 1e-12  # keeps singular poses solvable, and is nothing beside others
 _SINGULAR = 0.1  # smallest singular value of the scaled Jacobian that a pose may have
 
 
@@ -291,12 +292,23 @@ def _newton(
             break
         u = legs[~done] / norms[~done, :, None]
         J = np.concatenate([u, np.cross(arms[~done], u)], axis=-1)
-        step = (np.linalg.pinv(J) @ error[~done, :, None])[..., 0]
+        N = np.swapaxes(J, -1, -2) @ J + _DAMPING * np.eye(6)
+        step = np.linalg.solve(N, np.swapaxes(J, -1, -2) @ error[~done, :, None])[..., 0]
         turn = np.linalg.norm(step[:, 3:], axis=1, keepdims=True)
-        turned = step[:, 3:] * np.minimum(1.0, _LARGEST_TURN / np.maximum(turn, 1e-300))
         t[active] += step[:, :3]
-        R[active] = Rotation.from_rotvec(turned).as_matrix() @ R[active]
+        turned = step[:, 3:] * np.minimum(1.0, _LARGEST_TURN / np.maximum(turn, 1e-300))
+        R[active] = _turn(turned) @ R[active]
     return Rotation.from_matrix(R).as_matrix() if len(R) else R, t, best
+
+
+def _turn(w: Array) -> Array:
+    """Return the rotations of Gibbs vectors w / 2 (n, 3): by w [rad] where that is small."""
+    g = 0.5 * w
+    cross = np.zeros((len(w), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = g
+    cross[:, [1, 2, 0], [2, 0, 1]] = -g
+    scale = 2.0 / (1.0 + np.sum(g**2, axis=1))[:, None, None]
+    return np.asarray(np.eye(3) + scale * (cross + cross @ cross))
 
 
 def _legs(parameters: KinematicParameters, R: Array, t: Array) -> tuple[Array, Array]:
