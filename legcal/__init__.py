@@ -34,10 +34,13 @@ if TYPE_CHECKING:
     from legcal.mechanism.singularity import singularity
     from legcal.pipeline import calibrate
     from legcal.report.accuracy import evaluate
+    from legcal.simulation.settings import SimulationSettings
+    from legcal.simulation.simulate import simulate
 
 __all__ = [
     "Follower",
     "LegcalError",
+    "SimulationSettings",
     "__version__",
     "calibrate",
     "evaluate",
@@ -47,11 +50,13 @@ __all__ = [
     "load_dataset",
     "load_mechanism",
     "random_configurations",
+    "simulate",
     "singularity",
 ]
 
 _HOME = {
     "Follower": "legcal.mechanism.kinematics",
+    "SimulationSettings": "legcal.simulation.settings",
     "calibrate": "legcal.pipeline",
     "evaluate": "legcal.report.accuracy",
     "forward_kinematics": "legcal.mechanism.kinematics",
@@ -60,6 +65,7 @@ _HOME = {
     "load_dataset": "legcal.dataset.folder",
     "load_mechanism": "legcal.mechanism.load",
     "random_configurations": "legcal.mechanism.configurations",
+    "simulate": "legcal.simulation.simulate",
     "singularity": "legcal.mechanism.singularity",
 }
 

@@ -3,7 +3,7 @@
 Each camera has a sector around the machine, in the plane normal to the direction from base to
 platform (or to the plane of motion), and tries directions at several heights there. It takes the
 one from which most of the legs are seen, and longest in the image, over poses spread through the
-motion. It stands as near as the whole space that the machine moves in stays in the image.
+motion. It stands as near as the whole space that the legs move in stays in the image.
 """
 
 from __future__ import annotations
@@ -19,17 +19,20 @@ from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.cameras import look_at
 from legcal.simulation.posed_machine import PosedMachine
+from legcal.simulation.shapes import Cylinder
 from legcal.simulation.visibility import field_of_view, legs_in_image
 from legcal.vision.camera import Camera
 
 _TURNS = (-0.35, -0.15, 0.0, 0.15, 0.35)  # within its sector, in sectors of a right angle at most
 _LIFTS = (0.1, 0.25, 0.45, 0.7, 0.95, 1.2)  # [rad] above the plane across the machine
-_LIFTS_PLANAR = (0.8, 1.0, 1.15, 1.3)  # [rad] above the plane of motion
+_LIFTS_PLANAR = (0.8, 0.95, 1.1, 1.25, 1.4)  # [rad] above the plane of motion
 _TRIED = 5  # poses at which directions are judged
 _SAMPLES = 32  # points of a leg in that
 _ROLL = 0.08  # [rad] by which cameras are not upright
 _FURTHER = 0.08  # of the least distance, by which cameras stand further away
 _MARGIN = 0.06  # of the image that stays free at each side
+_ENDS = (-0.5, 0.5)  # of a cylinder, in its length
+_CENTRINGS = 3  # steps that bring the machine into the middle of the image
 _BEHIND = 0.3  # machine sizes that lie between the camera and the machine, at least
 
 
@@ -98,12 +101,21 @@ def _direction(up: Array, turn: float, lift: float) -> Array:
 
 
 def _reached(machines: Sequence[PosedMachine]) -> Array:
-    """Return points (n, 3) around everything that is seen of a machine in all of its poses."""
-    points = np.concatenate([part for s in machines for part in (s.caster.mesh.vertices, s.A, s.B)])
+    """Return points (n, 3) around the legs of a machine in all of its poses."""
+    points = np.concatenate([part for m in machines for part in (m.A, m.B, *_leg_ends(m))])
     try:
         return np.asarray(points[ConvexHull(points).vertices])
     except QhullError:  # all of them in a plane
-        return np.asarray(points)
+        return points
+
+
+def _leg_ends(machine: PosedMachine) -> list[Array]:
+    """Return both ends of every cylinder of a leg, (2, 3) each."""
+    return [
+        np.asarray(p.T_base_solid.apply([[0.0, 0.0, end * p.solid.shape.length] for end in _ENDS]))
+        for p in machine.solids
+        if p.solid.leg is not None and isinstance(p.solid.shape, Cylinder)
+    ]
 
 
 def _place(
@@ -111,14 +123,20 @@ def _place(
 ) -> RigidTransform:
     """Return the pose of a camera in a direction from which all points are in the image."""
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    turned = look_at(target + toward, target, roll, up=up)
-    p = turned.rotation.inv().apply(points - target)
+    rotation = look_at(target + toward, target, roll, up=up).rotation
     low, high = field_of_view(camera)
     low, high = (1.0 - 2.0 * _MARGIN) * low, (1.0 - 2.0 * _MARGIN) * high
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    needed = [np.max(p[:, :2] / limit - p[:, 2:]) for limit in (low, high)]
-    distance = further * float(max(*needed, _BEHIND * size - p[:, 2].min()))
-    return look_at(target + distance * toward, target, roll, up=up)
+    p = rotation.inv().apply(points - target)
+    for _ in range(_CENTRINGS):
+        needed = [np.max(p[:, :2] / limit - p[:, 2:]) for limit in (low, high)]
+        distance = float(max(*needed, _BEHIND * size - p[:, 2].min()))
+        seen = p[:, :2] / (p[:, 2:] + distance)
+        middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) - 0.5 * (low + high)
+        aside = np.append(distance * middle, 0.0)
+        p = p - aside
+        target = target + rotation.apply(aside)
+    return look_at(target + further * distance * toward, target, roll, up=up)
 
 
 def _score(

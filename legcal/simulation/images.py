@@ -59,11 +59,11 @@ class Images:
         """Return the legs that an image shows well enough to be measured."""
         return [j for j, leg in enumerate(self.shown[row]) if leg.is_seen]
 
-    def well_seen(self, view: int) -> list[int]:
-        """Return the legs that at least half of the images of a view show."""
+    def seen_in_view(self, view: int, least: float = 0.0) -> list[int]:
+        """Return the legs that more than a part of the images of a view show."""
         rows = np.flatnonzero(self.view == view)
         seen = np.array([[leg.is_seen for leg in self.shown[row]] for row in rows])
-        return [int(j) for j in np.flatnonzero(seen.mean(axis=0) >= 0.5)]
+        return [int(j) for j in np.flatnonzero(seen.mean(axis=0) > least)]
 
     def chosen(self, rows: Sequence[int]) -> Images:
         """Return some of the images."""

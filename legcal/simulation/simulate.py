@@ -39,7 +39,7 @@ from legcal.simulation.folder import (
 )
 from legcal.simulation.hints import rough_pose
 from legcal.simulation.images import Images, Viewpoint, take_images
-from legcal.simulation.motion import SimulatedPoses, draw_poses
+from legcal.simulation.motion import SimulatedPoses, draw_poses, given_poses
 from legcal.simulation.photographs import take_photographs
 from legcal.simulation.posed_machine import PosedMachine, pose_machine
 from legcal.simulation.settings import Level, SimulationSettings
@@ -47,6 +47,7 @@ from legcal.simulation.tables import axes_of_images, outlines_of_images
 from legcal.simulation.truth import write_true_model
 from legcal.vision.camera_file import read_camera
 
+_OFTEN = 0.5  # of the photographs of a view that show a leg which its hint names
 _STREAMS = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs")
 
 
@@ -193,8 +194,6 @@ def _session(
     shared = settings.shared_poses or isinstance(settings.poses, Path)
     progress("Poses", 0, 1)
     if isinstance(settings.poses, Path):
-        from legcal.simulation.given_poses import given_poses
-
         poses = given_poses(truth, settings.poses)
     else:
         n_poses = settings.poses * (1 if shared else n_views)
@@ -223,11 +222,14 @@ def _measurements(
 ) -> Measurements:
     """Return the rows of the dataset: readings with their errors, and what is told of cameras."""
     legs, images = session.truth.leg_names, session.images
+    # Tables say themselves what is seen; in photographs nobody looks for a leg that often hides.
+    least = _OFTEN if settings.level is Level.PHOTOGRAPHS else 0.0
     views = []
     for v, view in enumerate(session.views):
         T = rough_pose(view.T_base_camera, chance["hints"])
-        well = tuple(legs[j] for j in images.well_seen(v))
-        hints = (T, well if 0 < len(well) < len(legs) else None) if settings.hints else (None, None)
+        shown = tuple(legs[j] for j in images.seen_in_view(v, least))
+        hint = shown if 0 < len(shown) < len(legs) else None
+        hints = (T, hint) if settings.hints else (None, None)
         views.append(View(view.name, view.camera, *hints))
     q, size = session.poses.readings, settings.readings.size
     if settings.readings.distribution is Distribution.UNIFORM:
