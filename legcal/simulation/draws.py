@@ -19,7 +19,8 @@ TRIES = 60  # draws for each pose
 FULL_EXTREME, FULL = 12, 2  # of them over all of the travel; the next nearer to home
 NEARER = 0.85  # each
 LEARNED = 6  # draws before those that reached the last pose
-SHORTEST = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
+WAY = (0.25, 0.5, 0.75, 1.0)  # parts of the way from home: no leg goes through another before
+SHORTEST = 0.25  # of such a part; what is harder to reach is drawn again
 
 
 class Draws:
@@ -69,24 +70,28 @@ class Draws:
         start = max(0, self._tried - LEARNED)
         full = FULL_EXTREME if self._extreme else FULL
         for tried in range(start, start + TRIES):
-            nearer = NEARER ** max(0, tried + 1 - full)
+            found = self._reached(self._readings(NEARER ** max(0, tried + 1 - full)))
+            if not isinstance(found, str):
+                self._tried = tried
+                return found
+            self.problems[found] += 1
+        return None
+
+    def _reached(self, readings: Array) -> Array | str:
+        """Return the configuration at readings, or what stands in the way, there or before."""
+        configuration = self._mechanism.home_configuration
+        for part in WAY:
+            q = readings if part == 1.0 else self._home + part * (readings - self._home)
             try:
-                reached = follow(
-                    self._mechanism,
-                    self._mechanism.home_configuration,
-                    self._readings(nearer),
-                    shortest=SHORTEST,
-                    on_the_chain=True,
+                configuration = follow(
+                    self._mechanism, configuration, q, shortest=SHORTEST, on_the_chain=True
                 )
             except DidNotConverge:
-                self.problems["legs that cannot have such lengths at the same time"] += 1
-                continue
-            problem = self._admission.problem(reached)
-            if problem is None:
-                self._tried = tried
-                return reached
-            self.problems[problem] += 1
-        return None
+                return "legs that cannot have such lengths at the same time"
+            problem = self._admission.problem(configuration, of_motors=part == 1.0)
+            if problem is not None:
+                return problem
+        return configuration
 
     def _walked(self) -> Array | None:
         """Return where a random walk on the closed configurations comes to."""
