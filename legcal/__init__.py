@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from legcal.mechanism.load import load_mechanism
     from legcal.mechanism.singularity import singularity
     from legcal.pipeline import calibrate
+    from legcal.repeatability.noise import measure_noise
     from legcal.report.accuracy import evaluate
     from legcal.simulation.settings import SimulationSettings
     from legcal.simulation.simulate import simulate
@@ -49,6 +50,7 @@ __all__ = [
     "inverse_kinematics",
     "load_dataset",
     "load_mechanism",
+    "measure_noise",
     "random_configurations",
     "simulate",
     "singularity",
@@ -64,6 +66,7 @@ _HOME = {
     "inverse_kinematics": "legcal.mechanism.kinematics",
     "load_dataset": "legcal.dataset.folder",
     "load_mechanism": "legcal.mechanism.load",
+    "measure_noise": "legcal.repeatability.noise",
     "random_configurations": "legcal.mechanism.configurations",
     "simulate": "legcal.simulation.simulate",
     "singularity": "legcal.mechanism.singularity",
