@@ -11,9 +11,9 @@ from legcal.mechanism.model import Mechanism
 from legcal.simulation.shapes import Cylinder, Sphere
 from legcal.simulation.solids import Material, Solid, solids_of
 
-_BALL = Material(albedo=0.16, specular=0.9, shininess=90.0, limb=0.3)
+_BALL = Material(albedo=0.06, specular=1.0, shininess=250.0, limb=0.2)
 _POST = Material(albedo=0.04, specular=0.10, shininess=20.0, limb=0.3)
-_PLATE = Material(albedo=0.11, specular=0.12, shininess=18.0, limb=0.1, texture=0.12)
+_PLATE = Material(albedo=0.09, specular=0.10, shininess=18.0, limb=0.1, texture=0.06)
 _BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
 _POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
 _DEFAULT_RADIUS = 0.02  # of the distance between joints, where a leg shows no cylinder

@@ -45,8 +45,8 @@ class Material:
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-TUBE = Material(albedo=0.62, specular=0.10, shininess=25.0, limb=0.35)
-ROD = Material(albedo=0.42, specular=0.80, shininess=60.0, limb=0.35)
+TUBE = Material(albedo=0.70, specular=0.25, shininess=40.0, limb=0.35)
+ROD = Material(albedo=0.35, specular=0.80, shininess=80.0, limb=0.35)
 PART = Material(albedo=0.30, specular=0.05, shininess=15.0, limb=0.20)
 
 

@@ -17,6 +17,8 @@ class Light:
     ----------
     direction : tuple of float
         Where it stands, seen from the middle of the machine, in the base frame.
+    with_camera : bool
+        The direction is (right, up, back) of the camera instead: the lamp moves with it.
     distance : float
         How far from there, in radii of the machine.
     strength : float
@@ -28,6 +30,7 @@ class Light:
     """
 
     direction: tuple[float, float, float]
+    with_camera: bool = False
     distance: float = 4.0
     strength: float = 0.8
     radius: float = 0.15
@@ -35,8 +38,8 @@ class Light:
 
 
 WORKSHOP_LIGHTS = (
-    Light(direction=(0.5, -0.8, 1.1), strength=0.75),
-    Light(direction=(-0.9, -0.2, 0.5), strength=0.22, shadows=False),
+    Light(direction=(0.5, -0.8, 1.1), strength=0.95),
+    Light(direction=(-0.5, 0.6, 1.0), with_camera=True, strength=0.3, shadows=False),
 )
 
 
@@ -89,12 +92,12 @@ class Appearance:
     """
 
     lights: tuple[Light, ...] = WORKSHOP_LIGHTS
-    ambient: float = 0.16
+    ambient: float = 0.07
     shadows: bool = True
     limb: float = 1.0
     specular: float = 1.0
     texture: float = 1.0
-    background: float = 0.06
+    background: float = 0.03
     background_contrast: float = 0.5
     clutter: int = 15
     cables: int = 0

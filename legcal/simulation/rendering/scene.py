@@ -172,6 +172,8 @@ def _lighting(
     for light in appearance.lights:
         direction = np.array(light.direction) / np.linalg.norm(light.direction)
         distance = light.distance * surroundings.radius
+        if light.with_camera:
+            direction = T_camera_base.rotation.inv().apply(direction * [1.0, -1.0, -1.0])
         where: Array = surroundings.centre + distance * direction
         lamps.append(
             Lamp(

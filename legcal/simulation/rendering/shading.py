@@ -107,7 +107,7 @@ def shade(
     if gloss > _SHARP:
         of_eye = vx * upx + vy * upy + vz * upz
         sky = np.clip(0.5 + 0.5 * (2.0 * facing * up - of_eye), 0.0, 1.0)
-        mirror = (gloss * light.ambient) * (0.3 + sky * sky * 1.6)
+        mirror = (gloss * light.ambient) * (0.2 + 3.0 * sky**4)
     fixed = _channels(albedo * even, mirror, material.tint, light)
     of_lamp, faces_lamp = [], []
     for lamp in light.lamps:

@@ -13,7 +13,7 @@ from legcal.simulation.shapes import Box, Cylinder, Shape, Sphere
 from legcal.simulation.solids import Material, PlacedSolid, Solid
 from legcal.vision.camera import Camera
 
-_TABLE = Material(albedo=0.32, specular=0.06, shininess=12.0, limb=0.0, texture=0.25,
+_TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=0.08,
                   tint=(1.15, 1.0, 0.85))  # fmt: skip
 _CABLE = Material(albedo=0.04, specular=0.15, shininess=15.0, limb=0.2)
 
@@ -148,7 +148,7 @@ def _piece(
         specular=float(rng.choice([0.05, 0.15, 0.6])),
         shininess=float(rng.uniform(10.0, 60.0)),
         limb=float(rng.uniform(0.1, 0.4)),
-        texture=float(rng.uniform(0.0, 0.35)),
+        texture=float(rng.uniform(0.0, 0.2)),
         tint=_tint(rng),
     )
     return _placed(
