@@ -1,0 +1,328 @@
+"""Poses of simulated machines, drawn and given: reached, inside limits, no leg through another."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mechanisms import ROOT
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
+from legcal.geometry.types import Array
+from legcal.mechanism.closing import leg_vectors
+from legcal.mechanism.configurations import REGULAR
+from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.singularity import side, singularity
+from legcal.simulation.clearance import Clearance, segment_distance
+from legcal.simulation.draws import JITTER
+from legcal.simulation.motion import SimulatedPoses, draw_poses, given_poses
+
+SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
+LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel
+
+
+def _drawn(
+    mechanism: Mechanism, n: int, sampling: str = "extreme", seed: int = 0
+) -> SimulatedPoses:
+    return draw_poses(mechanism, n, np.random.default_rng(seed), sampling)
+
+
+def _parts(mechanism: Mechanism, poses: SimulatedPoses) -> Array:
+    """Return where the motors are in their travel, from 0 to 1, (n_poses, n_motors)."""
+    motors = list(mechanism.motors)
+    lower, upper = np.array([mechanism.legs[j].travel for j in motors]).T
+    return np.asarray((poses.readings[:, motors] - lower) / (upper - lower))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> None:
+    mechanism = load_mechanism(name)
+    poses = _drawn(mechanism, 5)
+    assert len(poses) == 5
+    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    least = REGULAR * singularity(mechanism, mechanism.home)
+    for configuration, readings, T in zip(
+        poses.configurations, poses.readings, poses.T_base_platform, strict=True
+    ):
+        assert np.abs(mechanism.chain.residual(configuration)).max() < 1e-11
+        np.testing.assert_allclose(readings, inverse_kinematics(mechanism, T), atol=1e-10)
+        assert np.all((readings >= lower - 1e-9) & (readings <= upper + 1e-9))
+        assert singularity(mechanism, T) >= least
+        assert side(mechanism, T) == side(mechanism, mechanism.home)
+    part = _parts(mechanism, poses)
+    assert np.ptp(part, axis=0).max() > 0.4
+    if name != LONG_TRAVEL:
+        assert np.all((part <= JITTER) | (part >= 1.0 - JITTER))
+
+
+def test_poses_of_the_workspace_are_anywhere_in_the_travel() -> None:
+    mechanism = load_mechanism("hexapod")
+    part = _parts(mechanism, _drawn(mechanism, 40, "workspace"))
+    assert np.abs(part.mean(axis=0) - 0.5).max() < 0.2
+    assert 0.4 < np.mean((part > 0.25) & (part < 0.75)) < 0.6
+
+
+def test_the_seed_gives_the_same_poses_to_the_last_bit() -> None:
+    mechanism = load_mechanism("3-rps")
+    one, two, other = (_drawn(mechanism, 3, seed=seed) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(one.configurations, two.configurations)
+    np.testing.assert_array_equal(one.readings, two.readings)
+    assert np.abs(one.readings - other.readings).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["hexapod", "tricept"])
+def test_without_enough_motors_the_machine_wanders(name: str) -> None:
+    mechanism = load_mechanism(name)
+    passive = replace(mechanism.legs[1], kind=LegKind.PASSIVE)
+    free = replace(mechanism, legs=(mechanism.legs[0], passive, *mechanism.legs[2:]))
+    poses = _drawn(free, 8)
+    lower, upper = np.array([leg.travel for leg in free.legs]).T
+    assert np.all((poses.readings >= lower - 1e-9) & (poses.readings <= upper + 1e-9))
+    assert np.ptp(poses.readings, axis=0).min() > 1e-3
+    for configuration in poses.configurations:
+        assert np.abs(mechanism.chain.residual(configuration)).max() < 1e-11
+
+
+def _copy(name: str, folder: Path, change: Callable[[str], str]) -> Mechanism:
+    """Load a copy of a shipped model with another URDF."""
+    for kind, suffix in (("models", "yaml"), ("urdf", "urdf")):
+        (folder / kind).mkdir()
+        text = (ROOT / kind / f"{name}.{suffix}").read_text()
+        (folder / kind / f"{name}.{suffix}").write_text(change(text) if kind == "urdf" else text)
+    return load_mechanism(folder / "models" / f"{name}.yaml")
+
+
+def _limited(name: str, joint: str, limits: tuple[float, float], folder: Path) -> Mechanism:
+    """Load a copy of a shipped model with other limits of some revolutes."""
+    lower, upper = limits
+    pattern = re.compile(rf'(<joint name="{joint}".*?<limit )lower="\S*" upper="\S*"')
+
+    def narrow(text: str) -> str:
+        changed, n = pattern.subn(rf'\1lower="{lower}" upper="{upper}"', text)
+        assert n > 0
+        return changed
+
+    return _copy(name, folder, narrow)
+
+
+def test_joint_limits_of_revolutes_are_kept(tmp_path: Path) -> None:
+    joints = [f"leg{j}_b{i}" for j in range(1, 7) for i in (1, 2)]
+    free = load_mechanism("hexapod")
+    columns = [free.chain.q_index(joint) for joint in joints]
+    wide = _drawn(free, 12).configurations[:, columns]
+    assert np.abs(wide).max() > 0.35
+    narrow = _limited("hexapod", r"leg\d_b\d", (-0.35, 0.35), tmp_path)
+    poses = _drawn(narrow, 12)
+    assert np.abs(poses.configurations[:, columns]).max() <= 0.35
+    part = _parts(narrow, poses)
+    assert np.any(part < JITTER)
+    assert np.any(part > 1.0 - JITTER)
+
+
+def test_whole_turns_of_a_joint_do_not_count(tmp_path: Path) -> None:
+    turned = _limited("hexapod", r"leg\d_b1", (2.0 * np.pi - 1.0, 2.0 * np.pi + 1.0), tmp_path)
+    np.testing.assert_array_equal(
+        _drawn(turned, 3).readings, _drawn(load_mechanism("hexapod"), 3).readings
+    )
+
+
+def test_a_machine_that_cannot_move_inside_its_limits_says_what_stands_in_the_way(
+    tmp_path: Path,
+) -> None:
+    stiff = _limited("hexapod", r"leg3_b\d", (-1e-9, 1e-9), tmp_path)
+    with pytest.raises(DidNotConverge) as caught:
+        _drawn(stiff, 8)
+    (problem,) = caught.value.problems
+    assert "8 poses could not be drawn: found 0 that the machine reaches in 300 draws" in problem
+    assert "times joint 'leg3_b" in problem
+    assert "outside its limits of -0.0 to 0.0 deg" in problem
+
+
+def test_a_joint_outside_its_limits_at_home_is_named(tmp_path: Path) -> None:
+    wrong = _limited("hexapod", "leg2_b1", (0.5, 1.0), tmp_path)
+    with pytest.raises(ModelError, match=r"joint 'leg2_b1' outside its limits of 28\.6 to 57\.3"):
+        _drawn(wrong, 2)
+
+
+@pytest.mark.parametrize(("n", "sampling"), [(0, "extreme"), (-3, "extreme"), (3, "often")])
+def test_no_poses_and_unknown_samplings_are_refused(n: int, sampling: str) -> None:
+    with pytest.raises(UsageError, match="Poses could not be drawn: found"):
+        _drawn(load_mechanism("3-rpr"), n, sampling)
+
+
+def _along(
+    mechanism: Mechanism, T: RigidTransform, j: int, n: int = 60
+) -> list[tuple[Array, float]]:
+    """Return points of the axes of a leg's cylinders, and their radii."""
+    vector = leg_vectors(mechanism, T)[j]
+    length = float(np.linalg.norm(vector))
+    return [
+        (mechanism.A_base[j] + np.linspace(*c.span(length), n)[:, None] * vector / length, c.radius)
+        for c in mechanism.legs[j].cylinders
+    ]
+
+
+def _overlap(mechanism: Mechanism, T: RigidTransform, i: int, j: int) -> float:
+    """Return by how much the cylinders of two legs overlap, from sampled points [m]."""
+    return max(
+        r + s - float(np.linalg.norm(P[:, None] - Q[None], axis=-1).min())
+        for P, r in _along(mechanism, T, i)
+        for Q, s in _along(mechanism, T, j)
+    )
+
+
+def _penetration(mechanism: Mechanism, T: RigidTransform) -> float:
+    """Return by how much the cylinders of any two legs overlap [m]."""
+    return max(_overlap(mechanism, T, i, j) for i, j in combinations(range(mechanism.n_legs), 2))
+
+
+def _with_radius(radius: float, folder: Path) -> Mechanism:
+    """Load a copy of the shipped hexapod with legs of another radius [m]."""
+    return _copy(
+        "hexapod", folder, lambda text: re.sub(r'radius="[^"]*"', f'radius="{radius}"', text)
+    )
+
+
+def test_legs_do_not_run_through_each_other(tmp_path: Path) -> None:
+    thick = _with_radius(0.037, tmp_path)
+    assert _penetration(thick, thick.home) < 0.0
+    thin = _drawn(load_mechanism("hexapod"), 25)
+    assert max(_penetration(thick, T) for T in thin.T_base_platform) > 5e-3
+    kept = _drawn(thick, 25)
+    assert max(_penetration(thick, T) for T in kept.T_base_platform) < 0.0
+
+
+def test_cylinders_that_overlap_at_home_are_not_judged(tmp_path: Path) -> None:
+    plump = _copy("hexapod", tmp_path, lambda text: re.sub(r'radius="[^"]*"', 'radius="0.2"', text))
+    assert _penetration(plump, plump.home) > 0.0
+    assert Clearance(plump).touching(plump.home) is None
+    assert len(_drawn(plump, 3)) == 3
+
+
+def test_two_legs_that_cross_are_named(tmp_path: Path) -> None:
+    thick = _with_radius(0.037, tmp_path)
+    clearance = Clearance(thick)
+    assert clearance.touching(thick.home) is None
+    turned = RigidTransform.from_components(
+        thick.home.translation, Rotation.from_euler("z", 150.0, degrees=True)
+    )
+    touching = clearance.touching(turned)
+    assert touching is not None
+    i, j = (thick.leg_names.index(name) for name in touching)
+    assert _overlap(thick, turned, i, j) > 0.0
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), flat=st.booleans())
+def test_the_distance_of_two_pieces_is_the_smallest_of_their_points(seed: int, flat: bool) -> None:
+    rng = np.random.default_rng(seed)
+    start, span = rng.normal(size=(2, 1, 2, 3))
+    if flat:
+        span[0, 1] = rng.normal() * span[0, 0]
+    found = float(segment_distance(start[:, 0], span[:, 0], start[:, 1], span[:, 1])[0])
+    s = np.linspace(0.0, 1.0, 201)[:, None]
+    P, Q = (start[0, i] + s * span[0, i] for i in (0, 1))
+    sampled = np.linalg.norm(P[:, None] - Q[None], axis=-1).min()
+    step = np.linalg.norm(span, axis=-1).max() / 200.0
+    assert found <= sampled + 1e-12
+    assert found >= sampled - step
+
+
+def _csv(folder: Path, mechanism: Mechanism, rows: Array, names: list[str] | None = None) -> Path:
+    """Write readings of all motors as a CSV."""
+    header = names or [str(mechanism.legs[j].prismatic) for j in mechanism.motors]
+    path = folder / "poses.csv"
+    lines = [",".join(header), *[",".join(repr(float(q)) for q in row) for row in rows]]
+    path.write_text("\n".join([*lines, ""]))
+    return path
+
+
+@pytest.mark.parametrize("name", ["hexapod", "tricept", "3-rpr"])
+def test_given_readings_are_reached_in_their_order(name: str, tmp_path: Path) -> None:
+    mechanism = load_mechanism(name)
+    motors = list(mechanism.motors)
+    drawn = _drawn(mechanism, 4)
+    path = _csv(tmp_path, mechanism, drawn.readings[:, motors])
+    found = given_poses(mechanism, path)
+    np.testing.assert_allclose(found.readings, drawn.readings, atol=1e-10)
+    for T, T_drawn, q in zip(
+        found.T_base_platform, drawn.T_base_platform, found.readings, strict=True
+    ):
+        np.testing.assert_allclose(T.as_matrix(), T_drawn.as_matrix(), atol=1e-9)
+        alone = forward_kinematics(mechanism, q).as_matrix()
+        np.testing.assert_allclose(T.as_matrix(), alone, atol=1e-9)
+
+
+def test_columns_of_given_readings_may_stand_in_any_order(tmp_path: Path) -> None:
+    mechanism = load_mechanism("3-rps")
+    rows = np.array([[0.02, 0.05, 0.09], [0.1, 0.06, 0.01]])
+    names = [f"leg{j}_prismatic" for j in (3, 1, 2)]
+    found = given_poses(mechanism, _csv(tmp_path, mechanism, rows[:, [2, 0, 1]], names))
+    np.testing.assert_allclose(found.readings, rows, atol=1e-12)
+
+
+HEAD = "leg1_prismatic,leg2_prismatic,leg3_prismatic\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "found no header and no row"),
+        (HEAD, "found a header and no row"),
+        (HEAD.replace(",", ";") + "0;0;0\n", "needed commas between columns"),
+        (HEAD.replace("leg2", "leg9") + "0,0,0\n", "unknown column 'leg9_prismatic'"),
+        (HEAD.replace("leg2", "leg9") + "0,0,0\n", "'leg2_prismatic' 0 times"),
+        (HEAD.replace("leg2", "leg1") + "0,0,0\n", "'leg1_prismatic' 2 times"),
+        (HEAD + "0,0,0\n0,0\n", r"row 2 \(line 3\): the row could not be used: found 2 cells"),
+        (HEAD + "0,0,\n", r"row 1 \(line 2\), column leg3_prismatic: .* found an empty cell"),
+        (HEAD + "0,nan,0\n", r"column leg2_prismatic: .* found 'nan', needed a number in metres"),
+        (HEAD + "0,0,1.0\n", "column leg3_prismatic: readings are outside the travel: found 1 m"),
+        (HEAD + "10,20,60\n", "these look like millimetres"),
+    ],
+)
+def test_malformed_files_of_poses_are_refused(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    with pytest.raises(DatasetError, match=said) as caught:
+        given_poses(load_mechanism("3-rps"), path)
+    assert all(problem.startswith(f"{path}") for problem in caught.value.problems)
+
+
+def test_given_readings_that_are_not_reached_are_named_by_row(tmp_path: Path) -> None:
+    mechanism = load_mechanism(LONG_TRAVEL)
+    (home, lower, upper) = (
+        inverse_kinematics(mechanism, mechanism.home),
+        *np.array([leg.travel for leg in mechanism.legs]).T,
+    )
+    rows = np.array([home, np.where(np.arange(6) % 2 == 0, lower, upper), home + 1e-3])
+    with pytest.raises(DatasetError) as caught:
+        given_poses(mechanism, _csv(tmp_path, mechanism, rows))
+    (problem,) = caught.value.problems
+    assert "row 2 (line 3): the pose could not be used: found legs that cannot have" in problem
+
+
+def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) -> None:
+    thick = _with_radius(0.037, tmp_path)
+    poses = _drawn(load_mechanism("hexapod"), 12)
+    overlaps = [_penetration(thick, T) for T in poses.T_base_platform]
+    with pytest.raises(DatasetError, match="run through each other there, needed") as caught:
+        given_poses(thick, _csv(tmp_path, thick, poses.readings))
+    rows = {int(re.findall(r"row (\d+)", problem)[0]) - 1 for problem in caught.value.problems}
+    assert rows == {i for i, overlap in enumerate(overlaps) if overlap > 0.0}
+
+
+def test_readings_that_do_not_tell_the_pose_are_refused(tmp_path: Path) -> None:
+    mechanism = load_mechanism("hexapod")
+    passive = replace(mechanism.legs[1], kind=LegKind.PASSIVE)
+    free = replace(mechanism, legs=(mechanism.legs[0], passive, *mechanism.legs[2:]))
+    with pytest.raises(UsageError, match="found a machine of 6 freedoms and 5 motors"):
+        given_poses(free, tmp_path / "poses.csv")
