@@ -8,8 +8,8 @@ from axes_session import AxesSession, axes_session
 from hexapod_session import disturbed_start, joint_errors, simulate
 
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry.types import Array, IntArray
-from legcal.observations.leg_axes import LegAxes, axes_from_outlines
+from legcal.geometry.types import Array
+from legcal.observations.leg_axes import axes_from_outlines, choose_axes
 from legcal.observations.sets import no_outlines
 from legcal.refinement import Start, refine
 from legcal.refinement.inputs import evaluate, evaluate_jacobian, inputs_of
@@ -22,11 +22,6 @@ from legcal.refinement.residuals import axis_residual
 @pytest.fixture(scope="module")
 def session() -> AxesSession:
     return axes_session()
-
-
-def _chosen(axes: LegAxes, chosen: IntArray) -> LegAxes:
-    parts = (axes.row, axes.leg, axes.u, axes.M, axes.basis, axes.covariance)
-    return LegAxes(*(part[chosen] for part in parts))
 
 
 def _inputs(session: AxesSession, start: Start) -> Array:
@@ -89,7 +84,7 @@ def test_exact_axes_give_the_truth(joints: float, coplanar: bool) -> None:
 
 def test_legs_that_no_image_shows_are_found_from_their_encoders() -> None:
     session = axes_session(15)
-    shown = _chosen(session.axes, np.flatnonzero(session.axes.leg != 2))
+    shown = choose_axes(session.axes, np.flatnonzero(session.axes.leg != 2))
     found = refine(session.legs, session.measurements, no_outlines(), session.start(), axes=shown)
     assert np.abs(session.errors(found.parameters)).max() < 1e-9
 
@@ -143,7 +138,7 @@ def test_a_built_fit_gives_for_other_data_what_a_new_one_gives(session: AxesSess
 
 def test_a_built_fit_refuses_data_of_another_structure(session: AxesSession) -> None:
     fit = build_axes_fit(session.legs, session.measurements, session.axes)
-    fewer = _chosen(session.axes, np.arange(len(session.axes) - 1))
+    fewer = choose_axes(session.axes, np.arange(len(session.axes) - 1))
     with pytest.raises(UsageError, match="other images, legs or poses"):
         solve_again(fit, session.measurements, fewer, session.start())
     q = session.measurements.q.copy()
@@ -214,6 +209,6 @@ def test_axes_in_degrees_are_refused(session: AxesSession) -> None:
 def test_fewer_equations_than_unknowns_are_refused_with_their_numbers(
     session: AxesSession,
 ) -> None:
-    few = _chosen(session.axes, np.arange(8))
+    few = choose_axes(session.axes, np.arange(8))
     with pytest.raises(NotIdentifiable, match=r"24 images with 8 axes and 144 readings give 176"):
         build_axes_fit(session.legs, session.measurements, few)
