@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from legcal.geometry.types import Array
 from legcal.studies.paper_summary import BOUND, Means, PaperSummary
-from legcal.studies.paper_table import JOINTS
+from legcal.studies.paper_table import JOINTS, LABELS
 
-_DRAWN = {
-    "literal": "steps as printed",
-    "default": "steps, legcal's criteria",
-    "fit": "one fit of everything",
-}
-_BAR, _LIMIT, _LINE = "#4c78a8", "#e45756", "#555555"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_DRAWN = ("literal", "default", "fit")
+_BAR, _LIMIT, _LINE = "#4c78a8", "#e45756", "#8a8a8a"
 _LETTERS = {"base": "A", "platform": "B", "offset": "q0"}
 _ERROR_AXIS, _TRUTH_AXIS = "mean error [mm]", "true value [mm]"
 _BARS, _MARKS, _TRUE = "mean error", "expected at the Cramer-Rao bound", "true value (right)"
@@ -36,7 +36,6 @@ class _Panel:
 
 def figure_as_html(summary: PaperSummary) -> bytes:
     """Return the figure as one HTML page that works without a network."""
-    import plotly.graph_objects as go
     from plotly.subplots import make_subplots
 
     grid, names = _panels(summary), list(map(_label, summary.names))
@@ -51,34 +50,13 @@ def figure_as_html(summary: PaperSummary) -> bytes:
     )
     for i, row in enumerate(grid):
         for j, panel in enumerate(row):
-            shown = i == j == 0
-            traces = (
-                (go.Bar(x=names, y=panel.errors, name=_BARS, marker_color=_BAR), False),
-                (
-                    go.Scatter(
-                        x=names,
-                        y=panel.limit,
-                        name=_MARKS,
-                        mode="markers",
-                        marker={
-                            "symbol": "line-ew",
-                            "size": 9,
-                            "line": {"width": 2, "color": _LIMIT},
-                        },
-                    ),
-                    False,
-                ),
-                (go.Scatter(x=names, y=panel.truth, name=_TRUE, line={"color": _LINE}), True),
-            )
-            for trace, right in traces:
-                trace.update(showlegend=shown, legendgroup=trace.name)
-                figure.add_trace(trace, row=i + 1, col=j + 1, secondary_y=right)
-            figure.update_yaxes(
-                title_text=_ERROR_AXIS, rangemode="tozero", row=i + 1, col=j + 1, secondary_y=False
-            )
-            figure.update_yaxes(
-                title_text=_TRUTH_AXIS, showgrid=False, row=i + 1, col=j + 1, secondary_y=True
-            )
+            place = {"row": i + 1, "col": j + 1}
+            for trace, on_right in _traces(panel, names):
+                trace.update(showlegend=i == j == 0, legendgroup=trace.name)
+                figure.add_trace(trace, **place, secondary_y=on_right)
+            left, right = {**place, "secondary_y": False}, {**place, "secondary_y": True}
+            figure.update_yaxes(title_text=_ERROR_AXIS, rangemode="tozero", **left)
+            figure.update_yaxes(title_text=_TRUTH_AXIS, showgrid=False, **right)
     figure.update_xaxes(tickangle=-90, tickfont={"size": 10})
     figure.update_layout(
         title=_title(summary), height=360 * n_rows, template="plotly_white", legend_orientation="h"
@@ -97,29 +75,43 @@ def figure_as_png(summary: PaperSummary) -> bytes:
     figure = Figure(figsize=(7.0 * n_columns, 2.9 * n_rows + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(n_rows, n_columns, squeeze=False)
-    handles = []
     for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
-        place = range(len(names))
-        bars = axis.bar(place, panel.errors, color=_BAR, label=_BARS)
-        marks = axis.scatter(
-            place, panel.limit, marker="_", s=60, color=_LIMIT, label=_MARKS, zorder=3
-        )
-        right = axis.twinx()
-        line = right.plot(place, panel.truth, color=_LINE, lw=1.0, marker=".", ms=3, label=_TRUE)
-        axis.set_title(panel.title, fontsize=10)
-        axis.set_xticks(place, names, rotation=90, fontsize=7)
-        axis.set_xlim(-0.7, len(names) - 0.3)
-        axis.set_ylim(bottom=0.0)
-        axis.set_ylabel(_ERROR_AXIS, fontsize=8)
-        right.set_ylabel(_TRUTH_AXIS, fontsize=8)
-        for side in (axis, right):
-            side.tick_params(axis="y", labelsize=8)
-        handles = [bars, marks, *line]
+        handles = _draw(axis, panel, names)
     figure.suptitle(_title(summary), fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
     return content.getvalue()
+
+
+def _traces(panel: _Panel, names: list[str]) -> list[tuple[Any, bool]]:
+    """Return what Plotly draws in a panel, and whether it belongs to the axis on the right."""
+    import plotly.graph_objects as go
+
+    tick = {"symbol": "line-ew", "size": 9, "line": {"width": 2, "color": _LIMIT}}
+    return [
+        (go.Bar(x=names, y=panel.errors, name=_BARS, marker_color=_BAR), False),
+        (go.Scatter(x=names, y=panel.limit, name=_MARKS, mode="markers", marker=tick), False),
+        (go.Scatter(x=names, y=panel.truth, name=_TRUE, line={"color": _LINE, "width": 1}), True),
+    ]
+
+
+def _draw(axis: Axes, panel: _Panel, names: list[str]) -> list[Any]:
+    """Draw a panel with Matplotlib and return what its legend explains."""
+    place = range(len(names))
+    bars = axis.bar(place, panel.errors, color=_BAR, label=_BARS)
+    marks = axis.scatter(place, panel.limit, marker="_", s=60, color=_LIMIT, label=_MARKS, zorder=3)
+    right = axis.twinx()
+    line = right.plot(place, panel.truth, color=_LINE, lw=0.8, marker=".", ms=3, label=_TRUE)
+    axis.set_title(panel.title, fontsize=10)
+    axis.set_xticks(place, names, rotation=90, fontsize=7)
+    axis.set_xlim(-0.7, len(names) - 0.3)
+    axis.set_ylim(bottom=0.0)
+    axis.set_ylabel(_ERROR_AXIS, fontsize=8)
+    right.set_ylabel(_TRUTH_AXIS, fontsize=8)
+    for side in (axis, right):
+        side.tick_params(axis="y", labelsize=8)
+    return [bars, marks, *line]
 
 
 def _panels(summary: PaperSummary) -> list[list[_Panel]]:
@@ -132,7 +124,7 @@ def _panel(summary: PaperSummary, machine: str, estimator: str) -> _Panel:
     by_name = {means.estimator: means for means in summary.of(machine)}
     means, limit = by_name[estimator], by_name[BOUND]
     return _Panel(
-        f"{_DRAWN[estimator]}, {JOINTS[machine]} joints{_failed(means)}",
+        f"{LABELS[estimator]}, {JOINTS[machine]} joints{_failed(means)}",
         1e3 * means.parameters,
         1e3 * limit.parameters,
         1e3 * summary.truths[machine],

@@ -10,11 +10,11 @@ from rich.text import Text
 from legcal.studies.paper_summary import Means, PaperSummary
 from legcal.studies.paper_text import AS_PRINTED
 
-LABELS = {
-    "initial": "initial parameters",
-    "literal": "steps, criteria as printed",
-    "default": "steps, legcal's criteria",
-    "fit": "one fit of everything",
+LABELS = {  # also of the figure
+    "initial": "before",
+    "literal": "steps as printed",
+    "default": "legcal's steps",
+    "fit": "one fit",
     "bound": "Cramer-Rao bound",
 }
 JOINTS = {"coplanar": "coplanar", "noncoplanar": "non-coplanar"}
@@ -26,7 +26,7 @@ def paper_table(summary: PaperSummary) -> RenderableType:
     table.add_column("joints")
     table.add_column("")
     for column in ("dX [mm]", "dE [deg]", "parameters [mm]", "runs", "failed"):
-        table.add_column(column, justify="right")
+        table.add_column(Text(column), justify="right")
     for name in summary.truths:
         for place, means in enumerate(summary.of(name)):
             table.add_row("" if place else JOINTS[name], LABELS[means.estimator], *_cells(means))

@@ -1,0 +1,247 @@
+"""The paper's evaluation: its records, means, table, figure and command."""
+
+import io
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.spatial.transform import RigidTransform
+from test_cli import run
+
+from legcal.errors import DidNotConverge, UsageError
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
+from legcal.simulation.machine import Machine
+from legcal.simulation.poses import random_poses
+from legcal.simulation.session import SimulatedSession
+from legcal.simulation.table_noise import TableNoise
+from legcal.studies import estimators
+from legcal.studies.eq20 import (
+    expected_errors,
+    expected_norm,
+    platform_by_parameters,
+    platform_errors,
+)
+from legcal.studies.paper import PaperStudy
+from legcal.studies.runner import StudyResult, run_study
+from legcal.studies.truths import coplanar_hexapod, noncoplanar_hexapod
+
+N_RUNS = 3
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyResult, Path]:
+    """Run the study once, with a few runs."""
+    output = tmp_path_factory.mktemp("study") / "paper"
+    return run_study(PaperStudy(), N_RUNS, output=output), output
+
+
+def _poses(machine: Machine, n: int = 10) -> RigidTransform:
+    return RigidTransform.concatenate(list(random_poses(machine, n, np.random.default_rng(0))))
+
+
+def _changed(machine: Machine, change: np.ndarray) -> KinematicParameters:
+    vector = to_vector(machine.parameters, machine.frame_legs) + change
+    return from_vector(vector, machine.n_legs, machine.frame_legs)
+
+
+def test_the_coplanar_truth_is_the_shipped_hexapod() -> None:
+    shipped, machine = load_mechanism("hexapod"), coplanar_hexapod()
+    assert tuple(machine.frame_legs) == tuple(shipped.frame_legs)
+    assert np.allclose(
+        to_vector(shipped.parameters, shipped.frame_legs),
+        to_vector(machine.parameters, machine.frame_legs),
+        atol=2e-6,
+    )
+    assert np.ptp(machine.parameters.base_joints[:, 2]) < 1e-15
+    assert np.ptp(noncoplanar_hexapod().parameters.base_joints[:, 2]) > 0.02
+
+
+def test_eq20_of_the_truth_is_zero_and_of_equal_offsets_the_travel_of_a_lift() -> None:
+    machine = noncoplanar_hexapod()
+    errors = platform_errors(machine, machine.parameters, _poses(machine))
+    assert max(errors.dX, errors.dE, errors.angle) < 1e-12
+    home = RigidTransform.concatenate([machine.home])
+    lifted = _changed(machine, np.concatenate([np.zeros(24), np.full(6, 1e-4)]))
+    assert 1e-4 < platform_errors(machine, lifted, home).dX < 3e-4
+
+
+def test_the_norm_of_small_euler_angles_is_nearly_the_angle_of_the_rotation() -> None:
+    machine = coplanar_hexapod()
+    change = np.random.default_rng(1).uniform(-2e-3, 2e-3, 30)
+    errors = platform_errors(machine, _changed(machine, change), _poses(machine))
+    assert errors.angle > 1e-3
+    assert errors.dE == pytest.approx(errors.angle, rel=1e-2)
+
+
+def test_the_platform_follows_parameters_as_forward_kinematics_does() -> None:
+    machine = noncoplanar_hexapod()
+    poses = _poses(machine, 3)
+    follow = platform_by_parameters(machine, poses)
+    for k, direction in enumerate(np.eye(30)):
+        found = platform_errors(machine, _changed(machine, 1e-7 * direction), poses)
+        assert found.dX / 1e-7 == pytest.approx(
+            np.linalg.norm(follow[:, :3, k], axis=-1).mean(), rel=1e-4
+        )
+        assert found.angle / 1e-7 == pytest.approx(
+            np.linalg.norm(follow[:, 3:, k], axis=-1).mean(), rel=1e-3
+        )
+
+
+def test_the_expected_norm_of_a_gaussian_vector_is_its_mean_norm() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3)) * [1.0, 0.3, 1e-3]
+    sample = rng.normal(size=(200_000, 3)) @ root.T
+    mean = np.linalg.norm(sample, axis=1).mean()
+    assert float(expected_norm(root @ root.T)) == pytest.approx(mean, rel=5e-3)
+
+
+def test_expected_errors_are_the_mean_errors_of_parameters_drawn_from_the_covariance() -> None:
+    machine = noncoplanar_hexapod()
+    rng, poses = np.random.default_rng(0), _poses(machine, 4)
+    root = 1e-5 * rng.normal(size=(30, 30))
+    expected = expected_errors(machine, root @ root.T, poses)
+    drawn = [
+        platform_errors(machine, _changed(machine, root @ rng.normal(size=30)), poses)
+        for _ in range(400)
+    ]
+    assert np.mean([errors.dX for errors in drawn]) == pytest.approx(expected.dX, rel=0.1)
+    assert np.mean([errors.dE for errors in drawn]) == pytest.approx(expected.dE, rel=0.1)
+
+
+def test_every_estimator_has_a_row_for_either_machine(
+    result: tuple[StudyResult, Path],
+) -> None:
+    document = result[0].document()
+    rows = document["rows"]
+    found = [(row["coplanar"], row["estimator"]) for row in rows]
+    assert found == [
+        (coplanar, estimator)
+        for coplanar in (True, False)
+        for estimator in ("literal", "default", "fit", "bound")
+    ]
+    assert all(len(row["parameters_mm"]) == 30 for row in rows)
+    assert all(row["runs"] + row["failed"] == N_RUNS for row in rows)
+    assert [row["coplanar"] for row in document["initial"]] == [True, False]
+    assert all(0.5 < np.mean(row["parameters_mm"]) < 1.5 for row in document["initial"])
+    assert len(document["names"]) == 30
+    assert json.loads((result[1] / "study.json").read_bytes()) == document
+
+
+def test_steps_as_printed_spoil_z_of_coplanar_joints_and_the_fit_is_near_the_bound(
+    result: tuple[StudyResult, Path],
+) -> None:
+    document = result[0].document()
+    rows = {(row["estimator"], row["coplanar"]): row for row in document["rows"]}
+    before = document["initial"][0]["dX_mm"]
+    assert rows["literal", True]["dX_mm"] > before
+    assert rows["default", True]["dX_mm"] < before / 5.0
+    errors = np.array(rows["literal", True]["parameters_mm"])
+    is_z = np.array([name.endswith(".z") for name in document["names"]])
+    assert errors[is_z].mean() > 4.0 * errors[~is_z].max()
+    for coplanar in (True, False):
+        bound = rows["bound", coplanar]
+        assert 0.5 < rows["fit", coplanar]["dX_mm"] / bound["dX_mm"] < 2.0
+        ratio = np.divide(rows["fit", coplanar]["parameters_mm"], bound["parameters_mm"])
+        assert 0.6 < ratio.mean() < 1.5
+        assert rows["default", coplanar]["dX_mm"] > bound["dX_mm"]
+
+
+def test_more_images_of_a_pose_lower_the_bound() -> None:
+    seed = np.random.SeedSequence(0)
+    one, nine = (
+        PaperStudy(n_poses=4, n_images=n).one_run(np.random.SeedSequence(seed.entropy))
+        for n in (1, 9)
+    )
+    ratio = np.divide(
+        one["noncoplanar"]["bound"]["parameters"], nine["noncoplanar"]["bound"]["parameters"]
+    )
+    assert np.all((ratio > 2.0) & (ratio < 3.001))  # readings are not repeated: less than 3
+
+
+def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+
+    def often_fails(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
+        calls.append(session)
+        if len(calls) % 2:
+            raise DidNotConverge("It did not.")
+        return nominal.parameters
+
+    def always_fails(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
+        raise DidNotConverge("It never does.")
+
+    for name, estimate in (("literal", often_fails), ("default", always_fails)):
+        monkeypatch.setitem(estimators.ESTIMATORS, name, estimate)
+    found = run_study(PaperStudy(n_poses=4), 2)
+    rows = {(row["estimator"], row["coplanar"]): row for row in found.document()["rows"]}
+    assert rows["literal", True]["failures"] == {"DidNotConverge": 2}
+    assert rows["literal", False]["failures"] == {}
+    assert rows["default", True]["dX_mm"] is None
+    assert rows["default", True]["parameters_mm"] == []
+    assert rows["fit", True]["runs"] == 2
+    assert found.document()["failures"] == {}
+
+
+def test_table_1_in_radians_is_another_study(result: tuple[StudyResult, Path]) -> None:
+    with pytest.raises(UsageError, match=r"other settings \(noise.psi 0.0008\d* instead of 0.05"):
+        run_study(PaperStudy(TableNoise.in_radians()), N_RUNS, output=result[1])
+
+
+def test_the_figure_needs_no_network_and_the_picture_no_browser(
+    result: tuple[StudyResult, Path],
+) -> None:
+    page = (result[1] / "fig4.html").read_text()
+    assert not re.search(r"<script[^>]*src=|<link[^>]*href=", page)
+    assert "Plotly.newPlot" in page
+    assert "A2x" in page
+    assert (result[1] / "fig4.png").read_bytes().startswith(b"\x89PNG")
+    assert "matplotlib.pyplot" not in sys.modules
+
+
+def test_the_command_prints_one_document(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    result: tuple[StudyResult, Path],
+) -> None:
+    words = ("study", "paper", "--runs", str(N_RUNS), "-o", result[1], "--json")
+    assert run(monkeypatch, *words) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out) == result[0].document()
+    assert f"{N_RUNS}/{N_RUNS}" in told.err
+
+
+def test_the_table_has_80_columns_units_and_the_printed_figures(
+    result: tuple[StudyResult, Path],
+) -> None:
+    told = io.StringIO()
+    Console(file=told, width=80).print(result[0].summary.table())
+    assert max(len(line) for line in told.getvalue().splitlines()) <= 80
+    for words in ("dX [mm]", "dE [deg]", "the paper, after", "Table 1", "within +-2 mm"):
+        assert words in told.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("papers",), "found the name 'papers', needed one of paper"),
+        (("paper", "--runs", "0"), "runs = 0"),
+        (("paper", "--workers", "0"), "workers = 0"),
+        (("paper", "--seed", "-1"), "seed = -1"),
+        (("paper", "-o", __file__), "a file of that name"),
+    ],
+)
+def test_wrong_use_of_the_command_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    message: str,
+) -> None:
+    assert run(monkeypatch, "study", *words) == 2
+    assert message in capsys.readouterr().err
