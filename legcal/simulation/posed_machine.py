@@ -17,7 +17,7 @@ from legcal.simulation.shapes import Box, Cylinder, Shape, Sphere
 from legcal.simulation.solids import PlacedSolid, Solid, link_poses, placed
 
 _SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
-_SUBDIVISIONS = 3  # of an icosahedron that stands for a sphere
+_SUBDIVISIONS = 2  # of an icosahedron that stands for a sphere
 _FLAT = 1e-3  # thickness of joint centres that lie in a plane, of their size
 
 

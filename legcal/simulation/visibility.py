@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -162,7 +163,8 @@ def _longest(chosen: BoolArray) -> tuple[int, int]:
     return int(starts[longest]), int(ends[longest])
 
 
-def _skin(cylinders: Sequence[Cylinder], length: float, samples: int) -> _Skin:
+@lru_cache(maxsize=4096)  # many cameras look at one machine
+def _skin(cylinders: tuple[Cylinder, ...], length: float, samples: int) -> _Skin:
     """Return the outer radius along a leg, and the cylinder that each stretch is named by.
 
     Touching cylinders of one radius look like one; the longest of them names it, and of equally

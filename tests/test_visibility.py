@@ -1,0 +1,173 @@
+"""What simulated cameras see of legs, where solids and borders hide it."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+import legcal
+from legcal.geometry.types import Array
+from legcal.mechanism.model import Mechanism
+from legcal.simulation.camera_places import places_around
+from legcal.simulation.cameras import look_at, sample_camera
+from legcal.simulation.dressing import dressed
+from legcal.simulation.images import Viewpoint, take_images
+from legcal.simulation.motion import SimulatedPoses
+from legcal.simulation.posed_machine import PosedMachine, pose_machine
+from legcal.simulation.shapes import Box
+from legcal.simulation.solids import Solid, solids_of
+from legcal.simulation.visibility import SEEN, LegView, legs_in_image
+
+SHIPPED = (
+    "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",
+    "hexapod-strut", "nategh-agheli", "tricept",
+)  # fmt: skip
+FAR = np.array([1.4, 0.3, 0.25])
+MIDDLE = np.array([0.0, 0.0, 0.2])
+
+
+@cache
+def machine(name: str) -> Mechanism:
+    return legcal.load_mechanism(name)
+
+
+def posed(name: str, n_poses: int, *more: Solid, bare: bool = True) -> tuple[PosedMachine, ...]:
+    mechanism = machine(name)
+    if n_poses == 1:
+        home = mechanism.home_configuration[None]
+        poses = SimulatedPoses(home, np.zeros((1, mechanism.n_legs)), (mechanism.home,))
+    else:
+        found = legcal.random_configurations(mechanism, n_poses, 0)
+        poses = SimulatedPoses(found.configurations, found.readings, tuple(found.poses))
+    shown = solids_of(mechanism) if bare else dressed(mechanism)
+    return pose_machine(mechanism, [*shown, *more], poses)
+
+
+def box(centre: Array, size: tuple[float, float, float]) -> Solid:
+    return Solid("box", None, Box(size), RigidTransform.from_translation(centre))
+
+
+def seen_at_home(*more: Solid) -> tuple[LegView, ...]:
+    T = look_at(FAR, MIDDLE)
+    return legs_in_image(machine("hexapod").legs, posed("hexapod", 1, *more)[0], sample_camera(), T)
+
+
+def test_without_anything_before_it_the_nearest_leg_is_seen_whole() -> None:
+    views = seen_at_home()
+    nearest = int(np.argmin(np.linalg.norm(machine("hexapod").A_base - FAR, axis=1)))
+    assert views[nearest].share == pytest.approx(1.0, abs=0.02)
+    [stretch] = views[nearest].stretches
+    assert stretch.part == f"leg{nearest + 1}_tube"
+    assert stretch.radius == 0.010
+
+
+def test_a_box_hides_what_the_lines_of_sight_say() -> None:
+    mechanism = machine("hexapod")
+    nearest = int(np.argmin(np.linalg.norm(mechanism.A_base - FAR, axis=1)))
+    A, B = mechanism.A_base[nearest], mechanism.home.apply(mechanism.B_platform[nearest])
+    split = A + 0.3 * (B - A)
+    # The upper face of a wide box stands where the line of sight to that point passes.
+    height = (split + 0.5 * (FAR - split))[2]
+    middle = 0.5 * (FAR + split)
+    wall = box(np.array([middle[0], middle[1], height - 0.5]), (0.02, 2.0, 1.0))
+    [stretch] = seen_at_home(wall)[nearest].stretches
+    found = stretch.start / np.linalg.norm(B - A)
+    assert found == pytest.approx(0.3, abs=0.03)  # the box is thick, the leg is round
+
+
+def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
+    def view(share: float) -> LegView:
+        return LegView(share, 100.0, seen_at_home()[3].stretches)
+
+    assert SEEN == 0.4
+    assert view(0.41).is_seen
+    assert not view(0.39).is_seen
+
+
+def test_a_camera_that_looks_along_a_leg_does_not_see_it() -> None:
+    mechanism = machine("hexapod")
+    A, B = mechanism.A_base[0], mechanism.home.apply(mechanism.B_platform[0])
+    T = look_at(A + 3.0 * (A - B), A, up=np.array([1.0, 0.0, 0.0]))
+    views = legs_in_image(mechanism.legs, posed("hexapod", 1)[0], sample_camera(), T)
+    assert not views[0].is_seen
+
+
+def test_the_border_of_the_image_cuts_legs() -> None:
+    mechanism, camera = machine("hexapod"), sample_camera()
+    here = posed("hexapod", 1)[0]
+    T = look_at(FAR, MIDDLE + np.array([0.0, 0.0, 0.45]))  # the base is below the image
+    views = legs_in_image(mechanism.legs, here, camera, T)
+    seen = [s for view in views for s in view.stretches]
+    assert seen
+    for s in seen:
+        u = (here.B[s.leg] - here.A[s.leg]) / np.linalg.norm(here.B[s.leg] - here.A[s.leg])
+        v = camera.project(T.inv().apply(here.A[s.leg] + s.start * u))[1]
+        assert v < camera.height
+    assert max(view.share for view in views) < 0.95
+
+
+def test_a_thick_tube_covers_the_rod_in_it() -> None:
+    leg = machine("3-rps").legs[0]
+    here = posed("3-rps", 1)[0]
+    T = look_at(np.array([1.0, -0.8, 0.3]), MIDDLE)
+    [first, *_] = legs_in_image(
+        (leg,), PosedMachine(here.A[:1], here.B[:1], here.solids, here.caster), sample_camera(), T
+    )
+    tube, rod = first.stretches
+    assert tube.radius > rod.radius
+    assert tube.end <= rod.start
+    length = float(np.linalg.norm(here.B[0] - here.A[0]))
+    hidden = next(c for c in leg.cylinders if c.link == rod.part)
+    assert hidden.span(length)[0] < tube.end < hidden.span(length)[1]
+
+
+def test_cylinders_of_one_radius_are_one_part() -> None:
+    leg = machine("hexapod").legs[0]
+    radii = {c.radius for c in leg.cylinders}
+    assert (len(leg.cylinders), len(radii)) == (2, 1)
+    assert all(len(view.stretches) <= 1 for view in seen_at_home())
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_cameras_around_any_machine_see_its_legs_and_all_of_its_workspace(name: str) -> None:
+    mechanism, camera = machine(name), sample_camera()
+    machines = posed(name, 3, bare=False)
+    places = places_around(mechanism, machines, [camera], np.random.default_rng(1))
+    for m in machines:
+        for T in places:
+            inside = camera.project(T.inv().apply(np.concatenate([m.A, m.B])))
+            assert np.all(inside > 0.0)
+            assert np.all(inside < [camera.width, camera.height])
+            assert not m.encloses(T.translation)
+    views = tuple(Viewpoint(f"c{v}", camera, T) for v, T in enumerate(places))
+    images = take_images(mechanism.legs, machines, views, 1, shared_poses=True)
+    seen = np.array([[leg.is_seen for leg in shown] for shown in images.shown])
+    assert seen.mean() > 0.7
+
+
+def test_cameras_of_a_machine_far_from_the_origin_stand_around_it() -> None:
+    """A machine that was moved is seen from cameras that are moved with it."""
+    motion = RigidTransform.from_components([5.0, -3.0, 2.0], Rotation.from_rotvec([0.3, 0.2, 0.1]))
+    here = posed("hexapod", 1)[0]
+    T = look_at(FAR, MIDDLE)
+    moved_solids = tuple(
+        Solid(p.solid.name, None, p.solid.shape, motion * p.T_base_solid) for p in here.solids
+    )
+    mechanism = machine("hexapod")
+    home = SimulatedPoses(mechanism.home_configuration[None], np.zeros((1, 6)), (mechanism.home,))
+    moved = pose_machine(mechanism, moved_solids, home)[0]
+    moved = PosedMachine(motion.apply(here.A), motion.apply(here.B), moved.solids, moved.caster)
+    one = legs_in_image(mechanism.legs, here, sample_camera(), T)
+    two = legs_in_image(mechanism.legs, moved, sample_camera(), motion * T)
+    assert [v.share for v in one] == pytest.approx([v.share for v in two], abs=0.03)
+
+
+def test_a_place_between_the_joints_or_in_a_leg_is_inside_the_machine() -> None:
+    here = posed("hexapod", 1)[0]
+    assert here.encloses(MIDDLE)
+    assert here.encloses(0.5 * (here.A[0] + here.B[0]))
+    assert not here.encloses(FAR)
+    flat = posed("3-rpr", 1)[0]
+    assert flat.encloses(0.3 * flat.B[0] + 0.7 * flat.A[0])
+    assert not flat.encloses(np.array([0.0, 0.0, 0.5]))
