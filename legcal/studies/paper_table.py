@@ -31,7 +31,7 @@ def paper_table(summary: PaperSummary) -> RenderableType:
         for place, means in enumerate(summary.of(name)):
             table.add_row("" if place else JOINTS[name], LABELS[means.estimator], *_cells(means))
     for place, (key, label) in enumerate(
-        (("initial", "the paper, before"), ("calibrated", "the paper, after"))
+        (("initial", "paper, before"), ("calibrated", "paper, after"))
     ):
         printed = AS_PRINTED[key]
         assert isinstance(printed, dict)
