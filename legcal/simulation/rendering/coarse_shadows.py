@@ -52,6 +52,6 @@ def seen_coarsely(
         cv2.blur(share, (3, 3)), around, out=np.ones_like(share), where=around > 0.05
     )
     share = np.where(known > 0.0, share, spread)
-    share = cv2.GaussianBlur(share, (3, 3), 0.0)  # a contact shadow would show the steps
+    share = np.asarray(cv2.GaussianBlur(share, (3, 3), 0.0), np.float32)  # contacts show steps
     fine = cv2.resize(share, None, fx=_STEP, fy=_STEP, interpolation=cv2.INTER_LINEAR)
     return np.asarray(fine[rows, columns], dtype=np.float32)

@@ -1,0 +1,295 @@
+"""Photographs: exact outlines, light as it falls, every mechanism, the same bits every time."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import UsageError
+from legcal.geometry.types import Array
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.simulation.dressing import dressed
+from legcal.simulation.rendering.appearance import Appearance, Light
+from legcal.simulation.rendering.scene import prepare_scene, render
+from legcal.simulation.shapes import Box, Cylinder, Mesh, Shape, Sphere
+from legcal.simulation.solids import (
+    Material,
+    PlacedSolid,
+    Solid,
+    link_poses,
+    placed,
+    solids_of,
+)
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
+
+ROOT = Path(__file__).resolve().parents[1]
+IDENTITY = RigidTransform.identity()
+WIDTH, HEIGHT, F = 320, 240, 400.0
+LENSES = {
+    "pinhole": Camera(np.array([[F, 0, 157.3], [0, 1.01 * F, 121.8], [0, 0, 1.0]]), WIDTH, HEIGHT),
+    "barrel": Camera(
+        np.array([[F, 0, 157.3], [0, 1.01 * F, 121.8], [0, 0, 1.0]]),
+        WIDTH,
+        HEIGHT,
+        np.array([-0.25, 0.08, 0.002, -0.001, 0.0]),
+    ),
+    "fisheye": Camera(
+        np.array([[0.6 * F, 0, 157.3], [0, 0.6 * F, 121.8], [0, 0, 1.0]]),
+        WIDTH,
+        HEIGHT,
+        np.array([-0.02, 0.004, 0.0, 0.0]),
+        "equidistant",
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=sorted(p.stem for p in (ROOT / "models").glob("*.yaml")))
+def shipped(request: pytest.FixtureRequest) -> Mechanism:
+    return load_mechanism(ROOT / "models" / f"{request.param}.yaml")
+
+
+def looking_at(mechanism: Mechanism, solids: tuple[PlacedSolid, ...]) -> RigidTransform:
+    """Return T_base_camera of a camera a little above the machine, which fills its picture."""
+    points = np.array([p.T_base_solid.translation for p in solids])
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    away = np.array([0.75, 0.4, 0.55]) / np.linalg.norm([0.75, 0.4, 0.55])
+    distance = 5.0 * np.linalg.norm(points - centre, axis=1).max()
+    x = np.cross(-away, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    turn = Rotation.from_matrix(np.column_stack([x, np.cross(-away, x), -away]))
+    return RigidTransform.from_components(centre + distance * away, turn)
+
+
+def solid(shape: Shape, T: RigidTransform, **looks: Any) -> PlacedSolid:
+    return PlacedSolid(Solid("solid", None, shape, T, Material(**looks)), T)
+
+
+def bar(angle: float, radius: float, tilt: float = 0.1) -> tuple[PlacedSolid, Array, Array]:
+    """Return a long cylinder at an angle in the image, and its direction and middle."""
+    u = np.array(
+        [math.cos(tilt) * math.cos(angle), math.cos(tilt) * math.sin(angle), math.sin(tilt)]
+    )
+    M = np.array([0.013, -0.007, 1.0])
+    turn = Rotation.align_vectors([u], [[0.0, 0.0, 1.0]])[0]
+    T = RigidTransform.from_components(M, turn)
+    return solid(Cylinder(radius, 8.0), T, albedo=0.6), u, M
+
+
+def edge_errors(image: Array, camera: Camera, h: Array, inward: Array) -> Array:
+    """Return how far an edge is inside of a line, along it [px], from areas: no edge detector.
+
+    Across the edge the pixels' levels, as parts of the step, add up to the covered length.
+    """
+    near = -h[:2] * h[2] / (h[:2] @ h[:2])
+    along = np.array([-h[1], h[0]]) / np.hypot(h[0], h[1])
+    curve = camera.distort(near + np.linspace(-1.2, 1.2, 4001)[:, None] * along)
+    middle = np.argmin(np.linalg.norm(curve - [WIDTH / 2, HEIGHT / 2], axis=1))
+    direction = curve[middle + 1] - curve[middle - 1]
+    steep = abs(direction[1]) > abs(direction[0])  # then measured along rows, else along columns
+    picture = image if steep else image.T
+    curve = curve if steep else curve[:, ::-1]
+    across = float(inward[0] if steep else inward[1])
+    order = np.argsort(curve[:, 1])
+    rows = np.arange(20, picture.shape[0] - 20)
+    expected = np.interp(rows, curve[order, 1], curve[order, 0])
+    errors = []
+    for row, x in zip(rows, expected, strict=True):
+        low, high = round(x) - 5, round(x) + 6
+        if low < 1 or high > picture.shape[1] - 1:
+            continue
+        levels = picture[row, low:high]
+        covered = float(np.sum((levels - levels.min()) / (levels.max() - levels.min())))
+        errors.append(covered - (high - 0.5 - x if across > 0.0 else x - low + 0.5))
+    slope = np.gradient(expected).mean()
+    return -np.array(errors) / math.hypot(1.0, slope)
+
+
+def clean(placed: list[PlacedSolid], **changes: Any) -> Array:
+    """Return radiance of solids before a pinhole at the origin, 0 to 1."""
+    looks = Appearance.clean(**changes)
+    image = render(placed, LENSES["pinhole"], IDENTITY, looks, np.random.default_rng(0))
+    return np.asarray(image / (2.0**looks.bits - 1.0))
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("radius", [0.02, 0.12])
+def test_outlines_are_where_the_tangent_planes_are(lens: str, radius: float) -> None:
+    camera = LENSES[lens]
+    worst = []
+    for degrees in range(0, 180, 15):
+        placed, u, M = bar(math.radians(degrees) + 1e-3, radius)
+        looks = Appearance.clean()
+        image = render([placed], camera, IDENTITY, looks, np.random.default_rng(0)).astype(float)
+        for h, epsilon in zip(outlines_of_axis(u, M, radius), (1.0, -1.0), strict=True):
+            errors = edge_errors(image, camera, h, epsilon * h[:2])
+            assert len(errors) > 100
+            worst.append(float(errors.mean()))
+            assert np.abs(errors - errors.mean()).max() < 0.15
+    assert np.abs(worst).max() < 0.01
+    assert abs(np.mean(worst)) < 0.002
+
+
+@pytest.mark.parametrize("width_px", [0.3, 0.9, 2.2])
+def test_thin_rods_cover_their_area(width_px: float) -> None:
+    placed, _, _ = bar(0.7, 0.5 * width_px / F, tilt=0.0)
+    covered = (clean([placed]) - 0.02) / 0.58
+    length = HEIGHT / math.sin(
+        math.atan(1.01 * math.tan(0.7))
+    )  # from the upper to the lower border
+    assert covered.sum() == pytest.approx(width_px * length, rel=0.02)
+
+
+def test_nearer_solids_hide_farther_ones_whatever_their_order() -> None:
+    near = solid(Sphere(0.1), RigidTransform.from_translation([0.0, 0.0, 0.8]), albedo=0.9)
+    far = solid(Box((0.6, 0.6, 0.1)), RigidTransform.from_translation([0.0, 0.0, 1.2]), albedo=0.3)
+    one, other = clean([near, far]), clean([far, near])
+    assert np.array_equal(one, other)
+    assert one[122, 157] == pytest.approx(0.9, abs=1e-4)
+    assert one[122, 157 + 80] == pytest.approx(0.3, abs=1e-4)
+
+
+def test_a_mesh_looks_like_the_shape_that_it_is_of() -> None:
+    size = (0.3, 0.2, 0.15)
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])
+    T = RigidTransform.from_components([0.02, 0.01, 1.0], Rotation.from_rotvec([0.5, 0.4, 0.3]))
+    solids = [
+        solid(shape, T, albedo=0.6) for shape in (Box(size), Mesh(np.array(size) * corners, faces))
+    ]
+    flat = [clean([one]) for one in solids]
+    assert np.abs(flat[0] - flat[1]).max() < 2e-3
+    looks = {"lights": (Light(direction=(0.4, -0.9, -0.5)),), "ambient": 0.1, "specular": 1.0}
+    lit = [clean([one], **looks) for one in solids]
+    assert np.ptp(lit[0]) > 0.3
+    assert np.mean(np.abs(lit[0] - lit[1]) > 2e-3) < 0.01  # at creases alone
+
+
+def test_surfaces_darken_towards_their_outline_as_the_material_says() -> None:
+    T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_euler("x", 90, degrees=True))
+    row = clean([solid(Cylinder(0.1, 2.0), T, albedo=0.8, limb=0.5)], limb=1.0)[122]
+    x = (np.arange(WIDTH) - 157.3) / F
+    t = (1.0 - np.sqrt(np.maximum(1.0 - (1.0 + x**2) * (1.0 - 0.01), 0.0))) / (1.0 + x**2)
+    P = np.stack([t * x, t], axis=-1)
+    cosine = -np.sum((P - [0.0, 1.0]) / 0.1 * P, axis=-1) / np.linalg.norm(P, axis=-1)
+    inside = np.abs(x) < 0.097
+    assert np.allclose(row[inside], 0.8 * (0.5 + 0.5 * cosine[inside]), atol=2e-3)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.3])
+def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: float) -> None:
+    wall = solid(Box((3.0, 3.0, 0.02)), RigidTransform.from_translation([0.0, 0.0, 1.51]))
+    ball = solid(Sphere(0.08), RigidTransform.from_translation([-0.1, 0.0, 1.0]))
+    scene = (wall, ball)
+    looks = Appearance.clean(
+        lights=(Light((-0.5, 0.0, -1.0), distance=3.0, radius=size),), ambient=0.0, shadows=True
+    )
+    rng = np.random.default_rng(0)
+    prepared = prepare_scene(scene, LENSES["pinhole"], IDENTITY, looks, rng)
+    lamp = prepared.painter.light.lamps[0].position
+    image = prepared.render(scene, rng) / 65535.0
+    centre = ball.T_base_solid.translation
+    foot = lamp + (1.5 - lamp[2]) / (centre[2] - lamp[2]) * (centre - lamp)
+    u, v = np.rint(LENSES["pinhole"].project(foot)).astype(int)
+    assert image[v, u] < 0.02
+    across = image[v, u : u + 70] / image[v, u + 70]
+    half_shadow = np.count_nonzero((across > 0.05) & (across < 0.95))
+    assert half_shadow <= 6 if size == 0.0 else half_shadow > 12
+
+
+def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Mechanism) -> None:
+    solids = placed(solids_of(shipped), link_poses(shipped, shipped.home_configuration))
+    camera, T = LENSES["pinhole"], looking_at(shipped, solids)
+    image = render(solids, camera, T, Appearance.clean(), np.random.default_rng(0)) / 65535.0
+    middles = T.inv().apply(np.array([p.T_base_solid.translation for p in solids]))
+    for u, v in np.rint(camera.project(middles)).astype(int):
+        assert image[v, u] > 0.3
+
+
+def test_every_mechanism_makes_a_photograph(shipped: Mechanism) -> None:
+    solids = placed(dressed(shipped), link_poses(shipped, shipped.home_configuration))
+    T, rng = looking_at(shipped, solids), np.random.default_rng(1)
+    image = render(solids, LENSES["barrel"], T, Appearance(clutter=4, samples=13), rng)
+    assert image.shape == (HEIGHT, WIDTH)
+    assert image.dtype == np.uint8
+    assert 15.0 < image.mean() < 180.0
+    assert image.std() > 15.0
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_does_not() -> None:
+    ball = solid(Sphere(0.2), RigidTransform.from_translation([0.0, 0.0, 1.0]))
+    camera = LENSES["barrel"]
+
+    def picture(scene_seed: int, noise_seed: int) -> Array:
+        rng = np.random.default_rng(scene_seed)
+        scene = prepare_scene([ball], camera, IDENTITY, Appearance(clutter=2, cables=2), rng)
+        return np.asarray(scene.render([ball], np.random.default_rng(noise_seed)))
+
+    first = picture(1, 2)
+    assert np.array_equal(first, picture(1, 2))
+    assert np.mean(first != picture(1, 3)) > 0.2
+    assert np.abs(first - picture(3, 2).astype(float)).mean() > 2.0
+
+
+@pytest.mark.parametrize("level", [0.1, 0.5])
+def test_noise_is_that_of_electrons_and_readout(level: float) -> None:
+    noise = {"electrons": 2000.0, "read_noise": 20.0, "background": level}
+    image = clean([], **noise)
+    assert image.mean() == pytest.approx(level, abs=2e-4)
+    assert image.std() == pytest.approx(math.sqrt(level / 2000.0 + 0.01**2), rel=0.02)
+
+
+def test_grey_levels_are_radiance_to_the_power_of_one_over_gamma() -> None:
+    placed_bar, _, _ = bar(0.4, 0.05)
+    linear, curved = clean([placed_bar]), clean([placed_bar], gamma=2.2)
+    assert np.allclose(curved**2.2, linear, atol=1e-4)
+    assert np.allclose(clean([placed_bar], bits=8), linear, atol=0.6 / 255.0)
+
+
+def test_blur_spreads_an_edge_by_its_sigma() -> None:
+    placed_bar, _, _ = bar(0.5 * math.pi, 0.06)
+    steps = np.abs(np.diff(clean([placed_bar], blur=1.5)[120, 150:]))
+    steps /= steps.sum()
+    x = np.arange(len(steps))
+    spread = math.sqrt(steps @ (x - steps @ x) ** 2)
+    assert spread == pytest.approx(math.hypot(1.5, math.sqrt(1.0 / 12.0)), rel=0.05)
+
+
+def test_light_saturates_at_full_scale() -> None:
+    placed_bar, _, _ = bar(0.4, 0.05)
+    assert clean([placed_bar], exposure=3.0).max() == 1.0
+
+
+def test_colours_are_the_materials_and_grey_is_their_mean() -> None:
+    T = RigidTransform.from_translation([0.0, 0.0, 1.0])
+    ball = solid(Sphere(0.1), T, albedo=0.5, tint=(1.5, 1.0, 0.5))
+    blue, green, red = clean([ball], colour=True)[122, 157]
+    assert [red, green, blue] == pytest.approx([0.75, 0.5, 0.25], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"read_noise": -1.0},
+        {"electrons": 0.0},
+        {"gamma": 0.0},
+        {"blur": -0.5},
+        {"blur": math.nan},
+        {"exposure": math.inf},
+        {"clutter": -1},
+        {"limb": 1.5},
+        {"bits": 12},
+        {"samples": 20},
+        {"lights": (Light((0.0, 0.0, 0.0)),)},
+        {"lights": (Light((0.0, 0.0, 1.0), distance=0.0),)},
+        {"lights": (Light((0.0, 0.0, 1.0), strength=-1.0),)},
+    ],
+)
+def test_looks_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=r"found .*, needed .*; c"):
+        Appearance(**wrong)
