@@ -135,6 +135,15 @@ def test_whole_turns_of_a_joint_do_not_count(tmp_path: Path) -> None:
     )
 
 
+def test_poses_are_drawn_inside_a_travel_that_home_is_a_little_out_of(tmp_path: Path) -> None:
+    home = inverse_kinematics(load_mechanism("hexapod"), load_mechanism("hexapod").home)
+    lower = float(home.max()) + 2e-3
+    moved = _copy("hexapod", tmp_path, lambda text: text.replace('"-0.004"', f'"{lower}"'))
+    poses = _drawn(moved, 3)
+    assert poses.readings.min() >= lower
+    assert poses.readings.max() > 0.12
+
+
 def test_a_machine_that_cannot_move_inside_its_limits_says_what_stands_in_the_way(
     tmp_path: Path,
 ) -> None:

@@ -24,7 +24,7 @@ from legcal.simulation.admission import Admission
 from legcal.simulation.draws import Draws
 from legcal.simulation.readings_file import read_readings
 
-HOPELESS = 5  # poses in vain, if they are the first
+HOPELESS = 5  # poses in vain, one after the other
 
 
 class Sampling(StrEnum):
@@ -96,12 +96,12 @@ def draw_poses(
         )
     draws = Draws(mechanism, rng, extreme=Sampling(sampling) is Sampling.EXTREME)
     found: list[Array] = []
-    for turn in range(n_poses):
+    in_vain = 0
+    while len(found) < n_poses and in_vain < HOPELESS:
         configuration = draws.next()
+        in_vain = in_vain + 1 if configuration is None else 0
         if configuration is not None:
             found.append(configuration)
-        elif turn - len(found) >= HOPELESS - 1:
-            break
     if len(found) < n_poses:
         raise DidNotConverge(
             f"{mechanism.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
