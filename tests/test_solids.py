@@ -1,0 +1,130 @@
+"""The solids that a machine is seen as: every visual of its URDF, at its place."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import ModelError
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.simulation.dressing import dressed
+from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
+from legcal.simulation.solids import link_poses, placed, solids_of
+
+ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = sorted(p.stem for p in (ROOT / "models").glob("*.yaml"))
+STL = b"""solid one
+facet normal 0 0 1
+outer loop
+vertex 0 0 0
+vertex 1 0 0
+vertex 0 1 0
+endloop
+endfacet
+endsolid one
+"""
+
+
+def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Mechanism:
+    """Return the hexapod with visuals on its platform and materials in its file."""
+    (folder / "models").mkdir()
+    (folder / "urdf").mkdir()
+    (folder / "models" / "hexapod.yaml").write_text((ROOT / "models/hexapod.yaml").read_text())
+    text = (ROOT / "urdf/hexapod.urdf").read_text()
+    text = text.replace('<link name="platform"/>', f'<link name="platform">{visuals}</link>')
+    text = text.replace('<link name="base"/>', f'{materials}<link name="base"/>')
+    (folder / "urdf" / "hexapod.urdf").write_text(text)
+    return load_mechanism(folder / "models" / "hexapod.yaml")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_leg_cylinders_stand_on_the_lines_of_their_legs(name: str) -> None:
+    mechanism = load_mechanism(ROOT / "models" / f"{name}.yaml")
+    solids = solids_of(mechanism)
+    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
+    counted = {(j, c.link) for j, leg in enumerate(mechanism.legs) for c in leg.cylinders}
+    assert {(s.leg, s.part) for s in solids if s.leg is not None} == counted
+    for p in placed(solids, link_poses(mechanism, mechanism.home_configuration)):
+        if p.solid.leg is not None:
+            along = B[p.solid.leg] - A[p.solid.leg]
+            axis = p.T_base_solid.rotation.as_matrix()[:, 2]
+            to_axis = np.cross(p.T_base_solid.translation - A[p.solid.leg], along)
+            assert np.linalg.norm(np.cross(axis, along)) < 1e-6
+            assert np.linalg.norm(to_axis) < 1e-6
+
+
+def test_every_shape_is_read_with_its_pose_and_colour(tmp_path: Path) -> None:
+    (tmp_path / "urdf_meshes").mkdir()
+    (tmp_path / "urdf_meshes" / "one.stl").write_bytes(STL)
+    mechanism = hexapod_showing(
+        tmp_path,
+        '<visual><origin xyz="0.1 0 0" rpy="0 0 1.5"/><material name="red"/>'
+        '<geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
+        '<visual><geometry><sphere radius="0.05"/></geometry></visual>'
+        '<visual><geometry><mesh filename="package://urdf_meshes/one.stl" scale="0.1 0.1 0.1"/>'
+        '</geometry><material name="own"><color rgba="0.2 0.4 0.6 1"/></material></visual>',
+        '<material name="red"><color rgba="0.9 0.3 0.3 1"/></material>',
+    )
+    box, ball, mesh = (s for s in solids_of(mechanism) if s.link == "platform")
+    assert box.shape == Box((0.1, 0.2, 0.3))
+    assert box.T_link_solid.translation == pytest.approx([0.1, 0.0, 0.0])
+    assert box.T_link_solid.rotation.as_euler("xyz") == pytest.approx([0.0, 0.0, 1.5])
+    assert box.material.albedo == pytest.approx(0.5)
+    assert box.material.tint == pytest.approx((1.8, 0.6, 0.6))
+    assert ball.shape == Sphere(0.05)
+    assert isinstance(mesh.shape, Mesh)
+    assert mesh.shape.vertices.max() == pytest.approx(0.1)
+    assert mesh.material.albedo == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("visual", "message"),
+    [
+        ('<mesh filename="gone.stl"/>', "found no mesh file 'gone.stl', needed it beside the URDF"),
+        ('<mesh filename=""/>', "found no mesh file"),
+        ('<mesh filename="bad.stl"/>', r"mesh file 'bad.stl'"),
+        ('<box size="0.1 0.1 0"/>', 'found <box size="0.1 0.1 0">, needed 3 positive numbers'),
+        ("<box/>", 'found <box size="">, needed 3 positive numbers'),
+        ("<sphere/>", 'found <sphere radius="">, needed a positive number'),
+        ("<capsule/>", "found <capsule>, needed a cylinder, sphere, box or mesh"),
+    ],
+)
+def test_visuals_that_cannot_be_shown_are_named(tmp_path: Path, visual: str, message: str) -> None:
+    (tmp_path / "bad.stl").write_bytes(b"nothing of a mesh")
+    with pytest.raises(ModelError, match=message):
+        solids_of(hexapod_showing(tmp_path, f"<visual><geometry>{visual}</geometry></visual>"))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> None:
+    mechanism = load_mechanism(ROOT / "models" / f"{name}.yaml")
+    solids = placed(dressed(mechanism), link_poses(mechanism, mechanism.home_configuration))
+    balls = [p.T_base_solid.translation for p in solids if isinstance(p.solid.shape, Sphere)]
+    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
+    ends = [A, B[[leg.platform_joint != "" for leg in mechanism.legs]]]
+    assert np.allclose(balls, np.concatenate(ends), atol=1e-6)
+    plates = [p for p in solids if p.solid.name.endswith("_plate")]
+    assert len(plates) == 2
+    middles = 0.5 * (A + B)
+    for plate in plates:
+        assert isinstance(plate.solid.shape, Cylinder)
+        local = plate.T_base_solid.inv().apply(np.concatenate([A, B, middles]))
+        assert np.abs(local[:, 2]).min() > 0.5 * plate.solid.shape.length
+        assert len(set(np.sign(local[:, 2]))) == 1  # all joints on one side of it
+
+
+def test_a_link_with_visuals_of_its_own_is_not_dressed(tmp_path: Path) -> None:
+    visual = '<visual><geometry><sphere radius="0.05"/></geometry></visual>'
+    solids = dressed(hexapod_showing(tmp_path, visual))
+    assert sum(s.link == "platform" for s in solids) == 1
+    assert sum(s.link == "base" for s in solids) == 13
+
+
+def test_a_solid_without_a_link_stays_in_the_base_frame() -> None:
+    mechanism = load_mechanism("hexapod")
+    one = solids_of(mechanism)[0]
+    free = type(one)("free", None, one.shape, RigidTransform.from_translation([1.0, 2.0, 3.0]))
+    (found,) = placed([free], {})
+    assert found.T_base_solid.translation == pytest.approx([1.0, 2.0, 3.0])
