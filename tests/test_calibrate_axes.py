@@ -87,6 +87,15 @@ def test_the_result_has_residuals_of_axes_and_no_outlines(
     assert "px" not in text
 
 
+def test_outlines_of_an_earlier_result_do_not_stay_beside_one_of_axes(dataset: Path) -> None:
+    result = dataset.parent / "result"
+    result.mkdir()
+    (result / "result.json").write_text('{"legcal_result": 1}')
+    (result / "observations.csv").write_text("of an earlier result")
+    calibrate(dataset, output=result)
+    assert not (result / "observations.csv").exists()
+
+
 def test_images_are_not_looked_at(tmp_path: Path) -> None:
     write_axes_dataset(tmp_path / "set", n_poses=5, images=True)
     stages: list[str] = []
