@@ -12,6 +12,7 @@ from mechanisms import ROOT
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError, UsageError
+from legcal.geometry.frames import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.mechanism.equations import demanded
 from legcal.mechanism.leg import LegKind
@@ -124,6 +125,22 @@ def test_rods_get_other_lengths_wherever_they_hang(
     rods = [j for j, leg in enumerate(true.legs) if leg.kind is LegKind.CONSTANT]
     assert len(rods) == 1
     assert abs(true.q0[rods[0]] - nominal.q0[rods[0]]) > 1e-5
+
+
+def test_a_leg_welded_to_the_platform_link_itself_moves_with_its_own_frame(tmp_path: Path) -> None:
+    layout = Layout((LegLayout(sphere=False, seed=1), *[LegLayout(seed=k) for k in range(2, 7)]))
+    path = write_machine(tmp_path / "nominal", MACHINES["6-UPS"](), layout)
+    joints = load_mechanism(path).urdf.joints
+    end, seat = (joints[f"leg1_{name}_frame"].T_parent_origin for name in ("end", "seat"))
+    T = end * seat.inv()
+    origin = " ".join(repr(float(x)) for x in T.translation)
+    angles = " ".join(repr(float(x)) for x in roll_pitch_yaw(T.rotation.as_matrix()))
+    urdf = path.with_suffix(".urdf")
+    head, tail = urdf.read_text().split('<joint name="leg1_end_frame"')
+    tail = re.sub("<origin [^>]*>", f'<origin xyz="{origin}" rpy="{angles}"/>', tail, count=1)
+    urdf.write_text(f'{head}<joint name="leg1_end_frame"{tail}')
+    path.write_text(path.read_text().replace("- leg1_seat", "- platform"))
+    _check(load_mechanism(path), tmp_path)
 
 
 def test_without_errors_the_urdf_is_the_nominal_one(tmp_path: Path) -> None:
