@@ -67,7 +67,7 @@ class Appearance:
     cables : int
         Thin cylinders that hang in front of the machine.
     table : bool
-        Whether the machine stands on a table.
+        Whether the machine stands on a table, for cameras above it.
     exposure : float
         Factor on all radiance before it saturates at full scale.
     blur : float

@@ -64,7 +64,8 @@ def draw_surroundings(
     """
     centre, radius = _around(placed)
     up = np.array([0.0, 0.0, 1.0])
-    floor = _table(placed, centre, radius, up) if appearance.table else ()
+    eye = T_base_camera.translation
+    floor = _table(placed, centre, radius, up, eye) if appearance.table else ()
     return Surroundings(
         centre=centre,
         radius=radius,
@@ -92,10 +93,12 @@ def _around(placed: Sequence[PlacedSolid]) -> tuple[Array, float]:
 
 
 def _table(
-    placed: Sequence[PlacedSolid], centre: Array, radius: float, up: Array
+    placed: Sequence[PlacedSolid], centre: Array, radius: float, up: Array, eye: Array
 ) -> tuple[PlacedSolid, ...]:
-    """Return a table right below the lowest solid."""
+    """Return a table right below the lowest solid; none where it would hide the machine."""
     lowest = min((_lowest(p, up) for p in placed), default=-radius)
+    if float(eye @ up) <= lowest:
+        return ()
     size = 4.0 * radius, 3.2 * radius, 0.06 * radius
     foot = centre + (lowest - float(centre @ up) - 0.5 * size[2]) * up
     T = RigidTransform.from_components(foot, Rotation.from_euler("z", 0.3))
