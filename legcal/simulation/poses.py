@@ -16,6 +16,8 @@ from legcal.mechanism.parameters import KinematicParameters
 from legcal.simulation.machine import Machine
 
 _ITERATIONS = 30
+_EXACT = 1e-14  # of the lengths
+_ON_THE_WAY = 1e-6
 _LARGEST_TURN = 0.3  # [rad] in one iteration
 _DAMPING = 1e-12  # keeps singular poses solvable, and is nothing beside others
 _SINGULAR = 0.1  # smallest singular value of the scaled Jacobian that a pose may have
@@ -262,7 +264,8 @@ def _followed(machine: Machine, lengths: Array, n_steps: int = 6) -> tuple[Array
     for part in np.linspace(0.0, 1.0, n_steps + 1)[1:]:
         here = np.flatnonzero(reached)
         wanted = first + part * (lengths[here] - first)
-        R_new, t_new, error = _newton(machine.parameters, wanted, R[here], t[here])
+        accuracy = _EXACT if part == 1.0 else _ON_THE_WAY
+        R_new, t_new, error = _newton(machine.parameters, wanted, R[here], t[here], accuracy)
         J = _jacobian(machine.parameters, R_new, t_new) / unit
         smallest = np.linalg.svd(J, compute_uv=False)[:, -1]
         well = (error == 0.0) & (smallest >= _SINGULAR)
@@ -272,11 +275,11 @@ def _followed(machine: Machine, lengths: Array, n_steps: int = 6) -> tuple[Array
 
 
 def _newton(
-    parameters: KinematicParameters, lengths: Array, R: Array, t: Array
+    parameters: KinematicParameters, lengths: Array, R: Array, t: Array, accuracy: float = _EXACT
 ) -> tuple[Array, Array, Array]:
     """Return R, t and the remaining error [m] of each pose; zero where Newton's method arrived."""
     R, t = R.copy(), t.copy()
-    tolerance = 1e-14 * lengths.max(axis=1, initial=0.0)
+    tolerance = accuracy * lengths.max(axis=1, initial=0.0)
     best = np.full(len(R), np.inf)
     active = np.arange(len(R))
     for _ in range(_ITERATIONS):
@@ -298,7 +301,7 @@ def _newton(
         t[active] += step[:, :3]
         turned = step[:, 3:] * np.minimum(1.0, _LARGEST_TURN / np.maximum(turn, 1e-300))
         R[active] = _turn(turned) @ R[active]
-    return Rotation.from_matrix(R).as_matrix() if len(R) else R, t, best
+    return R, t, best
 
 
 def _turn(w: Array) -> Array:

@@ -7,7 +7,7 @@ Hessian J'J (or leaves it the exact one) and refuses an answer that did not conv
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -69,21 +69,26 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
     """
     built = _built(problem.structure)
     scale = _scale(problem, built)
-    root_weight = np.ones(problem.n_residuals)
-    solution = _solve(problem, built, scale, np.zeros(len(problem.start)), root_weight)
     block = problem.block
-    if np.all(block < 0):
-        return solution
-    n_iterations = solution.n_iterations
-    for _ in range(_REWEIGHTINGS):
-        new = _cauchy_root_weights(solution.residuals / root_weight, block)
+    root_weight = np.ones(len(block))
+    found = _minimum(problem, built, scale, np.zeros(len(problem.start)), root_weight)
+    n_iterations = found.n_iterations
+    for _ in range(_REWEIGHTINGS if np.any(block >= 0) else 0):
+        new = _cauchy_root_weights(found.residuals, block)
         if np.max(np.abs(new - root_weight)) < _SETTLED:
             break
         root_weight = new
-        z = (solution.x - problem.start) / scale
-        solution = _solve(problem, built, scale, z, root_weight)
-        n_iterations += solution.n_iterations
-    return replace(solution, n_iterations=n_iterations)
+        found = _minimum(problem, built, scale, (found.x - problem.start) / scale, root_weight)
+        n_iterations += found.n_iterations
+    jacobian = _sparse(built.jacobian(found.x, problem.observed))
+    return Solution(
+        x=found.x,
+        residuals=root_weight * found.residuals,
+        jacobian=csc_array(diags_array(root_weight) @ jacobian),
+        n_shared=len(found.x) if problem.n_shared is None else problem.n_shared,
+        n_iterations=n_iterations,
+        status=found.status,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +136,20 @@ def _scale(problem: LeastSquares, built: _Built) -> Array:
     return scale
 
 
-def _solve(
+@dataclass(frozen=True, eq=False)
+class _Minimum:
+    """Where IPOPT ended with given weights, and the residuals there without them."""
+
+    x: Array
+    residuals: Array
+    n_iterations: int
+    status: str
+
+
+def _minimum(
     problem: LeastSquares, built: _Built, scale: Array, z: Array, root_weight: Array
-) -> Solution:
-    """Return the solution for given weights, or refuse."""
+) -> _Minimum:
+    """Return the minimum for given weights, or refuse."""
     observed = problem.observed
     parameter = np.concatenate([root_weight, problem.start, scale, observed])
     found = np.asarray(built.solver(x0=z, p=parameter)["x"].full()).ravel()
@@ -146,14 +161,8 @@ def _solve(
             "nominal model and the observations, or reject the ones with large residuals."
         )
     x = problem.start + scale * found
-    return Solution(
-        x=x,
-        residuals=root_weight * np.asarray(built.residuals(x, observed).full()).ravel(),
-        jacobian=csc_array(diags_array(root_weight) @ _sparse(built.jacobian(x, observed))),
-        n_shared=len(x) if problem.n_shared is None else problem.n_shared,
-        n_iterations=int(stats["iter_count"]),
-        status=str(stats["return_status"]),
-    )
+    residuals = np.asarray(built.residuals(x, observed).full()).ravel()
+    return _Minimum(x, residuals, int(stats["iter_count"]), str(stats["return_status"]))
 
 
 def _cauchy_root_weights(residuals: Array, block: IntArray) -> Array:
