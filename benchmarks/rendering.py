@@ -1,0 +1,91 @@
+"""How fast photographs are rendered: images a second of one core, with everything on.
+
+    OMP_NUM_THREADS=1 python benchmarks/rendering.py [IMAGES]
+
+1024 x 768, each shipped mechanism with balls, posts and plates on a table among 15 pieces of
+clutter, two lamps, soft shadows, limb darkening, highlights, lens distortion, blur, gamma and
+noise, a new pose for every image and one scene for all images of a view. Times are those of the
+processor: "scene" once a view, "image" the median and "png" the mean of writing it; the last column
+counts all three, 15 images a view.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.types import Array
+from legcal.mechanism.configurations import random_configurations
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.simulation.dressing import dressed
+from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.rendering.scene import prepare_scene
+from legcal.simulation.solids import PlacedSolid, link_poses, placed
+from legcal.vision.camera import Camera
+
+MODELS = Path(__file__).parents[1] / "models"
+CAMERA = Camera(
+    np.array([[1290.3, 0.0, 518.3], [0.0, 1290.3, 379.6], [0.0, 0.0, 1.0]]),
+    1024,
+    768,
+    np.array([-0.12, 0.05, 0.0005, -0.0003, 0.0]),
+)
+PER_VIEW = 15
+
+
+def looking_at(solids: tuple[PlacedSolid, ...]) -> RigidTransform:
+    """Return T_base_camera of a camera beside the machine, which fills its picture."""
+    points = np.array([p.T_base_solid.translation for p in solids])
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    away = np.array([0.8, 0.5, 0.35]) / np.linalg.norm([0.8, 0.5, 0.35])
+    x = np.cross(-away, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    turn = Rotation.from_matrix(np.column_stack([x, np.cross(-away, x), -away]))
+    distance = 4.2 * np.linalg.norm(points - centre, axis=1).max()
+    return RigidTransform.from_components(centre + distance * away, turn)
+
+
+def seconds(action: Callable[[], object]) -> float:
+    """Return the processor time of an action."""
+    begin = time.process_time()
+    action()
+    return time.process_time() - begin
+
+
+def measure(mechanism: Mechanism, n: int) -> str:
+    """Return the times of a mechanism as a line of the table."""
+    configurations: Array = random_configurations(mechanism, n, 1).configurations
+    solids = dressed(mechanism)
+    poses = [placed(solids, link_poses(mechanism, q)) for q in configurations]
+    T = looking_at(poses[0])
+    prepare_scene(poses[0], CAMERA, T, Appearance(), np.random.default_rng(0))  # loads and caches
+    rng = np.random.default_rng(0)
+    begin = time.process_time()
+    scene = prepare_scene(poses[0], CAMERA, T, Appearance(), rng)
+    preparing = time.process_time() - begin
+    rendering, images = [], []
+    for pose in poses:
+        rendering.append(seconds(lambda pose=pose: images.append(scene.render(pose, rng))))  # type: ignore[misc]
+    with TemporaryDirectory() as folder:
+        png = Path(folder) / "image.png"
+        writing = [seconds(lambda i=i: cv2.imwrite(str(png), i)) for i in images]  # type: ignore[misc]
+    image, write = float(np.median(rendering)), float(np.mean(writing))
+    rate = PER_VIEW / (preparing + PER_VIEW * (image + write))
+    return f"{len(solids):6d}{1e3 * preparing:9.0f}{1e3 * image:9.0f}{1e3 * write:9.0f}{rate:9.2f}"
+
+
+def main(n: int = 15) -> None:
+    """Print a line a model."""
+    print(f"{'[ms]':16}{'solids':>6}{'scene':>9}{'image':>9}{'png':>9}{'images/s':>9}")
+    for path in sorted(MODELS.glob("*.yaml")):
+        print(f"{path.stem:16}{measure(load_mechanism(path), n)}", flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
