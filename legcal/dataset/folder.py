@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.dataset.entry import DatasetEntry, ViewEntry
+from legcal.dataset.given_axes import AXES_NAME, read_given_axes, rows_without_axes
 from legcal.dataset.measurement_table import read_measurements
 from legcal.errors import DatasetError
 from legcal.files.inside import path_problem
@@ -16,8 +17,7 @@ from legcal.geometry.types import Image
 from legcal.mechanism.files import DATASET_YAML, shipped_folders, shipped_names
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.observations.axes_file import read_axes
-from legcal.observations.leg_axes import LegAxes, choose_axes
+from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
 from legcal.observations.table import read_observations
@@ -26,7 +26,6 @@ from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import image_problem, read_image
 
 OBSERVATIONS_NAME = "observations.csv"
-AXES_NAME = "axes.csv"
 CACHE_NAME = ".legcal-cache.json"
 
 
@@ -177,7 +176,12 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     measurements, notes = read_measurements(
         table_path, folder, views, mechanism.legs, entry.encoder_sigma
     )
-    axes, left_out = _read_axes(folder, mechanism, measurements)
+    if os.path.exists(folder / AXES_NAME) and os.path.exists(folder / OBSERVATIONS_NAME):
+        raise DatasetError(
+            f"{folder}: the observations could not be read: found {AXES_NAME} and "
+            f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
+        )
+    axes, left_out = read_given_axes(folder / AXES_NAME, mechanism.leg_names, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
@@ -280,35 +284,6 @@ def _read_outlines(
     return read_observations(path, mechanism.legs, measurements, skip_stale=is_own)
 
 
-def _read_axes(
-    folder: Path, mechanism: Mechanism, measurements: Measurements
-) -> tuple[LegAxes | None, list[str]]:
-    """Return the axes beside the dataset, if there are any, and a note about those not used."""
-    path = folder / AXES_NAME
-    if not os.path.exists(path):
-        return None, []
-    if os.path.exists(folder / OBSERVATIONS_NAME):
-        raise DatasetError(
-            f"{folder}: the observations could not be read: found {AXES_NAME} and "
-            f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
-        )
-    axes = read_axes(path, mechanism.leg_names, measurements)
-    views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
-    names = [mechanism.leg_names[leg] for leg in axes.leg.tolist()]
-    wanted = [
-        view.legs is None or name in view.legs for view, name in zip(views, names, strict=True)
-    ]
-    used = np.flatnonzero(wanted)
-    if len(used) == 0:
-        raise DatasetError(
-            f"{path}: the axes could not be used: found only legs that their views leave out, "
-            f"needed the legs that {DATASET_YAML} names; correct its legs or the table."
-        )
-    left_out = len(axes) - len(used)
-    note = f"{path}: {left_out} axes of legs that their views leave out are not used."
-    return choose_axes(axes, used), [note] if left_out else []
-
-
 def _unused_views(path: Path, measurements: Measurements) -> list[str]:
     """Return a note for each view without a row."""
     return [
@@ -321,7 +296,7 @@ def _unused_views(path: Path, measurements: Measurements) -> list[str]:
 def _row_problems(dataset: Dataset) -> list[str]:
     """Return the rows that neither an image nor outlines nor axes make usable."""
     if dataset.axes is not None:
-        return _rows_without_axes(dataset, dataset.axes)
+        return rows_without_axes(dataset.table_path, dataset.measurements, dataset.axes)
     outlines = dataset.observations
     given = set() if outlines is None else set(outlines.row.tolist())
     problems = []
@@ -337,13 +312,3 @@ def _row_problems(dataset: Dataset) -> list[str]:
             found = dataset.image_problem(row)
             problems += [found] if found else []
     return problems
-
-
-def _rows_without_axes(dataset: Dataset, axes: LegAxes) -> list[str]:
-    """Return the rows of a dataset with a table of axes that it says nothing of."""
-    blank = np.setdiff1d(np.arange(dataset.measurements.n_rows), axes.row).tolist()
-    return [
-        f"{dataset.table_path}, row {row + 1}: the row could not be used: found no axis of it in "
-        f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row."
-        for row in blank
-    ]
