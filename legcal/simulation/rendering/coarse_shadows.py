@@ -8,7 +8,6 @@ from legcal.simulation.rendering.rays import PixelRays, Single
 from legcal.simulation.rendering.shadows import Lamp, Occluders, seen_of_lamp
 
 _STEP = 4  # [px] between traced pixels
-_BLOCK = 16  # traced pixels along a side of a block: points near each other have few occluders
 
 
 def seen_coarsely(
@@ -40,8 +39,6 @@ def seen_coarsely(
     half = _STEP // 2
     traced = np.flatnonzero((rows % _STEP == half) & (columns % _STEP == half))
     i, j = rows[traced] // _STEP, columns[traced] // _STEP
-    order = np.argsort((i // _BLOCK) * rays.width + j // _BLOCK, kind="stable")
-    traced, i, j = traced[order], i[order], j[order]
     x, y, depth = rays.x[pixels[traced]], rays.y[pixels[traced]], z[traced]
     P = np.stack([x * depth, y * depth, depth])
     shape = -(-rays.height // _STEP), -(-rays.width // _STEP)

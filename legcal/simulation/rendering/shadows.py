@@ -1,6 +1,6 @@
 """Shadows of round lamps: how much of a lamp is seen from a point."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,8 @@ from legcal.simulation.shapes import Box, Cylinder, Sphere
 
 _TINY = 1e-12
 _SMALLEST = 1e-5  # [m] half-shadow of a point-like lamp
-_CHUNK = 1024  # points at a time
-_BALLS = 24
+_CHUNK = 2048  # points at a time
+_SPARE = 1e-4  # [m] for rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Lamp:
 
 
 class Occluders:
-    """Solids that stand between points and lamps, each held by a segment with a distance around it.
+    """Solids that stand between points and lamps: long ones around a line, others in a ball.
 
     Parameters
     ----------
@@ -49,37 +49,44 @@ class Occluders:
     """
 
     def __init__(self, solids: Sequence[SolidInView]) -> None:
+        long = [isinstance(s.shape, Cylinder) and s.shape.length > s.shape.radius for s in solids]
+        self._lines = [i for i, is_long in enumerate(long) if is_long]
+        self._balls = [i for i, is_long in enumerate(long) if not is_long]
         self.solids = tuple(solids)
-        self._centre = np.array([s.centre for s in solids]).reshape(-1, 3)
-        self._u = np.array([s.R[:, 2] for s in solids]).reshape(-1, 3)
-        self._half = np.zeros(len(solids))
-        self._around = np.array([s.reach for s in solids])
-        for i, solid in enumerate(solids):
-            shape = solid.shape
-            if isinstance(shape, Cylinder) and shape.length > shape.radius:
-                self._half[i], self._around[i] = 0.5 * shape.length, shape.radius
+        self._u = np.array([solids[i].R[:, 2] for i in self._lines]).reshape(-1, 3)
+        self._w = np.array([solids[i].w for i in self._lines]).reshape(-1, 3)
+        self._radius = np.array([s.shape.radius if isinstance(s.shape, Cylinder) else 0.0
+                                 for s in (solids[i] for i in self._lines)])  # fmt: skip
+        self._centre = np.array([solids[i].centre for i in self._balls]).reshape(-1, 3)
+        self._reach = np.array([solids[i].reach for i in self._balls])
 
-    def between(self, lamp: Lamp, P: Single) -> IntArray:
-        """Return which solids may hide a lamp from any of some points, by balls along the way.
+    def near(self, lamp: Lamp, to_lamp: Single) -> Iterator[tuple[int, IntArray]]:
+        """Yield solids with the points whose way to a lamp passes near them.
+
+        The way l from a point to the lamp at O passes the line (u, w) at the distance
+        l . (u x (O - w)) / |l x u|, and the ball about c at |l x (O - c)| / |l|.
 
         Parameters
         ----------
         lamp : Lamp
             The lamp.
-        P : (3, n) array
-            Points in the camera frame [m].
+        to_lamp : (3, n) array
+            From the points to the lamp [m].
         """
-        low, high = P.min(axis=1).astype(np.float64), P.max(axis=1).astype(np.float64)
-        middle, reach = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-        t = np.linspace(0.0, 1.0, _BALLS)[:, None]
-        way = middle + t * (lamp.position - middle)
-        step = float(np.linalg.norm(lamp.position - middle)) / (_BALLS - 1)
-        radii = reach + t * (lamp.radius - reach) + 0.5 * step
-        away = way[:, None] - self._centre
-        along = np.clip(np.einsum("bsi,si->bs", away, self._u), -self._half, self._half)
-        away -= along[..., None] * self._u
-        near = np.einsum("bsi,bsi->bs", away, away) < (radii + self._around) ** 2
-        return np.flatnonzero(near.any(axis=0))
+        l2 = np.einsum("in,in->n", to_lamp, to_lamp)
+        spare = lamp.radius + _SPARE
+        moment = np.cross(self._u, lamp.position - self._w).astype(np.float32) @ to_lamp
+        along = self._u.astype(np.float32) @ to_lamp
+        limit = ((self._radius + spare) ** 2).astype(np.float32)[:, None]
+        close = moment * moment < limit * (l2 - along * along + np.float32(1e-6) * l2)
+        for row in np.flatnonzero(close.any(axis=1)):
+            yield self._lines[row], np.flatnonzero(close[row])
+        away = lamp.position - self._centre
+        along = away.astype(np.float32) @ to_lamp
+        rest = np.sum(away**2, axis=1) - (self._reach + spare) ** 2
+        close = rest.astype(np.float32)[:, None] * l2 < along * along
+        for row in np.flatnonzero(close.any(axis=1)):
+            yield self._balls[row], np.flatnonzero(close[row])
 
 
 def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: int | None = None) -> Single:
@@ -93,7 +100,7 @@ def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: int | None = 
     lamp : Lamp
         The lamp.
     P : (3, n) array
-        Points in the camera frame, neighbours near each other [m].
+        Points in the camera frame [m].
     occluders : Occluders
         What may stand between.
     own : int, optional
@@ -102,12 +109,12 @@ def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: int | None = 
     seen = np.ones(P.shape[1], dtype=np.float32)
     position = lamp.position.astype(np.float32)[:, None]
     for start in range(0, P.shape[1], _CHUNK):
-        piece = slice(start, start + _CHUNK)
-        points = P[:, piece]
+        points = P[:, start : start + _CHUNK]
         to_lamp = position - points
-        for i in occluders.between(lamp, points):
+        for i, some in occluders.near(lamp, to_lamp):
             if i != own:
-                seen[piece] *= _past(occluders.solids[i], lamp, points, to_lamp)
+                share = _past(occluders.solids[i], lamp, points[:, some], to_lamp[:, some])
+                seen[start + some] *= share
     return seen
 
 

@@ -39,14 +39,14 @@ class SolidInView:
 
 def in_view(solids: Sequence[PlacedSolid], T_camera_base: RigidTransform) -> list[SolidInView]:
     """Return solids in the frame of a camera."""
+    if not solids:
+        return []
+    motions = np.stack([placed.T_base_solid.as_matrix() for placed in solids])
     found = []
-    for placed in solids:
-        T = T_camera_base * placed.T_base_solid
-        R, w = T.rotation.as_matrix(), np.array(T.translation)
-        middle, reach = holding_sphere(placed.solid.shape)
-        found.append(
-            SolidInView(placed.solid.shape, placed.solid.material, R, w, R @ middle + w, reach)
-        )
+    for placed, T in zip(solids, T_camera_base.as_matrix() @ motions, strict=True):
+        shape, R, w = placed.solid.shape, T[:3, :3], T[:3, 3]
+        middle, reach = holding_sphere(shape)
+        found.append(SolidInView(shape, placed.solid.material, R, w, R @ middle + w, reach))
     return found
 
 
