@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from layouts import Layout, LegLayout, LegSpec, Machine, write_machine
 from machines import MACHINES, ring
@@ -23,6 +24,8 @@ from legcal.mechanism.parametrization import geometries, in_links, parametrizati
 from legcal.simulation import truth
 from legcal.simulation.errors import Distribution, ParameterErrors, Spread, draw_errors
 from legcal.simulation.motion import draw_poses
+from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.simulate import simulate
 from legcal.simulation.truth import write_true_model
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -240,3 +243,17 @@ def test_a_machine_without_enough_motors_gets_a_true_model_and_poses(tmp_path: P
     true = _check(nominal, tmp_path / "true")
     poses = draw_poses(true, 8, np.random.default_rng(0))
     assert np.ptp(poses.readings, axis=0).min() > 0.02
+
+
+def test_meshes_beside_the_nominal_urdf_are_seen_on_the_true_machine(tmp_path: Path) -> None:
+    mesh = '<visual><geometry><mesh filename="meshes/plate.stl"/></geometry></visual>'
+    for kind, suffix in (("models", "yaml"), ("urdf", "urdf")):
+        (tmp_path / kind).mkdir()
+        text = (ROOT / kind / f"3-rps.{suffix}").read_text()
+        text = text.replace('<link name="platform"/>', f'<link name="platform">{mesh}</link>')
+        (tmp_path / kind / f"3-rps.{suffix}").write_text(text)
+    (tmp_path / "urdf" / "meshes").mkdir()
+    trimesh.creation.box((0.1, 0.1, 0.02)).export(tmp_path / "urdf" / "meshes" / "plate.stl")
+    settings = SimulationSettings(level=Level.OUTLINES, poses=1, views=1)
+    simulate(tmp_path / "models" / "3-rps.yaml", tmp_path / "seen", settings)
+    assert (tmp_path / "seen" / "observations.csv").exists()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -136,7 +136,7 @@ def simulate(
     with dataset_folder(destination, force=force) as folder:
         yaml_path, _ = write_model(nominal, folder)
         truth = write_true_model(nominal, settings.errors, chance["errors"], folder / TRUTH)
-        session = _session(truth, settings, chance, progress)
+        session = _session(truth, nominal.urdf.path, settings, chance, progress)
         m = _measurements(session, settings, chance)
         write_session(folder, nominal, yaml_path.relative_to(folder).as_posix(), m)
         _write_observations(folder, session, m, settings, chance)
@@ -183,6 +183,7 @@ def _streams(seed: int) -> dict[str, np.random.Generator]:
 
 def _session(
     truth: Mechanism,
+    meshes_from: Path,
     settings: SimulationSettings,
     chance: dict[str, np.random.Generator],
     progress: Report,
@@ -199,7 +200,9 @@ def _session(
         n_poses = settings.poses * (1 if shared else n_views)
         poses = draw_poses(truth, n_poses, chance["poses"], settings.sampling)
     progress("Poses", 1, 1)
-    machines = pose_machine(truth, dressed(truth), poses)
+    # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
+    shown = replace(truth, urdf=replace(truth.urdf, path=meshes_from))
+    machines = pose_machine(truth, dressed(shown), poses)
     progress("Cameras", 0, 1)
     if given is None:
         places = places_around(truth, machines, [camera] * n_views, chance["cameras"])
