@@ -29,6 +29,7 @@ from legcal.studies.eq20 import (
 from legcal.studies.paper import PaperStudy
 from legcal.studies.runner import StudyResult, run_study
 from legcal.studies.truths import coplanar_hexapod, noncoplanar_hexapod
+from legcal.studies.workers import child_seed
 
 N_RUNS = 3
 
@@ -149,6 +150,11 @@ def test_steps_as_printed_spoil_z_of_coplanar_joints_and_the_fit_is_near_the_bou
         ratio = np.divide(rows["fit", coplanar]["parameters_mm"], bound["parameters_mm"])
         assert 0.6 < ratio.mean() < 1.5
         assert rows["default", coplanar]["dX_mm"] > bound["dX_mm"]
+
+
+def test_a_run_does_not_depend_on_those_before_it(result: tuple[StudyResult, Path]) -> None:
+    lines = (result[1] / "runs.jsonl").read_text().splitlines()
+    assert {"run": 1, "record": PaperStudy().one_run(child_seed(0, 1))} == json.loads(lines[2])
 
 
 def test_more_images_of_a_pose_lower_the_bound() -> None:

@@ -99,10 +99,11 @@ def test_a_checkpoint_that_was_hardly_begun_is_begun_again(tmp_path: Path) -> No
     assert run_study(Draws(), 3, output=tmp_path).document() == expected
 
 
-def test_a_damaged_line_inside_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damaged", [b'{"run":1,\n', b"[1]\n", b'{"run":1}\n', b'{"record":{}}\n'])
+def test_a_damaged_line_inside_is_refused(tmp_path: Path, damaged: bytes) -> None:
     run_study(Draws(), 5, output=tmp_path)
     lines = _lines(tmp_path)
-    lines[2] = lines[2][:9] + b"\n"
+    lines[2] = damaged
     (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join(lines))
     with pytest.raises(UsageError, match="found line 3 damaged"):
         run_study(Draws(), 5, output=tmp_path)
@@ -134,8 +135,9 @@ def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(tmp_path: Path)
         run_study(Draws(), 5, output=tmp_path)
     with pytest.raises(UsageError, match="a file of that name"):
         run_study(Draws(), 5, output=tmp_path / "notes.txt")
-    with pytest.raises(UsageError, match="could not be written"):
-        run_study(Draws(), 5, output=tmp_path / "notes.txt" / "below")
+    for impossible in (tmp_path / "notes.txt" / "below", tmp_path / ("long" * 100)):
+        with pytest.raises(UsageError, match="needed a folder that can be created and read"):
+            run_study(Draws(), 5, output=impossible)
     (tmp_path / CHECKPOINT_NAME).write_text("mine\n")
     with pytest.raises(UsageError, match="no checkpoint of legcal"):
         run_study(Draws(), 5, output=tmp_path)

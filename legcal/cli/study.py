@@ -57,4 +57,8 @@ def study(
     if as_json:
         print_json(result.document())
     else:
-        print_table(result.summary.table())
+        from rich.console import Group
+        from rich.text import Text
+
+        where = [Text(f"\nRuns, document and figures: {output}")] if output is not None else []
+        print_table(Group(result.summary.table(), *where))

@@ -160,10 +160,11 @@ def _run_of(line: bytes) -> int | None:
     if not line.endswith(b"\n"):
         return None
     try:
-        run = json.loads(line)["run"]
-    except (ValueError, KeyError, TypeError):
+        found = json.loads(line)
+    except (ValueError, RecursionError):
         return None
-    return run if isinstance(run, int) else None
+    whole = isinstance(found, dict) and isinstance(found.get("run"), int)
+    return found["run"] if whole and ("record" in found or "failure" in found) else None
 
 
 def _check_header(path: Path, line: bytes, expected: dict[str, Any]) -> None:

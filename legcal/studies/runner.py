@@ -165,13 +165,13 @@ def _folder(output: Path | None) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
             yield Path(folder)
         return
-    _check_folder(output)
     try:
+        _check_folder(output)
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(
-            f"{output}: the study could not be written: found '{error.strerror}', needed a path "
-            "that can be created; give another output folder."
+            f"{output}: the study could not be written: found '{error.strerror}', needed a folder "
+            "that can be created and read; give another output folder."
         ) from error
     yield output
 
