@@ -62,7 +62,7 @@ def places_around(
     """
     reached = _reached(machines)
     tried = [machines[i] for i in np.unique(np.linspace(0, len(machines) - 1, _TRIED).astype(int))]
-    up = _up(mechanism, machines)
+    up = _up(mechanism)
     sector = 2.0 * np.pi / len(cameras)
     first = rng.uniform(0.0, 2.0 * np.pi)
     lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
@@ -81,15 +81,14 @@ def places_around(
     return tuple(found)
 
 
-def _up(mechanism: Mechanism, machines: Sequence[PosedMachine]) -> Array:
-    """Return the direction from base to platform, or the normal of the plane of motion."""
+def _up(mechanism: Mechanism) -> Array:
+    """Return the direction from base to platform at home, or the normal of the plane of motion."""
     if mechanism.base_normal is not None:
         return mechanism.base_normal
-    across = np.mean(
-        [machine.B.mean(axis=0) - machine.A.mean(axis=0) for machine in machines], axis=0
-    )
+    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
+    across = (B - A).mean(axis=0)
     size = float(np.linalg.norm(across))
-    reach = float(np.ptp(machines[0].A, axis=0).max())
+    reach = float(np.ptp(A, axis=0).max())
     return np.asarray(across / size) if size > 1e-3 * reach else np.array([0.0, 0.0, 1.0])
 
 

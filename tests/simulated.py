@@ -1,0 +1,41 @@
+"""Small simulated datasets for tests."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from legcal.geometry.types import Array
+from legcal.simulation.settings import Level, SimulationSettings
+from legcal.vision.camera import Camera
+from legcal.vision.camera_writer import camera_info
+
+SMALL = SimulationSettings(level=Level.OUTLINES, poses=3, views=2, seed=5)
+
+
+def small_camera(folder: Path, width: int = 200, height: int = 150) -> Path:
+    """Write the file of a camera for small, quick photographs."""
+    K = np.array([[1.25 * width, 0.0, 0.5 * width], [0.0, 1.25 * width, 0.5 * height], [0, 0, 1.0]])
+    path = folder / "small.yaml"
+    path.write_text(camera_info(Camera(K, width, height), "small"))
+    return path
+
+
+def settings(**changes: object) -> SimulationSettings:
+    """Return settings of a small dataset with some of them changed."""
+    return replace(SMALL, **changes)  # type: ignore[arg-type]
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return all files of a folder with their content."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def distances_to_lines(h: Array, xy: Array) -> Array:
+    """Return how far points (n, 2, 2) of the sensor plane are from lines (n, 3) there."""
+    value = np.sum(h[:, None, :2] * xy, axis=-1) + h[:, None, 2]
+    return np.asarray(value / np.linalg.norm(h[:, None, :2], axis=-1))
