@@ -47,7 +47,7 @@ ALL = ParameterErrors(
     axes=Spread(0.01),
     twists=Spread(0.01),
 )
-N = 200  # draws of errors
+N = 140  # draws of errors
 ORIGIN = re.compile(rb'(<origin xyz=")[^"]*(" rpy=")[^"]*(")')
 
 
@@ -174,11 +174,11 @@ def test_errors_have_the_size_and_distribution_that_was_asked_for() -> None:
         is_normal = ".platform." in name
         sd = size if is_normal else size / np.sqrt(3.0)
         assert abs(column.mean()) < 4.0 * sd / np.sqrt(N)
-        assert abs(column.std() / sd - 1.0) < 0.25
+        assert abs(column.std() / sd - 1.0) < 0.3
         assert (np.abs(column).max() > 1.8 * size) == is_normal
         assert is_normal or np.abs(column).max() < size * (1.0 + 1e-9)
     correlation = np.corrcoef(found.T) - np.eye(len(names))
-    assert np.abs(correlation).max() < 0.35
+    assert np.abs(correlation).max() < 0.45
 
 
 def test_errors_of_one_kind_do_not_depend_on_those_of_another() -> None:
