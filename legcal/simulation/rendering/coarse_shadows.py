@@ -16,7 +16,7 @@ def seen_coarsely(
     pixels: IntArray,
     z: Single,
     occluders: Occluders,
-    own: int | None = None,
+    own: int = -1,
 ) -> Single:
     """Return the share of a lamp that a large surface sees, (n,).
 

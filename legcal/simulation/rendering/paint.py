@@ -8,19 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legcal.geometry.types import BoolArray, IntArray
-from legcal.simulation.rendering.coarse_shadows import seen_coarsely
 from legcal.simulation.rendering.footprint import footprint
 from legcal.simulation.rendering.intersect import intersect
+from legcal.simulation.rendering.parts import Part, shares_of_lamps
 from legcal.simulation.rendering.rays import PixelRays, Single
-from legcal.simulation.rendering.shading import Lighting, Shaded, shade
-from legcal.simulation.rendering.shadows import Occluders, seen_of_lamp
+from legcal.simulation.rendering.shading import Lighting, shade
+from legcal.simulation.rendering.shadows import Occluders
 from legcal.simulation.rendering.solid_in_view import SolidInView
 from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
 
 _TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
 _THIN = 3.0  # [px] solids that rays through pixel centres may miss
 _PIXELS = 6144  # on edges, at a time
-_LARGE = 20_000  # pixels of a solid from which its shadows are traced coarsely
 _FACES = 8  # that are told apart in the search for edges
 
 
@@ -76,14 +75,17 @@ class Painter:
         key, face = self._first_hits(canvas.z, solids, feet)
         edge = self._edges(key, solids, feet)
         on_edge = np.flatnonzero(edge)
+        parts = []
         for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
             inside = foot[(key[foot] // _FACES == i + 1) & ~edge[foot]]
             if len(inside):
                 x, y = self.rays.x[inside], self.rays.y[inside]
                 shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light)
-                seen = self._seen_inside(shaded, inside, occluders, i)
-                canvas.terms[:, :, inside] = _terms(shaded, seen, len(canvas.terms))
-        del key, face
+                parts.append(Part(i, inside, shaded))
+        seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
+        for part, shares in zip(parts, seen, strict=True):
+            canvas.terms[:, :, part.pixels] = part.radiance(shares, len(canvas.terms))
+        del key, face, parts, seen
         for start in range(0, len(on_edge), _PIXELS):
             pixels = on_edge[start : start + _PIXELS]
             self._paint_edge(canvas, pixels, behind[pixels], solids, feet, occluders)
@@ -150,63 +152,19 @@ class Painter:
                 touched.append((i, here))
         uncovered = np.count_nonzero(who.reshape(n, S) == 0, axis=1) / S
         total = canvas.terms[:, :, pixels] * uncovered.astype(np.float32)
+        parts = []
         for i, here in touched:
             at = here[who[here] == i + 1]
-            if not len(at):
-                continue
-            shaded = shade(solids[i], X[at], Y[at], Z[at], faces[at], self.light)
-            row = at // S
-            first = np.flatnonzero(np.diff(row, prepend=-1))
-            seen = self._seen_on_edge(shaded, first, occluders, i)
-            sums = np.add.reduceat(_terms(shaded, seen, len(canvas.terms)), first, axis=-1)
-            total[:, :, row[first]] += sums * np.float32(1.0 / S)
+            if len(at):
+                shaded = shade(solids[i], X[at], Y[at], Z[at], faces[at], self.light)
+                row = at // S
+                first = np.flatnonzero(np.diff(row, prepend=-1))
+                parts.append(Part(i, row[first], shaded, first))
+        seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
+        for part, shares in zip(parts, seen, strict=True):
+            light = part.radiance(shares, len(canvas.terms))
+            total[:, :, part.pixels] += light * np.float32(1.0 / S)
         canvas.terms[:, :, pixels] = total
-
-    def _seen_inside(
-        self, shaded: Shaded, pixels: IntArray, occluders: Occluders, own: int
-    ) -> list[Single | None]:
-        """Return the share of each lamp that pixels of a solid see; None for all of it."""
-        found: list[Single | None] = []
-        for lamp, faces in zip(self.light.lamps, shaded.faces_lamp, strict=True):
-            if not lamp.shadows:
-                found.append(None)
-                continue
-            seen = np.ones(len(faces), dtype=np.float32)
-            facing = np.flatnonzero(faces)
-            P = shaded.P[:, facing]
-            if len(facing) > _LARGE:
-                seen[facing] = seen_coarsely(lamp, self.rays, pixels[facing], P[2], occluders, own)
-            else:
-                seen[facing] = seen_of_lamp(lamp, P, occluders, own)
-            found.append(seen)
-        return found
-
-    def _seen_on_edge(
-        self, shaded: Shaded, first: IntArray, occluders: Occluders, own: int
-    ) -> list[Single | None]:
-        """Return the same for rays in groups, one group a pixel, from its first ray."""
-        found: list[Single | None] = []
-        sizes = np.diff(first, append=shaded.P.shape[1])
-        for lamp, faces in zip(self.light.lamps, shaded.faces_lamp, strict=True):
-            if not lamp.shadows:
-                found.append(None)
-                continue
-            lit = np.flatnonzero(np.logical_or.reduceat(faces, first))
-            seen = np.ones(len(first), dtype=np.float32)
-            seen[lit] = seen_of_lamp(lamp, shaded.P[:, first[lit]], occluders, own)
-            found.append(np.repeat(seen, sizes))
-        return found
-
-
-def _terms(shaded: Shaded, seen: Sequence[Single | None], n_terms: int) -> Single:
-    """Return the radiance of points with their shadows, summed if there is one term only."""
-    lit = [
-        light if share is None else light * share
-        for light, share in zip(shaded.of_lamp, seen, strict=True)
-    ]
-    if n_terms == 1:
-        return np.asarray(sum(lit, shaded.fixed)[None])
-    return np.stack([shaded.fixed, *lit])
 
 
 def _thickness(solid: SolidInView) -> float:

@@ -13,7 +13,7 @@ from legcal.simulation.shapes import Box, Cylinder, Sphere
 
 _TINY = 1e-12
 _SMALLEST = 1e-5  # [m] half-shadow of a point-like lamp
-_CHUNK = 2048  # points at a time
+_CHUNK = 8192  # points at a time
 _SPARE = 1e-4  # [m] for rounding
 
 
@@ -89,7 +89,7 @@ class Occluders:
             yield self._balls[row], np.flatnonzero(close[row])
 
 
-def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: int | None = None) -> Single:
+def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: IntArray | int = -1) -> Single:
     """Return the share of a lamp that is seen from points past solids, (n,).
 
     The half-shadow is that of a straight edge: it goes smoothly from none to all over the
@@ -103,16 +103,19 @@ def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: int | None = 
         Points in the camera frame [m].
     occluders : Occluders
         What may stand between.
-    own : int, optional
+    own : int or (n,) array of int, optional
         The solid that the points are on, which does not shade itself.
     """
     seen = np.ones(P.shape[1], dtype=np.float32)
+    own = np.broadcast_to(own, seen.shape)
     position = lamp.position.astype(np.float32)[:, None]
     for start in range(0, P.shape[1], _CHUNK):
         points = P[:, start : start + _CHUNK]
         to_lamp = position - points
+        owners = own[start : start + _CHUNK]
         for i, some in occluders.near(lamp, to_lamp):
-            if i != own:
+            some = some[owners[some] != i]
+            if len(some):
                 share = _past(occluders.solids[i], lamp, points[:, some], to_lamp[:, some])
                 seen[start + some] *= share
     return seen
