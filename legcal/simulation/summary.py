@@ -60,4 +60,4 @@ def summary_table(made: SimulatedDataset) -> RenderableType:
         f"the true model: {made.truth_path}",
         f"calibrate with: legcal calibrate {made.folder} -o OUT",
     ]
-    return Group(heading, Text(), table, Text(), *(Text(s, overflow="ignore") for s in lines))
+    return Group(heading, Text(), table, Text(), *(Text(s, overflow="fold") for s in lines))

@@ -1,0 +1,263 @@
+"""``legcal simulate``: what it prints, and everything that it refuses, with nothing lost."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from simulated import files_of, settings
+
+from legcal import cli
+from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.simulation.errors import ParameterErrors, Spread
+from legcal.simulation.folder import TRUTH_NAME
+from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.simulate import simulate
+from legcal.simulation.table_noise import TableNoise
+
+QUICK = ("--level", "outlines", "--poses", "1", "--views", "1")
+LOOKING_AWAY = "{xyz: [1.5, 0.0, 0.2], quat_xyzw: [0.5, 0.5, 0.5, 0.5]}"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["legcal", "simulate", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert isinstance(stop.value.code, int)
+    return stop.value.code
+
+
+def test_one_command_writes_a_dataset_and_says_what_it_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *QUICK) == 0
+    printed = capsys.readouterr()
+    assert "hexapod: outlines, 1 images of 1 poses" in printed.out
+    assert f"{tmp_path}/sim/truth/models/hexapod.yaml" in printed.out.replace("\n", "")
+    assert "Cameras: 1/1" in printed.err
+    assert (tmp_path / "sim" / "observations.csv").exists()
+
+
+def test_json_is_one_document(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--error", "joints=1mm:normal", "--error", "axes=0.2deg", "--pixel-noise", "0.2px")
+    assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *QUICK, *words, "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["images"] == 1
+    assert document["views"]["c1"]["images"] == 1
+    assert set(document["views"]["c1"]["legs"]) == {f"leg{j}" for j in range(1, 7)}
+    truth = json.loads((tmp_path / "sim" / TRUTH_NAME).read_text())
+    errors = truth["settings"]["errors"]
+    assert errors["base_joints"] == {"size": 1e-3, "distribution": "normal"}
+    assert errors["offsets"] == {"size": 2e-3, "distribution": "uniform"}  # the default stays
+    assert truth["settings"]["sigma_px"] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--images", "0"), "found 0 images, needed a whole number from 1"),
+        (("--poses", "0"), "found 0 poses"),
+        (("--poses", "-3"), "needed a whole number"),
+        (("--poses", "1.5"), "needed a whole number"),
+        (("--views", "0"), "found 0 views"),
+        (("--seed", "-1"), "found the seed -1"),
+        (("--pixel-noise", "-0.1px"), "--pixel-noise could not be used: found the negative"),
+        (("--pixel-noise", "0.1"), "needed a number and its unit (px)"),
+        (("--encoder-noise", "-2um"), "--encoder-noise could not be used: found the negative"),
+        (("--encoder-noise", "2um:gauss"), "found the distribution 'gauss'"),
+        (("--error", "joints=-2mm"), "--error joints could not be used: found the negative"),
+        (("--error", "joints=0.1deg"), "needed a number and its unit (mm, um"),
+        (("--error", "axes=2mm"), "needed a number and its unit (deg"),
+        (("--error", "joint=2mm"), "did you mean 'joints'?"),
+        (("--error", "2mm"), "needed KIND=SIZE"),
+        (("--views", "2", "--cameras", "c.yaml"), "found both --views and --cameras"),
+        (("--poses", "p.csv", "--own-poses"), "found --own-poses with a file of poses"),
+        (("--camera", "none.yaml"), "none.yaml: the camera file could not be read"),
+        (("--cameras", "none.yaml"), "none.yaml: the cameras file could not be read"),
+        (("--appearance", "none.yaml"), "none.yaml: the appearance file could not be read"),
+        (("--poses", "none.csv"), "none.csv"),
+        (("--bits", "12"), "found bits = 12, needed one of 8, 16"),
+        (("--blur", "-1"), "found blur = -1"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_sentence_and_nothing_is_written(
+    words: tuple[str, ...],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, "hexapod", "-o", "sim", *words) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("legcal: ")
+    assert message in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("blurr: 1\n", "blurr could not be used: found an unknown key; did you mean 'blur'?"),
+        ("blur: many\n", "blur could not be read: found 'many', needed a number"),
+        ("blur: -1\n", "found blur = -1"),
+        ("lights: [{strength: 1}]\n", "lights.0.direction could not be read"),
+        ("[1]\n", "needed 'key: value' lines"),
+    ],
+)
+def test_a_wrong_appearance_file_is_refused(
+    text: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "look.yaml"
+    path.write_text(text)
+    words = ("--appearance", str(path))
+    assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *words) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "sim").exists()
+
+
+def test_an_appearance_file_is_used_and_options_go_over_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "look.yaml"
+    path.write_text("blur: 0.8\nclutter: 3\nlights:\n  - {direction: [0, 0, 1], strength: 0.5}\n")
+    words = ("--appearance", str(path), "--clutter", "7")
+    assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *QUICK, *words) == 0
+    look = json.loads((tmp_path / "sim" / TRUTH_NAME).read_text())["settings"]["appearance"]
+    assert (look["blur"], look["clutter"], len(look["lights"])) == (0.8, 7, 1)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sigma_px": -0.1},
+        {"sigma_px": float("nan")},
+        {"readings": Spread(-1e-6)},
+        {"errors": ParameterErrors(axes=Spread(float("inf")))},
+        {"table": TableNoise(psi=-1.0)},
+        {"images": True},
+        {"poses": 10**9},
+        {"seed": -1},
+    ],
+)
+def test_settings_without_sense_are_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="The dataset could not be simulated: found"):
+        settings(**changes)
+
+
+def test_a_folder_with_anything_in_it_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    for force in (False, True):
+        with pytest.raises(UsageError, match=r"folder with (other )?files"):
+            simulate("hexapod", tmp_path, settings(), force=force)
+    assert files_of(tmp_path) == {"notes.txt": b"mine"}
+
+
+def test_another_dataset_is_not_replaced_even_with_force(tmp_path: Path) -> None:
+    (tmp_path / "dataset.yaml").write_text("legcal_dataset: 1\n")
+    with pytest.raises(UsageError, match="needed a new or empty folder or that of an earlier"):
+        simulate("hexapod", tmp_path, settings(), force=True)
+    assert list(files_of(tmp_path)) == ["dataset.yaml"]
+
+
+def test_force_replaces_a_simulated_dataset_and_keeps_what_is_not_its_own(tmp_path: Path) -> None:
+    few = settings(poses=1, views=1)
+    simulate("hexapod", tmp_path, few)
+    with pytest.raises(UsageError, match=r"found a simulated dataset.*--force"):
+        simulate("hexapod", tmp_path, few)
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / ".legcal-cache.json").write_text("{}")
+    simulate("3-rps", tmp_path, settings(poses=1, views=1, level=Level.AXES), force=True)
+    files = files_of(tmp_path)
+    assert files["notes.txt"] == b"mine"
+    assert "axes.csv" in files
+    gone = {"observations.csv", ".legcal-cache.json", "models/hexapod.yaml", "urdf/hexapod.urdf"}
+    assert not gone & set(files)
+    assert set(json.loads(files[TRUTH_NAME])["files"]) == set(files) - {"notes.txt"}
+
+
+def test_a_failure_leaves_an_earlier_dataset_as_it_was(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    simulate("hexapod", folder, settings(poses=1, views=1))
+    before = files_of(tmp_path)
+    (tmp_path / "cameras.yaml").write_text(f"views: {{c1: {{T_base_camera: {LOOKING_AWAY}}}}}\n")
+    wrong = settings(poses=1, views=tmp_path / "cameras.yaml")
+    with pytest.raises(NotVisible):
+        simulate("hexapod", folder, wrong, force=True)
+    (tmp_path / "cameras.yaml").unlink()
+    assert files_of(tmp_path) == before
+
+
+def test_names_in_the_truth_of_a_dataset_do_not_reach_outside_it(tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("mine")
+    folder = tmp_path / "set"
+    simulate("hexapod", folder, settings(poses=1, views=1))
+    truth = json.loads((folder / TRUTH_NAME).read_text())
+    truth["files"] += ["../precious.txt", str(tmp_path / "precious.txt"), 7]
+    (folder / TRUTH_NAME).write_text(json.dumps(truth))
+    simulate("hexapod", folder, settings(poses=1, views=1), force=True)
+    assert (tmp_path / "precious.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("pose", "error", "message"),
+    [
+        (LOOKING_AWAY, NotVisible, "view c1: .* no image shows a leg"),
+        (
+            "{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 1]}",
+            UsageError,
+            "view c1: its camera could not be placed: found it inside the machine",
+        ),
+        ("{xyz: [0.0, 0.0, .inf], quat_xyzw: [0, 0, 0, 1]}", DatasetError, "views.c1"),
+        ("{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 2]}", DatasetError, "norm 2"),
+    ],
+)
+def test_cameras_that_see_nothing_or_stand_in_the_machine_are_refused(
+    pose: str, error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "cameras.yaml"
+    path.write_text(f"views: {{c1: {{T_base_camera: {pose}}}}}\n")
+    with pytest.raises(error, match=message):
+        simulate("hexapod", tmp_path / "set", settings(poses=1, views=path))
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_machine_without_visible_legs_cannot_be_seen(tmp_path: Path) -> None:
+    made = simulate("hexapod", tmp_path / "a", settings(poses=1, views=1))
+    urdf = made.folder / "urdf" / "hexapod.urdf"
+    urdf.write_text(re.sub(r"<visual>.*?</visual>", "", urdf.read_text()))
+    with pytest.raises(NotVisible, match="no leg with a visible cylinder"):
+        simulate(made.folder / "models" / "hexapod.yaml", tmp_path / "b", settings(poses=1))
+
+
+def test_the_defaults_are_those_that_the_help_names() -> None:
+    from legcal.simulation.request import requested
+
+    asked = requested(
+        level="photographs",
+        poses="15",
+        sampling="extreme",
+        shared_poses=None,
+        images=1,
+        views=None,
+        cameras=None,
+        camera=None,
+        errors=(),
+        coplanar=False,
+        pixel_noise="0.1px",
+        table_noise="degrees",
+        encoder_noise="2um",
+        hints=True,
+        seed=0,
+        appearance=None,
+        look={"blur": None},
+    )
+    assert asked == SimulationSettings()
