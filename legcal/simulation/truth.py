@@ -69,7 +69,7 @@ def write_true_model(
             if true.is_determined:
                 check_closes(true)
         except (ModelError, OutOfClass, DidNotConverge) as error:
-            problem = error.problems[0]
+            problem = error.problems[0].split(": ", 1)[-1]  # without the file, which goes
             continue
         if _class_of(true) == _class_of(nominal):
             return true
