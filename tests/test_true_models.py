@@ -233,7 +233,7 @@ def test_errors_that_leave_no_closed_machine_are_refused(
 
 def test_a_refusal_does_not_name_the_files_that_are_gone(tmp_path: Path) -> None:
     errors = ParameterErrors(Spread(1.0), Spread(1.0), Spread(1.0))
-    with pytest.raises(ModelError, match="none of 20 draws .*found leg .leg6. at") as caught:
+    with pytest.raises(ModelError, match=r"none of 20 draws .*found leg .leg6. at") as caught:
         write_true_model(load_mechanism("hexapod"), errors, np.random.default_rng(0), tmp_path)
     assert str(tmp_path) not in str(caught.value)
 
