@@ -19,7 +19,7 @@ from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
 
 _TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
 _THIN = 3.0  # [px] solids that rays through pixel centres may miss
-_PIXELS = 6144  # on edges, at a time
+_PIXELS = 8192  # on edges, at a time
 _FACES = 8  # that are told apart in the search for edges
 
 
