@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform
 from staged_hexapods import exact_session, noisy_session
 
 from legcal.errors import DidNotConverge
@@ -11,7 +12,17 @@ from legcal.geometry.lines import moment
 from legcal.simulation.cameras import cameras_around, look_at, sample_camera
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.poses import extreme_poses, follow, leg_vectors, platform_error, solve_pose
+from legcal.simulation.poses import (
+    extreme_poses,
+    follow,
+    leg_vectors,
+    leg_vectors_of_poses,
+    platform_error,
+    poses_from_home,
+    random_poses,
+    solve_pose,
+    solve_poses,
+)
 from legcal.simulation.session import simulate_session
 from legcal.simulation.table_noise import TableNoise
 
@@ -34,6 +45,61 @@ def test_extreme_poses_have_every_leg_near_an_end_of_its_travel() -> None:
         part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
         assert np.all((part < 0.121) | (part > 0.879))
         assert pose.translation[2] > 0.2  # above the base: the assembly mode of home
+
+
+def test_random_poses_have_lengths_all_over_the_travel() -> None:
+    machine = hexapod()
+    poses = RigidTransform.concatenate(list(random_poses(machine, 60, np.random.default_rng(1))))
+    lengths = np.linalg.norm(leg_vectors_of_poses(machine.parameters, poses), axis=-1)
+    part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
+    assert np.all((part >= 0.0) & (part <= 1.0))
+    shares = np.histogram(part, bins=4, range=(0.0, 1.0))[0] / part.size
+    assert np.all((shares > 0.15) & (shares < 0.35))
+
+
+def test_poses_from_home_have_their_lengths_and_others_stay_on_the_way() -> None:
+    machine = hexapod()
+    lengths = np.array([np.full(6, 0.42), [0.40, 0.41, 0.42, 0.43, 0.42, 0.41], np.full(6, 5.0)])
+    lengths[2, ::2] = 0.01
+    first, second, unreachable = poses_from_home(machine, lengths)
+    for pose, wanted in ((first, lengths[0]), (second, lengths[1])):
+        found = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
+        assert np.abs(found - wanted).max() < 1e-13
+    assert np.linalg.norm(unreachable.translation - machine.home.translation) < 0.2
+
+
+def test_poses_solved_together_are_those_solved_alone() -> None:
+    machine = perturb(hexapod(), np.random.default_rng(4), 0.002)
+    lengths = np.random.default_rng(1).uniform(0.40, 0.44, (5, 6))
+    start = RigidTransform.concatenate([machine.home] * 5)
+    together = solve_poses(machine.parameters, lengths, start).as_matrix()
+    for pose, row in zip(together, lengths, strict=True):
+        alone = solve_pose(machine.parameters, row, machine.home).as_matrix()
+        assert np.abs(pose - alone).max() < 1e-13
+    lengths[3, 0] = 5.0
+    with pytest.raises(DidNotConverge, match="A simulated pose was not found"):
+        solve_poses(machine.parameters, lengths, start)
+
+
+@pytest.mark.parametrize("uniform", [True, False])
+def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: bool) -> None:
+    rng = np.random.default_rng(0)
+    machine = hexapod()
+    session = simulate_session(
+        machine,
+        cameras_around(machine, rng),
+        rng,
+        noise=TableNoise(),
+        sigma_q=1e-5,
+        uniform_readings=uniform,
+        n_poses=60,
+    )
+    m = session.measurements
+    poses = RigidTransform.concatenate(list(session.T_Rb_Re))
+    lengths = np.linalg.norm(leg_vectors_of_poses(machine.parameters, poses), axis=-1)
+    error = (m.q[m.first_rows] - (lengths - machine.parameters.offsets)) / 1e-5
+    assert error.std() == pytest.approx(1.0, rel=0.1)
+    assert (np.abs(error).max() < np.sqrt(3.0) + 1e-6) == uniform
 
 
 def test_lengths_that_no_pose_has_are_refused() -> None:

@@ -134,9 +134,29 @@ def observe_session(
     noise: OutlineNoise | TableNoise,
     rng: np.random.Generator | None,
 ) -> tuple[Outlines | None, LegAxes]:
-    """Return what all images show, as outlines and as axes; exactly that if rng is None.
+    """Return what all images of a session show.
 
-    Images of one view stand together.
+    Parameters
+    ----------
+    machine : Machine
+        The true machine.
+    viewpoints : sequence of Viewpoint
+        The true cameras and the legs that they see.
+    T_Rb_Re : sequence of RigidTransform
+        The true platform poses, by index of pose.
+    measurements : Measurements
+        The view and the pose of each image; images of one view stand together.
+    noise : OutlineNoise or TableNoise
+        What disturbs the observations, and the covariance that they carry.
+    rng : numpy.random.Generator or None
+        Source of the noise; None leaves the observations exact.
+
+    Returns
+    -------
+    Outlines or None
+        Outlines; None where Table 1 gives the noise of the axes.
+    LegAxes
+        Axes, by image and then by leg.
     """
     poses = RigidTransform.concatenate(list(T_Rb_Re))
     seen = [np.array(viewpoints[v].legs, dtype=np.intp) for v in measurements.view]
