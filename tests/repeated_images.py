@@ -59,9 +59,18 @@ class RepeatedImages:
 
 
 def repeated_images(
-    path: Path, model: str = "hexapod", n_poses: int = 2, n_images: int = 3, noise: float = NOISE
+    path: Path,
+    model: str = "hexapod",
+    n_poses: int = 2,
+    n_images: int = 3,
+    *,
+    level_leg: int | None = None,
 ) -> RepeatedImages:
-    """Render a machine in random poses, each several times with other noise."""
+    """Render a machine in random poses, each several times with other noise.
+
+    The camera is held so that the image of ``level_leg`` in the first pose is parallel to the image
+    x axis.
+    """
     mechanism = load_mechanism(model)
     drawn = random_configurations(mechanism, n_poses, 3)
     middle = 0.5 * (
@@ -70,7 +79,13 @@ def repeated_images(
     lengths = np.linalg.norm(mechanism.home.apply(mechanism.B_platform) - mechanism.A_base, axis=1)
     size = max(float(lengths.max()), float(np.ptp(mechanism.A_base, axis=0).max()))
     aside = np.array([1.0, 0.45, 0.5]) if mechanism.spatial else np.array([0.15, 0.1, 1.3])
-    T_base_camera = look_at(middle + 1.7 * size * aside, middle, roll=0.1)
+    roll = 0.1
+    if level_leg is not None:
+        T = look_at(middle + 1.7 * size * aside, middle).inv()
+        B_base = drawn.poses[0].apply(mechanism.B_platform[level_leg])
+        normal = np.cross(T.apply(mechanism.A_base[level_leg]), T.apply(B_base))
+        roll = float(np.arctan2(-normal[0], normal[1]))
+    T_base_camera = look_at(middle + 1.7 * size * aside, middle, roll=roll)
     entry = {
         "legcal_dataset": 1,
         "mechanism": str(mechanism.yaml_path),
@@ -89,7 +104,7 @@ def repeated_images(
         clean = _picture(mechanism, T, T_base_camera)
         for k in range(n_images):
             name = f"images/p{p}_{k}.png"
-            made.pictures[name] = clean + noise * rng.standard_normal(clean.shape)
+            made.pictures[name] = clean + NOISE * rng.standard_normal(clean.shape)
             readings = {str(mechanism.legs[j].prismatic): f"{q[j]:.9f}" for j in mechanism.motors}
             made.rows.append({"view": "c1", "image": name, "pose": f"p{p}", **readings})
     return made

@@ -142,7 +142,23 @@ def test_rows_that_nothing_repeats_are_left_out(spoiled: RepeatedImages) -> None
     assert legs[1]["psi"] is None
 
 
-@pytest.mark.parametrize("model", ["3-rps", "tricept"])
+def test_a_leg_along_the_image_x_axis_is_said_to_have_no_M_LS(tmp_path: Path) -> None:
+    made = repeated_images(tmp_path / "level", "3-rps", n_poses=1, level_leg=1)
+    noise = measure_noise(made.write())
+    for method in noise_document(noise)["methods"].values():
+        leg = method["legs"][1]
+        assert leg["axes"] == 3
+        assert (leg["without_M_LS"], leg["x"], leg["z"]) == (1, None, None)
+        assert leg["psi"]["sd"] > 0.0
+        assert method["legs"][0]["without_M_LS"] == 0
+    note = "leg2: M_LS does not exist for detector in 1 of 1 orientations (c1/p0), where the leg is"
+    assert any(text.startswith(note) for text in noise.notes)
+    console = Console(width=100, record=True, file=StringIO())
+    console.print(noise_table(noise))
+    assert console.export_text().count("no M_LS") == 4
+
+
+@pytest.mark.parametrize("model", ["tricept"])
 def test_other_classes_of_mechanisms_are_measured_too(tmp_path: Path, model: str) -> None:
     made = repeated_images(tmp_path / model, model, n_poses=1, n_images=3)
     noise = measure_noise(made.write())

@@ -153,6 +153,12 @@ def test_M_LS_does_not_exist_for_a_leg_along_the_image_x_axis(
     assert np.all(np.isfinite(found.values))
 
 
+def test_M_LS_does_not_exist_where_it_may_lie_at_infinity() -> None:
+    # Parallel to the plane y = 0, yet the leg's image crosses that row: at the vanishing point.
+    u = np.array([[0.3, 1e-4, 0.9]] * 2)
+    assert not values_of(u, np.array([[0.02, 0.05, 0.9]] * 2)).has_M_LS
+
+
 def test_a_tilt_hardly_known_leaves_M_LS_in_existence() -> None:
     # The ray through M_LS is known well: the leg crosses the row of the image steeply.
     u = np.array([[0.6, 0.8, 0.0]] * 2)

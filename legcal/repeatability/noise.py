@@ -272,7 +272,7 @@ def _without_M_LS(measurements: Measurements, method: str, leg: LegNoise) -> lis
     inclination = np.degrees(min(o.inclination for o in without if o.inclination is not None))
     return [
         f"{leg.name}: M_LS does not exist for {method} in {len(without)} of "
-        f"{len(leg.orientations)} orientations ({', '.join(sorted(places))}), where its image is "
-        f"parallel to the image x axis within {inclination:.2f} deg: M_LS would slide along it by "
-        "more than its width."
+        f"{len(leg.orientations)} orientations ({', '.join(sorted(places))}), where the leg is "
+        f"parallel to the image x axis within {inclination:.2f} deg, or to the camera's plane y = 0: M_LS would "
+        "slide along it by more than its width, or lie at infinity."
     ]

@@ -17,6 +17,7 @@ from legcal.vision.euler import angles_of_direction
 ANGLES = ("psi", "theta", "angle", "tilt")
 QUANTITIES = ("psi", "theta", "x", "z", "angle", "across", "tilt", "depth")
 OF_M_LS = ("x", "z")
+SURELY = 3.0  # standard deviations by which an axis must be inclined to the plane of M_LS
 _STEP = 1e-6  # of derivatives [rad, m]
 _M_LS_ROWS = [QUANTITIES.index(name) for name in OF_M_LS]
 
@@ -35,7 +36,8 @@ class AxisValues:
         Angle between the image of each axis and the image x axis [rad].
     has_M_LS : bool
         False if any of the axes is seen so nearly parallel to the image x axis that the place in
-        the image where M_LS is seen has an expected standard deviation above the leg's width.
+        the image where M_LS is seen has an expected standard deviation above the leg's width, or
+        is parallel to the plane y = 0 within ``SURELY`` of its standard deviations.
     """
 
     values: Array
@@ -57,7 +59,7 @@ def axis_values(axes: LegAxes, chosen: BoolArray, radius: float) -> AxisValues:
         Radius of the leg [m].
     """
     u, M = axes.u[chosen], axes.M[chosen]
-    basis = axes.basis[chosen]
+    basis, covariance = axes.basis[chosen], axes.covariance[chosen]
     values = _values(u, M, u[0], M[0])
     derivative = np.empty((len(u), len(QUANTITIES), 4))
     for k in range(4):
@@ -65,15 +67,18 @@ def axis_values(axes: LegAxes, chosen: BoolArray, radius: float) -> AxisValues:
         du, dM = (step, np.zeros_like(M)) if k < 2 else (np.zeros_like(u), step)
         up, down = (_values(u + s * du, M + s * dM, u[0], M[0]) for s in (1.0, -1.0))
         derivative[..., k] = (up - down) / (2.0 * _STEP)
-    claimed = derivative @ axes.covariance[chosen] @ derivative.swapaxes(1, 2)
+    claimed = derivative @ covariance @ derivative.swapaxes(1, 2)
     normal = np.cross(u, M)
     inclination = np.arctan2(np.abs(normal[:, 0]), np.abs(normal[:, 1]))
-    return AxisValues(values, claimed, inclination, _has_M_LS(u, M, claimed, radius))
+    e_y = basis[:, :, 1]
+    sigma_u_y = np.sqrt(np.einsum("ni,nij,nj->n", e_y, covariance[:, :2, :2], e_y))
+    has_M_LS = _has_M_LS(u, M, sigma_u_y, claimed, radius)
+    return AxisValues(values, claimed, inclination, has_M_LS)
 
 
-def _has_M_LS(u: Array, M: Array, claimed: Array, radius: float) -> bool:
+def _has_M_LS(u: Array, M: Array, sigma_u_y: Array, claimed: Array, radius: float) -> bool:
     """Say whether M_LS is expected to be seen at the same place up to the width of the leg."""
-    if np.any(np.abs(u[:, 1]) < 10.0 * _STEP):
+    if np.any(np.abs(u[:, 1]) <= np.maximum(SURELY * sigma_u_y, 10.0 * _STEP)):
         return False
     x, z = _M_LS(u, M)
     gradient = np.column_stack([1.0 / z, -x / z**2])  # of x / z, where M_LS is seen
