@@ -19,9 +19,10 @@ from legcal.dataset.folder import load_dataset
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.mechanism.load import load_mechanism
 from legcal.repeatability.document import noise_document
-from legcal.repeatability.noise import Noise, measure_noise
+from legcal.repeatability.noise import measure_noise
 from legcal.repeatability.quantities import QUANTITIES
 from legcal.repeatability.repeats import find_repeats
+from legcal.repeatability.result import Noise
 from legcal.report.noise_table import noise_table
 
 FLAT = "images/p1_2.png"  # shows nothing

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from legcal.repeatability.noise import OUTLINE, LegNoise, MethodNoise, Noise
 from legcal.repeatability.quantities import QUANTITIES
+from legcal.repeatability.result import OUTLINE, LegNoise, MethodNoise, Noise
 from legcal.repeatability.samples import LegOrientation
 from legcal.repeatability.spread import Spread, pool
 

@@ -7,8 +7,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.repeatability.noise import OUTLINE, LegNoise, MethodNoise, Noise
 from legcal.repeatability.quantities import ANGLES
+from legcal.repeatability.result import OUTLINE, LegNoise, MethodNoise, Noise
 from legcal.repeatability.spread import Spread
 
 _METHODS = {"detector": "detector", "canny": "Canny"}
