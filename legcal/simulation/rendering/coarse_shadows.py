@@ -35,10 +35,11 @@ def seen_coarsely(
     own : int, optional
         The surface's own solid among them.
     """
-    rows, columns = np.divmod(pixels, rays.width)
-    half = _STEP // 2
-    traced = np.flatnonzero((rows % _STEP == half) & (columns % _STEP == half))
-    i, j = rows[traced] // _STEP, columns[traced] // _STEP
+    is_traced = np.zeros((rays.height, rays.width), dtype=np.bool_)
+    is_traced[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP] = True
+    traced = np.flatnonzero(is_traced.ravel()[pixels])
+    i, j = np.divmod(pixels[traced], rays.width)
+    i, j = i // _STEP, j // _STEP
     x, y, depth = rays.x[pixels[traced]], rays.y[pixels[traced]], z[traced]
     P = np.stack([x * depth, y * depth, depth])
     shape = -(-rays.height // _STEP), -(-rays.width // _STEP)
@@ -51,4 +52,5 @@ def seen_coarsely(
     share = np.where(known > 0.0, share, spread)
     share = np.asarray(cv2.GaussianBlur(share, (3, 3), 0.0), np.float32)  # contacts show steps
     fine = cv2.resize(share, None, fx=_STEP, fy=_STEP, interpolation=cv2.INTER_LINEAR)
-    return np.asarray(fine[rows, columns], dtype=np.float32)
+    whole = np.ascontiguousarray(fine[: rays.height, : rays.width], dtype=np.float32)
+    return np.asarray(whole.ravel()[pixels])

@@ -73,6 +73,8 @@ def _hull(points: Array) -> Array:
 
 def _cut(polygon: Array, low: Array, high: Array) -> Array:
     """Return the part of a convex polygon inside a rectangle."""
+    if np.all((polygon >= low) & (polygon <= high)):
+        return polygon
     for axis in (0, 1):
         for bound, sign in ((low[axis], 1.0), (high[axis], -1.0)):
             inside = sign * (polygon[:, axis] - bound)
@@ -93,8 +95,8 @@ def _cut(polygon: Array, low: Array, high: Array) -> Array:
 def _dense(polygon: Array, pieces: int = 12) -> Array:
     """Return more points along the sides of a polygon: the lens bends them."""
     t = np.arange(pieces)[:, None] / pieces
-    after = np.roll(polygon, -1, axis=0)
-    return np.concatenate([a + t * (b - a) for a, b in zip(polygon, after, strict=True)])
+    side = np.roll(polygon, -1, axis=0) - polygon
+    return np.asarray((polygon[:, None] + t * side[:, None]).reshape(-1, 2))
 
 
 def _filled(hull: Array, width: int, height: int) -> IntArray:
@@ -107,5 +109,6 @@ def _filled(hull: Array, width: int, height: int) -> IntArray:
     corners = np.rint((hull - low) * 2**_SHIFT).astype(np.int32)
     cv2.fillConvexPoly(mask, corners, 1, shift=_SHIFT)
     cv2.polylines(mask, [corners], True, 1, thickness=2 * MARGIN + 1, shift=_SHIFT)
-    rows, columns = np.nonzero(mask)
-    return np.asarray((rows + low[1]) * width + columns + low[0], dtype=np.intp)
+    where = np.flatnonzero(mask)
+    skipped = width - mask.shape[1]  # pixels between the end of a row and the start of the next
+    return np.asarray(where + where // mask.shape[1] * skipped + low[1] * width + low[0])

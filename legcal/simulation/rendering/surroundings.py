@@ -174,7 +174,7 @@ def _cable(
     width = radius * t
     aside = T_base_camera.rotation.apply([*rng.uniform(-0.8, 0.8, 2), 0.0])
     turn = T_base_camera.rotation * Rotation.from_euler(
-        "zx", [rng.uniform(0.0, np.pi), np.pi / 2 + rng.uniform(-0.3, 0.3)]
+        "xz", [np.pi / 2 + rng.uniform(-0.3, 0.3), rng.uniform(0.0, np.pi)]
     )
     where = eye + t * way + width * aside
     shape = Cylinder(width * rng.uniform(0.006, 0.02), 6.0 * width)
