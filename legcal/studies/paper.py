@@ -18,7 +18,8 @@ from legcal.simulation.session import SimulatedSession, observe_session, simulat
 from legcal.simulation.table_noise import TableNoise
 from legcal.studies.eq20 import PlatformErrors, expected_errors, platform_errors
 from legcal.studies.estimators import ESTIMATORS, bound_covariance
-from legcal.studies.paper_summary import BOUND, INITIAL, PaperSummary, summarize
+from legcal.studies.paper_means import BOUND, INITIAL, means_of
+from legcal.studies.paper_summary import PaperSummary
 from legcal.studies.study import Record
 from legcal.studies.truths import RAISED, coplanar_hexapod, noncoplanar_hexapod
 from legcal.studies.workers import failure_of
@@ -77,7 +78,9 @@ class PaperStudy:
     def summary(self, records: Iterable[Record]) -> PaperSummary:
         """Return the means over all runs."""
         machines = {name: truth() for name, truth in MACHINES.items()}
-        return summarize(records, machines, in_radians=self.noise == TableNoise.in_radians())
+        return PaperSummary(
+            means_of(records, machines), in_radians=self.noise == TableNoise.in_radians()
+        )
 
     def _calibrations(self, machine: Machine, rng: np.random.Generator) -> Record:
         """Return the errors of all estimators for one session of a machine."""

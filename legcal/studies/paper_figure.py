@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from legcal.geometry.types import Array
-from legcal.studies.paper_summary import BOUND, Means, PaperSummary
+from legcal.studies.paper_means import BOUND, Means, PaperMeans
 from legcal.studies.paper_table import JOINTS, LABELS
 
 if TYPE_CHECKING:
@@ -34,11 +34,11 @@ class _Panel:
     truth: Array
 
 
-def figure_as_html(summary: PaperSummary) -> bytes:
+def figure_as_html(found: PaperMeans) -> bytes:
     """Return the figure as one HTML page that works without a network."""
     from plotly.subplots import make_subplots
 
-    grid, names = _panels(summary), list(map(_label, summary.names))
+    grid, names = _panels(found), list(map(_label, found.names))
     n_rows, n_columns = len(grid), len(grid[0])
     figure = make_subplots(
         rows=n_rows,
@@ -59,25 +59,25 @@ def figure_as_html(summary: PaperSummary) -> bytes:
             figure.update_yaxes(title_text=_TRUTH_AXIS, showgrid=False, **right)
     figure.update_xaxes(tickangle=-90, tickfont={"size": 10})
     figure.update_layout(
-        title=_title(summary), height=360 * n_rows, template="plotly_white", legend_orientation="h"
+        title=_title(found), height=360 * n_rows, template="plotly_white", legend_orientation="h"
     )
     page: str = figure.to_html(include_plotlyjs=True, include_mathjax=False, div_id="fig4")
     return page.encode()
 
 
-def figure_as_png(summary: PaperSummary) -> bytes:
+def figure_as_png(found: PaperMeans) -> bytes:
     """Return the figure as a PNG picture."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    grid, names = _panels(summary), list(map(_label, summary.names))
+    grid, names = _panels(found), list(map(_label, found.names))
     n_rows, n_columns = len(grid), len(grid[0])
     figure = Figure(figsize=(7.0 * n_columns, 2.9 * n_rows + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(n_rows, n_columns, squeeze=False)
     for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
         handles = _draw(axis, panel, names)
-    figure.suptitle(_title(summary), fontsize=11)
+    figure.suptitle(_title(found), fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
@@ -114,20 +114,20 @@ def _draw(axis: Axes, panel: _Panel, names: list[str]) -> list[Any]:
     return [bars, marks, *line]
 
 
-def _panels(summary: PaperSummary) -> list[list[_Panel]]:
+def _panels(found: PaperMeans) -> list[list[_Panel]]:
     """Return the panels: a row for each estimator, a column for each machine."""
-    return [[_panel(summary, name, estimator) for name in summary.truths] for estimator in _DRAWN]
+    return [[_panel(found, name, estimator) for name in found.truths] for estimator in _DRAWN]
 
 
-def _panel(summary: PaperSummary, machine: str, estimator: str) -> _Panel:
+def _panel(found: PaperMeans, machine: str, estimator: str) -> _Panel:
     """Return one panel."""
-    by_name = {means.estimator: means for means in summary.of(machine)}
+    by_name = {means.estimator: means for means in found.of(machine)}
     means, limit = by_name[estimator], by_name[BOUND]
     return _Panel(
         f"{LABELS[estimator]}, {JOINTS[machine]} joints{_failed(means)}",
         1e3 * means.parameters,
         1e3 * limit.parameters,
-        1e3 * summary.truths[machine],
+        1e3 * found.truths[machine],
     )
 
 
@@ -137,10 +137,10 @@ def _failed(means: Means) -> str:
     return f" ({failed} of {means.n + failed} runs failed)" if failed else ""
 
 
-def _title(summary: PaperSummary) -> str:
+def _title(found: PaperMeans) -> str:
     """Return the title of the figure."""
-    n_runs = summary.means[0].n + sum(summary.means[0].failures.values())
-    return f"Fig. 4 of the paper: {len(summary.names)} parameters, means over {n_runs} calibrations"
+    n_runs = found.means[0].n + sum(found.means[0].failures.values())
+    return f"Fig. 4 of the paper: {len(found.names)} parameters, means over {n_runs} calibrations"
 
 
 def _label(name: str) -> str:

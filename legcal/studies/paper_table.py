@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.studies.paper_summary import Means, PaperSummary
+from legcal.studies.paper_means import Means, PaperMeans
 from legcal.studies.paper_text import AS_PRINTED
 
 LABELS = {  # also of the figure
@@ -20,15 +22,15 @@ LABELS = {  # also of the figure
 JOINTS = {"coplanar": "coplanar", "noncoplanar": "non-coplanar"}
 
 
-def paper_table(summary: PaperSummary) -> RenderableType:
+def paper_table(found: PaperMeans, readings: Sequence[str]) -> RenderableType:
     """Return errors before and after calibration, beside the figures that the paper prints."""
     table = Table(box=None, pad_edge=False)
     table.add_column("joints")
     table.add_column("")
     for column in ("dX [mm]", "dE [deg]", "parameters [mm]", "runs", "failed"):
         table.add_column(Text(column), justify="right")
-    for name in summary.truths:
-        for place, means in enumerate(summary.of(name)):
+    for name in found.truths:
+        for place, means in enumerate(found.of(name)):
             table.add_row("" if place else JOINTS[name], LABELS[means.estimator], *_cells(means))
     for place, (key, label) in enumerate(
         (("initial", "paper, before"), ("calibrated", "paper, after"))
@@ -44,7 +46,7 @@ def paper_table(summary: PaperSummary) -> RenderableType:
             "" if place == 0 else "100",
             "",
         )
-    notes = [Text(f"- {line}", style="dim") for line in (AS_PRINTED["note"], *summary.readings)]
+    notes = [Text(f"- {line}", style="dim") for line in (AS_PRINTED["note"], *readings)]
     return Group(table, Text(), *notes)
 
 
