@@ -81,7 +81,7 @@ def simulate(
         str,
         typer.Option(
             metavar="N|CSV",
-            help="Poses for each view; or a CSV of readings [m] with the motors' joints in its "
+            help="Poses for each view; or a CSV of readings in metres, the motors' joints in its "
             "header, for all views.",
             rich_help_panel=_MOTION,
         ),

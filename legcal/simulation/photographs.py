@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from legcal.detection.workers import Run
+from legcal.detection.workers import worker_pool
 from legcal.errors import OutOfResources
+from legcal.geometry.types import Image
 from legcal.progress import Report
 from legcal.simulation.images import Images, Viewpoint
 from legcal.simulation.posed_machine import PosedMachine
@@ -31,7 +32,7 @@ def take_photographs(
     viewpoints: Sequence[Viewpoint],
     appearance: Appearance,
     rng: np.random.Generator,
-    run: Run,
+    workers: int,
     progress: Report,
 ) -> None:
     """Render all images and write them.
@@ -51,8 +52,8 @@ def take_photographs(
         How the photographs look.
     rng : numpy.random.Generator
         Source of surroundings and noise.
-    run : Run
-        How the work is shared.
+    workers : int
+        Number of processes.
     progress : callable
         Told of finished photographs.
 
@@ -65,19 +66,23 @@ def take_photographs(
     (folder / "images").mkdir()
     done = 0
     progress(STAGE, done, len(images))
-    for v, viewpoint in enumerate(viewpoints):
-        rows = np.flatnonzero(images.view == v).tolist()
-        studio = _Studio(
-            viewpoint,
-            tuple(machines[images.pose[row]].solids for row in rows),
-            tuple(folder / names[row] for row in rows),
-            appearance,
-            of_views[v],
-            tuple(of_images[row] for row in rows),
-        )
-        for _ in run(studio.photograph, range(len(rows))):
-            done += 1
-            progress(STAGE, done, len(images))
+    with worker_pool(workers) as run:
+        for v, viewpoint in enumerate(viewpoints):
+            rows = np.flatnonzero(images.view == v)
+            # Every process paints the surroundings once, which takes as long as a few photographs.
+            n_parts = len(rows) if workers == 1 else min(workers, len(rows))
+            studio = _Studio(
+                viewpoint,
+                tuple(tuple(part.tolist()) for part in np.array_split(rows, n_parts)),
+                {row: machines[images.pose[row]].solids for row in rows.tolist()},
+                {row: folder / names[row] for row in rows.tolist()},
+                appearance,
+                of_views[v],
+                {row: of_images[row] for row in rows.tolist()},
+            )
+            for taken in run(studio.photograph, range(n_parts)):
+                done += taken
+                progress(STAGE, done, len(images))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,28 +90,40 @@ class _Studio:
     """A camera in its place, and the machine in the poses that it takes photographs of."""
 
     viewpoint: Viewpoint
-    machines: tuple[tuple[PlacedSolid, ...], ...]
-    paths: tuple[Path, ...]
+    parts: tuple[tuple[int, ...], ...]
+    machines: Mapping[int, tuple[PlacedSolid, ...]]
+    paths: Mapping[int, Path]
     appearance: Appearance
     rng: np.random.Generator
-    sensor_rngs: tuple[np.random.Generator, ...]
+    sensor_rngs: Mapping[int, np.random.Generator]
 
     @cached_property
     def scene(self) -> Scene:
         """The camera in front of its surroundings."""
         view = self.viewpoint
         return prepare_scene(
-            self.machines[0], view.camera, view.T_base_camera, self.appearance, self.rng
+            self.machines[self.parts[0][0]],
+            view.camera,
+            view.T_base_camera,
+            self.appearance,
+            self.rng,
         )
 
-    def photograph(self, k: int) -> None:
-        """Write photograph k."""
-        image = self.scene.render(self.machines[k], self.sensor_rngs[k])
-        found, content = cv2.imencode(".png", image, _FAST)
-        if not found:
-            raise OutOfResources(
-                f"{self.paths[k]}: the photograph could not be encoded: found an image of "
-                f"{image.shape[1]} x {image.shape[0]} px that PNG does not take, needed a smaller "
-                "one; use another camera."
+    def photograph(self, part: int) -> int:
+        """Write the photographs of some rows; return how many."""
+        for row in self.parts[part]:
+            self._write(
+                self.paths[row], self.scene.render(self.machines[row], self.sensor_rngs[row])
             )
-        self.paths[k].write_bytes(content.tobytes())
+        return len(self.parts[part])
+
+    def _write(self, path: Path, image: Image) -> None:
+        """Write a photograph."""
+        encoded, content = cv2.imencode(".png", image, _FAST)
+        if not encoded:
+            raise OutOfResources(
+                f"{path}: the photograph could not be encoded: found an image of {image.shape[1]} "
+                f"x {image.shape[0]} px that PNG does not take, needed a smaller one; use another "
+                "camera."
+            )
+        path.write_bytes(content.tobytes())

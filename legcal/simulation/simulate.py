@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from legcal.dataset.folder import OBSERVATIONS_NAME
-from legcal.detection.workers import worker_pool
 from legcal.geometry.types import Array
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
@@ -141,11 +140,10 @@ def simulate(
         write_session(folder, nominal, yaml_path.relative_to(folder).as_posix(), m)
         _write_observations(folder, session, m, settings, chance)
         if settings.level is Level.PHOTOGRAPHS:
-            with worker_pool(workers) as run:
-                take_photographs(
-                    folder, m.image, session.images, session.machines, session.views,
-                    settings.appearance, chance["photographs"], run, progress,
-                )  # fmt: skip
+            take_photographs(
+                folder, m.image, session.images, session.machines, session.views,
+                settings.appearance, chance["photographs"], workers, progress,
+            )  # fmt: skip
         files = [*files_in(folder), TRUTH_NAME]
         write_truth(
             folder / TRUTH_NAME, settings, truth, session.views, session.poses,
