@@ -14,6 +14,7 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.dressing import dressed
 from legcal.simulation.rendering.appearance import Appearance, Light
+from legcal.simulation.rendering.rays import PixelRays
 from legcal.simulation.rendering.scene import prepare_scene, render
 from legcal.simulation.shapes import Box, Cylinder, Mesh, Shape, Sphere
 from legcal.simulation.solids import (
@@ -302,3 +303,17 @@ def test_a_camera_below_the_machine_does_not_look_at_a_table() -> None:
         rng = np.random.default_rng(0)
         scene = prepare_scene([ball], LENSES["pinhole"], T, Appearance(clutter=0), rng)
         assert len(scene.surroundings.floor) == n_tables
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_every_pixel_looks_where_the_camera_says(lens: str) -> None:
+    camera = LENSES[lens]
+    rays = PixelRays(camera)
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    seen = camera.distort(np.stack([rays.x, rays.y], axis=-1).astype(float))
+    assert np.abs(seen - np.stack([u, v], axis=-1).reshape(-1, 2)).max() < 1e-4
+    x, y = rays.within(np.array([0, 77 * WIDTH + 100, WIDTH * HEIGHT - 1]), 34)
+    inside = camera.distort(np.stack([x, y], axis=-1).astype(float))
+    middles = np.array([[0, 0], [100, 77], [WIDTH - 1, HEIGHT - 1]])[:, None]
+    assert np.abs(inside - middles).max() < 0.501
+    assert np.abs((inside - middles).mean(axis=1)).max() < 0.02
