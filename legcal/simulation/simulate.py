@@ -19,6 +19,7 @@ from legcal.report.model_files import write_model
 from legcal.simulation.camera_places import places_around
 from legcal.simulation.cameras import mild_lens
 from legcal.simulation.cameras_file import read_cameras
+from legcal.simulation.commanded_poses import commanded_poses
 from legcal.simulation.dataset_files import (
     image_names,
     measurements_of,
@@ -38,7 +39,7 @@ from legcal.simulation.folder import (
 )
 from legcal.simulation.hints import rough_pose
 from legcal.simulation.images import Images, Viewpoint, take_images
-from legcal.simulation.motion import SimulatedPoses, draw_poses, given_poses
+from legcal.simulation.motion import SimulatedPoses, given_poses
 from legcal.simulation.photographs import take_photographs
 from legcal.simulation.posed_machine import PosedMachine, pose_machine
 from legcal.simulation.settings import Level, SimulationSettings
@@ -135,7 +136,7 @@ def simulate(
     with dataset_folder(destination, force=force) as folder:
         yaml_path, _ = write_model(nominal, folder)
         truth = write_true_model(nominal, settings.errors, chance["errors"], folder / TRUTH)
-        session = _session(truth, nominal.urdf.path, settings, chance, progress)
+        session = _session(truth, nominal, settings, chance, progress)
         m = _measurements(session, settings, chance)
         write_session(folder, nominal, yaml_path.relative_to(folder).as_posix(), m)
         _write_observations(folder, session, m, settings, chance)
@@ -181,7 +182,7 @@ def _streams(seed: int) -> dict[str, np.random.Generator]:
 
 def _session(
     truth: Mechanism,
-    meshes_from: Path,
+    nominal: Mechanism,
     settings: SimulationSettings,
     chance: dict[str, np.random.Generator],
     progress: Report,
@@ -196,10 +197,10 @@ def _session(
         poses = given_poses(truth, settings.poses)
     else:
         n_poses = settings.poses * (1 if shared else n_views)
-        poses = draw_poses(truth, n_poses, chance["poses"], settings.sampling)
+        poses = commanded_poses(truth, nominal, n_poses, chance["poses"], settings.sampling)
     progress("Poses", 1, 1)
     # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
-    shown = replace(truth, urdf=replace(truth.urdf, path=meshes_from))
+    shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
     machines = pose_machine(truth, dressed(shown), poses)
     progress("Cameras", 0, 1)
     if given is None:
