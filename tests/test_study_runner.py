@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_studies import Draws, Mistaken
+from toy_studies import Deadly, Draws, Mistaken
 
-from legcal.errors import DidNotConverge, UsageError
+from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.studies.checkpoint import CHECKPOINT_NAME
 from legcal.studies.runner import DOCUMENT_NAME, run_study
 from legcal.studies.workers import child_seed
@@ -79,6 +79,16 @@ def test_a_study_of_failures_only_says_why() -> None:
 def test_a_mistake_in_a_study_is_no_failed_run(workers: int) -> None:
     with pytest.raises(ZeroDivisionError):
         run_study(Mistaken(), 4, workers=workers)
+
+
+def test_a_process_that_is_ended_from_outside_is_told_and_what_was_done_is_kept(
+    tmp_path: Path,
+) -> None:
+    run_study(Draws(), 5, output=tmp_path)
+    before = _lines(tmp_path)
+    with pytest.raises(OutOfResources, match="one of 2 processes was ended from outside"):
+        run_study(Deadly(), 20, workers=2, output=tmp_path)
+    assert _lines(tmp_path) == before
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Small studies for the tests of the runner, and a program that runs one of them."""
 
+import os
+import signal
 import sys
 import time
 from collections.abc import Iterable
@@ -67,6 +69,15 @@ class Mistaken(Draws):
 
     def one_run(self, seed: np.random.SeedSequence) -> Record:
         return {"x": 1 // 0}
+
+
+@dataclass(frozen=True)
+class Deadly(Draws):
+    """A study that ends the process it runs in, as a system short of memory does."""
+
+    def one_run(self, seed: np.random.SeedSequence) -> Record:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return {}
 
 
 if __name__ == "__main__":
