@@ -79,7 +79,7 @@ class Painter:
         for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
             inside = foot[(key[foot] // _FACES == i + 1) & ~edge[foot]]
             if len(inside):
-                x, y = self.rays.x[inside], self.rays.y[inside]
+                x, y = self.rays.x.take(inside), self.rays.y.take(inside)
                 shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light)
                 parts.append(Part(i, inside, shaded))
         seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
@@ -97,8 +97,8 @@ class Painter:
         key = np.zeros(len(z), dtype=np.uint16)
         faces = np.zeros(len(z), dtype=np.int32)
         for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
-            depth, face = intersect(solid, self.rays.x[foot], self.rays.y[foot])
-            closer = np.flatnonzero(depth < z[foot] * np.float32(_TIE))
+            depth, face = intersect(solid, self.rays.x.take(foot), self.rays.y.take(foot))
+            closer = np.flatnonzero(depth < z.take(foot) * np.float32(_TIE))
             pixels = foot[closer]
             z[pixels], faces[pixels] = depth[closer], face[closer]
             key[pixels] = _FACES * (i + 1)
@@ -144,19 +144,21 @@ class Painter:
             low, high = np.searchsorted(foot, (pixels[0], pixels[-1] + 1))
             rows = row_of[foot[low:high]]
             here = (rows[rows >= 0, None] * S + one_pixel).ravel()
-            depth, face = intersect(solid, X[here], Y[here])
-            closer = np.flatnonzero(depth < Z[here] * np.float32(_TIE))
+            depth, face = intersect(solid, X.take(here), Y.take(here))
+            closer = np.flatnonzero(depth < Z.take(here) * np.float32(_TIE))
             if len(closer):
-                at = here[closer]
-                Z[at], who[at], faces[at] = depth[closer], i + 1, face[closer]
+                at = here.take(closer)
+                Z[at], who[at], faces[at] = depth.take(closer), i + 1, face.take(closer)
                 touched.append((i, here))
         uncovered = np.count_nonzero(who.reshape(n, S) == 0, axis=1) / S
         total = canvas.terms[:, :, pixels] * uncovered.astype(np.float32)
         parts = []
         for i, here in touched:
-            at = here[who[here] == i + 1]
+            at = here[who.take(here) == i + 1]
             if len(at):
-                shaded = shade(solids[i], X[at], Y[at], Z[at], faces[at], self.light)
+                shaded = shade(
+                    solids[i], X.take(at), Y.take(at), Z.take(at), faces.take(at), self.light
+                )
                 row = at // S
                 first = np.flatnonzero(np.diff(row, prepend=-1))
                 parts.append(Part(i, row[first], shaded, first))

@@ -116,7 +116,9 @@ def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: IntArray | in
         for i, some in occluders.near(lamp, to_lamp):
             some = some[owners[some] != i]
             if len(some):
-                share = _past(occluders.solids[i], lamp, points[:, some], to_lamp[:, some])
+                share = _past(
+                    occluders.solids[i], lamp, points.take(some, axis=1), to_lamp.take(some, axis=1)
+                )
                 seen[start + some] *= share
     return seen
 
