@@ -193,3 +193,14 @@ def test_a_small_set_of_photographs_of_every_class(name: str, tmp_path: Path) ->
         assert picture.shape == (150, 200)
         assert picture.std() > 5.0
     assert dataset.mechanism.n_legs == made.truth.n_legs
+
+
+def test_given_poses_are_seen_by_all_views_at_their_readings(tmp_path: Path) -> None:
+    rows = ["0.06,0.06,0.06,0.06,0.06,0.06", "0.07,0.06,0.05,0.06,0.08,0.06"]
+    header = ",".join(f"leg{j}_prismatic" for j in range(1, 7))
+    (tmp_path / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
+    exact = settings(poses=tmp_path / "poses.csv", readings=Spread(), level=Level.AXES)
+    m = load_dataset(simulate("hexapod", tmp_path / "set", exact).folder).measurements
+    given = np.array([[float(x) for x in row.split(",")] for row in rows])
+    assert m.pose.tolist() == [0, 1, 0, 1]
+    assert m.q == pytest.approx(given[m.pose], abs=1e-12)

@@ -112,7 +112,10 @@ def test_a_thick_tube_covers_the_rod_in_it() -> None:
     here = posed("3-rps", 1)[0]
     T = look_at(np.array([1.0, -0.8, 0.3]), MIDDLE)
     [first, *_] = legs_in_image(
-        (leg,), PosedMachine(here.A[:1], here.B[:1], here.solids, here.caster), sample_camera(), T
+        (leg,),
+        PosedMachine(here.A[:1], here.B[:1], here.solids, here.vertices, here.faces),
+        sample_camera(),
+        T,
     )
     tube, rod = first.stretches
     assert tube.radius > rod.radius
@@ -157,7 +160,9 @@ def test_cameras_of_a_machine_far_from_the_origin_stand_around_it() -> None:
     mechanism = machine("hexapod")
     home = SimulatedPoses(mechanism.home_configuration[None], np.zeros((1, 6)), (mechanism.home,))
     moved = pose_machine(mechanism, moved_solids, home)[0]
-    moved = PosedMachine(motion.apply(here.A), motion.apply(here.B), moved.solids, moved.caster)
+    moved = PosedMachine(
+        motion.apply(here.A), motion.apply(here.B), moved.solids, moved.vertices, moved.faces
+    )
     one = legs_in_image(mechanism.legs, here, sample_camera(), T)
     two = legs_in_image(mechanism.legs, moved, sample_camera(), motion * T)
     assert [v.share for v in one] == pytest.approx([v.share for v in two], abs=0.03)

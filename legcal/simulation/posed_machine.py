@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.motion import SimulatedPoses
 from legcal.simulation.shapes import Box, Cylinder, Shape, Sphere
@@ -31,14 +32,15 @@ class PosedMachine:
         Joint centres in the base link [m].
     solids : tuple of PlacedSolid
         What is seen of it, in the base link.
-    caster : trimesh.ray.ray_pyembree.RayMeshIntersector
-        Its triangles.
+    vertices, faces : (n, 3) array and (m, 3) array of int
+        The same as triangles, in the base link [m].
     """
 
     A: Array
     B: Array
     solids: tuple[PlacedSolid, ...]
-    caster: Any
+    vertices: Array
+    faces: IntArray
 
     def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
         """Return which points something stands before, seen from a centre.
@@ -55,7 +57,7 @@ class PosedMachine:
         ray = points - centre
         distance = np.linalg.norm(ray, axis=-1)
         ray = ray / distance[:, None]
-        hits, index, _ = self.caster.intersects_location(
+        hits, index, _ = _caster(self).intersects_location(
             np.broadcast_to(centre, ray.shape), ray, multiple_hits=False
         )
         hidden = np.zeros(len(points), dtype=np.bool_)
@@ -103,10 +105,15 @@ def pose_machine(
     for configuration, T in zip(poses.configurations, poses.T_base_platform, strict=True):
         here = placed(solids, link_poses(mechanism, configuration))
         vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
-        whole = trimesh.Trimesh(np.concatenate(vertices), stacked, process=False)
         B = np.asarray(T.apply(mechanism.B_platform))
-        machines.append(PosedMachine(mechanism.A_base, B, here, RayMeshIntersector(whole)))
+        machines.append(PosedMachine(mechanism.A_base, B, here, np.concatenate(vertices), stacked))
     return tuple(machines)
+
+
+@lru_cache(maxsize=8)  # many cameras may look at one machine, and thousands wait for theirs
+def _caster(machine: PosedMachine) -> RayMeshIntersector:
+    """Return what casts rays at a machine."""
+    return RayMeshIntersector(trimesh.Trimesh(machine.vertices, machine.faces, process=False))
 
 
 def _triangles(shape: Shape) -> Any:
