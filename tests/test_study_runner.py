@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.studies.checkpoint import CHECKPOINT_NAME
+from legcal.studies.checkpoint import CHECKPOINT_NAME, header, open_checkpoint
 from legcal.studies.runner import DOCUMENT_NAME, run_study
 from legcal.studies.workers import child_seed
 
@@ -89,6 +90,49 @@ def test_a_process_that_is_ended_from_outside_is_told_and_what_was_done_is_kept(
     with pytest.raises(OutOfResources, match="one of 2 processes was ended from outside"):
         run_study(Deadly(), 20, workers=2, output=tmp_path)
     assert _lines(tmp_path) == before
+
+
+@contextmanager
+def _files_no_larger_than(size: int) -> Iterator[None]:
+    """Let writing fail beyond a size, in the middle of a line, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("size", [40, 700])
+def test_a_full_disk_is_told_and_the_study_goes_on_when_there_is_room(
+    tmp_path: Path, size: int
+) -> None:
+    with (
+        _files_no_larger_than(size),
+        pytest.raises(OutOfResources, match=r"could not be written.*the runs before are kept"),
+    ):
+        run_study(Draws(), 100, output=tmp_path)
+    assert (tmp_path / CHECKPOINT_NAME).stat().st_size == size
+    assert run_study(Draws(), 100, output=tmp_path).document() == run_study(Draws(), 100).document()
+
+
+def test_figures_that_cannot_be_written_lose_no_run(tmp_path: Path) -> None:
+    (tmp_path / "total.txt").mkdir()
+    (tmp_path / "total.txt" / "mine").touch()
+    run_study(Draws(), 1, output=tmp_path / "out")
+    (tmp_path / "out" / "total.txt").unlink()
+    (tmp_path / "total.txt").rename(tmp_path / "out" / "total.txt")
+    with pytest.raises(OutOfResources, match=r"result of the study.*all runs are kept"):
+        run_study(Draws(), 3, output=tmp_path / "out")
+    assert len(_lines(tmp_path / "out")) == 4
+
+
+def test_a_checkpoint_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutOfResources, match="could not be opened"),
+        open_checkpoint(tmp_path, header("draws", {}, 0)),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(

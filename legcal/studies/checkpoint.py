@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -32,10 +33,13 @@ class Checkpoint:
         Where the line of each run begins, by the number of the run.
     """
 
-    def __init__(self, path: Path, file: BinaryIO, offsets: dict[int, int]) -> None:
+    def __init__(
+        self, path: Path, reader: BinaryIO, writer: FileIO, offsets: dict[int, int]
+    ) -> None:
         self.path = path
         self.offsets = offsets
-        self._file = file
+        self._reader = reader
+        self._writer = writer
 
     def append(self, lines: Sequence[dict[str, Any]]) -> None:
         """Add the lines of some runs; they are on the disk when this returns.
@@ -45,7 +49,7 @@ class Checkpoint:
         OutOfResources
             If they cannot be written, as on a full disk.
         """
-        place = self._file.seek(0, os.SEEK_END)
+        place = self._writer.seek(0, os.SEEK_END)
         places, content = {}, [_encoded(line) for line in lines]
         for line, text in zip(lines, content, strict=True):
             places[int(line["run"])] = place
@@ -60,15 +64,16 @@ class Checkpoint:
     def lines(self, n_runs: int) -> Iterator[dict[str, Any]]:
         """Return the lines of the first runs, in the order of their numbers."""
         for run in range(n_runs):
-            self._file.seek(self.offsets[run])
-            yield json.loads(self._file.readline())
+            self._reader.seek(self.offsets[run])
+            yield json.loads(self._reader.readline())
 
     def _write(self, content: bytes) -> None:
         """Append bytes and wait until the disk has them."""
         try:
-            self._file.write(content)
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            rest = memoryview(content)
+            while rest:
+                rest = rest[self._writer.write(rest) :]
+            os.fsync(self._writer.fileno())
         except OSError as error:
             raise OutOfResources(
                 f"{self.path}: the checkpoint could not be written: found '{error.strerror}', "
@@ -112,18 +117,19 @@ def open_checkpoint(path: Path, expected: dict[str, Any]) -> Iterator[Checkpoint
     OutOfResources
         If it cannot be read or written.
     """
-    try:
-        file = open(path, "a+b")  # noqa: SIM115 (closed below, whatever happens)
-    except OSError as error:
-        raise OutOfResources(
-            f"{path}: the checkpoint could not be opened: found '{error.strerror}', needed a file "
-            "that can be read and written; give another output folder."
-        ) from error
-    with file:
-        _lock(path, file)
-        offsets, end = _read(path, file, expected)
-        file.truncate(end)
-        checkpoint = Checkpoint(path, file, offsets)
+    with ExitStack() as files:
+        try:
+            writer = files.enter_context(open(path, "ab", buffering=0))
+            reader = files.enter_context(open(path, "rb"))
+        except OSError as error:
+            raise OutOfResources(
+                f"{path}: the checkpoint could not be opened: found '{error.strerror}', needed a "
+                "file that can be read and written; give another output folder."
+            ) from error
+        _lock(path, writer)
+        offsets, end = _read(path, reader, expected)
+        writer.truncate(end)
+        checkpoint = Checkpoint(path, reader, writer, offsets)
         if end == 0:
             checkpoint.begin(expected)
         yield checkpoint
@@ -131,7 +137,6 @@ def open_checkpoint(path: Path, expected: dict[str, Any]) -> Iterator[Checkpoint
 
 def _read(path: Path, file: BinaryIO, expected: dict[str, Any]) -> tuple[dict[int, int], int]:
     """Return where the line of each run begins, and where the last complete line ends."""
-    file.seek(0)
     first = file.readline()
     if not first.endswith(b"\n") and _encoded(expected).startswith(first):
         return {}, 0  # empty, or killed while it was begun
@@ -201,7 +206,7 @@ def _differences(found: Any, expected: Any, name: str = "") -> Iterator[str]:
         yield f"{name} {json.dumps(found)} instead of {json.dumps(expected)}"
 
 
-def _lock(path: Path, file: BinaryIO) -> None:
+def _lock(path: Path, file: FileIO) -> None:
     """Refuse a file that another process is writing, where the system can tell."""
     try:
         import fcntl
