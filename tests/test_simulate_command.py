@@ -143,6 +143,7 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
         {"readings": Spread(-1e-6)},
         {"errors": ParameterErrors(axes=Spread(float("inf")))},
         {"table": TableNoise(psi=-1.0)},
+        {"table": TableNoise(x=0.0)},
         {"images": True},
         {"poses": 10**9},
         {"seed": -1},

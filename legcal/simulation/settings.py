@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.errors import UsageError
+from legcal.observations.axes_file import SIGMA_RANGE
 from legcal.simulation.errors import Distribution, ParameterErrors, Spread
 from legcal.simulation.motion import Sampling
 from legcal.simulation.rendering.appearance import Appearance
@@ -110,13 +111,19 @@ class SimulationSettings:
             "noise of edge points": self.sigma_px,
             "noise of readings": self.readings.size,
             **{f"errors of {name.replace('_', ' ')}": size for name, size in spreads.items()},
-            **{f"noise of {name}": x for name, x in vars(self.table).items()},
         }
         problems += [
             f"The dataset could not be simulated: found {value:g} as the {name}, needed a finite "
             "number of zero or more; correct it."
             for name, value in noises.items()
             if not (math.isfinite(value) and value >= 0.0)
+        ]
+        least, most = SIGMA_RANGE
+        problems += [
+            f"The dataset could not be simulated: found {value:g} as the noise of {name}, needed "
+            f"{least:g} to {most:g}; correct it."
+            for name, value in vars(self.table).items()
+            if not least <= value <= most
         ]
         if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and self.seed >= 0):
             problems.append(
