@@ -83,7 +83,10 @@ class Appearance:
     colour : bool
         Blue, green, red as OpenCV has them instead of grey.
     samples : int
-        Rays of each pixel that an edge may cross: 13, 21, 34, 55, 89 or 144.
+        Rays of each pixel that an edge may cross: 13, 21, 34, 55, 89 or 144. An outline is not
+        biased by it, but its place scatters from one row of pixels to the next, by 0.030 px
+        (root mean square over directions) with 21 rays, 0.026 with 34, 0.015 with 55, 0.011
+        with 89.
 
     Raises
     ------
@@ -141,7 +144,7 @@ class Appearance:
         plain = cls(
             lights=(), ambient=1.0, shadows=False, limb=0.0, specular=0.0, texture=0.0,
             background=0.02, background_contrast=0.0, clutter=0, table=False,
-            blur=0.0, gamma=1.0, electrons=math.inf, read_noise=0.0, bits=16,
+            blur=0.0, gamma=1.0, electrons=math.inf, read_noise=0.0, bits=16, samples=89,
         )  # fmt: skip
         return replace(plain, **changes)  # type: ignore[arg-type]
 
