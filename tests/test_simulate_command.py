@@ -12,6 +12,7 @@ from legcal import cli
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.simulation.errors import ParameterErrors, Spread
 from legcal.simulation.folder import TRUTH_NAME
+from legcal.simulation.motion import Sampling
 from legcal.simulation.settings import Level, SimulationSettings
 from legcal.simulation.simulate import simulate
 from legcal.simulation.table_noise import TableNoise
@@ -145,6 +146,8 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
         {"table": TableNoise(psi=-1.0)},
         {"table": TableNoise(x=0.0)},
         {"images": True},
+        {"level": "pictures"},
+        {"sampling": "best"},
         {"poses": 10**9},
         {"seed": -1},
     ],
@@ -152,6 +155,12 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
 def test_settings_without_sense_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="The dataset could not be simulated: found"):
         settings(**changes)
+
+
+def test_choices_and_paths_may_be_given_as_text() -> None:
+    asked = settings(level="axes", sampling="workspace", poses="poses.csv", camera="lens.yaml")
+    assert (asked.level, asked.sampling) == (Level.AXES, Sampling.WORKSPACE)
+    assert (asked.poses, asked.camera) == (Path("poses.csv"), Path("lens.yaml"))
 
 
 def test_a_folder_with_anything_in_it_is_not_touched(tmp_path: Path) -> None:

@@ -45,13 +45,13 @@ class SimulationSettings:
     Attributes
     ----------
     level : Level
-        Axes with the noise of Table 1, outlines with noise in pixels, or photographs.
+        ``axes`` with the noise of Table 1, ``outlines`` with noise in pixels, or ``photographs``.
     errors : ParameterErrors
         How the true machine differs from the nominal model.
     poses : int or Path
         Number of poses for each view, or a CSV of readings that all views see.
     sampling : Sampling
-        How poses are drawn.
+        How poses are drawn: ``extreme`` or ``workspace``.
     shared_poses : bool
         Every view sees the same poses (several cameras at once) instead of its own.
     images : int
@@ -96,6 +96,11 @@ class SimulationSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        for name, choices in (("level", Level), ("sampling", Sampling)):
+            object.__setattr__(self, name, _choice(choices, name, getattr(self, name)))
+        for name in ("poses", "views", "camera"):
+            if isinstance(getattr(self, name), str):
+                object.__setattr__(self, name, Path(getattr(self, name)))
         counts = {"poses": self.poses, "views": self.views, "images": self.images}
         problems = [
             f"The dataset could not be simulated: found {count} {name}, needed a whole number from "
@@ -138,6 +143,16 @@ class SimulationSettings:
         """Standard deviation of a reading [m]."""
         size = self.readings.size
         return size if self.readings.distribution is Distribution.NORMAL else size / math.sqrt(3.0)
+
+
+def _choice(choices: type[StrEnum], name: str, found: str) -> StrEnum:
+    """Return a choice that may be given by its name."""
+    if found not in list(choices):
+        raise UsageError(
+            f"The dataset could not be simulated: found the {name} {found!r}, needed "
+            f"{' or '.join(choices)}; choose one."
+        )
+    return choices(found)
 
 
 def _is_count(count: object) -> bool:
