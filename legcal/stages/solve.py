@@ -67,27 +67,28 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
     DidNotConverge
         If IPOPT does not report success.
     """
-    built = _built(problem.structure)
-    scale = _scale(problem, built)
+    built, observed = _built(problem.structure), ca.DM(problem.observed)
+    scale = _scale(problem, built, observed)
+    given = ca.vertcat(ca.DM(problem.start), ca.DM(scale), observed)
     block = problem.block
     root_weight = np.ones(len(block))
-    found = _minimum(problem, built, scale, np.zeros(len(problem.start)), root_weight)
-    n_iterations = found.n_iterations
+    z, n_iterations, status = _minimum(problem, built, given, 0.0 * scale, root_weight)
+    x = problem.start + scale * z
     for _ in range(_REWEIGHTINGS if np.any(block >= 0) else 0):
-        new = _cauchy_root_weights(found.residuals, block)
+        new = _cauchy_root_weights(_dense(built.residuals(x, observed)), block)
         if np.max(np.abs(new - root_weight)) < _SETTLED:
             break
         root_weight = new
-        found = _minimum(problem, built, scale, (found.x - problem.start) / scale, root_weight)
-        n_iterations += found.n_iterations
-    jacobian = _sparse(built.jacobian(found.x, problem.observed))
+        z, more, status = _minimum(problem, built, given, z, root_weight)
+        x = problem.start + scale * z
+        n_iterations += more
     return Solution(
-        x=found.x,
-        residuals=root_weight * found.residuals,
-        jacobian=csc_array(diags_array(root_weight) @ jacobian),
-        n_shared=len(found.x) if problem.n_shared is None else problem.n_shared,
+        x=x,
+        residuals=root_weight * _dense(built.residuals(x, observed)),
+        jacobian=csc_array(diags_array(root_weight) @ _sparse(built.jacobian(x, observed))),
+        n_shared=len(x) if problem.n_shared is None else problem.n_shared,
         n_iterations=n_iterations,
-        status=found.status,
+        status=status,
     )
 
 
@@ -128,31 +129,19 @@ def _built(structure: Structure) -> _Built:
     return _Built(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian)
 
 
-def _scale(problem: LeastSquares, built: _Built) -> Array:
+def _scale(problem: LeastSquares, built: _Built, observed: ca.DM) -> Array:
     """Return the unit of each unknown: what one residual unit shows at the start."""
-    scale = column_scale(_sparse(built.jacobian(problem.start, problem.observed)))
+    scale = column_scale(_sparse(built.jacobian(problem.start, observed)))
     if problem.exact_hessian:  # coordinates of one kind; some columns of J may vanish
         scale = np.full_like(scale, scale.min())
     return scale
 
 
-@dataclass(frozen=True, eq=False)
-class _Minimum:
-    """Where IPOPT ended with given weights, and the residuals there without them."""
-
-    x: Array
-    residuals: Array
-    n_iterations: int
-    status: str
-
-
 def _minimum(
-    problem: LeastSquares, built: _Built, scale: Array, z: Array, root_weight: Array
-) -> _Minimum:
-    """Return the minimum for given weights, or refuse."""
-    observed = problem.observed
-    parameter = np.concatenate([root_weight, problem.start, scale, observed])
-    found = np.asarray(built.solver(x0=z, p=parameter)["x"].full()).ravel()
+    problem: LeastSquares, built: _Built, given: ca.DM, z: Array, root_weight: Array
+) -> tuple[Array, int, str]:
+    """Return the scaled minimum for given weights, the iterations and the status, or refuse."""
+    found = built.solver(x0=z, p=ca.vertcat(ca.DM(root_weight), given))
     stats = built.solver.stats()
     if not stats["success"]:
         raise DidNotConverge(
@@ -160,9 +149,7 @@ def _minimum(
             f"iterations with {stats['return_status']}, needed Solve_Succeeded; check the "
             "nominal model and the observations, or reject the ones with large residuals."
         )
-    x = problem.start + scale * found
-    residuals = np.asarray(built.residuals(x, observed).full()).ravel()
-    return _Minimum(x, residuals, int(stats["iter_count"]), str(stats["return_status"]))
+    return _dense(found["x"]), int(stats["iter_count"]), str(stats["return_status"])
 
 
 def _cauchy_root_weights(residuals: Array, block: IntArray) -> Array:
@@ -187,6 +174,11 @@ def _gauss_newton(z: ca.MX, p: ca.MX, jacobian: ca.MX) -> ca.Function:
         ["x", "p", "lam_f", "lam_g"],
         ["triu_hess_gamma_x_x"],
     )
+
+
+def _dense(column: ca.DM) -> Array:
+    """Return a CasADi column as an array."""
+    return np.asarray(column.full()).ravel()
 
 
 def _sparse(matrix: ca.DM) -> csc_array[np.float64]:
