@@ -1,6 +1,6 @@
 """How fast photographs are rendered: images a second of one core, with everything on.
 
-    OMP_NUM_THREADS=1 python benchmarks/rendering.py [IMAGES]
+    OMP_NUM_THREADS=1 python benchmarks/photographs.py [IMAGES]
 
 1024 x 768, each shipped mechanism with balls, posts and plates on a table among 15 pieces of
 clutter, two lamps, soft shadows, limb darkening, highlights, lens distortion, blur, gamma and
