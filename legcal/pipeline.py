@@ -36,7 +36,6 @@ from legcal.detection.observe import (
     given_outlines,
     scene_at_poses,
 )
-from legcal.detection.workers import Run, worker_pool
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible, OutOfClass
 from legcal.identify.check import check_identifiable
 from legcal.mechanism.kinematics import forward_kinematics_many
@@ -64,6 +63,7 @@ from legcal.report.files import check_destination
 from legcal.report.result import write_result
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import run_steps
+from legcal.workers import Run, worker_pool
 
 
 def calibrate(

@@ -10,9 +10,9 @@ from simulated import files_of, settings
 
 from legcal import cli
 from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.simulation.errors import ParameterErrors, Spread
 from legcal.simulation.folder import TRUTH_NAME
 from legcal.simulation.motion import Sampling
+from legcal.simulation.parameter_errors import ParameterErrors, Spread
 from legcal.simulation.settings import Level, SimulationSettings
 from legcal.simulation.simulate import simulate
 from legcal.simulation.table_noise import TableNoise

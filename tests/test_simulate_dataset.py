@@ -10,7 +10,7 @@ from simulated import files_of, settings, small_camera
 import legcal
 from legcal.dataset.folder import load_dataset
 from legcal.observations.table import read_observations
-from legcal.simulation.errors import ParameterErrors, Spread
+from legcal.simulation.parameter_errors import ParameterErrors, Spread
 from legcal.simulation.settings import Level
 from legcal.simulation.simulate import SimulatedDataset, simulate
 from legcal.vision.image_file import read_image
@@ -147,7 +147,7 @@ def test_without_errors_and_noise_readings_and_outlines_are_those_of_the_model(
 
 
 def test_uniform_noise_of_readings_stays_in_its_limits(tmp_path: Path) -> None:
-    from legcal.simulation.errors import Distribution
+    from legcal.simulation.parameter_errors import Distribution
 
     wide = Spread(1e-4, Distribution.UNIFORM)
     made = simulate("hexapod", tmp_path / "set", settings(readings=wide, poses=6, views=1))

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from legcal.detection.workers import worker_pool
 from legcal.errors import OutOfResources
 from legcal.signals import stopped_by_signals
+from legcal.workers import worker_pool
 
 POOL = """
 import multiprocessing, os, time
-from legcal.detection.workers import worker_pool
+from legcal.workers import worker_pool
 
 if __name__ == "__main__":
     with worker_pool(2) as run:

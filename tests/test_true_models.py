@@ -22,8 +22,8 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, in_links, parametrization_of, vector_of
 from legcal.simulation import truth
-from legcal.simulation.errors import Distribution, ParameterErrors, Spread, draw_errors
 from legcal.simulation.motion import draw_poses
+from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread, draw_errors
 from legcal.simulation.settings import Level, SimulationSettings
 from legcal.simulation.simulate import simulate
 from legcal.simulation.truth import write_true_model

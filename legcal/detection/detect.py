@@ -17,13 +17,13 @@ from legcal.detection.outline import OUTSIDE, PartOutlines, outline_parts
 from legcal.detection.picture import Grey, reduce, to_grey
 from legcal.detection.prediction import PredictedLeg, predict_legs
 from legcal.detection.strips import Strips, find_strips, reduction
-from legcal.detection.workers import Run, in_turn
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.vision.camera import Camera
+from legcal.workers import Run, in_turn
 
 Load = Callable[[int], Image]
 _Candidates = tuple[PredictedLeg, Strips, float]
@@ -74,7 +74,7 @@ def align_views(
         Called with the row of each image when it has been searched.
     run : callable
         How the images are searched: in turn, or by the processes of
-        :func:`legcal.detection.workers.worker_pool`.
+        :func:`legcal.workers.worker_pool`.
 
     Returns
     -------

@@ -25,7 +25,6 @@ from legcal.detection.detect import (
     detect_outlines,
 )
 from legcal.detection.outline import OUTSIDE, outline_parts
-from legcal.detection.workers import Run
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.leg import Cylinder
@@ -40,6 +39,7 @@ from legcal.observations.sets import (
     no_outlines,
 )
 from legcal.progress import Report
+from legcal.workers import Run
 
 NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry.lines import normal_basis
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array
 from legcal.identify.cameras import FOCAL_PX, default_cameras
 from legcal.identify.poses import random_poses
 from legcal.identify.session import Session
 from legcal.mechanism.leg import Leg, LegKind, main_cylinders
 from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.leg_steps import moved_legs
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import (
-    Parametrization,
-    geometries,
-    parametrization_of,
-    twist_after,
-)
+from legcal.mechanism.parametrization import Parametrization, geometries, parametrization_of
 
 SIGMA_Q = 2e-6  # [m] of a reading, where no dataset says
 _SEED = 2002
@@ -107,38 +101,6 @@ def perturbed(
     units = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
     step = _PERTURBATION * units * rng.uniform(-1.0, 1.0, len(units))
     return moved_legs(legs, parametrization.place, step)
-
-
-def moved_legs(
-    legs: Sequence[LegGeometry], place: IntArray, step: Array
-) -> tuple[LegGeometry, ...]:
-    """Return legs after a small step of the parameters, which stand at *place* of it."""
-    padded = np.append(step, 0.0)
-    moved = []
-    for leg, local in zip(legs, padded[place], strict=True):
-        twist = twist_after(leg, turn_of(leg.platform_axis, local[9:11]))
-        moved.append(
-            replace(
-                leg,
-                A=leg.A + local[:3],
-                B=leg.B + local[3:6],
-                q0=leg.q0 + float(local[6]),
-                base_axis=turned(leg.base_axis, local[7:9]),
-                platform_axis=turned(leg.platform_axis, local[9:11]),
-                twist=None if twist is None else twist + float(local[11]),
-            )
-        )
-    return tuple(moved)
-
-
-def turned(axis: Array | None, turn: Array) -> Array | None:
-    """Return an axis turned by two angles about its :func:`normal_basis`."""
-    return None if axis is None else np.asarray(turn_of(axis, turn).apply(axis))
-
-
-def turn_of(axis: Array | None, turn: Array) -> Rotation:
-    """Return the rotation by two angles about the :func:`normal_basis` of an axis."""
-    return Rotation.from_rotvec(np.zeros(3) if axis is None else turn @ normal_basis(axis))
 
 
 def radii(legs: Sequence[Leg], length: float) -> Array:

@@ -20,7 +20,6 @@ from legcal.dataset.folder import Dataset, load_dataset
 from legcal.detection.detect import Method
 from legcal.detection.observe import Photographs, align, detect, scene_at_poses
 from legcal.detection.outline import outline_parts
-from legcal.detection.workers import worker_pool
 from legcal.errors import NotVisible
 from legcal.geometry.types import IntArray
 from legcal.mechanism.kinematics import forward_kinematics_many
@@ -35,6 +34,7 @@ from legcal.repeatability.notes import noise_notes
 from legcal.repeatability.repeats import Repeats, find_repeats, group_rows
 from legcal.repeatability.result import OUTLINE, LegNoise, MethodNoise, Noise
 from legcal.repeatability.samples import LegOrientation, leg_orientations
+from legcal.workers import worker_pool
 
 METHODS: dict[str, tuple[Method, str]] = {
     "detector": (outline_parts, "Measuring outlines"),

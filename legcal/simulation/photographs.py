@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from legcal.detection.workers import worker_pool
 from legcal.errors import OutOfResources
 from legcal.geometry.types import Image
 from legcal.progress import Report
@@ -19,6 +18,7 @@ from legcal.simulation.posed_machine import PosedMachine
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import Scene, prepare_scene
 from legcal.simulation.solids import PlacedSolid
+from legcal.workers import worker_pool
 
 STAGE = "Photographs"
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise does not compress: more effort saves nothing

@@ -12,10 +12,10 @@ from legcal.errors import UsageError
 from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
 from legcal.files.schema import closest, describe
 from legcal.simulation.appearance_file import read_appearance
-from legcal.simulation.errors import Distribution, ParameterErrors, Spread
 from legcal.simulation.motion import Sampling
+from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread
 from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.settings import PAPER_ERRORS, Level, SimulationSettings
+from legcal.simulation.settings import DEFAULT_ERRORS, Level, SimulationSettings
 from legcal.simulation.table_noise import TableNoise
 
 _ERROR_KINDS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
@@ -123,7 +123,7 @@ def _poses(text: str) -> int | Path:
 
 def _errors(texts: Sequence[str]) -> ParameterErrors:
     """Return the errors of parameters that options ask for."""
-    found = PAPER_ERRORS
+    found = DEFAULT_ERRORS
     for text in texts:
         if text == "none":
             found = ParameterErrors()

@@ -11,14 +11,14 @@ import numpy as np
 
 from legcal.errors import UsageError
 from legcal.observations.axes_file import SIGMA_RANGE
-from legcal.simulation.errors import Distribution, ParameterErrors, Spread
 from legcal.simulation.motion import Sampling
+from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.table_noise import TableNoise
 
-_MILLIMETRES = Spread(2e-3)  # as the paper disturbs its machine
+_MILLIMETRES = Spread(2e-3)  # of the size by which the paper disturbs its machine
 _TENTH_DEGREE = Spread(float(np.deg2rad(0.1)))
-PAPER_ERRORS = ParameterErrors(
+DEFAULT_ERRORS = ParameterErrors(
     base_joints=_MILLIMETRES,
     platform_joints=_MILLIMETRES,
     offsets=_MILLIMETRES,
@@ -26,7 +26,7 @@ PAPER_ERRORS = ParameterErrors(
     axes=_TENTH_DEGREE,
     twists=_TENTH_DEGREE,
 )
-PAPER_READINGS = Spread(2e-6, Distribution.NORMAL)
+DEFAULT_READINGS = Spread(2e-6, Distribution.NORMAL)
 MOST_IMAGES = 100_000
 
 
@@ -81,7 +81,7 @@ class SimulationSettings:
     """
 
     level: Level = Level.PHOTOGRAPHS
-    errors: ParameterErrors = PAPER_ERRORS
+    errors: ParameterErrors = DEFAULT_ERRORS
     poses: int | Path = 15
     sampling: Sampling = Sampling.EXTREME
     shared_poses: bool = False
@@ -91,7 +91,7 @@ class SimulationSettings:
     hints: bool = True
     sigma_px: float = 0.1
     table: TableNoise = field(default_factory=TableNoise)
-    readings: Spread = PAPER_READINGS
+    readings: Spread = DEFAULT_READINGS
     appearance: Appearance = field(default_factory=Appearance)
     seed: int = 0
 

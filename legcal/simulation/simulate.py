@@ -28,7 +28,6 @@ from legcal.simulation.dataset_files import (
     write_truth,
 )
 from legcal.simulation.dressing import dressed
-from legcal.simulation.errors import Distribution
 from legcal.simulation.folder import (
     AXES_NAME,
     TRUTH,
@@ -40,6 +39,7 @@ from legcal.simulation.folder import (
 from legcal.simulation.hints import rough_pose
 from legcal.simulation.images import Images, Viewpoint, take_images
 from legcal.simulation.motion import SimulatedPoses, given_poses
+from legcal.simulation.parameter_errors import Distribution
 from legcal.simulation.photographs import take_photographs
 from legcal.simulation.posed_machine import PosedMachine, pose_machine
 from legcal.simulation.settings import Level, SimulationSettings

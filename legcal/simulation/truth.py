@@ -21,7 +21,7 @@ from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import in_links
 from legcal.report.model_files import mechanism_text, model_name
 from legcal.report.urdf import check_closes, write_urdf
-from legcal.simulation.errors import ParameterErrors, draw_errors
+from legcal.simulation.parameter_errors import ParameterErrors, draw_errors
 
 DRAWS = 20
 FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the true legs demand

@@ -1,6 +1,6 @@
-"""Searching images one after the other, or in several processes.
+"""Work on images one after the other, or in several processes.
 
-Threads do not pay: the search is many short steps, and they would wait for each other.
+Threads do not pay: the work is many short steps, and they would wait for each other.
 """
 
 import os
@@ -21,20 +21,20 @@ _CHUNKS = 4  # tasks for each process: few enough to spare messages, enough to s
 
 
 class Run(Protocol):
-    """How a search is carried out for all rows; results come in the order of the rows."""
+    """How work is carried out for all rows; results come in the order of the rows."""
 
-    def __call__(self, search: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+    def __call__(self, task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
         """Return the results."""
 
 
-def in_turn(search: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
-    """Search one row after the other, in this process."""
-    return map(search, rows)
+def in_turn(task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+    """Work on one row after the other, in this process."""
+    return map(task, rows)
 
 
 @contextmanager
 def worker_pool(workers: int) -> Iterator[Run]:
-    """Give a way to search in that many processes; one means in this process.
+    """Give a way to work in that many processes; one means in this process.
 
     Processes are started when they are first needed, anew and not as copies: a program that
     uses them must be safe to import (``if __name__ == "__main__":``).
@@ -54,15 +54,15 @@ def worker_pool(workers: int) -> Iterator[Run]:
         return
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_follow_parent)
 
-    def run(search: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
+    def run(task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
         chunk = max(1, len(rows) // (_CHUNKS * workers))
-        return pool.map(search, rows, chunksize=chunk)
+        return pool.map(task, rows, chunksize=chunk)
 
     try:
         yield run
     except BrokenProcessPool as error:
         raise OutOfResources(
-            f"The images could not be searched: found that one of {workers} processes was ended "
+            f"The images could not be worked on: found that one of {workers} processes was ended "
             "from outside, needed all of them to the end; see that there is enough memory and try "
             "again."
         ) from error

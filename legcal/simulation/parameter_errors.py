@@ -14,8 +14,8 @@ import numpy as np
 
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.identify.planned import moved_legs
 from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.leg_steps import moved_legs
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of
 
