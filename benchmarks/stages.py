@@ -20,11 +20,12 @@ from legcal.mechanism.parameters import KinematicParameters
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.poses import extreme_poses, platform_error
-from legcal.simulation.session import simulate_session
+from legcal.simulation.poses import extreme_poses
 from legcal.simulation.table_noise import TableNoise
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import run_steps
+from legcal.studies.eq20 import platform_errors
+from legcal.studies.session import simulate_session
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
     "outlines, 0.001 px a point, 300 points": OutlineNoise(1e-3, 300),
@@ -111,8 +112,8 @@ def _errors(
 def _platform_error(machine: Machine, parameters: KinematicParameters) -> tuple[float, float]:
     """Return the error of eq (20) over ten extreme poses [mm, deg]."""
     poses = extreme_poses(machine, 10, np.random.default_rng(20020721))
-    displacement, angle = platform_error(machine, parameters, poses)
-    return 1e3 * displacement, float(np.rad2deg(angle))
+    errors = platform_errors(machine, parameters, poses)
+    return 1e3 * errors.dX, float(np.rad2deg(errors.angle))
 
 
 def _cell(errors: Sequence[tuple[float, float]], n_machines: int) -> str:

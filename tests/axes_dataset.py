@@ -14,8 +14,8 @@ from legcal.observations.axes_file import write_axes
 from legcal.observations.measurements import Measurements
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
-from legcal.simulation.session import simulate_session
 from legcal.simulation.table_noise import TableNoise
+from legcal.studies.session import simulate_session
 
 ROOT = Path(__file__).parents[1]
 MODEL = ROOT / "models" / "hexapod.yaml"

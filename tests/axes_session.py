@@ -14,8 +14,8 @@ from legcal.refinement.legs import FittedLegs
 from legcal.refinement.start import Start, start_from
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import hexapod, perturb
-from legcal.simulation.session import simulate_session
 from legcal.simulation.table_noise import TableNoise
+from legcal.studies.session import simulate_session
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def axes_session(
         Start(
             machine.parameters,
             tuple(camera.T_Rb_camera.inv() for camera in cameras),
-            session.T_Rb_Re,
+            tuple(session.T_Rb_Re),
             "truth",
         ),
     )

@@ -10,8 +10,8 @@ from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vec
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.session import SimulatedSession, simulate_session
 from legcal.simulation.table_noise import TableNoise
+from legcal.studies.session import SimulatedSession, simulate_session
 
 
 @cache

@@ -18,7 +18,7 @@ from legcal.mechanism.model import Mechanism
 from legcal.stages import joints_in_base, offsets, platform_joints
 from legcal.stages.joints_in_base import JointsInBase, register_views
 from legcal.stages.joints_in_camera import locate_joints_in_cameras
-from legcal.stages.least_squares import LeastSquares, jacobian_of
+from legcal.stages.least_squares import LeastSquares, structure_jacobian
 from legcal.stages.leg_directions import directions_through_joints
 from legcal.stages.solution import Solution
 
@@ -39,7 +39,7 @@ def hexapod() -> Mechanism:
 
 def rank_of_first(problem: LeastSquares, wanted: int, known: slice = slice(0, 0)) -> int:
     """Return how many of the first unknowns a problem determines, others being free or known."""
-    J = np.asarray(jacobian_of(problem)(problem.start).full())
+    J = np.asarray(structure_jacobian(problem.structure)(problem.start, problem.observed).full())
     J[:, known] = 0.0
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     return _rank(J) - _rank(J[:, wanted:])

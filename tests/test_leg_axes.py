@@ -14,7 +14,7 @@ from legcal.observations.outlines import Outlines
 from legcal.simulation.cameras import cameras_around, sample_camera
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.session import SimulatedSession, simulate_session
+from legcal.studies.session import SimulatedSession, simulate_session
 from legcal.vision.camera import Camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
@@ -46,7 +46,7 @@ def test_exact_outlines_give_axes_through_both_joint_centres(camera: Camera) -> 
     axes = _axes(session, session.outlines or pytest.fail("no outlines"))
     for i in range(len(axes)):
         row = int(axes.row[i])
-        T_camera_Rb = session.viewpoints[session.measurements.view[row]].T_Rb_camera.inv()
+        T_camera_Rb = session.cameras[session.measurements.view[row]].T_Rb_camera.inv()
         pose = session.T_Rb_Re[session.measurements.pose[row]]
         A = T_camera_Rb.apply(session.machine.parameters.base_joints[axes.leg[i]])
         B_Rb = pose.apply(session.machine.parameters.platform_joints[axes.leg[i]])

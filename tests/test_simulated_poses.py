@@ -23,7 +23,7 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.singularity import side, singularity
 from legcal.simulation.clearance import Clearance, segment_distance
-from legcal.simulation.draws import JITTER
+from legcal.simulation.extremes import JITTER
 from legcal.simulation.motion import SimulatedPoses, draw_poses, given_poses
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

@@ -1,5 +1,7 @@
 """The simulator: poses, cameras, and noise of the spread that it claims."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,22 +11,31 @@ from staged_hexapods import exact_session, noisy_session
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.lines import moment
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.parameters import to_vector
 from legcal.simulation.cameras import cameras_around, look_at, sample_camera
+from legcal.simulation.extremes import JITTER
+from legcal.simulation.forward import follow_from_home, solve_poses
+from legcal.simulation.leg_vectors import leg_vectors
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.poses import (
-    extreme_poses,
-    follow,
-    leg_vectors,
-    leg_vectors_of_poses,
-    platform_error,
-    poses_from_home,
-    random_poses,
-    solve_pose,
-    solve_poses,
-)
-from legcal.simulation.session import simulate_session
+from legcal.simulation.poses import extreme_poses, random_poses
 from legcal.simulation.table_noise import TableNoise
+from legcal.studies.session import simulate_session
+
+
+def test_the_hexapod_in_memory_is_the_shipped_one() -> None:
+    shipped, machine = load_mechanism("hexapod"), hexapod()
+    assert tuple(machine.frame_legs) == tuple(shipped.frame_legs)
+    assert np.array_equal(machine.sign, shipped.sign)
+    found = to_vector(machine.parameters, machine.frame_legs)
+    assert np.allclose(found, to_vector(shipped.parameters, shipped.frame_legs), rtol=0, atol=1e-15)
+    home = shipped.T_base_Rb.inv() * shipped.home * shipped.T_platform_Re
+    assert np.allclose(machine.home.as_matrix(), home.as_matrix(), rtol=0.0, atol=2e-5)
+    for j, leg in enumerate(shipped.legs):
+        assert {cylinder.radius for cylinder in leg.cylinders} == {machine.radius[j]}
+        lower, upper = machine.travel[j] - shipped.q0[j]
+        assert leg.travel[0] <= lower < upper <= leg.travel[1]
 
 
 @given(seed=st.integers(0, 10**6))
@@ -32,40 +43,43 @@ from legcal.simulation.table_noise import TableNoise
 def test_forward_kinematics_returns_the_lengths_it_was_given(seed: int) -> None:
     rng = np.random.default_rng(seed)
     machine = perturb(hexapod(), rng, 0.002)
-    lengths = rng.uniform(0.40, 0.44, 6)
-    pose = solve_pose(machine.parameters, lengths, machine.home)
+    lengths = rng.uniform(0.40, 0.44, (1, 6))
+    start = RigidTransform.concatenate([machine.home])
+    pose = solve_poses(machine.parameters, lengths, start)
     found = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
     assert np.abs(found - lengths).max() < 1e-13
 
 
 def test_extreme_poses_have_every_leg_near_an_end_of_its_travel() -> None:
     machine = hexapod()
-    for pose in extreme_poses(machine, 10, np.random.default_rng(1)):
-        lengths = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
-        part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
-        assert np.all((part < 0.121) | (part > 0.879))
-        assert pose.translation[2] > 0.2  # above the base: the assembly mode of home
+    poses = extreme_poses(machine, 10, np.random.default_rng(1))
+    lengths = np.linalg.norm(leg_vectors(machine.parameters, poses), axis=-1)
+    part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
+    assert np.all((part < JITTER + 1e-9) | (part > 1.0 - JITTER - 1e-9))
+    assert np.any(part < JITTER)
+    assert np.any(part > 1.0 - JITTER)
+    assert np.all(poses.translation[:, 2] > 0.2)  # above the base: the assembly mode of home
 
 
 def test_random_poses_have_lengths_all_over_the_travel() -> None:
     machine = hexapod()
-    poses = RigidTransform.concatenate(list(random_poses(machine, 60, np.random.default_rng(1))))
-    lengths = np.linalg.norm(leg_vectors_of_poses(machine.parameters, poses), axis=-1)
+    poses = random_poses(machine, 60, np.random.default_rng(1))
+    lengths = np.linalg.norm(leg_vectors(machine.parameters, poses), axis=-1)
     part = (lengths - machine.travel[:, 0]) / np.ptp(machine.travel, axis=1)
     assert np.all((part >= 0.0) & (part <= 1.0))
     shares = np.histogram(part, bins=4, range=(0.0, 1.0))[0] / part.size
     assert np.all((shares > 0.15) & (shares < 0.35))
 
 
-def test_poses_from_home_have_their_lengths_and_others_stay_on_the_way() -> None:
+def test_poses_followed_from_home_have_their_lengths_and_others_stay_on_the_way() -> None:
     machine = hexapod()
     lengths = np.array([np.full(6, 0.42), [0.40, 0.41, 0.42, 0.43, 0.42, 0.41], np.full(6, 5.0)])
     lengths[2, ::2] = 0.01
-    first, second, unreachable = poses_from_home(machine, lengths)
-    for pose, wanted in ((first, lengths[0]), (second, lengths[1])):
-        found = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
-        assert np.abs(found - wanted).max() < 1e-13
-    assert np.linalg.norm(unreachable.translation - machine.home.translation) < 0.2
+    followed = follow_from_home(machine, lengths)
+    assert followed.reached.tolist() == [True, True, False]
+    found = np.linalg.norm(leg_vectors(machine.parameters, followed.T_Rb_Re), axis=-1)
+    assert np.abs(found - lengths)[:2].max() < 1e-13
+    assert np.linalg.norm(followed.t[2] - machine.home.translation) < 0.2
 
 
 def test_poses_solved_together_are_those_solved_alone() -> None:
@@ -74,7 +88,7 @@ def test_poses_solved_together_are_those_solved_alone() -> None:
     start = RigidTransform.concatenate([machine.home] * 5)
     together = solve_poses(machine.parameters, lengths, start).as_matrix()
     for pose, row in zip(together, lengths, strict=True):
-        alone = solve_pose(machine.parameters, row, machine.home).as_matrix()
+        alone = solve_poses(machine.parameters, row[None], start[:1]).as_matrix()
         assert np.abs(pose - alone).max() < 1e-13
     lengths[3, 0] = 5.0
     with pytest.raises(DidNotConverge, match="A simulated pose was not found"):
@@ -95,25 +109,16 @@ def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: boo
         n_poses=60,
     )
     m = session.measurements
-    poses = RigidTransform.concatenate(list(session.T_Rb_Re))
-    lengths = np.linalg.norm(leg_vectors_of_poses(machine.parameters, poses), axis=-1)
+    lengths = np.linalg.norm(leg_vectors(machine.parameters, session.T_Rb_Re), axis=-1)
     error = (m.q[m.first_rows] - (lengths - machine.parameters.offsets)) / 1e-5
     assert error.std() == pytest.approx(1.0, rel=0.1)
     assert (np.abs(error).max() < np.sqrt(3.0) + 1e-6) == uniform
 
 
-def test_lengths_that_no_pose_has_are_refused() -> None:
-    machine = hexapod()
-    with pytest.raises(DidNotConverge, match="simulated pose"):
-        follow(machine, np.array([0.1, 0.9, 0.1, 0.9, 0.1, 0.9]))
-
-
-def test_platform_error_of_the_truth_is_zero_and_of_an_offset_is_not() -> None:
-    machine = hexapod()
-    poses = extreme_poses(machine, 3, np.random.default_rng(1))
-    assert max(platform_error(machine, machine.parameters, poses)) < 1e-12
-    other = perturb(machine, np.random.default_rng(2), 0.002).parameters
-    assert platform_error(machine, other, poses)[0] > 1e-4
+def test_a_machine_that_reaches_no_pose_of_its_travel_is_refused() -> None:
+    machine = replace(hexapod(), travel=np.tile([[0.1, 0.1], [0.9, 0.9]], (3, 1)))
+    with pytest.raises(DidNotConverge, match="Only 0 of 2 random poses"):
+        extreme_poses(machine, 2, np.random.default_rng(0))
 
 
 def test_a_camera_sees_its_target_on_its_optical_axis_and_up_as_up() -> None:

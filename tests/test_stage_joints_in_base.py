@@ -10,10 +10,10 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.simulation.machine import Machine, hexapod
-from legcal.simulation.session import SimulatedSession
 from legcal.stages.joints_in_base import JointsInBase, build_scalar_products, locate_joints_in_base
 from legcal.stages.joints_in_camera import locate_joints_in_cameras
 from legcal.stages.nominal import Criteria
+from legcal.studies.session import SimulatedSession
 
 
 def _locate(
@@ -38,7 +38,7 @@ def test_rigid_parts_give_joints_and_cameras_exactly_from_five_millimetres(copla
     assert np.abs(nominal.parameters.base_joints - true).max() == pytest.approx(0.005)
     base = _locate(session, nominal)
     assert np.abs(base.A_Rb - true).max() < 1e-9
-    for T, viewpoint in zip(base.T_Rb_camera, session.viewpoints, strict=True):
+    for T, viewpoint in zip(base.T_Rb_camera, session.cameras, strict=True):
         assert T is not None
         difference = T.inv() * viewpoint.T_Rb_camera
         assert np.linalg.norm(difference.translation) < 1e-9

@@ -11,10 +11,10 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.observations.leg_axes import LegAxes
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.session import SimulatedSession
 from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.stages.leg_directions import select_axes
 from legcal.stages.nominal import Criteria
+from legcal.studies.session import SimulatedSession
 
 
 def _locate(session: SimulatedSession, axes: LegAxes, criteria: Criteria) -> JointsInCamera:
@@ -23,7 +23,7 @@ def _locate(session: SimulatedSession, axes: LegAxes, criteria: Criteria) -> Joi
 
 def _true(session: SimulatedSession) -> Array:
     A_Rb = session.machine.parameters.base_joints
-    return np.array([v.T_Rb_camera.inv().apply(A_Rb) for v in session.viewpoints])
+    return np.array([v.T_Rb_camera.inv().apply(A_Rb) for v in session.cameras])
 
 
 @pytest.mark.parametrize("criteria", ["default", "literal"])

@@ -10,7 +10,6 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import BoolArray
 from legcal.simulation.machine import Machine
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.session import SimulatedSession
 from legcal.stages.joints_in_base import locate_joints_in_base
 from legcal.stages.joints_in_camera import locate_joints_in_cameras
 from legcal.stages.leg_directions import (
@@ -20,6 +19,7 @@ from legcal.stages.leg_directions import (
 )
 from legcal.stages.nominal import Criteria
 from legcal.stages.offsets import build_consecutive, identify_offsets, leg_ends
+from legcal.studies.session import SimulatedSession
 
 
 def _directions(session: SimulatedSession, nominal: Machine, criteria: Criteria) -> LegDirections:
@@ -91,7 +91,7 @@ def test_passing_through_the_joint_improves_the_tilt_of_a_leg() -> None:
             A = session.machine.parameters.base_joints[j]
             B = session.T_Rb_Re[pose].apply(session.machine.parameters.platform_joints[j])
             u = (B - A) / np.linalg.norm(B - A)
-            camera = session.viewpoints[v].T_Rb_camera
+            camera = session.cameras[v].T_Rb_camera
             true.append(camera.inv().rotation.apply(u) if directions is observed else u)
         miss.append(np.sqrt(np.mean(np.sum(np.cross(directions.u, true) ** 2, axis=1))))
     assert miss[1] < 0.5 * miss[0]

@@ -11,13 +11,13 @@ from legcal.mechanism.parameters import KinematicParameters
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.session import SimulatedSession, simulate_session
 from legcal.stages.joints_in_base import locate_joints_in_base
 from legcal.stages.joints_in_camera import locate_joints_in_cameras
 from legcal.stages.leg_directions import LegDirections, directions_through_joints, select_axes
 from legcal.stages.offsets import Offsets, identify_offsets
 from legcal.stages.platform_joints import locate_platform_joints
 from legcal.stages.run import run_steps
+from legcal.studies.session import SimulatedSession, simulate_session
 
 
 def _until_offsets(session: SimulatedSession, nominal: Machine) -> tuple[LegDirections, Offsets]:

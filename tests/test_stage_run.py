@@ -14,11 +14,12 @@ from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations.leg_axes import LegAxes, axes_from_outlines
 from legcal.simulation.machine import Machine
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.poses import extreme_poses, platform_error
-from legcal.simulation.session import SimulatedSession
+from legcal.simulation.poses import extreme_poses
 from legcal.simulation.table_noise import TableNoise
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import StagedResult, run_steps
+from legcal.studies.eq20 import platform_errors
+from legcal.studies.session import SimulatedSession
 
 
 def _run(
@@ -155,8 +156,8 @@ def _improvement(seeds: range, noise: OutlineNoise | TableNoise, criteria: Crite
         session, nominal = noisy_session(seed, noise)
         poses = extreme_poses(session.machine, 5, np.random.default_rng(99))
         result = _run(session, nominal, criteria)
-        before.append(platform_error(session.machine, nominal.parameters, poses)[0])
-        after.append(platform_error(session.machine, result.parameters, poses)[0])
+        before.append(platform_errors(session.machine, nominal.parameters, poses).dX)
+        after.append(platform_errors(session.machine, result.parameters, poses).dX)
     return float(np.mean(before) / np.mean(after))
 
 
@@ -177,7 +178,7 @@ def test_wrong_outlines_are_named_and_hardly_matter() -> None:
     assert session.outlines is not None
     offsets = np.zeros((len(session.outlines), 2))
     offsets[::40] = 15.0
-    camera = session.viewpoints[0].camera
+    camera = session.cameras[0].camera
     h, ends = shifted_outlines(camera, session.outlines.h, session.outlines.ends, offsets)
     wrong = replace(session.outlines, h=h, ends=ends)
     axes = axes_from_outlines(wrong, session.measurements, session.machine.radius_of_part())

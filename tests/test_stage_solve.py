@@ -11,8 +11,8 @@ from legcal.errors import DidNotConverge
 from legcal.stages.least_squares import (
     LeastSquares,
     Term,
-    jacobian_of,
-    residuals_of,
+    structure_jacobian,
+    structure_residuals,
 )
 from legcal.stages.motion import moved, moved_points, register_groups, register_points
 from legcal.stages.solve import solve_least_squares
@@ -91,13 +91,13 @@ def _poses_of_a_plane(n_poses: int, seen: int) -> LeastSquares:
 
 def test_the_sparse_jacobian_is_the_derivative_of_the_residuals() -> None:
     problem = _poses_of_a_plane(4, 3)
-    residuals, jacobian = residuals_of(problem), jacobian_of(problem)
+    residuals, start, seen = structure_residuals(problem.structure), problem.start, problem.observed
     h = 1e-6
     numeric = [
-        (residuals(problem.start + h * e) - residuals(problem.start - h * e)).full() / (2 * h)
-        for e in np.eye(len(problem.start))
+        (residuals(start + h * e, seen) - residuals(start - h * e, seen)).full() / (2 * h)
+        for e in np.eye(len(start))
     ]
-    found = jacobian(problem.start)
+    found = structure_jacobian(problem.structure)(start, seen)
     assert np.allclose(found.full(), np.hstack(numeric), atol=1e-8)
     assert found.nnz() <= problem.n_residuals * 5
 
@@ -143,7 +143,9 @@ def test_the_number_of_nonzeros_grows_with_the_number_of_poses_and_no_faster() -
 def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:
     x = ca.SX.sym("x", 1)
     problem = _problem("A root", x, ca.sqrt(x) - 1.0, [-1.0])
-    with pytest.raises(DidNotConverge, match=r"A root could not be computed.*Invalid_Number"):
+    with pytest.raises(
+        DidNotConverge, match=r"A root could not be .*Invalid_Number.*, needed "
+    ):
         solve_least_squares(problem)
 
 

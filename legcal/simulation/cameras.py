@@ -17,8 +17,8 @@ PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a 
 
 
 @dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """A camera that stands somewhere and the legs that it sees.
+class LegCamera:
+    """A camera around a machine in memory, and the legs that it is said to see.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def cameras_around(
     legs: Sequence[Sequence[int]] = PAPER_VIEWS,
     distance: float = 0.9,
     camera: Camera | None = None,
-) -> tuple[Viewpoint, ...]:
+) -> tuple[LegCamera, ...]:
     """Return cameras that stand around a machine, each on the side of the legs it sees.
 
     Parameters
@@ -72,13 +72,13 @@ def cameras_around(
 
     Returns
     -------
-    tuple of Viewpoint
+    tuple of LegCamera
     """
     A_Rb = machine.parameters.base_joints
     B_Rb = machine.home.apply(machine.parameters.platform_joints)
     middle = 0.5 * (A_Rb + B_Rb)
     centre = middle.mean(axis=0)
-    viewpoints = []
+    cameras = []
     for seen in legs:
         outward = (middle[list(seen)] - centre).mean(axis=0)
         outward[2] = 0.0
@@ -89,8 +89,8 @@ def cameras_around(
         toward = np.array([*(outward[:2] * np.cos(lift)), np.sin(lift)])
         position = centre + distance * rng.uniform(0.95, 1.05) * toward
         pose = look_at(position, centre, roll=rng.uniform(-0.1, 0.1))
-        viewpoints.append(Viewpoint(camera or sample_camera(), pose, tuple(seen)))
-    return tuple(viewpoints)
+        cameras.append(LegCamera(camera or sample_camera(), pose, tuple(seen)))
+    return tuple(cameras)
 
 
 def look_at(

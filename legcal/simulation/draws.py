@@ -13,8 +13,8 @@ from legcal.mechanism.configurations import beyond_travel, strolled
 from legcal.mechanism.following import follow
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.admission import Admission
+from legcal.simulation.extremes import near_ends
 
-JITTER = 0.12  # of the travel, by which extreme lengths stay away from its ends
 TRIES = 60  # draws for each pose
 FULL_EXTREME, FULL = 12, 2  # of them over all of the travel; the next nearer to home
 NEARER = 0.85  # each
@@ -109,7 +109,7 @@ class Draws:
         """Return drawn readings of the motors, taken nearer to home by a factor [m]."""
         part = self._rng.random(len(self._home))
         if self._extreme:
-            part = np.abs(self._rng.integers(0, 2, len(self._home)) - JITTER * part)
+            part = near_ends(self._rng.integers(0, 2, len(self._home)), part)
         q = self._lower + part * (self._upper - self._lower)
         if nearer < 1.0:
             q = np.clip(self._home + nearer * (q - self._home), self._lower, self._upper)

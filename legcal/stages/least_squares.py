@@ -152,20 +152,6 @@ class LeastSquares:
         return np.concatenate(blocks)
 
 
-def residuals_of(problem: LeastSquares) -> ca.Function:
-    """Return the function x -> residuals of all terms, (m,)."""
-    x = ca.MX.sym("x", len(problem.start))
-    of_structure = structure_residuals(problem.structure)
-    return ca.Function("residuals", [x], [of_structure(x, ca.DM(problem.observed))])
-
-
-def jacobian_of(problem: LeastSquares) -> ca.Function:
-    """Return the function x -> sparse Jacobian of the residuals, (m, n)."""
-    x = ca.MX.sym("x", len(problem.start))
-    of_structure = structure_jacobian(problem.structure)
-    return ca.Function("jacobian", [x], [of_structure(x, ca.DM(problem.observed))])
-
-
 def structure_residuals(structure: Structure) -> ca.Function:
     """Return the function (x, observed) -> residuals of all terms, (m,)."""
     x, seen = _symbols(structure)

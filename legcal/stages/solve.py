@@ -65,7 +65,7 @@ def solve_least_squares(problem: LeastSquares) -> Solution:
     Raises
     ------
     DidNotConverge
-        If IPOPT does not report success.
+        If IPOPT does not report success, to its tolerance or to the acceptable one.
     """
     built, observed = _built(problem.structure), ca.DM(problem.observed)
     scale = _scale(problem, built, observed)
@@ -146,8 +146,9 @@ def _minimum(
     if not stats["success"]:
         raise DidNotConverge(
             f"{problem.name} could not be computed: IPOPT stopped after {stats['iter_count']} "
-            f"iterations with {stats['return_status']}, needed Solve_Succeeded; check the "
-            "nominal model and the observations, or reject the ones with large residuals."
+            f"iterations with {stats['return_status']}, needed Solve_Succeeded or "
+            "Solved_To_Acceptable_Level; check the nominal model and the observations, or reject "
+            "the ones with large residuals."
         )
     return _dense(found["x"]), int(stats["iter_count"]), str(stats["return_status"])
 

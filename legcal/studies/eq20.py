@@ -10,8 +10,9 @@ from scipy.special import elliprg
 
 from legcal.geometry.types import Array
 from legcal.mechanism.parameters import KinematicParameters, free_coordinates
+from legcal.simulation.forward import solve_poses
+from legcal.simulation.leg_vectors import leg_vectors, length_jacobian
 from legcal.simulation.machine import Machine
-from legcal.simulation.poses import length_jacobian, poses_of_readings
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,35 @@ def platform_errors(
     )
 
 
+def poses_of_readings(
+    machine: Machine, parameters: KinematicParameters, T_Rb_Re: RigidTransform
+) -> RigidTransform:
+    """Return the poses that other parameters compute from the readings of true poses.
+
+    Parameters
+    ----------
+    machine : Machine
+        The true machine.
+    parameters : KinematicParameters
+        Other parameters.
+    T_Rb_Re : RigidTransform, n_poses of them
+        True poses.
+
+    Returns
+    -------
+    RigidTransform
+        T_Rb_Re of the other parameters, n_poses of them.
+
+    Raises
+    ------
+    DidNotConverge
+        If they cannot have these readings.
+    """
+    lengths = np.linalg.norm(leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
+    changed = lengths - machine.parameters.offsets + parameters.offsets
+    return solve_poses(parameters, changed, T_Rb_Re)
+
+
 def expected_errors(machine: Machine, covariance: Array, T_Rb_Re: RigidTransform) -> PlatformErrors:
     """Return the expected errors of eq (20) for Gaussian errors of the parameters, to first order.
 
@@ -89,14 +119,15 @@ def platform_by_parameters(machine: Machine, T_Rb_Re: RigidTransform) -> Array:
     -------
     (n_poses, 6, n_parameters) array
     """
-    J = length_jacobian(machine.parameters, T_Rb_Re)
+    R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
+    J = length_jacobian(machine.parameters, R, t)
     n_poses, n_legs = J.shape[:2]
     u = J[..., :3]
     to_base = np.zeros((n_poses, n_legs, n_legs, 3))
     to_platform = np.zeros((n_poses, n_legs, n_legs, 3))
     leg = np.arange(n_legs)
     to_base[:, leg, leg] = u
-    to_platform[:, leg, leg] = -(u @ T_Rb_Re.rotation.as_matrix())
+    to_platform[:, leg, leg] = -(u @ R)
     free = free_coordinates(n_legs, machine.frame_legs)
     to_offsets = np.tile(np.eye(n_legs), (n_poses, 1, 1))
     change = np.concatenate([to_base[:, :, free], to_platform[:, :, free], to_offsets], axis=-1)

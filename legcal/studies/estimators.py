@@ -21,10 +21,10 @@ from legcal.refinement.repeated import (
     solve_again,
 )
 from legcal.refinement.start import Start, cameras_from_hints, start_from
+from legcal.simulation.forward import follow_from_home
 from legcal.simulation.machine import Machine
-from legcal.simulation.poses import poses_from_home
-from legcal.simulation.session import SimulatedSession
 from legcal.stages.run import run_steps
+from legcal.studies.session import SimulatedSession
 
 Estimator = Callable[[SimulatedSession, Machine], KinematicParameters]
 """Called as ``estimator(session, nominal)``; it looks at measurements and axes alone."""
@@ -51,7 +51,7 @@ def one_fit(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
         measurements,
         fit.legs,
         cameras_from_hints(measurements, RigidTransform.identity()),
-        poses_from_home(nominal, lengths),
+        tuple(follow_from_home(nominal, lengths).T_Rb_Re),
         "nominal",
     )
     return solve_again(fit, measurements, axes, start).parameters
@@ -76,8 +76,8 @@ def bound_covariance(session: SimulatedSession, exact: LegAxes) -> Array:
     fit = _fit_of(session.machine, session.measurements, axes)
     truth = Start(
         session.machine.parameters,
-        tuple(viewpoint.T_Rb_camera.inv() for viewpoint in session.viewpoints),
-        session.T_Rb_Re,
+        tuple(camera.T_Rb_camera.inv() for camera in session.cameras),
+        tuple(session.T_Rb_Re),
         "truth",
     )
     return bound(fit, session.measurements, axes, truth).covariance

@@ -14,12 +14,12 @@ from legcal.mechanism.parameters import KinematicParameters, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import Machine, perturb
 from legcal.simulation.poses import random_poses
-from legcal.simulation.session import SimulatedSession, observe_session, simulate_session
 from legcal.simulation.table_noise import TableNoise
 from legcal.studies.eq20 import PlatformErrors, expected_errors, platform_errors
 from legcal.studies.estimators import ESTIMATORS, bound_covariance
 from legcal.studies.paper_means import BOUND, INITIAL, means_of
 from legcal.studies.paper_summary import PaperSummary
+from legcal.studies.session import SimulatedSession, observe_session, simulate_session
 from legcal.studies.study import Record
 from legcal.studies.truths import RAISED, coplanar_hexapod, noncoplanar_hexapod
 from legcal.studies.workers import failure_of
@@ -95,7 +95,7 @@ class PaperStudy:
             n_poses=self.n_poses,
             n_images=self.n_images,
         )
-        checked = RigidTransform.concatenate(list(random_poses(machine, self.n_checked, rng)))
+        checked = random_poses(machine, self.n_checked, rng)
         found = {INITIAL: _errors(machine, nominal.parameters, checked)}
         for name, estimate in ESTIMATORS.items():
             try:
@@ -109,7 +109,7 @@ class PaperStudy:
         """Return the errors to expect at the Cramer-Rao bound."""
         machine = session.machine
         _, exact = observe_session(
-            machine, session.viewpoints, session.T_Rb_Re, session.measurements, self.noise, None
+            machine, session.cameras, session.T_Rb_Re, session.measurements, self.noise, None
         )
         covariance = bound_covariance(session, exact)
         sigma = np.sqrt(np.diagonal(covariance))

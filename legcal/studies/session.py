@@ -6,20 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
 from legcal.observations.leg_axes import LegAxes, axes_from_outlines
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
-from legcal.simulation.cameras import Viewpoint
+from legcal.simulation.cameras import LegCamera
+from legcal.simulation.hints import rough_pose
+from legcal.simulation.leg_vectors import leg_vectors
 from legcal.simulation.machine import Machine
-from legcal.simulation.observe import (
-    OutlineNoise,
-    observe_outlines,
-    outline_table,
-)
-from legcal.simulation.poses import extreme_poses, leg_vectors_of_poses
+from legcal.simulation.observe import OutlineNoise, observe_outlines, outline_table
+from legcal.simulation.poses import extreme_poses
 from legcal.simulation.table_noise import TableNoise, observe_axes
 
 
@@ -37,9 +35,9 @@ class SimulatedSession:
         Axes of the legs.
     machine : Machine
         The true machine.
-    viewpoints : tuple of Viewpoint
+    cameras : tuple of LegCamera
         The true cameras.
-    T_Rb_Re : tuple of RigidTransform
+    T_Rb_Re : RigidTransform, n_poses of them
         The true platform poses, by index of pose.
     """
 
@@ -47,13 +45,13 @@ class SimulatedSession:
     outlines: Outlines | None
     axes: LegAxes
     machine: Machine
-    viewpoints: tuple[Viewpoint, ...]
-    T_Rb_Re: tuple[RigidTransform, ...]
+    cameras: tuple[LegCamera, ...]
+    T_Rb_Re: RigidTransform
 
 
 def simulate_session(
     machine: Machine,
-    viewpoints: Sequence[Viewpoint],
+    cameras: Sequence[LegCamera],
     rng: np.random.Generator,
     *,
     noise: OutlineNoise | TableNoise,
@@ -70,7 +68,7 @@ def simulate_session(
     ----------
     machine : Machine
         The true machine.
-    viewpoints : sequence of Viewpoint
+    cameras : sequence of LegCamera
         The true cameras and the legs that they see.
     rng : numpy.random.Generator
         Source of poses and noise.
@@ -93,17 +91,17 @@ def simulate_session(
     -------
     SimulatedSession
     """
-    n_views = len(viewpoints)
+    n_views = len(cameras)
     T_Rb_Re = extreme_poses(machine, n_poses if share_poses else n_views * n_poses, rng)
     view = np.repeat(np.arange(n_views), n_poses * n_images)
     pose = np.repeat(np.arange(n_views * n_poses), n_images)
     pose = (pose % n_poses if share_poses else pose).astype(np.intp)
-    legs = leg_vectors_of_poses(machine.parameters, RigidTransform.concatenate(list(T_Rb_Re)))
-    q = (np.linalg.norm(legs, axis=-1) - machine.parameters.offsets) * machine.sign
+    lengths = np.linalg.norm(leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
+    q = (lengths - machine.parameters.offsets) * machine.sign
     if noisy:
         q = q + _reading_errors(rng, sigma_q, q.shape, uniform=uniform_readings)
     measurements = Measurements(
-        views=tuple(_view(i, v, machine, rng if noisy else None) for i, v in enumerate(viewpoints)),
+        views=tuple(_view(i, c, machine, rng if noisy else None) for i, c in enumerate(cameras)),
         image=("",) * len(view),
         view=view.astype(np.intp),
         pose=pose,
@@ -111,9 +109,9 @@ def simulate_session(
         sigma_q=sigma_q,
     )
     outlines, axes = observe_session(
-        machine, viewpoints, T_Rb_Re, measurements, noise, rng if noisy else None
+        machine, cameras, T_Rb_Re, measurements, noise, rng if noisy else None
     )
-    return SimulatedSession(measurements, outlines, axes, machine, tuple(viewpoints), T_Rb_Re)
+    return SimulatedSession(measurements, outlines, axes, machine, tuple(cameras), T_Rb_Re)
 
 
 def _reading_errors(
@@ -128,8 +126,8 @@ def _reading_errors(
 
 def observe_session(
     machine: Machine,
-    viewpoints: Sequence[Viewpoint],
-    T_Rb_Re: Sequence[RigidTransform],
+    cameras: Sequence[LegCamera],
+    T_Rb_Re: RigidTransform,
     measurements: Measurements,
     noise: OutlineNoise | TableNoise,
     rng: np.random.Generator | None,
@@ -140,9 +138,9 @@ def observe_session(
     ----------
     machine : Machine
         The true machine.
-    viewpoints : sequence of Viewpoint
+    cameras : sequence of LegCamera
         The true cameras and the legs that they see.
-    T_Rb_Re : sequence of RigidTransform
+    T_Rb_Re : RigidTransform, n_poses of them
         The true platform poses, by index of pose.
     measurements : Measurements
         The view and the pose of each image; images of one view stand together.
@@ -158,19 +156,18 @@ def observe_session(
     LegAxes
         Axes, by image and then by leg.
     """
-    poses = RigidTransform.concatenate(list(T_Rb_Re))
-    seen = [np.array(viewpoints[v].legs, dtype=np.intp) for v in measurements.view]
+    seen = [np.array(cameras[v].legs, dtype=np.intp) for v in measurements.view]
     legs = [
-        _legs_in_camera(machine, viewpoint, poses[measurements.pose[measurements.view == v]])
-        for v, viewpoint in enumerate(viewpoints)
+        _legs_in_camera(machine, camera, T_Rb_Re[measurements.pose[measurements.view == v]])
+        for v, camera in enumerate(cameras)
     ]
     if isinstance(noise, TableNoise):
         row = np.repeat(np.arange(len(seen)), [len(s) for s in seen])
         u, A, _, _ = (np.concatenate(part) for part in zip(*legs, strict=True))
         return None, observe_axes(row, np.concatenate(seen), u, A, noise, rng)
     images = [
-        observe_outlines(viewpoint.camera, of_view, noise, rng)
-        for viewpoint, of_view in zip(viewpoints, legs, strict=True)
+        observe_outlines(camera.camera, of_view, noise, rng)
+        for camera, of_view in zip(cameras, legs, strict=True)
     ]
     h, ends = zip(*images, strict=True)
     outlines = outline_table(range(len(seen)), seen, h, ends, machine.parts, noise)
@@ -178,28 +175,22 @@ def observe_session(
 
 
 def _legs_in_camera(
-    machine: Machine, viewpoint: Viewpoint, T_Rb_Re: RigidTransform
+    machine: Machine, camera: LegCamera, T_Rb_Re: RigidTransform
 ) -> tuple[Array, Array, Array, Array]:
     """Return u, A (camera frame), length and radius of the legs in images, by image, then leg."""
-    seen = list(viewpoint.legs)
-    legs = leg_vectors_of_poses(machine.parameters, T_Rb_Re)[:, seen].reshape(-1, 3)
+    seen = list(camera.legs)
+    legs = leg_vectors(machine.parameters, T_Rb_Re)[:, seen].reshape(-1, 3)
     length = np.linalg.norm(legs, axis=-1)
-    T_camera_Rb = viewpoint.T_Rb_camera.inv()
+    T_camera_Rb = camera.T_Rb_camera.inv()
     u = T_camera_Rb.rotation.apply(legs / length[:, None])
     A = T_camera_Rb.apply(machine.parameters.base_joints[seen])
     n_images = len(T_Rb_Re)
     return u, np.tile(A, (n_images, 1)), length, np.tile(machine.radius[seen], n_images)
 
 
-def _view(
-    index: int, viewpoint: Viewpoint, machine: Machine, rng: np.random.Generator | None
-) -> View:
-    """Return the view with a rough camera pose: about 1 cm and 1 degree off."""
-    T = viewpoint.T_Rb_camera
-    if rng is not None:
-        turn = Rotation.from_rotvec(np.deg2rad(1.0) / np.sqrt(3.0) * rng.normal(size=3))
-        shift = 0.01 / np.sqrt(3.0) * rng.normal(size=3)
-        T = RigidTransform.from_components(T.translation + shift, turn * T.rotation)
-    names = tuple(f"leg{j + 1}" for j in viewpoint.legs)
+def _view(index: int, camera: LegCamera, machine: Machine, rng: np.random.Generator | None) -> View:
+    """Return the view with a rough camera pose; the true one without a source of chance."""
+    T = camera.T_Rb_camera if rng is None else rough_pose(camera.T_Rb_camera, rng)
+    names = tuple(f"leg{j + 1}" for j in camera.legs)
     everything = len(names) == machine.n_legs
-    return View(f"c{index + 1}", viewpoint.camera, T, None if everything else names)
+    return View(f"c{index + 1}", camera.camera, T, None if everything else names)
