@@ -75,6 +75,7 @@ class Painter:
         key, face = self._first_hits(canvas.z, solids, feet)
         edge = self._edges(key, solids, feet)
         on_edge = np.flatnonzero(edge)
+        near = self._near_edges(key, on_edge, solids, feet)
         parts = []
         for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
             inside = foot[(key[foot] // _FACES == i + 1) & ~edge[foot]]
@@ -88,7 +89,8 @@ class Painter:
         del key, face, parts, seen
         for start in range(0, len(on_edge), _PIXELS):
             pixels = on_edge[start : start + _PIXELS]
-            self._paint_edge(canvas, pixels, behind[pixels], solids, feet, occluders)
+            shown = near[:, start : start + _PIXELS]
+            self._paint_edge(canvas, pixels, behind[pixels], solids, shown, occluders)
 
     def _first_hits(
         self, z: Single, solids: Sequence[SolidInView], feet: Sequence[IntArray]
@@ -109,16 +111,46 @@ class Painter:
     def _edges(
         self, key: NDArray[np.uint16], solids: Sequence[SolidInView], feet: Sequence[IntArray]
     ) -> BoolArray:
-        """Return the pixels that an edge of a painted surface may cross."""
+        """Return the pixels that an edge of a painted surface may cross.
+
+        A straight edge through a pixel parts its centre from that of one of the four beside it.
+        """
         picture = key.reshape(self.rays.height, self.rays.width)
-        block = np.ones((3, 3), np.uint8)
-        edge = (cv2.dilate(picture, block) != cv2.erode(picture, block)).ravel()
-        per_radian = float(self.rays.camera.K[0, 0])
+        cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        edge = (cv2.dilate(picture, cross) != cv2.erode(picture, cross)).ravel()
         for solid, foot in zip(solids, feet, strict=True):
-            farthest = float(solid.centre[2]) + solid.reach
-            if _thickness(solid) * per_radian < _THIN * farthest:
+            if self._is_thin(solid):
                 edge[foot] = True
         return np.asarray(edge, dtype=np.bool_)
+
+    def _near_edges(
+        self,
+        key: NDArray[np.uint16],
+        on_edge: IntArray,
+        solids: Sequence[SolidInView],
+        feet: Sequence[IntArray],
+    ) -> BoolArray:
+        """Return which solids each of some pixels may show, (n_solids, n): those of pixels around.
+
+        Thin ones may be anywhere in their footprints.
+        """
+        rows, columns = np.divmod(on_edge, self.rays.width)
+        above, below = np.maximum(rows - 1, 0), np.minimum(rows + 1, self.rays.height - 1)
+        left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, self.rays.width - 1)
+        shown = np.zeros((len(solids) + 1, len(on_edge)), dtype=np.bool_)
+        every = np.arange(len(on_edge))
+        for row in (above, rows, below):
+            for column in (left, columns, right):
+                shown[key.take(row * self.rays.width + column) // _FACES, every] = True
+        for solid, foot, here in zip(solids, feet, shown[1:], strict=True):
+            if self._is_thin(solid):
+                here |= np.isin(on_edge, foot, assume_unique=True)
+        return shown[1:]
+
+    def _is_thin(self, solid: SolidInView) -> bool:
+        """Return whether rays through the centres of pixels may miss a solid."""
+        farthest = float(solid.centre[2]) + solid.reach
+        return _thickness(solid) * float(self.rays.camera.K[0, 0]) < _THIN * farthest
 
     def _paint_edge(
         self,
@@ -126,25 +158,24 @@ class Painter:
         pixels: IntArray,
         behind: Single,
         solids: Sequence[SolidInView],
-        feet: Sequence[IntArray],
+        shown: BoolArray,
         occluders: Occluders,
     ) -> None:
-        """Average many rays in each of some pixels; ``behind`` is the depth before painting."""
+        """Average many rays in each of some pixels, which may show some of the solids.
+
+        ``behind`` is the depth before painting.
+        """
         n, S = len(pixels), self.samples
         X, Y = self.rays.within(pixels, S)
         X, Y = X.ravel(), Y.ravel()
         Z = np.repeat(behind, S)
         who = np.zeros(n * S, dtype=np.uint16)
         faces = np.zeros(n * S, dtype=np.int32)
-        row_of = np.full(len(canvas.z), -1, dtype=np.int32)
-        row_of[pixels] = np.arange(n, dtype=np.int32)
         one_pixel = np.arange(S)
         touched = []
-        for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
-            low, high = np.searchsorted(foot, (pixels[0], pixels[-1] + 1))
-            rows = row_of[foot[low:high]]
-            here = (rows[rows >= 0, None] * S + one_pixel).ravel()
-            depth, face = intersect(solid, X.take(here), Y.take(here))
+        for i in np.flatnonzero(shown.any(axis=1)).tolist():
+            here = (np.flatnonzero(shown[i])[:, None] * S + one_pixel).ravel()
+            depth, face = intersect(solids[i], X.take(here), Y.take(here))
             closer = np.flatnonzero(depth < Z.take(here) * np.float32(_TIE))
             if len(closer):
                 at = here.take(closer)

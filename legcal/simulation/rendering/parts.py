@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.geometry.types import BoolArray, IntArray
-from legcal.simulation.rendering.coarse_shadows import seen_coarsely
+from legcal.simulation.rendering.coarse_shadows import CoarseSurface
 from legcal.simulation.rendering.rays import PixelRays, Single
 from legcal.simulation.rendering.shading import Shaded
 from legcal.simulation.rendering.shadows import Lamp, Occluders, seen_of_lamp
@@ -99,7 +99,8 @@ def shares_of_lamps(
                 start += len(some)
             else:
                 pixels = part.pixels[some]
-                share[some] = seen_coarsely(lamp, rays, pixels, P[2], occluders, part.solid)
+                surface = CoarseSurface(rays, pixels, P[2])
+                share[some] = surface.seen(lamp, occluders, part.solid).take(pixels)
             shares.append(share)
     return found
 

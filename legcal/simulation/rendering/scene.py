@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array, Image
 from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.coarse_shadows import seen_coarsely
+from legcal.simulation.rendering.coarse_shadows import CoarseSurface
 from legcal.simulation.rendering.paint import Canvas, Painter
 from legcal.simulation.rendering.rays import PixelRays, Single, pixel_rays
 from legcal.simulation.rendering.sensor import develop
@@ -78,18 +79,20 @@ class Scene:
 
     def _backdrop(self, solids: Sequence[SolidInView]) -> Single:
         """Return the surroundings with the shadows of solids, (1, n_channels, n)."""
-        z, terms = self.canvas.z, self.canvas.terms
-        total: Single = terms[0].copy()
+        total: Single = self.canvas.terms[0].copy()
         occluders = Occluders(solids)
-        near = np.flatnonzero(np.isfinite(z))
-        for lamp, light in zip(self.painter.light.lamps, terms[1:], strict=True):
-            if lamp.shadows and len(near):
-                seen = np.ones_like(z)
-                seen[near] = seen_coarsely(lamp, self.painter.rays, near, z[near], occluders)
-                total += light * seen
+        for lamp, light in zip(self.painter.light.lamps, self.canvas.terms[1:], strict=True):
+            if lamp.shadows:
+                total += light * self._around.seen(lamp, occluders)
             else:
                 total += light
         return np.asarray(total[None])
+
+    @cached_property
+    def _around(self) -> CoarseSurface:
+        """The surfaces on which the machine casts shadows; no lamp lights the background."""
+        near = np.flatnonzero(np.isfinite(self.canvas.z))
+        return CoarseSurface(self.painter.rays, near, self.canvas.z[near])
 
 
 def prepare_scene(
