@@ -1,15 +1,18 @@
 """The solids that a machine is seen as: every visual of its URDF, at its place."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
+from yourdfpy import URDF
 
 from legcal.errors import ModelError
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.dressing import dressed
+from legcal.simulation.motion import draw_poses
 from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
 from legcal.simulation.solids import link_poses, placed, solids_of
 
@@ -86,6 +89,7 @@ def test_every_shape_is_read_with_its_pose_and_colour(tmp_path: Path) -> None:
         ('<mesh filename=""/>', "found no mesh file"),
         ('<mesh filename="bad.stl"/>', r"mesh file 'bad.stl'"),
         ('<box size="0.1 0.1 0"/>', 'found <box size="0.1 0.1 0">, needed 3 positive numbers'),
+        ('<mesh filename="one.stl" scale="1 0 1"/>', "needed 3 numbers other than zero"),
         ("<box/>", 'found <box size="">, needed 3 positive numbers'),
         ("<sphere/>", 'found <sphere radius="">, needed a positive number'),
         ("<capsule/>", "found <capsule>, needed a cylinder, sphere, box or mesh"),
@@ -93,8 +97,61 @@ def test_every_shape_is_read_with_its_pose_and_colour(tmp_path: Path) -> None:
 )
 def test_visuals_that_cannot_be_shown_are_named(tmp_path: Path, visual: str, message: str) -> None:
     (tmp_path / "bad.stl").write_bytes(b"nothing of a mesh")
+    (tmp_path / "one.stl").write_bytes(STL)
     with pytest.raises(ModelError, match=message):
         solids_of(hexapod_showing(tmp_path, f"<visual><geometry>{visual}</geometry></visual>"))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_visuals_stand_where_the_scene_of_yourdfpy_shows_them(name: str) -> None:
+    mechanism = load_mechanism(ROOT / "models" / f"{name}.yaml")
+    robot = URDF.load(io.BytesIO(mechanism.urdf.content))
+    joints = mechanism.urdf.joints.values()
+    parents = {joint.child: joint.parent for joint in joints if joint.type != "floating"}
+    for configuration in draw_poses(mechanism, 2, np.random.default_rng(0)).configurations:
+        q = {
+            joint.name: float(configuration[mechanism.chain.q_index(joint.name)])
+            for joint in joints
+            if joint.type in ("revolute", "prismatic")
+        }
+        robot.update_cfg(q)
+        poses = link_poses(mechanism, configuration)
+        shown = [robot.scene.graph.get(node) for node in robot.scene.graph.nodes_geometry]
+        ours = placed(solids_of(mechanism), poses)
+        assert len(ours) == len(shown) >= mechanism.n_legs
+        for p in ours:
+            root = str(p.solid.link)
+            while root in parents:  # it knows no loops: legs hang where the tree has them
+                root = parents[root]
+            found = (poses[root].inv() * p.T_base_solid).as_matrix()
+            T_root = np.linalg.inv(robot.get_transform(root))
+            (size,) = {
+                (float(solid.radius), float(solid.height))
+                for T, geometry in shown
+                for solid in [robot.scene.geometry[geometry].primitive]
+                if np.abs(T_root @ T - found).max() < 1e-12
+                and float(solid.radius) == vars(p.solid.shape)["radius"]
+            }
+            assert p.solid.shape == Cylinder(*size)
+
+
+def test_a_mesh_is_scaled_and_placed_as_yourdfpy_shows_it(tmp_path: Path) -> None:
+    (tmp_path / "one.stl").write_bytes(STL)
+    mechanism = hexapod_showing(
+        tmp_path,
+        '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/>'
+        '<geometry><mesh filename="../one.stl" scale="0.1 -0.2 0.3"/></geometry></visual>',
+    )
+    (mesh,) = (s for s in solids_of(mechanism) if s.link == "platform")
+    assert isinstance(mesh.shape, Mesh)
+    turn = Rotation.from_euler("xyz", [0.4, 0.5, 0.6])
+    expected = turn.apply([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, -0.2, 0.0]])
+    expected += [0.1, 0.2, 0.3]
+    found = mesh.T_link_solid.apply(mesh.shape.vertices)
+    assert sorted(np.round(found, 9).tolist()) == sorted(np.round(expected, 9).tolist())
+    corners = found[mesh.shape.faces[0]]
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    assert abs(normal @ turn.apply([0.0, 0.0, 1.0])) == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -1,11 +1,15 @@
-"""The visuals of a URDF, every shape of them, as the file has them."""
+"""The visuals of a URDF, every shape of them, read with yourdfpy.
 
+What yourdfpy would pass over or stumble on is looked for before, and said with its line.
+"""
+
+import io
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from lxml import etree
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
 from legcal.mechanism.robot_xml import parse_robot
@@ -43,7 +47,8 @@ def visuals(urdf: Urdf) -> list[Visual]:
             if geometry is None or len(geometry) == 0:
                 continue
             try:
-                shape = _shape(urdf.path, geometry[0])
+                _check(urdf.path, geometry[0])
+                shape, T = _shown(urdf.path, visual)
             except ValueError as error:
                 problems.append(
                     f"{urdf.path}, line {visual.sourceline}: the visual of link "
@@ -54,52 +59,77 @@ def visuals(urdf: Urdf) -> list[Visual]:
             colour = None
             if material is not None:
                 colour = _rgb(material) or named.get(material.get("name", ""))
-            found.append(Visual(link.get("name", ""), shape, _origin(visual), colour))
+            found.append(Visual(link.get("name", ""), shape, T, colour))
     if problems:
         raise ModelError(problems)
     return found
 
 
-def _shape(urdf_path: Path, element: etree._Element) -> Shape:
-    """Return the shape of a ``<geometry>``; ValueError says what was found and needed."""
+def _check(urdf_path: Path, element: etree._Element) -> None:
+    """Check a shape; ValueError says what was found and needed."""
     tag = str(element.tag)
     if tag == "mesh":
-        return _mesh(urdf_path, element)
-    if tag not in _SIZES:
+        _check_mesh(urdf_path, element)
+    elif tag not in _SIZES:
         raise ValueError(
             f"found <{tag}>, needed a cylinder, sphere, box or mesh; write one of them"
         )
-    sizes = {name: _numbers(element, name, 3 if name == "size" else 1) for name in _SIZES[tag]}
-    if tag == "cylinder":
-        return Cylinder(sizes["radius"][0], sizes["length"][0])
-    if tag == "sphere":
-        return Sphere(sizes["radius"][0])
-    return Box((sizes["size"][0], sizes["size"][1], sizes["size"][2]))
+    for name in _SIZES.get(tag, ()):
+        text, count = element.get(name, ""), 3 if name == "size" else 1
+        numbers = number_list(text, count)
+        if numbers is None or min(numbers) <= 0.0:
+            needed = "a positive number" if count == 1 else f"{count} positive numbers"
+            raise ValueError(f'found <{tag} {name}="{text}">, needed {needed}; write it [m]')
 
 
-def _numbers(element: etree._Element, name: str, count: int) -> list[float]:
-    """Return sizes that must be positive."""
-    numbers = number_list(element.get(name, ""), count)
-    if numbers is None or min(numbers) <= 0.0:
-        raise ValueError(
-            f'found <{element.tag} {name}="{element.get(name, "")}">, needed '
-            f"{'a positive number' if count == 1 else f'{count} positive numbers'}; write it [m]"
-        )
-    return numbers
-
-
-def _mesh(urdf_path: Path, element: etree._Element) -> Mesh:
-    """Return the triangles of a mesh file, which is looked for as other tools look for it."""
-    import trimesh  # half a second: only where there is something to read
-
-    name = element.get("filename", "")
-    path = _found(urdf_path, name)
-    if path is None:
+def _check_mesh(urdf_path: Path, element: etree._Element) -> None:
+    """Check that a mesh has a file and a size."""
+    name, scale = element.get("filename", ""), element.get("scale", "1 1 1")
+    if _found(urdf_path, name) is None:
         raise ValueError(
             f"found no mesh file '{name}', needed it beside the URDF; copy it or correct the name"
         )
+    factors = number_list(scale, 3)
+    if factors is None or min(abs(factor) for factor in factors) == 0.0:
+        raise ValueError(
+            f'found <mesh scale="{scale}">, needed 3 numbers other than zero; correct it'
+        )
+
+
+def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransform]:
+    """Return the shape of a visual and T_link_shape, as yourdfpy has them.
+
+    A mesh is scaled and placed by yourdfpy, its vertices are those in the link. ValueError says
+    what was found and needed where its file holds none.
+    """
+    from yourdfpy import URDF  # half a second: only where there is something to read
+
+    if visual.find("geometry/mesh") is not None:
+        return _mesh(urdf_path, visual), RigidTransform.identity()
+    alone = io.BytesIO(_alone(visual))
+    robot: Any = URDF.load(alone, build_scene_graph=False, load_meshes=False).robot
+    (read,) = robot.links[0].visuals
+    T = RigidTransform.from_matrix(np.asarray(read.origin, dtype=float))
+    cylinder, sphere = read.geometry.cylinder, read.geometry.sphere
+    if cylinder is not None:
+        return Cylinder(float(cylinder.radius), float(cylinder.length)), T
+    if sphere is not None:
+        return Sphere(float(sphere.radius)), T
+    x, y, z = (float(side) for side in read.geometry.box.size)
+    return Box((x, y, z)), T
+
+
+def _mesh(urdf_path: Path, visual: etree._Element) -> Mesh:
+    """Return the triangles of a mesh file in the link, from the scene that yourdfpy makes of it."""
+    from yourdfpy import URDF
+
+    name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
     try:
-        mesh: Any = trimesh.load(str(path), force="mesh")
+        scene: Any = URDF.load(
+            io.BytesIO(_alone(visual)),
+            filename_handler=lambda fname: str(_found(urdf_path, fname)),
+        ).scene
+        mesh = scene.to_geometry()
         vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
     except (ValueError, KeyError, IndexError, AttributeError, TypeError, OSError) as error:
         reason = " ".join(str(error).split())
@@ -111,8 +141,23 @@ def _mesh(urdf_path: Path, element: etree._Element) -> Mesh:
         raise ValueError(
             f"found no triangles in the mesh file '{name}', needed some; export it again"
         )
-    scale = number_list(element.get("scale", "1 1 1"), 3) or [1.0, 1.0, 1.0]
-    return Mesh(vertices * np.array(scale), faces.astype(np.intp))
+    return Mesh(vertices, faces.astype(np.intp))
+
+
+def _alone(visual: etree._Element) -> bytes:
+    """Return a URDF of one link with the shape and the place of a visual, and nothing else."""
+    robot = etree.Element("robot", {"name": "visual"})
+    shown = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
+    origin = visual.find("origin")
+    place = {}
+    for key in ("xyz", "rpy"):
+        numbers = None if origin is None else number_list(origin.get(key, ""), 3)
+        place[key] = " ".join(repr(x) for x in numbers or (0.0, 0.0, 0.0))
+    etree.SubElement(shown, "origin", place)
+    shape = visual.find("geometry")[0]  # type: ignore[index]
+    geometry = etree.SubElement(shown, "geometry")
+    etree.SubElement(geometry, str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
+    return etree.tostring(robot)
 
 
 def _found(urdf_path: Path, name: str) -> Path | None:
@@ -126,16 +171,6 @@ def _found(urdf_path: Path, name: str) -> Path | None:
             if (folder / tail).is_file():
                 return folder / tail
     return None
-
-
-def _origin(visual: etree._Element) -> RigidTransform:
-    """Return T_link_shape."""
-    origin = visual.find("origin")
-    if origin is None:
-        return RigidTransform.identity()
-    xyz, rpy = (number_list(origin.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
-    rotation = Rotation.from_euler("xyz", rpy or [0.0, 0.0, 0.0])
-    return RigidTransform.from_components(xyz or [0.0, 0.0, 0.0], rotation)
 
 
 def _rgb(material: etree._Element) -> tuple[float, float, float] | None:
