@@ -319,6 +319,21 @@ def test_given_readings_that_are_not_reached_are_named_by_row(tmp_path: Path) ->
     assert "row 2 (line 3): the pose could not be used: found legs that cannot have" in problem
 
 
+def test_given_readings_a_little_outside_the_travel_are_refused_by_row(tmp_path: Path) -> None:
+    mechanism = load_mechanism("hexapod")
+    q = inverse_kinematics(mechanism, mechanism.home)
+    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    rows = np.tile(q, (4, 1))
+    rows[1, 2], rows[2, 4], rows[3, 4] = upper[2] + 0.003, lower[4] - 0.001, upper[4]
+    with pytest.raises(DatasetError) as caught:
+        given_poses(mechanism, _csv(tmp_path, mechanism, rows))
+    one, two = caught.value.problems
+    assert "row 2 (line 3)" in one
+    assert "leg3_prismatic at 0.147 m, outside its travel of -0.004 to 0.144 m" in one
+    assert "row 3 (line 4)" in two
+    assert "leg5_prismatic at -0.005 m" in two
+
+
 def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) -> None:
     thick = _with_radius(0.037, tmp_path)
     poses = _drawn(load_mechanism("hexapod"), 12)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DatasetError, DidNotConverge, UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.closing import platform_pose, slider_columns
-from legcal.mechanism.configurations import joint_values
+from legcal.mechanism.configurations import INSIDE, joint_values
 from legcal.mechanism.following import follow
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.admission import Admission
@@ -151,14 +151,16 @@ def given_poses(mechanism: Mechanism, path: Path) -> SimulatedPoses:
     reached = [mechanism.home_configuration]
     for where, row in zip(given.where, given.readings, strict=True):
         nearest = int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))
-        try:
-            configuration = follow(mechanism, reached[nearest], row)
-        except DidNotConverge:
-            problem: str | None = "legs that cannot have these lengths at the same time"
-        else:
-            problem = admission.problem(configuration, of_motors=False)
-            known.append(row)
-            reached.append(configuration)
+        problem = _outside_travel(mechanism, row)
+        if problem is None:
+            try:
+                configuration = follow(mechanism, reached[nearest], row)
+            except DidNotConverge:
+                problem = "legs that cannot have these lengths at the same time"
+            else:
+                problem = admission.problem(configuration, of_motors=False)
+                known.append(row)
+                reached.append(configuration)
         if problem is not None:
             problems.append(
                 f"{where}: the pose could not be used: found {problem} there, needed a pose that "
@@ -167,6 +169,17 @@ def given_poses(mechanism: Mechanism, path: Path) -> SimulatedPoses:
     if problems:
         raise DatasetError(problems)
     return _poses(mechanism, reached[1:])
+
+
+def _outside_travel(mechanism: Mechanism, row: Array) -> str | None:
+    """Return which reading of the motors, (n_motors,) [m], is outside its travel."""
+    for j, q in zip(mechanism.motors, row, strict=True):
+        leg = mechanism.legs[j]
+        lower, upper = leg.travel
+        if not lower - INSIDE <= q <= upper + INSIDE:
+            travel = f"{lower:.9g} to {upper:.9g} m"
+            return f"{leg.prismatic} at {q:.9g} m, outside its travel of {travel},"
+    return None
 
 
 def _poses(mechanism: Mechanism, configurations: list[Array]) -> SimulatedPoses:
