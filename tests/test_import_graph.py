@@ -106,6 +106,29 @@ def test_no_module_of_the_method_imports_the_simulation() -> None:
     assert users == set()
 
 
+def test_the_simulation_does_not_reach_the_method() -> None:
+    method = {"detection", "stages", "refinement", "identify", "calibration", "repeatability"}
+    modules = [module for module in _modules() if _unit(module) == "simulation"]
+    assert modules
+    reached = {(m, other) for m in modules for other in _reachable(m) if _unit(other) in method}
+    assert reached == set()
+
+
+def test_the_simulation_takes_only_cameras_and_tables_from_what_observes() -> None:
+    cameras = {f"vision.{name}" for name in ("camera", "camera_file", "camera_writer")}
+    tables = {"measurements", "outlines", "table", "axes_file"}
+    allowed = cameras | {f"observations.{name}" for name in tables}
+    modules = [module for module in _modules() if _unit(module) == "simulation"]
+    taken = {
+        (module, other)
+        for module in modules
+        for other in _imports(module)
+        if _unit(other) in {"vision", "observations"}
+        and other.removeprefix("legcal.") not in allowed
+    }
+    assert taken == set()
+
+
 def test_no_module_names_the_true_model_of_the_example() -> None:
     users = [m for m, path in _modules().items() if "hexapod-truth" in path.read_text()]
     assert users == []

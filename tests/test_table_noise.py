@@ -9,12 +9,19 @@ from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.table_axes import axes_of_table, table_of_axes
-from legcal.simulation.table_noise import TableNoise, observe_axes
+from legcal.simulation.table_noise import TableNoise, observe_axes, table_of_lines
+from legcal.vision.cylinder import point_with_zero_y
 from legcal.vision.euler import angles_of_direction, direction_derivative, direction_of_angles
 
 
 def _indices(n: int) -> tuple[IntArray, IntArray]:
     return np.arange(n, dtype=np.intp), np.zeros(n, dtype=np.intp)
+
+
+def _observed(u: Array, A: Array, noise: TableNoise, rng: np.random.Generator | None) -> LegAxes:
+    """Return axes with the noise of Table 1 as the method takes them from the table."""
+    table = observe_axes(*_indices(len(u)), u, A, noise, rng)
+    return axes_of_table(table.row, table.leg, table.values, table.sigmas)
 
 
 def _random_lines(n: int, seed: int = 0) -> tuple[Array, Array]:
@@ -58,8 +65,8 @@ def test_the_noise_of_table_1_has_the_spread_of_its_covariance() -> None:
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     A = np.tile([0.1, 0.2, 0.9], (n, 1))
     noise = TableNoise()
-    axes = observe_axes(*_indices(n), u, A, noise, np.random.default_rng(0))
-    exact = observe_axes(*_indices(n), u, A, noise, None)
+    axes = _observed(u, A, noise, np.random.default_rng(0))
+    exact = _observed(u, A, noise, None)
     M, basis, covariance = exact.M[0], exact.basis[0], exact.covariance[0]
     beta = (axes.M - M) @ basis.T
     alpha = (axes.u / (axes.u @ u[0])[:, None]) @ basis.T
@@ -78,15 +85,34 @@ def test_the_angles_of_table_1_are_degrees_unless_radians_are_asked_for() -> Non
 
 def test_axes_without_noise_are_the_lines_that_they_were_made_of() -> None:
     u, A = _random_lines(30)
-    axes = observe_axes(*_indices(30), u, A, TableNoise(), None)
+    axes = _observed(u, A, TableNoise(), None)
     assert np.allclose(axes.u, u, atol=1e-15)
     assert np.allclose(axes.M[:, 1], 0.0)
     assert np.allclose(distance_to_line(A, axes.u, axes.M), 0.0, atol=1e-14)
 
 
+def test_the_simulator_has_its_own_way_to_the_table_and_it_leads_to_the_same() -> None:
+    u, A = _random_lines(200, seed=3)
+    u[:4] = [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1e-9, -1.0, 0.0], [1e-5, 1e-4, 1.0]]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    M = point_with_zero_y(u, A)
+    psi, theta = angles_of_direction(u)
+    found = table_of_lines(u, A)
+    turn = np.abs(found[:, 1] - theta)
+    assert np.abs(found[:, 0] - psi).max() < 1e-14
+    assert np.minimum(turn, 2.0 * np.pi - turn).max() < 1e-11  # near the optical axis
+    assert np.minimum(turn, 2.0 * np.pi - turn)[4:].max() < 1e-14
+    assert np.allclose(found[:, 2:], M[:, [0, 2]], rtol=1e-11, atol=1e-14)
+    # and both to the line that was there, by turning it back
+    turns = Rotation.from_euler("xz", found[:, :2])
+    assert np.allclose(turns.apply([0.0, 1.0, 0.0]), u, atol=1e-14)
+    points = np.stack([found[:, 2], np.zeros(len(u)), found[:, 3]], axis=-1)
+    assert np.allclose(distance_to_line(A[4:], u[4:], points[4:]), 0.0, atol=1e-14)
+
+
 def test_angles_and_points_come_back_from_axes_wherever_their_points_lie() -> None:
     u, A = _random_lines(30)
-    axes = observe_axes(*_indices(30), u, A, TableNoise(), np.random.default_rng(2))
+    axes = _observed(u, A, TableNoise(), np.random.default_rng(2))
     shift = np.linspace(-0.4, 0.4, 30)
     move = np.tile(np.eye(4), (30, 1, 1))
     move[:, 2, 0] = move[:, 3, 1] = shift  # a tilt moves the line where it is looked at

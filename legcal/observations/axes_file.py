@@ -17,6 +17,7 @@ from legcal.errors import DatasetError
 from legcal.files.atomic import write_atomically
 from legcal.files.csv_file import read_named_rows
 from legcal.files.schema import describe
+from legcal.geometry.types import Array, IntArray
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
 from legcal.observations.row import number_in, place_in_measurements
@@ -56,20 +57,45 @@ def write_axes(
     OSError
         If the file cannot be written.
     """
-    write_atomically(path, format_axes(axes, measurements, leg_names).encode())
+    write_axis_table(path, axes.row, axes.leg, *table_of_axes(axes), measurements, leg_names)
 
 
-def format_axes(axes: LegAxes, measurements: Measurements, leg_names: Sequence[str]) -> str:
-    """Return the text of ``axes.csv``; arguments as in :func:`write_axes`."""
+def write_axis_table(
+    path: Path,
+    row: IntArray,
+    leg: IntArray,
+    values: Array,
+    sigmas: Array,
+    measurements: Measurements,
+    leg_names: Sequence[str],
+) -> None:
+    """Write axes that are given as the table has them, the file complete or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        ``axes.csv``.
+    row, leg : (n,) array of int
+        Indices of the image and of the leg.
+    values, sigmas : (n, 4) array
+        psi, theta, x, z and their standard deviations [rad, rad, m, m].
+    measurements, leg_names
+        As in :func:`write_axes`.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
     names = row_names(measurements)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    numbers = np.hstack(table_of_axes(axes)).tolist()
-    for row, leg, cells in zip(axes.row.tolist(), axes.leg.tolist(), numbers, strict=True):
-        view = measurements.views[measurements.view[row]].name
-        writer.writerow([view, names[row], leg_names[leg], *(repr(x) for x in cells)])
-    return text.getvalue()
+    numbers = np.hstack([values, sigmas]).tolist()
+    for r, j, cells in zip(row.tolist(), leg.tolist(), numbers, strict=True):
+        view = measurements.views[measurements.view[r]].name
+        writer.writerow([view, names[r], leg_names[j], *(repr(x) for x in cells)])
+    write_atomically(path, text.getvalue().encode())
 
 
 def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) -> LegAxes:

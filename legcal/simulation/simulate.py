@@ -11,7 +11,7 @@ from legcal.dataset.folder import OBSERVATIONS_NAME
 from legcal.geometry.types import Array
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.observations.axes_file import write_axes
+from legcal.observations.axes_file import write_axis_table
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.table import write_observations
 from legcal.progress import Report, no_progress
@@ -263,4 +263,4 @@ def _write_observations(
         write_observations(folder / OBSERVATIONS_NAME, noisy, m, legs)
     elif settings.level is Level.AXES:
         axes = axes_of_images(images, machines, views, settings.table, chance["observations"])
-        write_axes(folder / AXES_NAME, axes, m, legs)
+        write_axis_table(folder / AXES_NAME, axes.row, axes.leg, axes.values, axes.sigmas, m, legs)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from legcal.errors import NotVisible
 from legcal.geometry.types import Array, IntArray
-from legcal.observations.leg_axes import LegAxes
-from legcal.observations.table_axes import axes_of_table
-from legcal.vision.cylinder import point_with_zero_y
-from legcal.vision.euler import angles_of_direction
+
+_LEAST_UPRIGHT = 1e-9  # component along the image y axis
 
 
 @dataclass(frozen=True)
@@ -44,6 +43,60 @@ class TableNoise:
         return np.array([self.psi, self.theta, self.x, self.z])
 
 
+@dataclass(frozen=True, eq=False)
+class AxisTable:
+    """Axes of legs as Table 1 states them.
+
+    Attributes
+    ----------
+    row, leg : (n,) array of int
+        Indices of the image and of the leg.
+    values, sigmas : (n, 4) array
+        psi, theta, x, z and their standard deviations [rad, rad, m, m].
+    """
+
+    row: IntArray
+    leg: IntArray
+    values: Array
+    sigmas: Array
+
+
+def table_of_lines(u: Array, A: Array) -> Array:
+    """Return psi, theta and M_LS of lines, by the way of their moments.
+
+    The direction u is at 90 deg - psi to the optical axis, and its picture u_y - i u_x as a complex
+    number is at theta to the image's y axis. M_LS is in the plane y = 0 and has the moment of
+    the line, M x u = A x u. The method finds the same by other ways, so that a mistake shows.
+
+    Parameters
+    ----------
+    u, A : (n, 3) array
+        Directions, and a point of each line [m], in the camera frame.
+
+    Returns
+    -------
+    (n, 4) array
+        psi, theta [rad] and x, z [m].
+
+    Raises
+    ------
+    NotVisible
+        If a line is parallel to the plane y = 0, where M_LS does not exist.
+    """
+    u_x, u_y, u_z = u.T
+    if np.any(np.abs(u_y) < _LEAST_UPRIGHT):
+        raise NotVisible(
+            "The axis of a simulated leg could not be tabulated: found it parallel to the image x "
+            "axis, needed a leg that crosses the plane y = 0 of its camera; turn the camera."
+        )
+    # The angle to the optical axis from the chords to both of its ends: exact for all angles.
+    across = np.hypot(u_x, u_y)
+    psi = 0.5 * np.pi - 2.0 * np.arctan2(np.hypot(across, u_z - 1.0), np.hypot(across, u_z + 1.0))
+    theta = np.angle(u_y - 1j * u_x)
+    moment = np.cross(A, u)
+    return np.stack([psi, theta, moment[:, 2] / u_y, -moment[:, 0] / u_y], axis=-1)
+
+
 def observe_axes(
     row: IntArray,
     leg: IntArray,
@@ -51,8 +104,8 @@ def observe_axes(
     A: Array,
     noise: TableNoise,
     rng: np.random.Generator | None,
-) -> LegAxes:
-    """Return the axes of legs as images show them.
+) -> AxisTable:
+    """Return the table of the axes of legs as images show them.
 
     Parameters
     ----------
@@ -61,21 +114,20 @@ def observe_axes(
     u, A : (n, 3) array
         True directions, and a point of each axis [m], in the camera frame.
     noise : TableNoise
-        What disturbs the axes, and the covariance that they carry.
+        What disturbs the axes, and the standard deviations that they carry.
     rng : numpy.random.Generator or None
         Source of the noise; None leaves the axes exact.
 
     Returns
     -------
-    LegAxes
+    AxisTable
 
     Raises
     ------
     NotVisible
         If an axis is parallel to the image x axis, where M_LS does not exist.
     """
-    M = point_with_zero_y(u, A)
-    values = np.stack([*angles_of_direction(u), M[:, 0], M[:, 2]], axis=-1)
+    values = table_of_lines(u, A)
     if rng is not None:
         values += rng.normal(size=values.shape) * noise.sigmas
-    return axes_of_table(row, leg, values, np.broadcast_to(noise.sigmas, values.shape))
+    return AxisTable(row, leg, values, np.broadcast_to(noise.sigmas, values.shape))

@@ -8,13 +8,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
-from legcal.observations.leg_axes import LegAxes
 from legcal.observations.outlines import Outlines
 from legcal.simulation.images import Images, Viewpoint
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.posed_machine import PosedMachine
 from legcal.simulation.silhouette import silhouette
-from legcal.simulation.table_noise import TableNoise, observe_axes
+from legcal.simulation.table_noise import AxisTable, TableNoise, observe_axes
 from legcal.simulation.visibility import Stretch
 from legcal.vision.camera import Camera
 
@@ -87,8 +86,8 @@ def axes_of_images(
     viewpoints: Sequence[Viewpoint],
     noise: TableNoise,
     rng: np.random.Generator,
-) -> LegAxes:
-    """Return the axes of all legs that images show, by row and leg.
+) -> AxisTable:
+    """Return the table of the axes of all legs that images show, by row and leg.
 
     A leg parallel to the image x axis has no point M_LS = (x, 0, z) and is left out.
 

@@ -12,6 +12,7 @@ from legcal.geometry.types import Array
 from legcal.observations.leg_axes import LegAxes, axes_from_outlines
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
+from legcal.observations.table_axes import axes_of_table
 from legcal.simulation.cameras import LegCamera
 from legcal.simulation.hints import rough_pose
 from legcal.simulation.leg_vectors import leg_vectors
@@ -164,7 +165,8 @@ def observe_session(
     if isinstance(noise, TableNoise):
         row = np.repeat(np.arange(len(seen)), [len(s) for s in seen])
         u, A, _, _ = (np.concatenate(part) for part in zip(*legs, strict=True))
-        return None, observe_axes(row, np.concatenate(seen), u, A, noise, rng)
+        table = observe_axes(row, np.concatenate(seen), u, A, noise, rng)
+        return None, axes_of_table(table.row, table.leg, table.values, table.sigmas)
     images = [
         observe_outlines(camera.camera, of_view, noise, rng)
         for camera, of_view in zip(cameras, legs, strict=True)
