@@ -1,6 +1,6 @@
 """How fast photographs are rendered: images a second of one core, with everything on.
 
-    OMP_NUM_THREADS=1 python benchmarks/photographs.py [IMAGES]
+    OMP_NUM_THREADS=1 python benchmarks/photographs.py [--images 15] [MODEL ...]
 
 1024 x 768, each shipped mechanism with balls, posts and plates on a table among 15 pieces of
 clutter, two lamps, soft shadows, limb darkening, highlights, lens distortion, blur, gamma and
@@ -9,7 +9,7 @@ processor: "scene" once a view, "image" the median and "png" the mean of writing
 counts all three, 15 images a view.
 """
 
-import sys
+import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -80,12 +80,21 @@ def measure(mechanism: Mechanism, n: int) -> str:
     return f"{len(solids):6d}{1e3 * preparing:9.0f}{1e3 * image:9.0f}{1e3 * write:9.0f}{rate:9.2f}"
 
 
-def main(n: int = 15) -> None:
+def main() -> None:
     """Print a line a model."""
+    shipped = sorted(path.stem for path in MODELS.glob("*.yaml"))
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("models", nargs="*", metavar="MODEL", help="shipped models; all of them")
+    parser.add_argument("--images", type=int, default=15, help="photographs of each; 15")
+    options = parser.parse_args()
+    if unknown := set(options.models) - set(shipped):
+        parser.error(f"found {', '.join(sorted(unknown))}, needed some of {', '.join(shipped)}")
+    if options.images < 1:
+        parser.error(f"found {options.images} images, needed at least one")
     print(f"{'[ms]':16}{'solids':>6}{'scene':>9}{'image':>9}{'png':>9}{'images/s':>9}")
-    for path in sorted(MODELS.glob("*.yaml")):
-        print(f"{path.stem:16}{measure(load_mechanism(path), n)}", flush=True)
+    for name in options.models or shipped:
+        print(f"{name:16}{measure(load_mechanism(name), options.images)}", flush=True)
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main()

@@ -21,7 +21,7 @@ from legcal.simulation.solids import PlacedSolid
 from legcal.workers import worker_pool
 
 STAGE = "Photographs"
-_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise does not compress: more effort saves nothing
+_FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written faster without
 
 
 def take_photographs(
@@ -119,7 +119,7 @@ class _Studio:
 
     def _write(self, path: Path, image: Image) -> None:
         """Write a photograph."""
-        encoded, content = cv2.imencode(".png", image, _FAST)
+        encoded, content = cv2.imencode(".png", image, _FAST if image.ndim == 3 else ())
         if not encoded:
             raise OutOfResources(
                 f"{path}: the photograph could not be encoded: found an image of {image.shape[1]} "

@@ -75,7 +75,8 @@ class Appearance:
     gamma : float
         Grey levels are radiance to the power 1 / gamma; 1 is linear.
     electrons : float
-        Electrons of a pixel at full scale, which fixes the shot noise; infinite for none.
+        Electrons of a pixel at full scale, which fixes the shot noise; infinite for no noise at
+        all, since read noise is counted in electrons too.
     read_noise : float
         Standard deviation of the noise in the dark [electrons].
     bits : {8, 16}

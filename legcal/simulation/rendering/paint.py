@@ -1,4 +1,8 @@
-"""Solids painted into a picture: one ray a pixel inside surfaces, many where edges are."""
+"""Solids painted into a picture: one ray a pixel inside surfaces, many where edges are.
+
+Edges are where solids, or the faces of a cylinder or box, meet in the picture. Those between the
+triangles of one mesh, and where a mesh hides a part of itself, keep one ray a pixel.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +24,7 @@ from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
 _TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
 _THIN = 3.0  # [px] solids that rays through pixel centres may miss
 _PIXELS = 8192  # on edges, at a time
+_SHADED = 3  # of so many of a pixel's rays that meet a solid, one is shaded
 _FACES = 8  # that are told apart in the search for edges
 
 
@@ -183,21 +188,35 @@ class Painter:
                 touched.append((i, here))
         uncovered = np.count_nonzero(who.reshape(n, S) == 0, axis=1) / S
         total = canvas.terms[:, :, pixels] * uncovered.astype(np.float32)
-        parts = []
+        parts, weights = [], []
         for i, here in touched:
             at = here[who.take(here) == i + 1]
             if len(at):
+                at, first, weight = _some_of_each(at, at // S)
                 shaded = shade(
                     solids[i], X.take(at), Y.take(at), Z.take(at), faces.take(at), self.light
                 )
-                row = at // S
-                first = np.flatnonzero(np.diff(row, prepend=-1))
-                parts.append(Part(i, row[first], shaded, first))
+                parts.append(Part(i, at[first] // S, shaded, first))
+                weights.append(weight)
         seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
-        for part, shares in zip(parts, seen, strict=True):
+        for part, shares, weight in zip(parts, seen, weights, strict=True):
             light = part.radiance(shares, len(canvas.terms))
-            total[:, :, part.pixels] += light * np.float32(1.0 / S)
+            total[:, :, part.pixels] += light * (weight / np.float32(S))
         canvas.terms[:, :, pixels] = total
+
+
+def _some_of_each(
+    rays: IntArray, pixel: NDArray[np.intp]
+) -> tuple[IntArray, NDArray[np.intp], Single]:
+    """Return every third ray of each pixel, where each pixel's rays start, and what they weigh.
+
+    A surface's light varies little inside a pixel; that its rays are many matters for its edge.
+    """
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    count = np.diff(first, append=len(rays))
+    kept = (np.arange(len(rays)) - np.repeat(first, count)) % _SHADED == 0
+    n_kept = -(-count // _SHADED)
+    return rays[kept], np.cumsum(n_kept) - n_kept, (count / n_kept).astype(np.float32)
 
 
 def _thickness(solid: SolidInView) -> float:

@@ -139,22 +139,19 @@ def _past_cylinder(
     solid: SolidInView, shape: Cylinder, lamp: Lamp, P: Single, to_lamp: Single
 ) -> Single:
     """Return the share of the lamp seen past a cylinder."""
-    ux, uy, uz = solid.R[:, 2].tolist()
-    qx, qy, qz = (P[i] - float(solid.w[i]) for i in range(3))
-    lx, ly, lz = to_lamp
-    s0, ds = qx * ux + qy * uy + qz * uz, lx * ux + ly * uy + lz * uz
+    R = solid.R.T.astype(np.float32)
+    qx, qy, qz = R @ (P - solid.w.astype(np.float32)[:, None])
+    lx, ly, lz = R @ to_lamp
     # The part of the way that lies between the planes of the caps.
-    safe = np.where(np.abs(ds) < _TINY, np.float32(_TINY), ds)
-    t1, t2 = (-0.5 * shape.length - s0) / safe, (0.5 * shape.length - s0) / safe
-    first = np.clip(np.minimum(t1, t2), 0.0, 1.0)
-    last = np.clip(np.maximum(t1, t2), 0.0, 1.0)
+    safe = np.where(np.abs(lz) < _TINY, np.float32(_TINY), lz)
+    t1, t2 = (-0.5 * shape.length - qz) / safe, (0.5 * shape.length - qz) / safe
+    first = np.minimum(np.maximum(np.minimum(t1, t2), 0.0), 1.0)
+    last = np.minimum(np.maximum(np.maximum(t1, t2), 0.0), 1.0)
     # Closest approach to the axis there.
-    qx, qy, qz = qx - s0 * ux, qy - s0 * uy, qz - s0 * uz
-    lx, ly, lz = lx - ds * ux, ly - ds * uy, lz - ds * uz
-    l2 = np.maximum(lx * lx + ly * ly + lz * lz, _TINY)
-    t = np.clip(-(qx * lx + qy * ly + qz * lz) / l2, first, last)
-    px, py, pz = qx + t * lx, qy + t * ly, qz + t * lz
-    gap = np.sqrt(px * px + py * py + pz * pz) - shape.radius
+    t = -(qx * lx + qy * ly) / np.maximum(lx * lx + ly * ly, _TINY)
+    t = np.minimum(np.maximum(t, first), last)
+    px, py = qx + t * lx, qy + t * ly
+    gap = np.sqrt(px * px + py * py) - shape.radius
     return np.where(last > first, _half_shadow(gap, t, lamp), np.float32(1.0))
 
 
