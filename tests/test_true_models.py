@@ -1,6 +1,7 @@
 """True machines: drawn errors are what a written model differs by, and it is one machine still."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from legcal.mechanism.leg_geometry import Demand, LegGeometry
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, in_links, parametrization_of, vector_of
+from legcal.report.urdf_patch import patch_radii
 from legcal.simulation import truth
 from legcal.simulation.motion import draw_poses
 from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread, draw_errors
@@ -206,6 +208,52 @@ def test_sizes_that_are_none_are_refused(size: float, tmp_path: Path) -> None:
         write_true_model(load_mechanism("3-upu"), errors, np.random.default_rng(0), tmp_path)
 
 
+RADIUS = re.compile(rb'radius="[^"]*"')
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "tricept"])
+def test_radii_of_the_true_legs_are_drawn_and_nothing_else_with_them(
+    name: str, tmp_path: Path
+) -> None:
+    nominal = load_mechanism(name)
+    of_radii = ParameterErrors(radii=Spread(1e-4))
+    true = write_true_model(nominal, of_radii, np.random.default_rng(2), tmp_path)
+    before, after = nominal.urdf.content, true.urdf.content
+    assert RADIUS.sub(b"", before) == RADIUS.sub(b"", after)
+    pairs = [
+        (j, was.radius, now.radius)
+        for j, (leg, true_leg) in enumerate(zip(nominal.legs, true.legs, strict=True))
+        for was, now in zip(leg.cylinders, true_leg.cylinders, strict=True)
+    ]
+    errors = {(j, was): now - was for j, was, now in pairs}
+    assert all(errors[j, was] == now - was for j, was, now in pairs)  # one tube stays one
+    size = np.abs(list(errors.values()))
+    assert 3e-5 < size.max() <= 1e-4
+    assert len(set(errors.values())) == len(errors) >= nominal.n_legs
+    both = replace(ALL, radii=Spread(1e-4))
+    found = write_true_model(nominal, both, np.random.default_rng(2), tmp_path / "both")
+    alone = write_true_model(nominal, ALL, np.random.default_rng(2), tmp_path / "alone")
+    assert RADIUS.findall(found.urdf.content) == RADIUS.findall(after)
+    assert np.array_equal(found.A_base, alone.A_base)
+
+
+@pytest.mark.parametrize("spread", [Spread(8e-3), Spread(2e-3, Distribution.NORMAL)])
+def test_errors_that_leave_nothing_of_a_leg_are_refused(spread: Spread, tmp_path: Path) -> None:
+    errors = ParameterErrors(radii=spread)
+    with pytest.raises(UsageError, match=r"errors of radii could not be drawn: .* needed at most"):
+        write_true_model(load_mechanism("hexapod"), errors, np.random.default_rng(0), tmp_path)
+
+
+def test_other_cylinders_keep_their_radii_and_their_places_in_the_file() -> None:
+    content = b"""<robot name="a"><link name="x"><collision><geometry>
+    <cylinder radius="1" length="1"/></geometry></collision><visual><geometry>
+    <box size="1 1 1"/></geometry></visual><visual><geometry>
+    <cylinder radius="2" length="1"/></geometry></visual><visual><geometry>
+    <cylinder length="1" radius='3'/></geometry></visual></link></robot>"""
+    assert patch_radii(content, {("x", 1): 0.25}) == content.replace(b"'3'", b"'0.25'")
+    assert patch_radii(content, {("x", 0): 0.25}) == content.replace(b'"2"', b'"0.25"')
+
+
 def _five_parallel_rods(folder: Path) -> Path:
     """Write a platform that five equal and parallel rods keep upright: no others would."""
     A = ring([10, 80, 150, 220, 290, 330, 100, 190], 0.3)
@@ -226,14 +274,14 @@ def test_errors_that_leave_no_closed_machine_are_refused(
     assert write_true_model(
         nominal, ParameterErrors(offsets=Spread(2e-3)), chance, tmp_path
     ).is_determined
-    with pytest.raises(ModelError, match=r"none of 3 draws of errors closes.*smaller errors"):
+    with pytest.raises(ModelError, match=r"3 times a platform .*smaller errors"):
         write_true_model(nominal, ParameterErrors(lengths=Spread(2e-3)), chance, tmp_path)
     assert not list((tmp_path / "models").glob("*"))
 
 
 def test_a_refusal_does_not_name_the_files_that_are_gone(tmp_path: Path) -> None:
     errors = ParameterErrors(Spread(1.0), Spread(1.0), Spread(1.0))
-    with pytest.raises(ModelError, match=r"none of 20 draws .*found leg .leg6. at") as caught:
+    with pytest.raises(ModelError, match=r"20 times a machine that .* in 20 draws") as caught:
         write_true_model(load_mechanism("hexapod"), errors, np.random.default_rng(0), tmp_path)
     assert str(tmp_path) not in str(caught.value)
 

@@ -1,7 +1,7 @@
 """Changing attribute values of a URDF in place: every other byte of the file stays as it was."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.parsers import expat
 
@@ -12,7 +12,7 @@ from legcal.geometry.types import Array
 
 _ATTRIBUTES = {
     name: re.compile(rb"""(?<=\s)%s\s*=\s*(?:"([^"]*)"|'([^']*)')""" % name.encode())
-    for name in ("xyz", "rpy")
+    for name in ("xyz", "rpy", "radius")
 }
 
 
@@ -72,11 +72,65 @@ def patch_origins(content: bytes, origins: Mapping[str, Origin]) -> bytes:
         for joint, origin in origins.items()
         for change in _changes(content, tags[joint], origin)
     ]
+    return _changed(content, changes)
+
+
+def patch_radii(content: bytes, radii: Mapping[tuple[str, int], float]) -> bytes:
+    """Return a URDF with other radii of some visual cylinders, otherwise as it was.
+
+    Parameters
+    ----------
+    content : bytes
+        A checked URDF.
+    radii : mapping of (str, int) to float
+        New radii [m] by link and number of the cylinder among the visual cylinders of that link.
+    """
+    tags = _cylinder_tags(content)
+    return _changed(
+        content,
+        [
+            (_span_in_tag(content, tags[place], "radius"), repr(float(R)).encode())
+            for place, R in radii.items()
+        ],
+    )
+
+
+def _changed(content: bytes, changes: Sequence[tuple[_Span, bytes]]) -> bytes:
+    """Return a file with values at the places of some spans."""
     pieces, at = [], 0
     for span, value in sorted(changes, key=lambda change: change[0].start):
         pieces += [content[at : span.start], span.before, value, span.after]
         at = span.end
     return b"".join([*pieces, content[at:]])
+
+
+def _cylinder_tags(content: bytes) -> dict[tuple[str, int], int]:
+    """Return where the tag of every visual cylinder stands, by link and number in it."""
+    tags: dict[tuple[str, int], int] = {}
+    path: list[str] = []
+    link, count, is_first = "", 0, True
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal link, count, is_first
+        if path == ["robot"] and tag == "link":
+            link, count = attributes["name"], 0
+        elif path == ["robot", "link", "visual"] and tag == "geometry":
+            is_first = True
+        elif path == ["robot", "link", "visual", "geometry"]:
+            if tag == "cylinder" and is_first:
+                tags[link, count] = parser.CurrentByteIndex
+                count += 1
+            is_first = False
+        path.append(tag)
+
+    def end(_tag: str) -> None:
+        path.pop()
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.Parse(content, True)
+    return tags
 
 
 def _origin_tags(content: bytes) -> dict[str, tuple[int, bool]]:
@@ -141,7 +195,7 @@ def _tag_end(content: bytes, start: int) -> int:
 
 
 def _span_in_tag(content: bytes, start: int, name: str) -> _Span:
-    """Return the span of an attribute's value in an origin tag, or where to write it."""
+    """Return the span of an attribute's value in a tag, or where an origin is to have it."""
     tag = content[start : _tag_end(content, start)]
     found = _ATTRIBUTES[name].search(tag)
     if found is None:

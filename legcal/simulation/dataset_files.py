@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg import LegKind, main_cylinders
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements, View
 from legcal.simulation.images import Images, Viewpoint
@@ -125,7 +125,7 @@ def write_truth(
     labels: Sequence[str],
     files: Sequence[str],
 ) -> None:
-    """Write ``truth.json``: settings, cameras and poses as they really were.
+    """Write ``truth.json``: settings, radii, cameras and poses as they really were.
 
     Parameters
     ----------
@@ -150,6 +150,10 @@ def write_truth(
         "legcal": __version__,
         "model": f"models/{mechanism.yaml_path.name}",
         "settings": _plain(asdict(settings)),
+        "radii": {
+            leg.name: {part: c.radius for part, c in main_cylinders(leg.cylinders).items()}
+            for leg in mechanism.legs
+        },
         "views": {
             view.name: {"T_base_camera": motion_to_xyz_quat(view.T_base_camera)} for view in views
         },

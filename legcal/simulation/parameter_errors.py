@@ -62,6 +62,8 @@ class ParameterErrors:
         Of both angles of axes at base and platform [rad].
     twists : Spread
         Of the angles that legs without an S joint keep [rad].
+    radii : Spread
+        Of the cylinders that legs are seen as [m]; no parameter of the kinematics.
     coplanar : bool
         Whether joint centres keep their heights, their z in R_b and R_e: what is coplanar stays so.
     """
@@ -72,6 +74,7 @@ class ParameterErrors:
     lengths: Spread = Spread()
     axes: Spread = Spread()
     twists: Spread = Spread()
+    radii: Spread = Spread()
     coplanar: bool = False
 
 
@@ -84,6 +87,16 @@ _FIELDS = {
     "platform_axis": "axes",
     "twist": "twists",
 }
+
+
+KINDS = (*dict.fromkeys(_FIELDS.values()), "radii")  # the fields that are sizes
+
+
+def kinds_of(mechanism: Mechanism) -> set[str]:
+    """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
+    names = parametrization_of(mechanism, twists=True).names
+    kinds = {_FIELDS[name.split(".")[1]] for name in names}
+    return kinds | ({"radii"} if any(leg.cylinders for leg in mechanism.legs) else set())
 
 
 def draw_errors(
@@ -143,7 +156,7 @@ def _footed(leg: LegGeometry, origin: Array) -> LegGeometry:
 def _check(errors: ParameterErrors) -> None:
     """Refuse sizes that are no sizes."""
     problems = []
-    for kind in dict.fromkeys(_FIELDS.values()):
+    for kind in KINDS:
         size = getattr(errors, kind).size
         if not (math.isfinite(size) and 0.0 <= size <= LARGEST):
             problems.append(

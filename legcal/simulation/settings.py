@@ -12,7 +12,7 @@ import numpy as np
 from legcal.errors import UsageError
 from legcal.observations.axes_file import SIGMA_RANGE
 from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread
+from legcal.simulation.parameter_errors import KINDS, Distribution, ParameterErrors, Spread
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.table_noise import TableNoise
 
@@ -108,10 +108,7 @@ class SimulationSettings:
             for name, count in counts.items()
             if not isinstance(count, Path) and not _is_count(count)
         ]
-        spreads = {
-            name: getattr(self.errors, name).size
-            for name in ("base_joints", "platform_joints", "offsets", "lengths", "axes", "twists")
-        }
+        spreads = {name: getattr(self.errors, name).size for name in KINDS}
         noises = {
             "noise of edge points": self.sigma_px,
             "noise of readings": self.readings.size,

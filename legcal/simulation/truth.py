@@ -6,7 +6,8 @@ closed pose nearest to the nominal home.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,9 @@ from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import in_links
 from legcal.report.model_files import mechanism_text, model_name
 from legcal.report.urdf import check_closes, write_urdf
+from legcal.report.urdf_patch import patch_radii
 from legcal.simulation.parameter_errors import ParameterErrors, draw_errors
+from legcal.simulation.radii import draw_radii
 
 DRAWS = 20
 FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the true legs demand
@@ -52,39 +55,49 @@ def write_true_model(
 
     Raises
     ------
+    UsageError
+        If an error is negative, not finite or beyond reason.
     ModelError
         If no machine with such errors closes.
     OutOfClass
         If the tree of the URDF does not let its legs move one by one.
     """
-    problem = ""
+    problems: Counter[str] = Counter()
+    of_radii = rng.spawn(1)[0]
     for _ in range(DRAWS):
         legs = draw_errors(nominal, errors, rng)
-        home, problem = _home(nominal, legs)
+        radii = draw_radii(nominal, errors.radii, of_radii)
+        home = _home(nominal, legs)
         if home is None:
+            problems["legs that do not meet near home"] += 1
             continue
-        path = write_model_with(nominal, legs, home, folder)
+        path = write_model_with(nominal, legs, home, folder, radii)
         try:
             true = load_mechanism(path)
             if true.is_determined:
                 check_closes(true)
-        except (ModelError, OutOfClass, DidNotConverge) as error:
-            problem = error.problems[0].split(": ", 1)[-1]  # without the file, which goes
+        except (ModelError, OutOfClass, DidNotConverge):
+            problems["a machine that no model can be, as with motors out of their travel"] += 1
             continue
         if _class_of(true) == _class_of(nominal):
             return true
-        problem = "another mechanism, whose platform has other freedoms"
+        problems["a platform with other freedoms"] += 1
     for path in _places(nominal, folder):
         path.unlink(missing_ok=True)
+    found = ", ".join(f"{count} times {what}" for what, count in problems.most_common())
     raise ModelError(
-        f"{nominal.yaml_path}: no true machine could be made: found that none of {DRAWS} draws of "
-        f"errors closes as the nominal model does ({problem.rstrip('.')}), needed one; give "
-        "smaller errors, or none of the axes and lengths that close the loops."
+        f"{nominal.yaml_path}: no true machine could be made: found {found} in {DRAWS} draws of "
+        "errors, needed one draw that closes as the nominal model does; give smaller errors, or "
+        "none of the axes and lengths that close the loops."
     )
 
 
 def write_model_with(
-    nominal: Mechanism, legs: Sequence[LegGeometry], home: RigidTransform, folder: Path
+    nominal: Mechanism,
+    legs: Sequence[LegGeometry],
+    home: RigidTransform,
+    folder: Path,
+    radii: Mapping[tuple[str, int], float],
 ) -> Path:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism with other numbers.
 
@@ -98,6 +111,8 @@ def write_model_with(
         T_base_platform of a pose in which they close.
     folder : Path
         The folder that gets ``models`` and ``urdf``.
+    radii : mapping
+        Of cylinders, as from :func:`draw_radii` [m]; the others keep theirs.
 
     Returns
     -------
@@ -108,6 +123,7 @@ def write_model_with(
     for path in (yaml_path, urdf_path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_urdf(nominal, legs, urdf_path)
+    urdf_path.write_bytes(patch_radii(urdf_path.read_bytes(), radii))
     text = mechanism_text(replace(nominal, home=home), f"../urdf/{urdf_path.name}")
     yaml_path.write_text(text, encoding="utf-8")
     return yaml_path
@@ -119,8 +135,8 @@ def _places(nominal: Mechanism, folder: Path) -> tuple[Path, Path]:
     return folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
 
 
-def _home(nominal: Mechanism, legs: Sequence[LegGeometry]) -> tuple[RigidTransform | None, str]:
-    """Return the closed pose nearest to the nominal home, or None and what is in the way."""
+def _home(nominal: Mechanism, legs: Sequence[LegGeometry]) -> RigidTransform | None:
+    """Return the closed pose nearest to the nominal home, or None if there is none."""
     moved = tuple(
         replace(
             leg,
@@ -134,7 +150,7 @@ def _home(nominal: Mechanism, legs: Sequence[LegGeometry]) -> tuple[RigidTransfo
         for leg, wanted in zip(nominal.legs, in_links(nominal, legs), strict=True)
     )
     home, problem = settle(replace(nominal, legs=moved), nominal.home, FURTHEST)
-    return (None, problem) if problem is not None else (home, "")
+    return None if problem is not None else home
 
 
 def _class_of(mechanism: Mechanism) -> tuple[object, ...]:
