@@ -55,8 +55,9 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-for command in (inspect, identify, calibrate, evaluate, new, noise, simulate, study):
+for command in (inspect, identify, calibrate, evaluate, new, noise, simulate):
     app.command()(command)
+app.add_typer(study, name="study")
 
 
 def main() -> None:

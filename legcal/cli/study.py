@@ -1,9 +1,9 @@
-"""``legcal study``."""
+"""``legcal study``: the commands of the studies, each with the settings that are its own."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,40 +11,58 @@ from legcal.cli.options import JsonOption
 from legcal.cli.output import print_json, print_table
 from legcal.cli.processors import processors
 
+if TYPE_CHECKING:
+    from legcal.studies.study import Study
 
-def study(
-    name: Annotated[
-        str,
-        typer.Argument(metavar="NAME", help="Which study: paper (its section 4.3)."),
-    ],
-    runs: Annotated[int, typer.Option(help="Number of runs.")] = 100,
-    seed: Annotated[int, typer.Option(help="Seed of all runs.")] = 0,
-    workers: Annotated[
-        int | None,
-        typer.Option(help="Processes; all cores without it. Results do not depend on it."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT",
-            help="Folder for the runs, the document and the figures. A study that was stopped "
-            "goes on from what is there.",
-        ),
-    ] = None,
+RunsOption = Annotated[int, typer.Option(help="Number of runs.")]
+SeedOption = Annotated[int, typer.Option(help="Seed of all runs.")]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(help="Processes; all cores without it. Results do not depend on it."),
+]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="OUT",
+        help="Folder for the runs, the document and the figures. A study that was stopped "
+        "goes on from what is there.",
+    ),
+]
+
+study = typer.Typer(
+    help="Measure on many simulated machines what is claimed; their truth is known.",
+    no_args_is_help=True,
+)
+
+
+@study.command()
+def paper(
+    runs: RunsOption = 100,
+    seed: SeedOption = 0,
+    workers: WorkersOption = None,
+    output: OutputOption = None,
     radians: Annotated[
-        bool,
-        typer.Option("--radians", help="paper: take the angles of Table 1 as radians, as printed."),
+        bool, typer.Option("--radians", help="Take the angles of Table 1 as radians, as printed.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure on many simulated machines what is claimed; their truth is known."""
+    """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
+    from legcal.simulation.table_noise import TableNoise
+    from legcal.studies.paper import PaperStudy
+
+    noise = TableNoise.in_radians() if radians else TableNoise()
+    _run(PaperStudy(noise), runs, seed, workers, output, as_json=as_json)
+
+
+def _run(
+    chosen: Study, runs: int, seed: int, workers: int | None, output: Path | None, *, as_json: bool
+) -> None:
+    """Run a study and print what it found."""
     from legcal.report.progress_bars import progress_on_stderr
-    from legcal.studies.catalogue import study_named
     from legcal.studies.runner import run_study
 
-    chosen = study_named(name, radians=radians)
     with progress_on_stderr() as progress:
         result = run_study(
             chosen,

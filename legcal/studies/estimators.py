@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -41,7 +42,11 @@ def default_steps(session: SimulatedSession, nominal: Machine) -> KinematicParam
 
 
 def one_fit(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
-    """Return what one fit of everything finds, started from the nominal model and rough cameras."""
+    """Return what one fit of everything finds, started from the nominal model and rough cameras.
+
+    ``legcal calibrate`` also starts from what the steps find and keeps the better of both; here the
+    fit is compared with the steps, and does without them.
+    """
     measurements = session.measurements
     axes = average_images(session.axes, measurements)
     fit = _fit_of(nominal, measurements, axes)
@@ -92,18 +97,35 @@ ESTIMATORS: dict[str, Estimator] = {
 
 def _fit_of(machine: Machine, measurements: Measurements, axes: LegAxes) -> AxesFit:
     """Return the fit of axes, built once for all sessions that show the same legs and poses."""
-    key = np.column_stack([axes.leg, measurements.view[axes.row], measurements.pose[axes.row]])
-    names = (machine.leg_names, machine.frame_legs, tuple(machine.sign.tolist()))
-    built = _kept_fits()
-    place = (*names, key.tobytes())
-    if place not in built:
-        built.clear()  # one structure at a time: it may be large
-        legs = FittedLegs(machine.leg_names, machine.sign, machine.frame_legs, {})
-        built[place] = build_axes_fit(legs, measurements, axes)
-    return built[place]
+    shown = np.column_stack([axes.leg, measurements.view[axes.row], measurements.pose[axes.row]])
+    return _built(
+        _Structure(
+            machine.leg_names,
+            machine.frame_legs,
+            tuple(machine.sign.tolist()),
+            shown.tobytes(),
+            (machine, measurements, axes),
+        )
+    )
 
 
-@cache
-def _kept_fits() -> dict[tuple[object, ...], AxesFit]:
-    """Return the fits that this process has built."""
-    return {}
+@dataclass(frozen=True)
+class _Structure:
+    """What fits of sessions share, and a session to build one of.
+
+    The legs, and which leg at which pose is in which view; the session makes no difference.
+    """
+
+    leg_names: tuple[str, ...]
+    frame_legs: tuple[int, ...]
+    sign: tuple[int, ...]
+    shown: bytes
+    session: tuple[Machine, Measurements, LegAxes] = field(compare=False)
+
+
+@lru_cache(maxsize=1)  # it may be large
+def _built(structure: _Structure) -> AxesFit:
+    """Return the fit of a structure."""
+    machine, measurements, axes = structure.session
+    legs = FittedLegs(machine.leg_names, machine.sign, machine.frame_legs, {})
+    return build_axes_fit(legs, measurements, axes)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError
+from legcal.geometry.types import Array
 from legcal.mechanism.parameters import KinematicParameters, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import Machine, perturb
@@ -43,6 +44,8 @@ class PaperStudy:
         Extreme poses of each camera position, and images of each pose.
     n_checked : int
         Random poses of eq (20).
+    estimators : tuple of str
+        Which are compared, of ``ESTIMATORS``.
     """
 
     noise: TableNoise = field(default_factory=TableNoise)
@@ -51,6 +54,7 @@ class PaperStudy:
     n_poses: int = 15
     n_images: int = 3
     n_checked: int = 10
+    estimators: tuple[str, ...] = tuple(ESTIMATORS)
 
     @property
     def name(self) -> str:
@@ -64,7 +68,7 @@ class PaperStudy:
             **asdict(self),
             "raised": RAISED,
             "views": [[f"leg{leg + 1}" for leg in legs] for legs in PAPER_VIEWS],
-            "estimators": [*ESTIMATORS, BOUND],
+            "estimators": [*self.estimators, BOUND],
         }
 
     def one_run(self, seed: np.random.SeedSequence) -> Record:
@@ -96,37 +100,56 @@ class PaperStudy:
             n_images=self.n_images,
         )
         checked = random_poses(machine, self.n_checked, rng)
-        found = {INITIAL: _errors(machine, nominal.parameters, checked)}
-        for name, estimate in ESTIMATORS.items():
+        covariance = self._bound_covariance(session)
+        found = {INITIAL: _errors(machine, nominal.parameters, covariance, checked)}
+        for name in self.estimators:
             try:
-                found[name] = _errors(machine, estimate(session, nominal), checked)
+                parameters = ESTIMATORS[name](session, nominal)
             except LegcalError as error:
                 found[name] = {"failure": failure_of(error)}
-        found[BOUND] = self._bound(session, checked)
+            else:
+                found[name] = _errors(machine, parameters, covariance, checked)
+        found[BOUND] = _expected(machine, covariance, checked)
         return found
 
-    def _bound(self, session: SimulatedSession, checked: RigidTransform) -> Record:
-        """Return the errors to expect at the Cramer-Rao bound."""
-        machine = session.machine
+    def _bound_covariance(self, session: SimulatedSession) -> Array:
+        """Return the covariance of the Cramer-Rao bound of a session [m^2]."""
         _, exact = observe_session(
-            machine, session.cameras, session.T_Rb_Re, session.measurements, self.noise, None
+            session.machine,
+            session.cameras,
+            session.T_Rb_Re,
+            session.measurements,
+            self.noise,
+            None,
         )
-        covariance = bound_covariance(session, exact)
-        sigma = np.sqrt(np.diagonal(covariance))
-        return _record(expected_errors(machine, covariance, checked), np.sqrt(2.0 / np.pi) * sigma)
+        return bound_covariance(session, exact)
 
 
-def _errors(machine: Machine, parameters: KinematicParameters, checked: RigidTransform) -> Record:
+def _errors(
+    machine: Machine, parameters: KinematicParameters, covariance: Array, checked: RigidTransform
+) -> Record:
     """Return the errors of eq (20) and those of every parameter, or the failure to compute them."""
     difference = to_vector(parameters, machine.frame_legs) - to_vector(
         machine.parameters, machine.frame_legs
     )
+    squared = float(difference @ np.linalg.solve(covariance, difference)) / len(difference)
     try:
-        return _record(platform_errors(machine, parameters, checked), np.abs(difference))
+        errors = platform_errors(machine, parameters, checked)
     except LegcalError as error:
         return {"failure": failure_of(error)}
+    return _record(errors, squared, np.abs(difference))
 
 
-def _record(errors: PlatformErrors, parameters: np.ndarray[Any, Any]) -> Record:
+def _expected(machine: Machine, covariance: Array, checked: RigidTransform) -> Record:
+    """Return the errors to expect at the Cramer-Rao bound."""
+    sigma = np.sqrt(np.diagonal(covariance))
+    return _record(expected_errors(machine, covariance, checked), 1.0, np.sqrt(2.0 / np.pi) * sigma)
+
+
+def _record(errors: PlatformErrors, of_bound_squared: float, parameters: Array) -> Record:
     """Return errors as a record [m, rad]."""
-    return {**asdict(errors), "parameters": parameters.tolist()}
+    return {
+        **asdict(errors),
+        "of_bound_squared": of_bound_squared,
+        "parameters": parameters.tolist(),
+    }

@@ -1,7 +1,8 @@
 """Figure 4 of the paper: mean errors of the thirty parameters as bars, true values as a line.
 
 Drawn twice from the same panels: with Plotly as a page that needs nothing from elsewhere, and with
-Matplotlib as a picture, which needs no browser.
+Matplotlib as a picture, which needs no browser. Errors are on one logarithmic scale in all panels:
+those of the steps are up to a hundred times those at the bound.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from legcal.geometry.types import Array
 from legcal.studies.paper_means import BOUND, Means, PaperMeans
@@ -40,6 +43,7 @@ def figure_as_html(found: PaperMeans) -> bytes:
 
     grid, names = _panels(found), list(map(_label, found.names))
     n_rows, n_columns = len(grid), len(grid[0])
+    decades = np.log10(_limits(grid)).tolist()
     figure = make_subplots(
         rows=n_rows,
         cols=n_columns,
@@ -55,7 +59,7 @@ def figure_as_html(found: PaperMeans) -> bytes:
                 trace.update(showlegend=i == j == 0, legendgroup=trace.name)
                 figure.add_trace(trace, **place, secondary_y=on_right)
             left, right = {**place, "secondary_y": False}, {**place, "secondary_y": True}
-            figure.update_yaxes(title_text=_ERROR_AXIS, rangemode="tozero", **left)
+            figure.update_yaxes(title_text=_ERROR_AXIS, type="log", range=decades, **left)
             figure.update_yaxes(title_text=_TRUTH_AXIS, showgrid=False, **right)
     figure.update_xaxes(tickangle=-90, tickfont={"size": 10})
     figure.update_layout(
@@ -69,14 +73,18 @@ def figure_as_png(found: PaperMeans) -> bytes:
     """Return the figure as a PNG picture."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     grid, names = _panels(found), list(map(_label, found.names))
     n_rows, n_columns = len(grid), len(grid[0])
-    figure = Figure(figsize=(7.0 * n_columns, 2.9 * n_rows + 0.6), layout="constrained")
+    figure = Figure(
+        figsize=(7.0 * n_columns, 2.9 * n_rows + 0.6), layout=ConstrainedLayoutEngine(h_pad=0.12)
+    )
     FigureCanvasAgg(figure)
     axes = figure.subplots(n_rows, n_columns, squeeze=False)
     for axis, panel in zip(axes.flat, (panel for row in grid for panel in row), strict=True):
         handles = _draw(axis, panel, names)
+        axis.set_ylim(_limits(grid))
     figure.suptitle(_title(found), fontsize=11)
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
     content = io.BytesIO()
@@ -100,13 +108,15 @@ def _draw(axis: Axes, panel: _Panel, names: list[str]) -> list[Any]:
     """Draw a panel with Matplotlib and return what its legend explains."""
     place = range(len(names))
     bars = axis.bar(place, panel.errors, color=_BAR, label=_BARS)
-    marks = axis.scatter(place, panel.limit, marker="_", s=60, color=_LIMIT, label=_MARKS, zorder=3)
+    marks = axis.scatter(place, panel.limit, marker="_", s=70, lw=2.0, color=_LIMIT, label=_MARKS)
+    marks.set_zorder(3)
     right = axis.twinx()
     line = right.plot(place, panel.truth, color=_LINE, lw=0.8, marker=".", ms=3, label=_TRUE)
     axis.set_title(panel.title, fontsize=10)
     axis.set_xticks(place, names, rotation=90, fontsize=7)
     axis.set_xlim(-0.7, len(names) - 0.3)
-    axis.set_ylim(bottom=0.0)
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter("{x:g}")
     axis.set_ylabel(_ERROR_AXIS, fontsize=8)
     right.set_ylabel(_TRUTH_AXIS, fontsize=8)
     for side in (axis, right):
@@ -116,7 +126,21 @@ def _draw(axis: Axes, panel: _Panel, names: list[str]) -> list[Any]:
 
 def _panels(found: PaperMeans) -> list[list[_Panel]]:
     """Return the panels: a row for each estimator, a column for each machine."""
-    return [[_panel(found, name, estimator) for name in found.truths] for estimator in _DRAWN]
+    compared = {means.estimator for means in found.means}
+    return [
+        [_panel(found, name, estimator) for name in found.truths]
+        for estimator in _DRAWN
+        if estimator in compared
+    ]
+
+
+def _limits(grid: list[list[_Panel]]) -> tuple[float, float]:
+    """Return the ends of the scale of errors that all panels share [mm]."""
+    values = np.concatenate(
+        [[1e-2, 1.0], *(x for row in grid for p in row for x in (p.errors, p.limit))]
+    )
+    shown = values[values > 0.0]
+    return 0.7 * float(shown.min()), 1.4 * float(shown.max())
 
 
 def _panel(found: PaperMeans, machine: str, estimator: str) -> _Panel:

@@ -32,8 +32,12 @@ class Means:
         The others, by kind of error.
     dX, dE, angle : float
         Means of eq (20) [m], [rad]; zero without any run, as all others.
-    dX_uncertainty : float
-        Standard deviation of the mean of dX [m].
+    of_bound : float
+        Root mean square of d' inv(C) d / n for errors d of the n parameters, C being the covariance
+        of the Cramer-Rao bound of the same run: 1 for an estimator that reaches it. Its spread
+        is far smaller than that of dX.
+    dX_uncertainty, dE_uncertainty, of_bound_uncertainty : float
+        Standard deviations of these means [m], [rad], [1].
     parameters : (n_parameters,) array
         Mean absolute error of every parameter [m].
     """
@@ -45,7 +49,10 @@ class Means:
     dX: float
     dE: float
     angle: float
+    of_bound: float
     dX_uncertainty: float
+    dE_uncertainty: float
+    of_bound_uncertainty: float
     parameters: Array
 
     def document(self) -> dict[str, Any]:
@@ -58,6 +65,9 @@ class Means:
             "parameters_mm": (1e3 * self.parameters).tolist() if self.n else [],
             "angle_deg": float(np.degrees(self.angle)) if self.n else None,
             "dX_mean_sigma_mm": 1e3 * self.dX_uncertainty if self.n else None,
+            "dE_mean_sigma_deg": float(np.degrees(self.dE_uncertainty)) if self.n else None,
+            "of_bound": self.of_bound if self.n else None,
+            "of_bound_sigma": self.of_bound_uncertainty if self.n else None,
             "runs": self.n,
             "failed": sum(self.failures.values()),
             "failures": self.failures,
@@ -92,7 +102,8 @@ class _Sums:
 
     def __init__(self, n_parameters: int) -> None:
         self.n = 0
-        self.scalars = np.zeros(4)  # dX, its square, dE, angle
+        self.scalars = np.zeros(4)  # dX, dE, angle, square of the errors in units of the bound
+        self.squares = np.zeros(4)  # of these
         self.parameters = np.zeros(n_parameters)
         self.failures: Counter[str] = Counter()
 
@@ -101,15 +112,19 @@ class _Sums:
         if "failure" in record:
             self.failures[record["failure"]["kind"]] += 1
             return
-        dX = record["dX"]
+        scalars = np.array([record[name] for name in ("dX", "dE", "angle", "of_bound_squared")])
         self.n += 1
-        self.scalars += (dX, dX**2, record["dE"], record["angle"])
+        self.scalars += scalars
+        self.squares += scalars**2
         self.parameters += record["parameters"]
 
     def means(self, machine: str, estimator: str) -> Means:
         """Return the means."""
-        dX, square, dE, angle = (self.scalars / max(self.n, 1)).tolist()
-        spread = max(square - dX**2, 0.0) / max(self.n - 1, 1)
+        means = self.scalars / max(self.n, 1)
+        variances = np.maximum(self.squares / max(self.n, 1) - means**2, 0.0)
+        dX, dE, angle, squared = means.tolist()
+        of_dX, of_dE, _, of_squared = np.sqrt(variances / max(self.n - 1, 1)).tolist()
+        ratio = float(np.sqrt(squared))
         return Means(
             machine,
             estimator,
@@ -118,7 +133,10 @@ class _Sums:
             dX,
             dE,
             angle,
-            float(np.sqrt(spread)),
+            ratio,
+            of_dX,
+            of_dE,
+            of_squared / (2.0 * ratio) if ratio else 0.0,
             self.parameters / max(self.n, 1),
         )
 

@@ -6,7 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from legcal.studies.paper_means import INITIAL, PaperMeans
-from legcal.studies.paper_text import AS_PRINTED, IN_DEGREES, IN_RADIANS, READINGS
+from legcal.studies.paper_text import (
+    CONTEXT,
+    IN_DEGREES,
+    IN_RADIANS,
+    PRINTED_AFTER,
+    PRINTED_BEFORE,
+    READINGS,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -40,7 +47,11 @@ class PaperSummary:
             "initial": [means.document() for means in found.means if means.estimator == INITIAL],
             "names": list(found.names),
             "true_values_mm": {name: (1e3 * xi).tolist() for name, xi in found.truths.items()},
-            "as_printed": AS_PRINTED,
+            "as_printed": {
+                "initial": PRINTED_BEFORE.document(),
+                "calibrated": PRINTED_AFTER.document(),
+                "note": CONTEXT,
+            },
             "readings": list(self.readings),
         }
 

@@ -124,7 +124,7 @@ def run_study(
 def _result(study: Study, seed: int, n_runs: int, checkpoint: Checkpoint) -> StudyResult:
     """Return what all runs found."""
     failures: Counter[str] = Counter()
-    first: list[str] = []
+    messages: list[str] = []
 
     def records() -> Iterator[Record]:
         for line in checkpoint.lines(n_runs):
@@ -132,14 +132,14 @@ def _result(study: Study, seed: int, n_runs: int, checkpoint: Checkpoint) -> Stu
                 yield line["record"]
             else:
                 failures[line["failure"]["kind"]] += 1
-                first.append(line["failure"]["message"])
-                del first[1:]
+                if not messages:
+                    messages.append(line["failure"]["message"])
 
     summary = study.summary(records())
     if failures.total() == n_runs:
         raise DidNotConverge(
             f"The study {study.name} found nothing: all of its {n_runs} runs failed, needed one "
-            f"that does not; the first one says: {first[0]}"
+            f"that does not; the first one says: {messages[0]}"
         )
     return StudyResult(study.name, study.settings, seed, n_runs, dict(failures), summary)
 
