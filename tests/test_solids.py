@@ -172,6 +172,23 @@ def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> Non
         assert len(set(np.sign(local[:, 2]))) == 1  # all joints on one side of it
 
 
+def test_plates_of_a_planar_machine_lie_below_its_legs_and_each_other() -> None:
+    mechanism = load_mechanism("3-rpr")
+    solids = placed(dressed(mechanism), link_poses(mechanism, mechanism.home_configuration))
+    heights = {
+        p.solid.name: (p.T_base_solid.translation - mechanism.A_base[0]) @ mechanism.base_normal
+        for p in solids
+    }
+    base, platform = (heights[f"{end}_plate"] for end in (mechanism.base, mechanism.platform))
+    thickness = max(
+        s.shape.length
+        for s in dressed(mechanism)
+        if s.name.endswith("_plate") and isinstance(s.shape, Cylinder)
+    )
+    assert base + thickness < platform
+    assert platform + thickness < min(h for name, h in heights.items() if "ball" in name)
+
+
 def test_a_link_with_visuals_of_its_own_is_not_dressed(tmp_path: Path) -> None:
     visual = '<visual><geometry><sphere radius="0.05"/></geometry></visual>'
     solids = dressed(hexapod_showing(tmp_path, visual))

@@ -133,13 +133,13 @@ def test_cylinders_of_one_radius_are_one_part() -> None:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_cameras_around_any_machine_see_its_legs_and_all_of_its_workspace(name: str) -> None:
+def test_cameras_around_any_machine_see_its_legs_and_all_of_it(name: str) -> None:
     mechanism, camera = machine(name), sample_camera()
     machines = posed(name, 3, bare=False)
     places = places_around(mechanism, machines, [camera], np.random.default_rng(1))
     for m in machines:
         for T in places:
-            inside = camera.project(T.inv().apply(np.concatenate([m.A, m.B])))
+            inside = camera.project(T.inv().apply(m.vertices))
             assert np.all(inside > 0.0)
             assert np.all(inside < [camera.width, camera.height])
             assert not m.encloses(T.translation)
@@ -147,6 +147,17 @@ def test_cameras_around_any_machine_see_its_legs_and_all_of_its_workspace(name: 
     images = take_images(mechanism.legs, machines, views, 1, shared_poses=True)
     seen = np.array([[leg.is_seen for leg in shown] for shown in images.shown])
     assert seen.mean() > 0.7
+
+
+def test_walls_do_not_drive_cameras_away_from_the_machine() -> None:
+    mechanism, camera = machine("hexapod"), sample_camera()
+    machines = posed("hexapod", 2, bare=False)
+    walled = posed("hexapod", 2, box(np.array([0.0, -9.0, 0.0]), (20.0, 0.1, 20.0)), bare=False)
+    one, two = (
+        places_around(mechanism, m, [camera], np.random.default_rng(1))[0]
+        for m in (machines, walled)
+    )
+    assert np.array_equal(one.as_matrix(), two.as_matrix())
 
 
 def test_cameras_of_a_machine_far_from_the_origin_stand_around_it() -> None:

@@ -3,7 +3,8 @@
 Each camera has a sector around the machine, in the plane normal to the direction from base to
 platform (or to the plane of motion), and tries directions at several heights there. It takes the
 one from which most of the legs are seen, and longest in the image, over poses spread through the
-motion. It stands as near as the whole space that the legs move in stays in the image.
+motion. It stands as near as the whole machine stays in the image in all poses, but for solids
+larger than the space that the legs move in: walls and floors.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.cameras import look_at
 from legcal.simulation.posed_machine import PosedMachine
-from legcal.simulation.shapes import Cylinder
+from legcal.simulation.rendering.footprint import surrounding_points
+from legcal.simulation.rendering.solid_in_view import in_view
 from legcal.simulation.visibility import field_of_view, legs_in_image
 from legcal.vision.camera import Camera
 
@@ -30,8 +32,7 @@ _TRIED = 5  # poses at which directions are judged
 _SAMPLES = 32  # points of a leg in that
 _ROLL = 0.08  # [rad] by which cameras are not upright
 _FURTHER = 0.08  # of the least distance, by which cameras stand further away
-_MARGIN = 0.06  # of the image that stays free at each side
-_ENDS = (-0.5, 0.5)  # of a cylinder, in its length
+_MARGIN = 0.03  # of the image that stays free at each side
 _CENTRINGS = 3  # steps that bring the machine into the middle of the image
 _BEHIND = 0.3  # machine sizes that lie between the camera and the machine, at least
 
@@ -100,21 +101,16 @@ def _direction(up: Array, turn: float, lift: float) -> Array:
 
 
 def _reached(machines: Sequence[PosedMachine]) -> Array:
-    """Return points (n, 3) around the legs of a machine in all of its poses."""
-    points = np.concatenate([part for m in machines for part in (m.A, m.B, *_leg_ends(m))])
+    """Return points (n, 3) around a machine in all of its poses, without its walls and floors."""
+    joints = np.concatenate([part for m in machines for part in (m.A, m.B)])
+    size = float(np.linalg.norm(np.ptp(joints, axis=0)))
+    solids = [s for m in machines for s in in_view(m.solids, RigidTransform.identity())]
+    around = [surrounding_points(s) for s in solids if s.reach < size]
+    points = np.concatenate([joints, *around])
     try:
         return np.asarray(points[ConvexHull(points).vertices])
     except QhullError:  # all of them in a plane
         return points
-
-
-def _leg_ends(machine: PosedMachine) -> list[Array]:
-    """Return both ends of every cylinder of a leg, (2, 3) each."""
-    return [
-        np.asarray(p.T_base_solid.apply([[0.0, 0.0, end * p.solid.shape.length] for end in _ENDS]))
-        for p in machine.solids
-        if p.solid.leg is not None and isinstance(p.solid.shape, Cylinder)
-    ]
 
 
 def _place(

@@ -17,6 +17,7 @@ _PLATE = Material(albedo=0.09, specular=0.10, shininess=18.0, limb=0.1, texture=
 _BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
 _POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
 _DEFAULT_RADIUS = 0.02  # of the distance between joints, where a leg shows no cylinder
+_GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
 _FLAT = 0.2  # cosine between legs and plates below which the legs lie along the plates
 
 
@@ -24,7 +25,9 @@ def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
     """Return all that pictures show of a mechanism: its visuals, and what they lack.
 
     A link that has no visual of its own gets balls at the joint centres and, for three joints or
-    more, a round plate that carries them on posts, on the side away from the legs.
+    more, a round plate that carries them on posts, on the side away from the legs. Both plates of a
+    planar machine are below its legs, that of the base lowest, so that the legs are seen from
+    above.
 
     Parameters
     ----------
@@ -42,7 +45,8 @@ def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
     added: list[Solid] = []
     if mechanism.base in bare:
         away = _away(mechanism.A_base, mechanism, -1.0)
-        added += _end(mechanism.base, mechanism.A_base, radii, [True] * len(radii), away)
+        below = 0.0 if mechanism.spatial else _POST_LENGTH + _PLATE_THICKNESS + _GAP
+        added += _end(mechanism.base, mechanism.A_base, radii, [True] * len(radii), away, below)
     if mechanism.platform in bare:
         balls = [leg.platform_joint != "" for leg in mechanism.legs]
         B = mechanism.B_platform
@@ -54,9 +58,17 @@ def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
 
 
 def _end(
-    link: str, joints: Array, radii: Array, balls: Iterable[bool], away: Array | None
+    link: str,
+    joints: Array,
+    radii: Array,
+    balls: Iterable[bool],
+    away: Array | None,
+    further: float = 0.0,
 ) -> list[Solid]:
-    """Return the balls, posts and plate at one end of the legs, in its link."""
+    """Return the balls, posts and plate at one end of the legs, in its link.
+
+    The posts are ``further`` radii of the thickest leg longer than they need to be.
+    """
     solids = []
     for j, (joint, R, ball) in enumerate(zip(joints, radii, balls, strict=True)):
         if ball:
@@ -66,7 +78,7 @@ def _end(
         return solids
     turn = Rotation.align_vectors([away], [[0.0, 0.0, 1.0]])[0]
     thickest = float(radii.max())
-    outside = float((joints @ away).max()) + _POST_LENGTH * thickest
+    outside = float((joints @ away).max()) + (_POST_LENGTH + further) * thickest
     for j, (joint, R) in enumerate(zip(joints, radii, strict=True)):
         length = outside - float(joint @ away)
         middle = RigidTransform.from_components(joint + 0.5 * length * away, turn)
@@ -93,7 +105,8 @@ def _away(joints_base: Array, mechanism: Mechanism, side: float) -> Array | None
     mechanism : Mechanism
         The mechanism.
     side : float
-        -1 for the base, +1 for the platform: from A to B times this is away from the legs.
+        -1 for the base, +1 for the platform: from A to B times this is away from the legs. Of no
+        account for planar machines.
 
     Returns
     -------
@@ -101,7 +114,7 @@ def _away(joints_base: Array, mechanism: Mechanism, side: float) -> Array | None
         None where the joints lie on a line and no plate carries them.
     """
     if mechanism.base_normal is not None:
-        return np.asarray(side * mechanism.base_normal)
+        return -mechanism.base_normal
     spread = joints_base - joints_base.mean(axis=0)
     _, sizes, axes = np.linalg.svd(spread)
     if len(joints_base) < 3 or sizes[1] < 0.05 * sizes[0]:
