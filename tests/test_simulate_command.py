@@ -6,14 +6,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from simulated import files_of, settings
+from simulated import files_of, settings, small_camera
 
 from legcal import cli
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.simulation.folder import TRUTH_NAME
 from legcal.simulation.motion import Sampling
 from legcal.simulation.parameter_errors import ParameterErrors, Spread
-from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.settings import Level
 from legcal.simulation.simulate import simulate
 from legcal.simulation.table_noise import TableNoise
 
@@ -44,7 +44,7 @@ def test_one_command_writes_a_dataset_and_says_what_it_shows(
 def test_json_is_one_document(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("--error", "joints=1mm:normal", "--error", "axes=0.2deg", "--pixel-noise", "0.2px")
+    words = ("--error", "joints=1mm:normal", "--error", "radii=0.1mm", "--pixel-noise", "0.2px")
     assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *QUICK, *words, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["images"] == 1
@@ -55,6 +55,7 @@ def test_json_is_one_document(
     assert errors["base_joints"] == {"size": 1e-3, "distribution": "normal"}
     assert errors["offsets"] == {"size": 2e-3, "distribution": "uniform"}  # the default stays
     assert truth["settings"]["sigma_px"] == 0.2
+    assert 1e-6 < abs(truth["radii"]["leg1"]["leg1_tube"] - 0.010) <= 1e-4
 
 
 @pytest.mark.parametrize(
@@ -66,8 +67,11 @@ def test_json_is_one_document(
         (("--poses", "1.5"), "needed a whole number"),
         (("--views", "0"), "found 0 views"),
         (("--seed", "-1"), "found the seed -1"),
-        (("--pixel-noise", "-0.1px"), "--pixel-noise could not be used: found the negative"),
-        (("--pixel-noise", "0.1"), "needed a number and its unit (px)"),
+        (
+            ("--level", "outlines", "--pixel-noise", "-0.1px"),
+            "--pixel-noise could not be used: found the negative",
+        ),
+        (("--level", "outlines", "--pixel-noise", "0.1"), "needed a number and its unit (px)"),
         (("--encoder-noise", "-2um"), "--encoder-noise could not be used: found the negative"),
         (("--encoder-noise", "2um:gauss"), "found the distribution 'gauss'"),
         (("--error", "joints=-2mm"), "--error joints could not be used: found the negative"),
@@ -81,6 +85,11 @@ def test_json_is_one_document(
         (("--cameras", "none.yaml"), "none.yaml: the cameras file could not be read"),
         (("--appearance", "none.yaml"), "none.yaml: the appearance file could not be read"),
         (("--poses", "none.csv"), "none.csv"),
+        (("--pixel-noise", "0.2px"), "found --level photographs, needed --level outlines"),
+        (("--level", "axes", "--blur", "1"), "found --level axes, needed --level photographs"),
+        (("--error", "twists=1deg"), "--error twists could not be used: found none in the"),
+        (("--error", "joints=500mm"), "no true machine could be made: found 20 times a machine"),
+        (("--error", "radii=9mm"), "The errors of radii could not be drawn: found a size of 9 mm"),
         (("--bits", "12"), "found bits = 12, needed one of 8, 16"),
         (("--blur", "-1"), "found blur = -1"),
     ],
@@ -130,8 +139,9 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
 ) -> None:
     path = tmp_path / "look.yaml"
     path.write_text("blur: 0.8\nclutter: 3\nlights:\n  - {direction: [0, 0, 1], strength: 0.5}\n")
-    words = ("--appearance", str(path), "--clutter", "7")
-    assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *QUICK, *words) == 0
+    words = ("--appearance", path, "--clutter", "7", "--camera", small_camera(tmp_path))
+    one = ("--poses", "1", "--views", "1")
+    assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *one, *words) == 0
     look = json.loads((tmp_path / "sim" / TRUTH_NAME).read_text())["settings"]["appearance"]
     assert (look["blur"], look["clutter"], len(look["lights"])) == (0.8, 7, 1)
 
@@ -246,28 +256,3 @@ def test_a_machine_without_visible_legs_cannot_be_seen(tmp_path: Path) -> None:
     urdf.write_text(re.sub(r"<visual>.*?</visual>", "", urdf.read_text()))
     with pytest.raises(NotVisible, match="no leg with a visible cylinder"):
         simulate(made.folder / "models" / "hexapod.yaml", tmp_path / "b", settings(poses=1))
-
-
-def test_the_defaults_are_those_that_the_help_names() -> None:
-    from legcal.simulation.request import requested
-
-    asked = requested(
-        level="photographs",
-        poses="15",
-        sampling="extreme",
-        shared_poses=None,
-        images=1,
-        views=None,
-        cameras=None,
-        camera=None,
-        errors=(),
-        coplanar=False,
-        pixel_noise="0.1px",
-        table_noise="degrees",
-        encoder_noise="2um",
-        hints=True,
-        seed=0,
-        appearance=None,
-        look={"blur": None},
-    )
-    assert asked == SimulationSettings()

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from legcal.errors import UsageError
 from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
 from legcal.files.schema import closest, describe
+from legcal.mechanism.model import Mechanism
 from legcal.simulation.appearance_file import read_appearance
 from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread
+from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread, kinds_of
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.settings import DEFAULT_ERRORS, Level, SimulationSettings
 from legcal.simulation.table_noise import TableNoise
@@ -26,87 +26,145 @@ _ERROR_KINDS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "lengths": (("lengths",), LENGTH),
     "axes": (("axes",), ANGLE),
     "twists": (("twists",), ANGLE),
+    "radii": (("radii",), LENGTH),
+}
+_OF_LEVEL = {
+    "pixel_noise": ("--pixel-noise", "outlines"),
+    "table_noise": ("--table-noise", "axes"),
+    "appearance": ("--appearance", "photographs"),
+    "blur": ("--blur", "photographs"),
+    "clutter": ("--clutter", "photographs"),
+    "bits": ("--bits", "photographs"),
+    "colour": ("--colour or --grey", "photographs"),
 }
 _NUMBER = re.compile(r"[-+]?[\d.]+")
 
 
-def requested(
-    *,
-    level: str,
-    poses: str,
-    sampling: str,
-    shared_poses: bool | None,
-    images: int,
-    views: int | None,
-    cameras: Path | None,
-    camera: Path | None,
-    errors: Sequence[str],
-    coplanar: bool,
-    pixel_noise: str,
-    table_noise: str,
-    encoder_noise: str,
-    hints: bool,
-    seed: int,
-    appearance: Path | None,
-    look: Mapping[str, Any],
-) -> SimulationSettings:
-    """Return the settings of options, named as on the command line.
+@dataclass(frozen=True)
+class Request:
+    """The options of ``legcal simulate``, named as on the command line; None where not given.
 
-    Parameters
+    Attributes
     ----------
-    level, poses, sampling, shared_poses, images, views, cameras, camera
-        What is simulated: ``poses`` is a number or the path of a CSV; at most one of ``views`` and
-        ``cameras``; None where an option was not given.
-    errors : sequence of str
+    level : str
+        ``photographs``, ``outlines`` or ``axes``.
+    seed : int
+        What all chance comes from.
+    error : tuple of str
         ``joints=2mm``, ``axes=0.1deg:normal`` or ``none``; each replaces the default of its kind.
     coplanar : bool
         Keep joints in the plane that they are nominally in.
+    poses : str
+        A number or the path of a CSV.
+    sampling, shared_poses, images, views, cameras, camera, hints
+        As in :class:`legcal.simulation.settings.SimulationSettings`; at most one of ``views`` and
+        the file ``cameras``.
     pixel_noise, table_noise, encoder_noise : str
         ``0.1px``; ``degrees`` or ``radians``; ``2um`` or ``2um:uniform``.
-    hints, seed
-        As in :class:`legcal.simulation.settings.SimulationSettings`.
     appearance : Path or None
         A YAML file of an appearance.
-    look : mapping
-        Fields of the appearance that replace those of the file; None for those not given.
+    blur, clutter, bits, colour
+        Fields of the appearance that replace those of the file.
+    """
+
+    level: str = "photographs"
+    seed: int = 0
+    error: tuple[str, ...] = ()
+    coplanar: bool = False
+    poses: str = "15"
+    sampling: str | None = None
+    shared_poses: bool | None = None
+    images: int = 1
+    views: int | None = None
+    cameras: Path | None = None
+    camera: Path | None = None
+    hints: bool = True
+    pixel_noise: str | None = None
+    table_noise: str | None = None
+    encoder_noise: str = "2um"
+    appearance: Path | None = None
+    blur: float | None = None
+    clutter: int | None = None
+    bits: int | None = None
+    colour: bool | None = None
+
+
+def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
+    """Return the settings that options ask for.
 
     Raises
     ------
     UsageError
-        If an option cannot be understood, or contradicts another.
+        If an option cannot be understood, contradicts another, or has no effect.
     DatasetError
         If the file of the appearance is malformed.
     """
-    if views is not None and cameras is not None:
-        raise UsageError(
+    given = _poses(request.poses)
+    _refuse_contradictions(request, given, nominal)
+    _refuse_other_levels(request)
+    noise = request.pixel_noise or "0.1px"
+    return SimulationSettings(
+        level=Level(request.level),
+        errors=replace(_errors(request, nominal), coplanar=request.coplanar),
+        poses=given,
+        sampling=Sampling(request.sampling or Sampling.EXTREME),
+        shared_poses=bool(request.shared_poses) or isinstance(given, Path),
+        images=request.images,
+        views=request.cameras or (3 if request.views is None else request.views),
+        camera=request.camera,
+        hints=request.hints,
+        sigma_px=parse_quantity(noise, PIXELS, "--pixel-noise"),
+        table=TableNoise.in_radians() if request.table_noise == "radians" else TableNoise(),
+        readings=_spread(request.encoder_noise, LENGTH, Distribution.NORMAL, "--encoder-noise"),
+        appearance=_appearance(request),
+        seed=request.seed,
+    )
+
+
+def _refuse_contradictions(request: Request, poses: int | Path, nominal: Mechanism) -> None:
+    """Refuse options that others make void."""
+    problems = []
+    if request.views is not None and request.cameras is not None:
+        problems.append(
             "The cameras could not be placed: found both --views and --cameras, needed one of "
             "them; leave out --views, the file says how many there are."
         )
-    given = _poses(poses)
-    if isinstance(given, Path) and shared_poses is False:
-        raise UsageError(
+    if isinstance(poses, Path) and request.shared_poses is False:
+        problems.append(
             "The poses could not be used: found --own-poses with a file of poses, needed poses "
             "that all views see; leave out --own-poses."
         )
-    changes = {name: value for name, value in look.items() if value is not None}
-    return SimulationSettings(
-        level=Level(level),
-        errors=replace(_errors(errors), coplanar=coplanar),
-        poses=given,
-        sampling=Sampling(sampling),
-        shared_poses=bool(shared_poses) or isinstance(given, Path),
-        images=images,
-        views=cameras if cameras is not None else 3 if views is None else views,
-        camera=camera,
-        hints=hints,
-        sigma_px=parse_quantity(pixel_noise, PIXELS, "--pixel-noise"),
-        table=TableNoise.in_radians() if table_noise == "radians" else TableNoise(),
-        readings=_spread(encoder_noise, LENGTH, Distribution.NORMAL, "--encoder-noise"),
-        appearance=replace(
-            Appearance() if appearance is None else read_appearance(appearance), **changes
-        ),
-        seed=seed,
-    )
+    if isinstance(poses, Path) and request.sampling is not None:
+        problems.append(
+            "The poses could not be used: found --sampling with a file of poses, needed a number "
+            "of poses to draw; leave out --sampling."
+        )
+    elif request.sampling is not None and not nominal.is_determined:
+        problems.append(
+            "The poses could not be drawn: found --sampling for a machine whose motors do not "
+            "determine its pose, needed none, it takes a random walk; leave out --sampling."
+        )
+    if problems:
+        raise UsageError(problems)
+
+
+def _refuse_other_levels(request: Request) -> None:
+    """Refuse options that belong to another level."""
+    problems = [
+        f"{option} could not be used: found --level {request.level}, needed --level {level}, the "
+        "only one that it has an effect on; leave it out or give that level."
+        for name, (option, level) in _OF_LEVEL.items()
+        if getattr(request, name) is not None and request.level != level
+    ]
+    if problems:
+        raise UsageError(problems)
+
+
+def _appearance(request: Request) -> Appearance:
+    """Return how photographs look."""
+    base = Appearance() if request.appearance is None else read_appearance(request.appearance)
+    given = {name: getattr(request, name) for name in ("blur", "clutter", "bits", "colour")}
+    return replace(base, **{name: value for name, value in given.items() if value is not None})
 
 
 def _poses(text: str) -> int | Path:
@@ -121,10 +179,10 @@ def _poses(text: str) -> int | Path:
     return int(text)
 
 
-def _errors(texts: Sequence[str]) -> ParameterErrors:
+def _errors(request: Request, nominal: Mechanism) -> ParameterErrors:
     """Return the errors of parameters that options ask for."""
-    found = DEFAULT_ERRORS
-    for text in texts:
+    found, possible = DEFAULT_ERRORS, kinds_of(nominal)
+    for text in request.error:
         if text == "none":
             found = ParameterErrors()
             continue
@@ -136,8 +194,17 @@ def _errors(texts: Sequence[str]) -> ParameterErrors:
             )
         fields, units = _ERROR_KINDS[kind]
         spread = _spread(size, units, Distribution.UNIFORM, f"--error {kind}")
+        if spread.size > 0.0 and not possible & set(fields):
+            raise UsageError(
+                f"--error {kind} could not be used: found none in the mechanism "
+                f"'{nominal.name}', needed one that has them; leave it out."
+            )
         for field in fields:
             found = replace(found, **{field: spread})  # type: ignore[arg-type]
+    if request.coplanar and found.base_joints.size == found.platform_joints.size == 0.0:
+        raise UsageError(
+            "--coplanar could not be used: found no errors of joints, needed some; leave it out."
+        )
     return found
 
 
