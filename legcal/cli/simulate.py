@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from legcal.cli import simulate_options as opt
+import legcal.cli.simulate_options as opt
 from legcal.cli.calibrate import MOST_WORKERS
 from legcal.cli.options import JsonOption, ModelArgument
 from legcal.cli.output import print_json, print_table
