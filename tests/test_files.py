@@ -222,7 +222,7 @@ def test_folder_with_other_files_is_refused(tmp_path: Path, result: str | None) 
 
 def test_path_below_a_file_and_broken_link_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(UsageError, match="file cannot be written to"):
+    with pytest.raises(UsageError, match="file is a file, needed a path"):
         check_destination(tmp_path / "file" / "out")
     (tmp_path / "link").symlink_to(tmp_path / "none")
     with pytest.raises(UsageError, match="found a broken link"):

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 TEMPORARY_SUFFIX = ".legcal-part"
+_MOST_OF_NAME = 40  # letters: a name of the greatest length leaves none for what is added to it
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -33,7 +34,9 @@ def write_atomically(path: Path, content: bytes) -> None:
 @contextmanager
 def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
     """Give a folder of a name that nobody else uses, and remove it when the block ends."""
-    folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=TEMPORARY_SUFFIX, dir=parent))
+    folder = Path(
+        tempfile.mkdtemp(prefix=f".{name[:_MOST_OF_NAME]}.", suffix=TEMPORARY_SUFFIX, dir=parent)
+    )
     try:
         yield folder
     finally:

@@ -9,12 +9,12 @@ looked at again.
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from legcal.errors import OutOfResources, UsageError
+from legcal.errors import LegcalError, OutOfResources, UsageError
 from legcal.files.atomic import TEMPORARY_SUFFIX, temporary_folder
 
 
@@ -61,22 +61,8 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
     UsageError
         If it is a file, holds files but nothing of this kind, or cannot be written to.
     """
+    check_path(destination, kind)
     start = f"{destination}: the {kind.noun} could not be written: found"
-    try:
-        os.lstat(destination)
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except OSError as error:
-        raise UsageError(
-            f"{start} '{error.strerror}', needed a path that can be created; give another "
-            "output folder."
-        ) from error
-    if destination.is_symlink() and not destination.exists():
-        raise UsageError(f"{start} a broken link, needed a folder; give another output folder.")
-    if destination.exists() and not destination.is_dir():
-        raise UsageError(
-            f"{start} a file of that name, needed a folder; give another output folder."
-        )
     if destination.is_dir() and holds_files(destination) and not kind.is_in(destination):
         raise UsageError(
             f"{start} a folder with other files and no {kind.marker} of legcal, needed a new or "
@@ -90,9 +76,47 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
         )
 
 
+def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
+    """Refuse a path at which no folder is and none can be made.
+
+    Parameters
+    ----------
+    destination, kind
+        As in :func:`check_destination`.
+
+    Raises
+    ------
+    UsageError
+        If it is too long, a file or below one, or a folder that cannot be listed.
+    """
+    start = f"{destination}: the {kind.noun} could not be written: found"
+    remedy = "needed a path that can be created; give another output folder."
+    try:
+        os.lstat(destination)
+        if destination.is_dir():
+            os.listdir(destination)
+    except FileNotFoundError:
+        pass
+    except NotADirectoryError as error:
+        above = _existing_parent(destination)
+        raise UsageError(f"{start} that {above} is a file, {remedy}") from error
+    except OSError as error:
+        raise UsageError(f"{start} '{error.strerror}', {remedy}") from error
+    if destination.is_symlink() and not destination.exists():
+        raise UsageError(f"{start} a broken link, needed a folder; give another output folder.")
+    if destination.exists() and not destination.is_dir():
+        raise UsageError(
+            f"{start} a file of that name, needed a folder; give another output folder."
+        )
+
+
 @contextmanager
 def result_folder(
-    destination: Path, kind: OutputKind = RESULT, stale: Iterable[Path] = ()
+    destination: Path,
+    kind: OutputKind = RESULT,
+    stale: Iterable[Path] = (),
+    *,
+    replaceable: Container[Path] | None = None,
 ) -> Iterator[Path]:
     """Give a temporary folder whose files become the result when the block ends well.
 
@@ -107,6 +131,8 @@ def result_folder(
         What it is to hold.
     stale : iterable of Path
         Files of an earlier output, relative to the folder, that go where they are not replaced.
+    replaceable : container of Path, optional
+        The only files, relative to the folder, that may be replaced; all without it.
 
     Yields
     ------
@@ -116,7 +142,8 @@ def result_folder(
     Raises
     ------
     UsageError
-        As :func:`check_destination`, before the block runs.
+        As :func:`check_destination`, before the block runs; or if something else stands in the
+        place of a file, after it.
     OutOfResources
         If the files cannot be written, as on a full disk.
     """
@@ -125,7 +152,9 @@ def result_folder(
         with temporary_folder(_workshop(destination), destination.name) as temporary:
             new = temporary / "new"
             new.mkdir()
-            yield new
+            with _named(destination, new):
+                yield new
+            _check_places(new, destination, kind, replaceable)
             destination.parent.mkdir(parents=True, exist_ok=True)
             if destination.exists():
                 _replace_files(new, destination, temporary / "old", stale)
@@ -137,6 +166,47 @@ def result_folder(
             "needed a folder that takes its files; free some space or give another output folder; "
             "nothing was written."
         ) from error
+
+
+@contextmanager
+def _named(destination: Path, new: Path) -> Iterator[None]:
+    """Let what is refused in the block speak of the destination, not of the temporary folder."""
+    try:
+        yield
+    except LegcalError as error:
+        said = [problem.replace(str(new), str(destination)) for problem in error.problems]
+        raise type(error)(said) from error
+
+
+def _check_places(
+    new: Path, destination: Path, kind: OutputKind, replaceable: Container[Path] | None
+) -> None:
+    """Refuse to replace what is no file of an earlier output, and to write through links."""
+    for name in _files_in(new):
+        found = ""
+        for parent in [destination / above for above in name.parents if above != Path()]:
+            if parent.is_symlink() or (parent.exists() and not parent.is_dir()):
+                found = f"{parent.relative_to(destination)}, which is no folder of its own"
+        if not found and os.path.lexists(destination / name):
+            if (destination / name).is_dir():
+                found = f"{name}, which is a folder"
+            elif replaceable is not None and name not in replaceable:
+                found = f"{name}, which legcal did not write"
+        if found:
+            raise UsageError(in_the_way(destination, kind, found))
+
+
+def in_the_way(destination: Path, kind: OutputKind, found: str) -> str:
+    """Return what is said about something that stands where a file of an output belongs."""
+    return (
+        f"{destination}: the {kind.noun} could not be written: found {found}, needed its place; "
+        "move it away, or give another folder; nothing was changed."
+    )
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """Return the files of a folder, relative to it."""
+    return [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
 def _workshop(destination: Path) -> Path:
@@ -172,12 +242,12 @@ def _existing_parent(destination: Path) -> Path:
 
 def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:
     """Move files into a folder; if that is interrupted, put back what was there."""
-    names = [path.relative_to(new) for path in sorted(new.rglob("*")) if path.is_file()]
+    names = _files_in(new)
     gone = [name for name in stale if name not in names and (destination / name).is_file()]
-    kept = [name for name in names if (destination / name).exists()] + gone
+    kept = [name for name in names if os.path.lexists(destination / name)] + gone
     for name in kept:
         (old / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(destination / name, old / name)
+        shutil.copy2(destination / name, old / name, follow_symlinks=False)
     try:
         for name in names:
             (destination / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,182 @@
+"""The folder of a simulated dataset: what ``--force`` replaces, and what it never touches."""
+
+import json
+from pathlib import Path
+
+import pytest
+from simulated import files_of, settings
+
+from legcal.errors import OutOfResources, UsageError
+from legcal.simulation.folder import (
+    TRUTH_NAME,
+    check_dataset_destination,
+    dataset_folder,
+)
+from legcal.simulation.simulate import simulate
+
+FEW = settings(poses=1, views=1)
+OWN = ("dataset.yaml", "images/c1_p01.png", "models/a.yaml", "truth/models/a.yaml")
+EDITED = "view,source\nc1,edited\n"
+DETECTED = "view,source\nc1,detected\n"
+
+
+def write(folder: Path, files: dict[str, str]) -> None:
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content)
+
+
+def fill(folder: Path, content: str = "new", more: tuple[str, ...] = ()) -> None:
+    write(folder, dict.fromkeys((*OWN, *more), content))
+    truth = {"legcal_truth": 1, "files": [*OWN, *more, TRUTH_NAME]}
+    (folder / TRUTH_NAME).write_text(json.dumps(truth))
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """An earlier simulated dataset."""
+    out = tmp_path / "out"
+    fill(out, "old")
+    return out
+
+
+def replace(out: Path) -> None:
+    with dataset_folder(out, force=True) as folder:
+        fill(folder)
+
+
+def test_the_files_of_an_earlier_dataset_are_replaced(out: Path) -> None:
+    write(out, {"notes.txt": "mine", "result/result.json": "mine", "images/.hidden": "mine"})
+    replace(out)
+    found = files_of(out)
+    assert {found[name] for name in OWN} == {b"new"}
+    assert found["notes.txt"] == found["result/result.json"] == found["images/.hidden"] == b"mine"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "images/c2_p01.png",
+        "images/mine/a.png",
+        "axes.csv",
+        "observations.csv",
+        "camera_info_c2.yaml",
+        "measurements.csv",
+        "models/b.yaml",
+        "truth/notes.txt",
+        "urdf",
+    ],
+)
+def test_a_file_of_the_user_where_a_dataset_has_its_own_is_refused_first(
+    name: str, out: Path
+) -> None:
+    write(out, {name: "mine"})
+    before = files_of(out)
+    with pytest.raises(UsageError, match="nothing was changed") as refusal:
+        check_dataset_destination(out, force=True)
+    assert name.removesuffix("/a.png") in str(refusal.value)
+    assert files_of(out) == before
+
+
+def test_the_photograph_that_somebody_put_into_a_set_of_outlines_stays(tmp_path: Path) -> None:
+    simulate("hexapod", tmp_path, FEW)
+    write(tmp_path, {"images/c1_p01.png": "mine"})
+    with pytest.raises(UsageError, match=r"images/c1_p01\.png, which an earlier simulation did"):
+        simulate("hexapod", tmp_path, FEW, force=True)
+    assert (tmp_path / "images" / "c1_p01.png").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["images", "truth/models", "dataset.yaml", "images/c1_p01.png"])
+def test_nothing_is_written_through_links(name: str, out: Path, tmp_path: Path) -> None:
+    (out / name).rename(tmp_path / "elsewhere")
+    (out / name).symlink_to(tmp_path / "elsewhere")
+    before = files_of(tmp_path)
+    with pytest.raises(UsageError, match=f"found {name}, which is a link"):
+        replace(out)
+    assert files_of(tmp_path) == before
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused(out: Path) -> None:
+    (out / "dataset.yaml").unlink()
+    (out / "dataset.yaml").mkdir()
+    with pytest.raises(UsageError, match=r"found dataset\.yaml, which is a folder"):
+        replace(out)
+
+
+def test_what_appears_while_a_dataset_is_made_is_not_replaced(out: Path) -> None:
+    def late(name: str) -> None:
+        with dataset_folder(out, force=True) as folder:
+            fill(folder, more=("images/c2_p01.png",))
+            write(out, {name: "mine"})
+
+    with pytest.raises(UsageError, match=r"images/c2_p01\.png, which legcal did not write"):
+        late("images/c2_p01.png")
+    found = files_of(out)
+    assert found.pop("images/c2_p01.png") == b"mine"
+    assert {found[name] for name in OWN} == {b"old"}
+
+
+def test_outlines_that_a_calibration_left_go(out: Path) -> None:
+    write(out, {"observations.csv": DETECTED, ".legcal-cache.json": '{"given": []}'})
+    replace(out)
+    assert not {"observations.csv", ".legcal-cache.json"} & set(files_of(out))
+
+
+@pytest.mark.parametrize(
+    ("table", "cache"),
+    [
+        (EDITED, '{"given": []}'),
+        (DETECTED, '{"given": [["c1", "images/c1_p01.png"]]}'),
+        (DETECTED, "{"),
+        (DETECTED, "[]"),
+        ("view\n\0\xe9", '{"given": [1]}'),
+    ],
+)
+def test_outlines_that_somebody_gave_or_corrected_stay(table: str, cache: str, out: Path) -> None:
+    write(out, {"observations.csv": table, ".legcal-cache.json": cache})
+    before = files_of(out)
+    with pytest.raises(UsageError, match=r"observations\.csv, which an earlier simulation did not"):
+        replace(out)
+    assert files_of(out) == before
+
+
+@pytest.mark.parametrize("named", ["notes.txt", "result/a.csv", "..", "", "images/../notes.txt"])
+def test_a_truth_that_names_other_files_does_not_reach_them(named: str, out: Path) -> None:
+    write(out, {"notes.txt": "mine", "result/a.csv": "mine"})
+    truth = {"legcal_truth": 1, "files": [*OWN, TRUTH_NAME, named]}
+    (out / TRUTH_NAME).write_text(json.dumps(truth))
+    replace(out)
+    found = files_of(out)
+    assert found["notes.txt"] == found["result/a.csv"] == b"mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("n" * 300, "'File name too long', needed a path that can be created"),
+        ("file/sub", "file is a file, needed a path that can be created"),
+        ("file", "found a file of that name"),
+    ],
+)
+def test_a_path_where_no_folder_can_be_is_refused(name: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(UsageError, match=message):
+        simulate("hexapod", tmp_path / name, FEW)
+    assert files_of(tmp_path) == {"file": b"mine"}
+
+
+def test_a_name_of_the_greatest_length_is_a_name(tmp_path: Path) -> None:
+    with dataset_folder(tmp_path / ("ä" * 127), force=False) as folder:
+        fill(folder)
+    assert (tmp_path / ("ä" * 127) / "dataset.yaml").exists()
+
+
+def test_what_cannot_be_written_names_the_folder_that_was_asked_for(tmp_path: Path) -> None:
+    def full(out: Path) -> None:
+        with dataset_folder(out, force=False) as folder:
+            raise OutOfResources(f"{folder}: found 'No space left on device'.")
+
+    with pytest.raises(OutOfResources, match=f"^{tmp_path}/out: found 'No space") as refusal:
+        full(tmp_path / "out")
+    assert "legcal-part" not in str(refusal.value)
+    assert files_of(tmp_path) == {}
