@@ -16,7 +16,8 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.studies.checkpoint import CHECKPOINT_NAME, header, open_checkpoint
+from legcal.studies.checkpoint import CHECKPOINT_NAME, open_checkpoint
+from legcal.studies.checkpoint_lines import header
 from legcal.studies.runner import DOCUMENT_NAME, run_study
 from legcal.studies.workers import child_seed
 
@@ -130,7 +131,7 @@ def test_figures_that_cannot_be_written_lose_no_run(tmp_path: Path) -> None:
 def test_a_checkpoint_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
     with (
         pytest.raises(OutOfResources, match="could not be opened"),
-        open_checkpoint(tmp_path, header("draws", {}, 0)),
+        open_checkpoint(tmp_path, header("draws", {}, 0), Draws().is_record),
     ):
         pass
 
@@ -149,19 +150,57 @@ def test_a_half_written_last_line_is_done_again(tmp_path: Path, rest: bytes) -> 
 def test_a_checkpoint_that_was_hardly_begun_is_begun_again(tmp_path: Path) -> None:
     expected = run_study(Draws(), 3, output=tmp_path).document()
     path = tmp_path / CHECKPOINT_NAME
-    path.write_bytes(path.read_bytes()[:17])
-    assert run_study(Draws(), 3, output=tmp_path).document() == expected
+    begun = path.read_bytes()[:17]
+    for left in (b"", begun):
+        folder = tmp_path / f"left {len(left)}"
+        folder.mkdir()
+        (folder / CHECKPOINT_NAME).write_bytes(left)
+        assert run_study(Draws(), 3, output=folder).document() == expected
+    (tmp_path / DOCUMENT_NAME).write_text("mine")
+    path.write_bytes(b"")  # no study yet, and files that no study wrote
+    with pytest.raises(UsageError, match="a folder with other files"):
+        run_study(Draws(), 3, output=tmp_path)
+    assert (tmp_path / DOCUMENT_NAME).read_text() == "mine"
 
 
-@pytest.mark.parametrize("damaged", [b'{"run":1,\n', b"[1]\n", b'{"run":1}\n', b'{"record":{}}\n'])
-def test_a_damaged_line_inside_is_refused(tmp_path: Path, damaged: bytes) -> None:
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b'{"run":1,\n',
+        b"[" * 100_000 + b"\n",
+        b"[1]\n",
+        b'{"run":1}\n',
+        b'{"record":{"x":1.0}}\n',
+        b'{"run":-1,"record":{"x":1.0}}\n',
+        b'{"run":true,"record":{"x":1.0}}\n',
+        b'{"run":1,"record":null}\n',
+        b'{"run":1,"record":{"x":"1.0"}}\n',
+        b'{"run":1,"failure":"x"}\n',
+        b'{"run":1,"failure":{"kind":1,"message":"x"}}\n',
+    ],
+)
+@pytest.mark.parametrize("n_after", [0, 3])
+def test_a_damaged_line_is_refused(tmp_path: Path, damaged: bytes, n_after: int) -> None:
     run_study(Draws(), 5, output=tmp_path)
-    lines = _lines(tmp_path)
-    lines[2] = damaged
+    before = _lines(tmp_path)
+    lines = [*before[:2], damaged, *before[3 : 3 + n_after]]
+    if n_after == 0 and not damaged.endswith(b"}\n"):
+        lines.append(before[3])  # as the last line it may be what a killed run left
     (tmp_path / CHECKPOINT_NAME).write_bytes(b"".join(lines))
     with pytest.raises(UsageError, match="found line 3 damaged"):
         run_study(Draws(), 5, output=tmp_path)
     assert _lines(tmp_path) == lines
+
+
+def test_a_first_line_of_brackets_is_no_checkpoint(tmp_path: Path) -> None:
+    (tmp_path / CHECKPOINT_NAME).write_bytes(b"[" * 100_000 + b"\n")
+    with pytest.raises(UsageError, match="no checkpoint of legcal"):
+        run_study(Draws(), 5, output=tmp_path)
+
+
+def test_more_processes_than_are_of_use_are_not_started() -> None:
+    study = Draws()
+    assert run_study(study, 2, workers=10**11).document() == run_study(study, 2).document()
 
 
 @pytest.mark.parametrize(
@@ -203,6 +242,7 @@ def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(tmp_path: Path)
     ("numbers", "message"),
     [
         ({"n_runs": 0}, "runs = 0, needed 1 or more"),
+        ({"n_runs": 10**9}, "runs = 1000000000, needed 1000000 at most"),
         ({"n_runs": 1, "seed": -1}, "seed = -1, needed 0 or more"),
         ({"n_runs": 1, "workers": 0}, "workers = 0, needed 1 or more"),
     ],
@@ -215,6 +255,18 @@ def test_numbers_that_make_no_sense_are_refused(numbers: dict[str, int], message
             seed=numbers.get("seed", 0),
             workers=numbers.get("workers", 1),
         )
+
+
+def test_a_full_disk_without_a_folder_promises_nothing_and_warns_of_nothing(
+    recwarn: pytest.WarningsRecorder,
+) -> None:
+    with (
+        _files_no_larger_than(400),
+        pytest.raises(OutOfResources, match=r"give an output folder elsewhere") as told,
+    ):
+        run_study(Draws(seconds=0.01), 100, workers=2)
+    assert "are kept" not in str(told.value)
+    assert not [str(warning.message) for warning in recwarn]
 
 
 @contextmanager

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from legcal.errors import OutOfResources, UsageError
-from legcal.version import __version__
+from legcal.studies.checkpoint_lines import IsRecord, check_header, encoded, is_run, parsed
 
 CHECKPOINT_NAME = "runs.jsonl"
-_KEY = "legcal_study"
-_VERSION = 1
+_NEXT = "free some space and start the same command again; the runs before are kept"
+_NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keeps what is done"
 
 
 class Checkpoint:
@@ -34,10 +34,17 @@ class Checkpoint:
     """
 
     def __init__(
-        self, path: Path, reader: BinaryIO, writer: FileIO, offsets: dict[int, int]
+        self,
+        path: Path,
+        reader: BinaryIO,
+        writer: FileIO,
+        offsets: dict[int, int],
+        *,
+        kept: bool,
     ) -> None:
         self.path = path
         self.offsets = offsets
+        self._kept = kept
         self._reader = reader
         self._writer = writer
 
@@ -50,7 +57,7 @@ class Checkpoint:
             If they cannot be written, as on a full disk.
         """
         place = self._writer.seek(0, os.SEEK_END)
-        places, content = {}, [_encoded(line) for line in lines]
+        places, content = {}, [encoded(line) for line in lines]
         for line, text in zip(lines, content, strict=True):
             places[int(line["run"])] = place
             place += len(text)
@@ -59,7 +66,7 @@ class Checkpoint:
 
     def begin(self, first: dict[str, Any]) -> None:
         """Write the first line of an empty checkpoint; raises as :meth:`append`."""
-        self._write(_encoded(first))
+        self._write(encoded(first))
 
     def lines(self, n_runs: int) -> Iterator[dict[str, Any]]:
         """Return the lines of the first runs, in the order of their numbers."""
@@ -77,29 +84,14 @@ class Checkpoint:
         except OSError as error:
             raise OutOfResources(
                 f"{self.path}: the checkpoint could not be written: found '{error.strerror}', "
-                "needed a folder that takes its lines; free some space and start the same "
-                "command again; the runs before are kept."
+                f"needed a folder that takes its lines; {_NEXT if self._kept else _NEXT_WITHOUT}."
             ) from error
 
 
-def header(name: str, settings: dict[str, Any], seed: int) -> dict[str, Any]:
-    """Return the first line of the checkpoint of a study."""
-    found: dict[str, Any] = json.loads(
-        _encoded(
-            {
-                _KEY: _VERSION,
-                "study": name,
-                "version": __version__,
-                "seed": seed,
-                "settings": settings,
-            }
-        )
-    )
-    return found
-
-
 @contextmanager
-def open_checkpoint(path: Path, expected: dict[str, Any]) -> Iterator[Checkpoint]:
+def open_checkpoint(
+    path: Path, expected: dict[str, Any], is_record: IsRecord, *, kept: bool = True
+) -> Iterator[Checkpoint]:
     """Open the checkpoint of a study, or begin it.
 
     Parameters
@@ -108,12 +100,16 @@ def open_checkpoint(path: Path, expected: dict[str, Any]) -> Iterator[Checkpoint
         The file; its folder exists.
     expected : dict
         Its first line, from :func:`header`.
+    is_record : callable
+        Tells what the study records from anything else.
+    kept : bool
+        Whether the file is still there afterwards, for messages.
 
     Raises
     ------
     UsageError
-        If it belongs to another study, or is no checkpoint, or is being written by another
-        process. It is left as it was.
+        If it belongs to another study, or is no checkpoint, or is damaged, or is being
+        written by another process. It is left as it was.
     OutOfResources
         If it cannot be read or written.
     """
@@ -127,83 +123,54 @@ def open_checkpoint(path: Path, expected: dict[str, Any]) -> Iterator[Checkpoint
                 "file that can be read and written; give another output folder."
             ) from error
         _lock(path, writer)
-        offsets, end = _read(path, reader, expected)
+        offsets, end = _read(path, reader, expected, is_record)
         writer.truncate(end)
-        checkpoint = Checkpoint(path, reader, writer, offsets)
+        checkpoint = Checkpoint(path, reader, writer, offsets, kept=kept)
         if end == 0:
             checkpoint.begin(expected)
         yield checkpoint
 
 
-def _read(path: Path, file: BinaryIO, expected: dict[str, Any]) -> tuple[dict[int, int], int]:
+def is_begun(path: Path) -> bool:
+    """Return whether a file holds the first line of a checkpoint, or of something else."""
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        return file.readline().endswith(b"\n")
+
+
+def _read(
+    path: Path, file: BinaryIO, expected: dict[str, Any], is_record: IsRecord
+) -> tuple[dict[int, int], int]:
     """Return where the line of each run begins, and where the last complete line ends."""
     first = file.readline()
-    if not first.endswith(b"\n") and _encoded(expected).startswith(first):
+    if not first.endswith(b"\n") and encoded(expected).startswith(first):
         return {}, 0  # empty, or killed while it was begun
-    _check_header(path, first, expected)
+    check_header(path, first, expected)
     offsets: dict[int, int] = {}
     end, broken, number = len(first), 0, 1
     for line in file:
         number += 1
         if broken:
-            raise UsageError(
-                f"{path}: the checkpoint could not be continued: found line {broken} damaged, "
-                "needed a complete JSON object on every line but the last; remove that line, or "
-                "give another output folder."
-            )
-        run = _run_of(line)
-        if run is None:
+            raise _damaged(path, broken)
+        found = parsed(line) if line.endswith(b"\n") else None
+        if found is None:
             broken = number  # only the last line may be
             continue
-        offsets.setdefault(run, end)
+        if not is_run(found, is_record):
+            raise _damaged(path, number)
+        offsets.setdefault(found["run"], end)
         end += len(line)
     return offsets, end
 
 
-def _run_of(line: bytes) -> int | None:
-    """Return the number of the run that a line describes, None if the line is not whole."""
-    if not line.endswith(b"\n"):
-        return None
-    try:
-        found = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    whole = isinstance(found, dict) and isinstance(found.get("run"), int)
-    return found["run"] if whole and ("record" in found or "failure" in found) else None
-
-
-def _check_header(path: Path, line: bytes, expected: dict[str, Any]) -> None:
-    """Refuse a first line that is not the expected one."""
-    start = f"{path}: the study could not be continued: found"
-    end = "give another output folder, or this one the command that began it."
-    try:
-        found = json.loads(line)
-    except ValueError:
-        found = None
-    if not isinstance(found, dict) or found.get(_KEY) != _VERSION:
-        raise UsageError(
-            f"{start} a file that is no checkpoint of legcal, needed one or none; "
-            "give another output folder."
-        )
-    if found.get("study") != expected["study"]:
-        raise UsageError(
-            f"{start} the checkpoint of the study '{found.get('study')}', needed one of "
-            f"'{expected['study']}'; {end}"
-        )
-    if found != expected:
-        different = "; ".join(_differences(found, expected))
-        raise UsageError(f"{start} a checkpoint of other settings ({different}); {end}")
-
-
-def _differences(found: Any, expected: Any, name: str = "") -> Iterator[str]:
-    """Name what two documents differ in."""
-    if isinstance(found, dict) and isinstance(expected, dict):
-        for key in sorted(found.keys() | expected.keys()):
-            if found.get(key) != expected.get(key):
-                inner = key if name in ("", "settings") else f"{name}.{key}"
-                yield from _differences(found.get(key), expected.get(key), inner)
-    else:
-        yield f"{name} {json.dumps(found)} instead of {json.dumps(expected)}"
+def _damaged(path: Path, number: int) -> UsageError:
+    """Return the refusal of a line that cannot be what a killed run left of it."""
+    return UsageError(
+        f"{path}: the checkpoint could not be continued: found line {number} damaged, "
+        "needed a complete JSON object of a run on every line but the last; remove that line, or "
+        "give another output folder."
+    )
 
 
 def _lock(path: Path, file: FileIO) -> None:
@@ -219,8 +186,3 @@ def _lock(path: Path, file: FileIO) -> None:
             f"{path}: the study could not be continued: found that another process writes this "
             "checkpoint, needed it alone; wait for that one, or give another output folder."
         ) from error
-
-
-def _encoded(document: dict[str, Any]) -> bytes:
-    """Return a document as one line."""
-    return json.dumps(document, allow_nan=False, separators=(",", ":")).encode() + b"\n"

@@ -16,9 +16,10 @@ from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import Machine, perturb
 from legcal.simulation.poses import random_poses
 from legcal.simulation.table_noise import TableNoise
-from legcal.studies.eq20 import PlatformErrors, expected_errors, platform_errors
+from legcal.studies.eq20 import expected_errors, platform_errors
 from legcal.studies.estimators import ESTIMATORS, bound_covariance
 from legcal.studies.paper_means import BOUND, INITIAL, means_of
+from legcal.studies.paper_record import errors_record, has_keys, is_errors
 from legcal.studies.paper_summary import PaperSummary
 from legcal.studies.session import SimulatedSession, observe_session, simulate_session
 from legcal.studies.study import Record
@@ -65,6 +66,7 @@ class PaperStudy:
     def settings(self) -> dict[str, Any]:
         """Everything that decides a run beside its seed."""
         return {
+            "radians": self.noise == TableNoise.in_radians(),
             **asdict(self),
             "raised": RAISED,
             "views": [[f"leg{leg + 1}" for leg in legs] for legs in PAPER_VIEWS],
@@ -78,6 +80,14 @@ class PaperStudy:
             name: self._calibrations(truth(), np.random.default_rng(child))
             for (name, truth), child in zip(MACHINES.items(), seeds, strict=True)
         }
+
+    def is_record(self, found: Any) -> bool:
+        """Return whether a document has the errors of every estimator on either machine."""
+        wanted = {INITIAL, *self.estimators, BOUND}
+        return has_keys(found, set(MACHINES)) and all(
+            has_keys(of_machine, wanted) and all(map(is_errors, of_machine.values()))
+            for of_machine in found.values()
+        )
 
     def summary(self, records: Iterable[Record]) -> PaperSummary:
         """Return the means over all runs."""
@@ -137,19 +147,12 @@ def _errors(
         errors = platform_errors(machine, parameters, checked)
     except LegcalError as error:
         return {"failure": failure_of(error)}
-    return _record(errors, squared, np.abs(difference))
+    return errors_record(errors, squared, np.abs(difference))
 
 
 def _expected(machine: Machine, covariance: Array, checked: RigidTransform) -> Record:
     """Return the errors to expect at the Cramer-Rao bound."""
     sigma = np.sqrt(np.diagonal(covariance))
-    return _record(expected_errors(machine, covariance, checked), 1.0, np.sqrt(2.0 / np.pi) * sigma)
-
-
-def _record(errors: PlatformErrors, of_bound_squared: float, parameters: Array) -> Record:
-    """Return errors as a record [m, rad]."""
-    return {
-        **asdict(errors),
-        "of_bound_squared": of_bound_squared,
-        "parameters": parameters.tolist(),
-    }
+    return errors_record(
+        expected_errors(machine, covariance, checked), 1.0, np.sqrt(2.0 / np.pi) * sigma
+    )

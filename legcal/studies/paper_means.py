@@ -12,6 +12,7 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.mechanism.parameters import parameter_names, to_vector
 from legcal.simulation.machine import Machine
+from legcal.studies.paper_record import SCALARS
 from legcal.studies.study import Record
 
 INITIAL = "initial"
@@ -102,8 +103,8 @@ class _Sums:
 
     def __init__(self, n_parameters: int) -> None:
         self.n = 0
-        self.scalars = np.zeros(4)  # dX, dE, angle, square of the errors in units of the bound
-        self.squares = np.zeros(4)  # of these
+        self.scalars = np.zeros(len(SCALARS))
+        self.squares = np.zeros(len(SCALARS))
         self.parameters = np.zeros(n_parameters)
         self.failures: Counter[str] = Counter()
 
@@ -112,7 +113,7 @@ class _Sums:
         if "failure" in record:
             self.failures[record["failure"]["kind"]] += 1
             return
-        scalars = np.array([record[name] for name in ("dX", "dE", "angle", "of_bound_squared")])
+        scalars = np.array([record[name] for name in SCALARS])
         self.n += 1
         self.scalars += scalars
         self.squares += scalars**2

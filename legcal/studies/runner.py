@@ -11,7 +11,7 @@ import json
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,18 @@ from typing import Any
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
 from legcal.files.atomic import TEMPORARY_SUFFIX, write_atomically
 from legcal.progress import Report, no_progress
-from legcal.studies.checkpoint import CHECKPOINT_NAME, Checkpoint, header, open_checkpoint
+from legcal.studies.checkpoint import (
+    CHECKPOINT_NAME,
+    Checkpoint,
+    is_begun,
+    open_checkpoint,
+)
+from legcal.studies.checkpoint_lines import header
 from legcal.studies.study import Record, Study, Summary
 from legcal.studies.workers import lines_of_runs
 
 DOCUMENT_NAME = "study.json"
+MOST_RUNS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +90,7 @@ def run_study(
     seed : int
         Seed of the study.
     workers : int
-        Number of processes.
+        Number of processes; more than a few for each core are not started.
     output : Path, optional
         Folder for the checkpoint, the document and the figures. One that holds a checkpoint of
         the same study is continued; more runs than before are added to those that are there.
@@ -107,14 +114,17 @@ def run_study(
     stage = f"Study {study.name}"
     with _folder(output) as folder:
         path = folder / CHECKPOINT_NAME
-        with open_checkpoint(path, header(study.name, study.settings, seed)) as checkpoint:
+        first = header(study.name, study.settings, seed)
+        kept = output is not None
+        with open_checkpoint(path, first, study.is_record, kept=kept) as checkpoint:
             missing = [run for run in range(n_runs) if run not in checkpoint.offsets]
             done = n_runs - len(missing)
             progress(stage, done, n_runs)
-            for lines in lines_of_runs(study, seed, missing, workers):
-                checkpoint.append(lines)
-                done += len(lines)
-                progress(stage, done, n_runs)
+            with closing(lines_of_runs(study, seed, missing, workers)) as chunks:
+                for lines in chunks:
+                    checkpoint.append(lines)
+                    done += len(lines)
+                    progress(stage, done, n_runs)
             result = _result(study, seed, n_runs, checkpoint)
         if output is not None:
             _write(result, folder)
@@ -183,10 +193,11 @@ def _check_folder(output: Path) -> None:
         raise UsageError(
             f"{start} a file of that name, needed a folder; give another output folder."
         )
-    if not output.is_dir() or (output / CHECKPOINT_NAME).is_file():
+    checkpoint = output / CHECKPOINT_NAME
+    if not output.is_dir() or is_begun(checkpoint):
         return
     others = [path for path in output.iterdir() if not path.name.endswith(TEMPORARY_SUFFIX)]
-    if others:
+    if any(path != checkpoint or path.is_dir() for path in others):
         raise UsageError(
             f"{start} a folder with other files and no {CHECKPOINT_NAME} of a study, needed a new "
             "or empty folder or that of the same study; give another output folder."
@@ -195,6 +206,11 @@ def _check_folder(output: Path) -> None:
 
 def _check_numbers(n_runs: int, seed: int, workers: int) -> None:
     """Refuse numbers that make no sense."""
+    if n_runs > MOST_RUNS:
+        raise UsageError(
+            f"The study could not be run: found runs = {n_runs}, needed {MOST_RUNS} at most; give "
+            "another number."
+        )
     for name, found, least in (("runs", n_runs, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if found < least:
             raise UsageError(

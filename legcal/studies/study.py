@@ -45,5 +45,8 @@ class Study(Protocol):
     def one_run(self, seed: np.random.SeedSequence) -> Record:
         """Return the record of one run; a LegcalError is recorded as a failed run."""
 
+    def is_record(self, found: Any) -> bool:
+        """Return whether what a checkpoint has of a run is what :meth:`one_run` returns."""
+
     def summary(self, records: Iterable[Record]) -> Summary:
         """Return what the records of all runs that did not fail say, read once and in order."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from threading import Thread
 from typing import Any
 
@@ -17,6 +19,7 @@ from legcal.errors import LegcalError, OutOfResources
 from legcal.studies.study import Study
 
 _LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
+_PROCESSES = 4  # for each core; more only wait for each other
 _CHUNKS = 16  # for each process: the work is shared evenly to the end
 
 
@@ -27,7 +30,7 @@ def child_seed(seed: int, run: int) -> np.random.SeedSequence:
 
 def lines_of_runs(
     study: Study, seed: int, runs: Sequence[int], workers: int
-) -> Iterator[list[dict[str, Any]]]:
+) -> Generator[list[dict[str, Any]]]:
     """Return the lines of runs, chunk by chunk, in the order in which they are finished.
 
     Chunks are handed out as processes get free, so that memory does not grow with their number.
@@ -41,7 +44,8 @@ def lines_of_runs(
     runs : sequence of int
         Numbers of the runs.
     workers : int
-        Number of processes; one means this one.
+        Number of processes, as many as there are runs and a few for each core at most; one means
+        this one.
 
     Yields
     ------
@@ -54,17 +58,21 @@ def lines_of_runs(
     OutOfResources
         If a process is ended from outside.
     """
+    workers = min(workers, max(len(runs), 1), _PROCESSES * (os.cpu_count() or 1))
     chunks = _chunks(runs, workers)
     if workers == 1:
         for chunk in chunks:
             yield run_chunk(study, seed, chunk)
         return
-    with parallel_config(
-        "loky",
-        n_jobs=workers,
-        inner_max_num_threads=1,
-        initializer=_follow,
-        initargs=(os.getpid(),),
+    with (
+        _without_advice(),
+        parallel_config(
+            "loky",
+            n_jobs=workers,
+            inner_max_num_threads=1,
+            initializer=_follow,
+            initargs=(os.getpid(),),
+        ),
     ):
         parallel = Parallel(
             return_as="generator_unordered", pre_dispatch="2 * n_jobs", batch_size=1
@@ -99,6 +107,14 @@ def failure_of(error: LegcalError) -> dict[str, str]:
 def _chunks(runs: Sequence[int], workers: int) -> Iterator[Sequence[int]]:
     size = min(max(len(runs) // (_CHUNKS * workers), 1), _LARGEST_CHUNK)
     return (runs[first : first + size] for first in range(0, len(runs), size))
+
+
+@contextmanager
+def _without_advice() -> Iterator[None]:
+    """Keep joblib from advising its user where a study is stopped before its end."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"\d+ tasks (which were|have been) ", UserWarning)
+        yield
 
 
 def _follow(parent: int) -> None:
