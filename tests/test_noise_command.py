@@ -20,6 +20,7 @@ from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.mechanism.load import load_mechanism
 from legcal.repeatability.document import noise_document
 from legcal.repeatability.noise import measure_noise
+from legcal.repeatability.notes import noise_notes
 from legcal.repeatability.quantities import QUANTITIES
 from legcal.repeatability.repeats import find_repeats
 from legcal.repeatability.result import Noise
@@ -114,14 +115,48 @@ def test_the_upper_bound_is_the_largest_of_all_legs_and_orientations(found: Nois
             assert method["upper_bound"][name] == max(v for v in values if v is not None)
 
 
+def test_the_orientations_that_set_upper_bounds_are_named(found: Noise) -> None:
+    for method in noise_document(found)["methods"].values():
+        for name in (*QUANTITIES, "outline"):
+            at = method["upper_bound_at"][name]
+            (leg,) = [leg for leg in method["legs"] if leg["leg"] == at["leg"]]
+            (o,) = [
+                o for o in leg["orientations"] if (o["view"], o["pose"]) == (at["view"], at["pose"])
+            ]
+            assert leg[name]["largest"] == method["upper_bound"][name]
+            assert method["all"][name]["median"] < method["upper_bound"][name]
+            assert name == "outline" or o[name] == method["upper_bound"][name]
+
+
+def test_an_edge_that_jumps_between_images_is_named(rendered: RepeatedImages, found: Noise) -> None:
+    measurements = load_dataset(rendered.path).measurements
+    assert not any("jumps" in note for note in noise_notes(measurements, found.methods))
+    detector, canny = found.methods
+    first, *others = canny.legs[2].orientations
+    jumping = replace(first.lines[0], covariance=400.0 * first.lines[0].claimed)
+    leg = replace(
+        canny.legs[2],
+        orientations=(replace(first, lines=(jumping, *first.lines[1:])), *others),
+    )
+    canny = replace(canny, legs=(*canny.legs[:2], leg, *canny.legs[3:]))
+    (note,) = [n for n in noise_notes(measurements, [detector, canny]) if "jumps" in n]
+    place = f"leg3 in c1/{measurements.pose_labels[first.pose]} ({jumping.sd:.3f} px)"
+    assert note.startswith("Canny: single outlines spread over 3 times")
+    assert place in note
+
+
 def test_the_table_fits_80_columns_and_says_what_repeats_do_not_show(found: Noise) -> None:
     console = Console(width=80, record=True, file=StringIO())
     console.print(noise_table(found))
     text = console.export_text()
     assert max(len(line) for line in text.splitlines()) <= 80
     flowing = " ".join(text.split())
-    for words in ("psi [deg]", "x [mm]", "upper bound", "Canny", "claimed", "2/12", "not the bias"):
+    for words in (
+        "psi [deg]", "x [mm]", "upper bound", "Canny", "claims", "claimed", "2/12", "not the bias",
+        "median", "Upper bounds by detector: leg", "95 % ranges hold for normal",
+    ):  # fmt: skip
         assert words in flowing
+    assert text.count("leg1  ") == 3  # on one line in every table
 
 
 def test_the_result_does_not_depend_on_the_order_of_rows(

@@ -41,6 +41,18 @@ def _method(noise: Noise, method: MethodNoise) -> dict[str, Any]:
             name: None if (spread := method.spread(name)) is None else spread.largest
             for name in (*QUANTITIES, OUTLINE)
         },
+        "upper_bound_at": {
+            name: None if (o := method.bounding(name)) is None else _place(noise, o)
+            for name in (*QUANTITIES, OUTLINE)
+        },
+    }
+
+
+def _place(noise: Noise, orientation: LegOrientation) -> dict[str, str]:
+    return {
+        "leg": noise.dataset.mechanism.leg_names[orientation.leg],
+        "view": noise.view_names[orientation.view],
+        "pose": noise.pose_labels[orientation.pose],
     }
 
 
@@ -82,6 +94,7 @@ def _spread(spread: Spread | None) -> dict[str, Any] | None:
         "ratio": spread.ratio,
         "ratio_low": low,
         "ratio_high": high,
+        "median": spread.median,
         "largest": spread.largest,
         "dof": spread.dof,
         "samples": spread.samples,

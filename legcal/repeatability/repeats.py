@@ -58,7 +58,8 @@ def find_repeats(measurements: Measurements, has_image: BoolArray, where: Path) 
         found = "two images of one pose in any view" if measurements.pose_labels else "column pose"
         raise NotIdentifiable(
             f"{what} {found}, needed several images of each pose from one camera position; take "
-            "every image several times and give its rows the same label in the column pose."
+            "every image several times and give its rows the same label in the column pose "
+            "(legcal simulate --images 4 does, for a simulated machine)."
         )
     return repeats
 

@@ -13,6 +13,7 @@ from legcal.repeatability.samples import LegOrientation
 from legcal.repeatability.spread import Sample, Spread, pool
 
 OUTLINE = "outline"  # the spread of outlines, beside the QUANTITIES of axes
+CALLED = {"detector": "detector", "canny": "Canny"}  # methods, in words
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +48,7 @@ class LegNoise:
 
     def samples(self, quantity: str) -> list[Sample]:
         """Return the samples of one of the ``QUANTITIES`` or of the outlines."""
-        if quantity == OUTLINE:
-            return [line for o in self.orientations for line in o.lines]
-        return [o.quantities[quantity] for o in self.orientations if quantity in o.quantities]
+        return [sample for o in self.orientations for sample in samples_of(o, quantity)]
 
     def spread(self, quantity: str) -> Spread | None:
         """Return the spread over all orientations, None where nothing was found twice."""
@@ -74,6 +73,18 @@ class MethodNoise:
     def spread(self, quantity: str) -> Spread | None:
         """Return the spread over all legs and orientations; its largest is that of Table 1."""
         return pool([sample for leg in self.legs for sample in leg.samples(quantity)])
+
+    def bounding(self, quantity: str) -> LegOrientation | None:
+        """Return the orientation whose standard deviation is the largest, None without any."""
+        every = [o for leg in self.legs for o in leg.orientations if samples_of(o, quantity)]
+        return max(every, key=lambda o: max(s.sd for s in samples_of(o, quantity)), default=None)
+
+
+def samples_of(orientation: LegOrientation, quantity: str) -> list[Sample]:
+    """Return what repeats say of one of the ``QUANTITIES``, or of each outline."""
+    if quantity == OUTLINE:
+        return list(orientation.lines)
+    return [orientation.quantities[quantity]] if quantity in orientation.quantities else []
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,6 +41,11 @@ class Sample:
         """Standard deviation, the root mean square over the components."""
         return float(np.sqrt(np.trace(self.covariance) / len(self.covariance)))
 
+    @property
+    def ratio(self) -> float:
+        """Standard deviation in the claimed one."""
+        return float(np.sqrt(np.trace(self.covariance) / np.trace(self.claimed)))
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -50,8 +55,8 @@ class Spread:
     ----------
     sd, claimed : float
         Standard deviation of the repeats, and the one that the method claims.
-    largest : float
-        The largest standard deviation of one orientation.
+    median, largest : float
+        The median and the largest standard deviation of one orientation.
     dof : float
         Degrees of freedom of ``sd``.
     samples : int
@@ -60,6 +65,7 @@ class Spread:
 
     sd: float
     claimed: float
+    median: float
     largest: float
     dof: float
     samples: int
@@ -114,5 +120,12 @@ def pool(samples: Sequence[Sample]) -> Spread | None:
     traces = np.array([np.trace(s.claimed) for s in samples])
     squares = np.array([np.sum(s.claimed**2) for s in samples])  # tr C^2 of a symmetric C
     effective = float(dof @ traces) ** 2 / float(dof @ squares)
-    largest = max(s.sd for s in samples)
-    return Spread(float(found), float(claimed), largest, effective, len(samples))
+    each = [s.sd for s in samples]
+    return Spread(
+        sd=float(found),
+        claimed=float(claimed),
+        median=float(np.median(each)),
+        largest=max(each),
+        dof=effective,
+        samples=len(samples),
+    )

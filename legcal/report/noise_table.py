@@ -7,11 +7,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.repeatability.quantities import ANGLES
-from legcal.repeatability.result import OUTLINE, LegNoise, MethodNoise, Noise
+from legcal.repeatability.quantities import ANGLES, QUANTITIES
+from legcal.repeatability.result import CALLED, OUTLINE, LegNoise, MethodNoise, Noise
 from legcal.repeatability.spread import Spread
 
-_METHODS = {"detector": "detector", "canny": "Canny"}
+_CLAIMING = "detector"  # the method whose claims stand beside its axes
+_LEAST_NAME = 6  # characters of a leg's name that are never wrapped
 _TABLE_1 = {"psi": r"psi \[deg]", "theta": r"theta \[deg]", "x": r"x \[mm]", "z": r"z \[mm]"}
 _BY_DIRECTION = {
     "angle": r"angle \[deg]",
@@ -45,10 +46,28 @@ def noise_table(noise: Noise) -> RenderableType:
         Text(),
         _outline_table(noise),
         Text(),
+        *_bounding(noise),
         *_difference(noise),
         *(Text(sentence, style="dim") for sentence in (_CONVENTIONS, _PAPER)),
         *(Text(f"note: {note}") for note in noise.notes),
     )
+
+
+def _bounding(noise: Noise) -> list[Text]:
+    """Return lines on which orientations set the upper bounds."""
+    lines = []
+    for method in noise.methods:
+        places: dict[str, list[str]] = {}
+        for quantity in (*QUANTITIES, OUTLINE):
+            o = method.bounding(quantity)
+            if o is not None:
+                leg = noise.dataset.mechanism.leg_names[o.leg]
+                place = f"{leg} in {noise.view_names[o.view]}/{noise.pose_labels[o.pose]}"
+                places.setdefault(place, []).append(quantity)
+        if places:
+            found = "; ".join(f"{place} ({', '.join(of)})" for place, of in places.items())
+            lines.append(Text(f"Upper bounds by {CALLED[method.name]}: {found}."))
+    return [*lines, Text()] if lines else []
 
 
 def _difference(noise: Noise) -> list[Text]:
@@ -67,12 +86,13 @@ def _difference(noise: Noise) -> list[Text]:
     ]
 
 
-def _table(title: str, columns: Sequence[str]) -> Table:
+def _table(noise: Noise, title: str, columns: Sequence[str]) -> Table:
     """Return a table by leg and method."""
+    longest = max(len(leg.name) for leg in noise.methods[0].legs)
     table = Table(
         title=Text(title), title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0)
     )
-    table.add_column("leg", overflow="fold")
+    table.add_column("leg", overflow="fold", min_width=min(longest, _LEAST_NAME))
     table.add_column("method", no_wrap=True)
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
@@ -90,42 +110,51 @@ def _rows(noise: Noise) -> list[tuple[str, MethodNoise, LegNoise]]:
 
 def _axis_table(noise: Noise, title: str, columns: dict[str, str]) -> Table:
     """Return pooled standard deviations of some quantities, and their upper bounds."""
-    table = _table(title, [*columns.values(), "images"])
+    table = _table(noise, title, [*columns.values(), "images"])
     for name, method, leg in _rows(noise):
         cells = [_value(leg.spread(q), q, lambda s: s.sd, "no M_LS" * (leg.without_M_LS > 0))
                  for q in columns]  # fmt: skip
-        table.add_row(name, _METHODS[method.name], *cells, f"{leg.axes}/{leg.images}")
-    for k, method in enumerate(noise.methods):
-        cells = [_value(method.spread(q), q, lambda s: s.largest) for q in columns]
-        table.add_row("upper bound" if k == 0 else "", _METHODS[method.name], *cells, "")
+        table.add_row(name, CALLED[method.name], *cells, f"{leg.axes}/{leg.images}")
+        if method.name == _CLAIMING:
+            cells = [_value(leg.spread(q), q, lambda s: s.claimed) for q in columns]
+            table.add_row("", " claims", *cells, "", style="dim")
+    of_all: dict[str, Callable[[Spread], float]] = {
+        "median": lambda s: s.median,
+        "upper bound": lambda s: s.largest,
+    }
+    for what, of in of_all.items():
+        for k, method in enumerate(noise.methods):
+            cells = [_value(method.spread(q), q, of) for q in columns]
+            table.add_row(what if k == 0 else "", CALLED[method.name], *cells, "")
     return table
 
 
 def _outline_table(noise: Noise) -> Table:
     """Return the spread of outlines beside what is claimed of them."""
-    columns = (r"spread \[px]", r"claimed \[px]", "ratio", "(95 %)", "largest", "missed")
-    table = _table("Outlines, offsets at both ends", columns)
+    columns = ("spread", "claimed", "ratio", "(95 %)", "median", "largest", "missed")
+    table = _table(noise, "Outlines, offsets at both ends [px]", columns)
     for name, method, leg in _rows(noise):
         shown = sum(o.outlines for o in leg.orientations)
         missed = shown - sum(o.outlines_found for o in leg.orientations)
         cells = _outline_cells(leg.spread(OUTLINE))
-        table.add_row(name, _METHODS[method.name], *cells, f"{missed}/{shown}")
+        table.add_row(name, CALLED[method.name], *cells, f"{missed}/{shown}")
     for k, method in enumerate(noise.methods):
         cells = _outline_cells(method.spread(OUTLINE))
-        table.add_row("all" if k == 0 else "", _METHODS[method.name], *cells, "")
+        table.add_row("all" if k == 0 else "", CALLED[method.name], *cells, "")
     return table
 
 
 def _outline_cells(spread: Spread | None) -> list[str]:
-    """Return spread, claim, ratio with its range, and the largest."""
+    """Return spread, claim, ratio with its range, the median and the largest."""
     if spread is None:
-        return ["-"] * 5
+        return ["-"] * 6
     low, high = spread.ratio_range
     return [
         f"{spread.sd:.4f}",
         f"{spread.claimed:.4f}",
         f"{spread.ratio:.2f}",
         f"{low:.2f} to {high:.2f}",
+        f"{spread.median:.4f}",
         f"{spread.largest:.4f}",
     ]
 
