@@ -35,7 +35,7 @@ def test_one_command_writes_a_dataset_and_says_what_it_shows(
     monkeypatch.setenv("COLUMNS", "80")
     assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *QUICK) == 0
     printed = capsys.readouterr()
-    assert "hexapod: outlines, 1 images of 1 poses" in printed.out
+    assert "hexapod: outlines, 1 image of 1 pose" in printed.out
     assert f"{tmp_path}/sim/truth/models/hexapod.yaml" in printed.out.replace("\n", "")
     assert "Cameras: 1/1" in printed.err
     assert (tmp_path / "sim" / "observations.csv").exists()
@@ -48,6 +48,7 @@ def test_json_is_one_document(
     assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *QUICK, *words, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["images"] == 1
+    assert document["extreme_poses"] == 1
     assert document["views"]["c1"]["images"] == 1
     assert set(document["views"]["c1"]["legs"]) == {f"leg{j}" for j in range(1, 7)}
     truth = json.loads((tmp_path / "sim" / TRUTH_NAME).read_text())
@@ -88,7 +89,6 @@ def test_json_is_one_document(
         (("--pixel-noise", "0.2px"), "found --level photographs, needed --level outlines"),
         (("--level", "axes", "--blur", "1"), "found --level axes, needed --level photographs"),
         (("--error", "twists=1deg"), "--error twists could not be used: found none in the"),
-        (("--error", "joints=500mm"), "no true machine could be made: found 20 times a machine"),
         (("--error", "radii=9mm"), "The errors of radii could not be drawn: found a size of 9 mm"),
         (("--bits", "12"), "found bits = 12, needed one of 8, 16"),
         (("--blur", "-1"), "found blur = -1"),
@@ -160,6 +160,7 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
         {"sampling": "best"},
         {"poses": 10**9},
         {"seed": -1},
+        {"poses": 1000, "views": 100, "images": 2},
     ],
 )
 def test_settings_without_sense_are_refused(changes: dict[str, object]) -> None:
@@ -248,6 +249,27 @@ def test_cameras_that_see_nothing_or_stand_in_the_machine_are_refused(
     with pytest.raises(error, match=message):
         simulate("hexapod", tmp_path / "set", settings(poses=1, views=path))
     assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize("size", [(4_000_000_000, 3000), (20_000, 20_000)])
+def test_cameras_whose_pictures_nothing_holds_are_refused(
+    size: tuple[int, int], tmp_path: Path
+) -> None:
+    camera = small_camera(tmp_path, *size)
+    with pytest.raises(DatasetError, match=f"found {size[0]} x {size[1]} px, needed at most 65535"):
+        simulate("hexapod", tmp_path / "set", settings(poses=1, views=1, camera=camera))
+    assert not (tmp_path / "set").exists()
+
+
+def test_more_cameras_of_a_file_than_images_fit_are_refused(tmp_path: Path) -> None:
+    place = "{T_base_camera: {xyz: [1, 0, 0.2], quat_xyzw: [0, 0, 0, 1]}}"
+    path = tmp_path / "cameras.yaml"
+    path.write_text(f"views: {{a: {place}, b: {place}}}\n")
+    many = settings(poses=1, views=path, images=60_000)
+    with pytest.raises(
+        UsageError, match=r"found 120000 images \(2 views of 1 poses, 60000 of each"
+    ):
+        simulate("hexapod", tmp_path / "set", many)
 
 
 def test_a_machine_without_visible_legs_cannot_be_seen(tmp_path: Path) -> None:

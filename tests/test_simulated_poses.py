@@ -23,7 +23,7 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.singularity import side, singularity
 from legcal.simulation.clearance import Clearance, segment_distance
-from legcal.simulation.extremes import JITTER
+from legcal.simulation.extremes import JITTER, are_extreme
 from legcal.simulation.motion import SimulatedPoses, draw_poses, given_poses
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -62,6 +62,15 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
     assert np.ptp(part, axis=0).max() > 0.4
     if name != LONG_TRAVEL:
         assert np.all((part <= JITTER) | (part >= 1.0 - JITTER))
+
+
+def test_long_travel_leaves_some_poses_extreme_and_they_are_counted() -> None:
+    mechanism = load_mechanism(LONG_TRAVEL)
+    poses = _drawn(mechanism, 16)
+    part = _parts(mechanism, poses)
+    extreme = np.all((part <= JITTER) | (part >= 1.0 - JITTER), axis=1)
+    assert are_extreme(mechanism, poses.readings).tolist() == extreme.tolist()
+    assert 2 <= extreme.sum() < 16
 
 
 def test_poses_of_the_workspace_are_anywhere_in_the_travel() -> None:

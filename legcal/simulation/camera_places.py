@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
+from legcal.progress import Report, no_progress
 from legcal.simulation.cameras import look_at
 from legcal.simulation.posed_machine import PosedMachine
 from legcal.simulation.rendering.footprint import surrounding_points
@@ -42,6 +43,7 @@ def places_around(
     machines: Sequence[PosedMachine],
     cameras: Sequence[Camera],
     rng: np.random.Generator,
+    progress: Report = no_progress,
 ) -> tuple[RigidTransform, ...]:
     """Return where cameras stand.
 
@@ -55,6 +57,8 @@ def places_around(
         The camera of each view.
     rng : numpy.random.Generator
         Source of the first sector, of roll and distance.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -69,6 +73,7 @@ def places_around(
     lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
     found = []
     for v, camera in enumerate(cameras):
+        progress("Cameras", v, len(cameras))
         roll, further = rng.uniform(-_ROLL, _ROLL), 1.0 + _FURTHER * rng.random()
         candidates = [
             _place(
@@ -79,6 +84,7 @@ def places_around(
         ]
         scores = [_score(mechanism, tried, camera, T) for T in candidates]
         found.append(candidates[int(np.argmax(scores))])
+    progress("Cameras", len(cameras), len(cameras))
     return tuple(found)
 
 

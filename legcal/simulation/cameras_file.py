@@ -17,10 +17,13 @@ from typing import Annotated
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
+from legcal.errors import DatasetError
 from legcal.files.motion import MotionEntry
 from legcal.files.schema import FileSchema, PlainName, parse_yaml, read_text, validate
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
+
+MOST_SIDE, MOST_PIXELS = 65_535, 100_000_000  # what PNG files and memory hold
 
 
 class PlaceEntry(FileSchema):
@@ -34,6 +37,24 @@ class CamerasEntry(FileSchema):
     """The whole file."""
 
     views: Annotated[dict[PlainName, PlaceEntry], Field(min_length=1)]
+
+
+def read_lens(path: Path) -> Camera:
+    """Return the camera of a camera file, of a size that pictures can have.
+
+    Raises
+    ------
+    DatasetError
+        If the file is malformed, or its pictures too large.
+    """
+    camera = read_camera(path)
+    if max(camera.width, camera.height) > MOST_SIDE or camera.width * camera.height > MOST_PIXELS:
+        raise DatasetError(
+            f"{path}: the camera could not be simulated: found {camera.width} x {camera.height} "
+            f"px, needed at most {MOST_SIDE} px a side and {MOST_PIXELS // 10**6} million px; "
+            "correct its image size."
+        )
+    return camera
 
 
 def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTransform]]:
@@ -55,7 +76,7 @@ def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTra
     entry = validate(CamerasEntry, found, path)
     return {
         name: (
-            camera if view.camera is None else read_camera(path.parent / view.camera),
+            camera if view.camera is None else read_lens(path.parent / view.camera),
             view.T_base_camera.motion(),
         )
         for name, view in entry.views.items()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from legcal.errors import DidNotConverge
@@ -9,6 +11,7 @@ from legcal.geometry.types import Array
 from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.singularity import singularity
+from legcal.progress import Report, no_progress
 from legcal.simulation.motion import Sampling, SimulatedPoses, draw_poses
 
 _REGULAR = 0.05  # of the nominal model's singularity measure at home
@@ -21,6 +24,7 @@ def commanded_poses(
     n_poses: int,
     rng: np.random.Generator,
     sampling: Sampling,
+    progress: Report = no_progress,
 ) -> SimulatedPoses:
     """Return random poses of a machine that its nominal model reaches at the same readings.
 
@@ -38,6 +42,8 @@ def commanded_poses(
         Source of the poses.
     sampling : Sampling
         How they are drawn.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
 
     Raises
     ------
@@ -47,7 +53,8 @@ def commanded_poses(
     kept: list[SimulatedPoses] = []
     missing = n_poses
     for _ in range(_ROUNDS):
-        drawn = draw_poses(truth, missing, rng, sampling)
+        report = partial(_report, progress, n_poses - missing)
+        drawn = draw_poses(truth, missing, rng, sampling, report)
         reached = [i for i, q in enumerate(drawn.readings) if _reaches(nominal, q)]
         kept.append(_chosen(drawn, reached))
         missing -= len(reached)
@@ -58,6 +65,11 @@ def commanded_poses(
         f"the true machine and the nominal model reach at the same readings in {_ROUNDS} rounds, "
         "needed all; make the errors of the true machine smaller, or give poses."
     )
+
+
+def _report(progress: Report, kept: int, stage: str, done: int, total: int) -> None:
+    """Report poses beside those that are kept already."""
+    progress(stage, kept + done, kept + total)
 
 
 def _reaches(nominal: Mechanism, q: Array) -> bool:

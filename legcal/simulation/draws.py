@@ -18,7 +18,7 @@ from legcal.simulation.extremes import near_ends
 TRIES = 60  # draws for each pose
 FULL_EXTREME, FULL = 12, 2  # of them over all of the travel; the next nearer to home
 NEARER = 0.85  # each
-LEARNED = 6  # draws before those that reached the last pose
+LEARNED = 6  # draws before those that reached the last pose; extremes are tried first always
 WAY = (0.25, 0.5, 0.75, 1.0)  # parts of the way from home: no leg goes through another before
 SHORTEST = 0.25  # of such a part; what is harder to reach is drawn again
 
@@ -67,7 +67,7 @@ class Draws:
 
     def _followed(self) -> Array | None:
         """Return what is followed from home to drawn readings of the motors."""
-        start = max(0, self._tried - LEARNED)
+        start = 0 if self._extreme else max(0, self._tried - LEARNED)
         full = FULL_EXTREME if self._extreme else FULL
         for tried in range(start, start + TRIES):
             found = self._reached(self._readings(NEARER ** max(0, tried + 1 - full)))

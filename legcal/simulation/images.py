@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import NotVisible, UsageError
 from legcal.geometry.types import IntArray
 from legcal.mechanism.leg import Leg
+from legcal.progress import Report, no_progress
 from legcal.simulation.posed_machine import PosedMachine
 from legcal.simulation.visibility import SEEN, LegView, legs_in_image
 from legcal.vision.camera import Camera
@@ -79,6 +80,7 @@ def take_images(
     n_images: int,
     *,
     shared_poses: bool,
+    progress: Report = no_progress,
 ) -> Images:
     """Return the images that cameras take of a machine in its poses.
 
@@ -95,6 +97,8 @@ def take_images(
         Images of each pose in each view.
     shared_poses : bool
         Every view sees all poses.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
 
     Raises
     ------
@@ -112,6 +116,7 @@ def take_images(
     shown: list[tuple[LegView, ...]] = []
     problems = []
     for v, (viewpoint, poses) in enumerate(zip(viewpoints, of_view, strict=True)):
+        progress("Views", v, len(viewpoints))
         camera, T = viewpoint.camera, viewpoint.T_base_camera
         _refuse_inside(viewpoint, [machines[p] for p in poses])
         views = [legs_in_image(legs, machines[p], camera, T) for p in poses]
@@ -120,6 +125,7 @@ def take_images(
         for p, view in zip(poses, views, strict=True):
             rows += [(v, p, k) for k in range(n_images)]
             shown += [view] * n_images
+    progress("Views", len(viewpoints), len(viewpoints))
     if problems:
         raise NotVisible(problems)
     view_of_row, pose_of_row, repeat_of_row = np.array(rows, dtype=np.intp).T

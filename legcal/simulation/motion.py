@@ -2,7 +2,8 @@
 
 They are reached from home without crossing a singularity, with every joint inside its limits and no
 leg through another. Extreme ones have every motor near an end of its travel; where the legs cannot
-have such lengths at the same time, they go as far that way as they can.
+have such lengths at the same time, they go as far that way as they can: after some draws in vain
+over all of the travel, the next are drawn nearer to home.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from legcal.mechanism.closing import platform_pose, slider_columns
 from legcal.mechanism.configurations import INSIDE, joint_values
 from legcal.mechanism.following import follow
 from legcal.mechanism.model import Mechanism
+from legcal.progress import Report, no_progress
 from legcal.simulation.admission import Admission
 from legcal.simulation.draws import Draws
 from legcal.simulation.readings_file import read_readings
 
+STAGE = "Poses"
 HOPELESS = 5  # poses in vain, one after the other
 
 
@@ -61,6 +64,7 @@ def draw_poses(
     n_poses: int,
     rng: np.random.Generator,
     sampling: Sampling | str = Sampling.EXTREME,
+    progress: Report = no_progress,
 ) -> SimulatedPoses:
     """Return random poses of a machine.
 
@@ -75,6 +79,8 @@ def draw_poses(
     sampling : Sampling
         How they are drawn. Where the motors do not determine the pose the machine takes a random
         walk in either case.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
 
     Returns
     -------
@@ -97,11 +103,13 @@ def draw_poses(
     draws = Draws(mechanism, rng, extreme=Sampling(sampling) is Sampling.EXTREME)
     found: list[Array] = []
     in_vain = 0
+    progress(STAGE, 0, n_poses)
     while len(found) < n_poses and in_vain < HOPELESS:
         configuration = draws.next()
         in_vain = in_vain + 1 if configuration is None else 0
         if configuration is not None:
             found.append(configuration)
+            progress(STAGE, len(found), n_poses)
     if len(found) < n_poses:
         raise DidNotConverge(
             f"{mechanism.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "

@@ -134,6 +134,24 @@ class SimulationSettings:
             )
         if problems:
             raise UsageError(problems)
+        n_views, n_poses = (1 if isinstance(x, Path) else x for x in (self.views, self.poses))
+        self.check_images(n_views, n_poses)
+
+    def check_images(self, n_views: int, n_poses: int) -> None:
+        """Refuse more images than a dataset may have.
+
+        Parameters
+        ----------
+        n_views, n_poses : int
+            Number of views, and of poses in each of them.
+        """
+        found = n_views * n_poses * self.images
+        if found > MOST_IMAGES:
+            raise UsageError(
+                f"The dataset could not be simulated: found {found} images ({n_views} views of "
+                f"{n_poses} poses, {self.images} of each), needed at most {MOST_IMAGES}; give "
+                "fewer views, poses or images."
+            )
 
     @property
     def encoder_sigma(self) -> float:

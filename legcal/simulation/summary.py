@@ -33,6 +33,7 @@ def summary_document(made: SimulatedDataset) -> dict[str, Any]:
         "truth": str(made.truth_path),
         "images": made.measurements.n_rows,
         "poses": made.measurements.n_poses,
+        "extreme_poses": made.n_extreme,
         "left_out": made.left_out,
         "views": views,
     }
@@ -41,10 +42,8 @@ def summary_document(made: SimulatedDataset) -> dict[str, Any]:
 def summary_table(made: SimulatedDataset) -> RenderableType:
     """Return what was simulated as people read it: how many images of a view show each leg."""
     document = summary_document(made)
-    heading = Text.assemble(
-        (document["mechanism"], "bold"),
-        f": {document['level']}, {document['images']} images of {document['poses']} poses",
-    )
+    size = f"{_count(document['images'], 'image')} of {_count(document['poses'], 'pose')}"
+    heading = Text.assemble((document["mechanism"], "bold"), f": {document['level']}, {size}")
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("view", overflow="fold")
     table.add_column("images", justify="right")
@@ -55,9 +54,25 @@ def summary_table(made: SimulatedDataset) -> RenderableType:
         table.add_row(Text(name), str(view["images"]), *counts)
     lines = [
         "Images of each view that show 40 % of a leg or more in one piece.",
-        *([f"{made.left_out} images show no leg and are left out."] if made.left_out else []),
+        *([_left_out(made.left_out)] if made.left_out else []),
+        f"{made.n_extreme} of {made.measurements.n_poses} poses have every motor near an end of "
+        "its travel.",
         f"\nwritten: {made.folder}",
         f"the true model: {made.truth_path}",
         f"calibrate with: legcal calibrate {made.folder} -o OUT",
     ]
     return Group(heading, Text(), table, Text(), *(Text(s, overflow="fold") for s in lines))
+
+
+def _left_out(n: int) -> str:
+    """Return how many images are left out, in words."""
+    return (
+        "1 image shows no leg and is left out."
+        if n == 1
+        else (f"{n} images show no leg and are left out.")
+    )
+
+
+def _count(n: int, what: str) -> str:
+    """Return a number of things."""
+    return f"{n} {what}{'s' * (n != 1)}"
