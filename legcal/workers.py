@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
 from threading import Thread
 from typing import Protocol, TypeVar
 
@@ -37,7 +38,8 @@ def worker_pool(workers: int) -> Iterator[Run]:
     """Give a way to work in that many processes; one means in this process.
 
     Processes are started when they are first needed, anew and not as copies: a program that
-    uses them must be safe to import (``if __name__ == "__main__":``).
+    uses them must be safe to import (``if __name__ == "__main__":``). When the block is left by
+    an exception, they end at once, in the middle of their work.
 
     Parameters
     ----------
@@ -52,7 +54,9 @@ def worker_pool(workers: int) -> Iterator[Run]:
     if workers <= 1:
         yield in_turn
         return
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_follow_parent)
+    context = get_context("spawn")
+    held, lifeline = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with, initargs=(held,))
 
     def run(task: Callable[[int], T], rows: Sequence[int], /) -> Iterable[T]:
         chunk = max(1, len(rows) // (_CHUNKS * workers))
@@ -66,21 +70,25 @@ def worker_pool(workers: int) -> Iterator[Run]:
             "from outside, needed all of them to the end; see that there is enough memory and try "
             "again."
         ) from error
+    except BaseException:
+        lifeline.close()  # nobody waits for work that is not wanted any more
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
+        lifeline.close()
+        held.close()
 
 
-def _follow_parent() -> None:
-    """Leave the answer to Ctrl-C to the process that started this one, and end when it does.
+def _end_with(lifeline: Connection) -> None:
+    """Leave the answer to Ctrl-C to the process that started this one, and end when it says so.
 
-    A pool's processes wait for work for ever when their parent is killed.
+    The other end of the lifeline closes when the pool is stopped, or its process killed: a pool's
+    processes would then wait for work for ever.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
+    Thread(target=_wait_for_end, args=(lifeline,), daemon=True).start()
 
 
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+def _wait_for_end(lifeline: Connection) -> None:
+    wait([lifeline])
+    os._exit(1)

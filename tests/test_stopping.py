@@ -78,3 +78,15 @@ def _runs(pid: int) -> bool:
 def test_a_process_that_is_ended_from_outside_is_said_in_one_sentence() -> None:
     with pytest.raises(OutOfResources, match="ended from outside"), worker_pool(2) as run:
         list(run(os._exit, [1, 1]))
+
+
+def test_processes_do_not_finish_work_that_is_not_wanted_any_more() -> None:
+    def stop_after_the_first() -> None:
+        with worker_pool(2) as run:
+            for _ in run(time.sleep, [0, 300, 300, 300]):
+                raise KeyboardInterrupt
+
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        stop_after_the_first()
+    assert time.monotonic() - start < 30.0

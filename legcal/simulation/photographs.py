@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -66,56 +66,58 @@ def take_photographs(
     (folder / "images").mkdir()
     done = 0
     progress(STAGE, done, len(images))
-    with worker_pool(workers) as run:
-        for v, viewpoint in enumerate(viewpoints):
-            rows = np.flatnonzero(images.view == v)
-            # Every process paints the surroundings once, which takes as long as a few photographs.
-            n_parts = len(rows) if workers == 1 else min(workers, len(rows))
-            studio = _Studio(
-                viewpoint,
-                tuple(tuple(part.tolist()) for part in np.array_split(rows, n_parts)),
-                {row: machines[images.pose[row]].solids for row in rows.tolist()},
-                {row: folder / names[row] for row in rows.tolist()},
-                appearance,
-                of_views[v],
-                {row: of_images[row] for row in rows.tolist()},
-            )
-            for taken in run(studio.photograph, range(n_parts)):
-                done += taken
-                progress(STAGE, done, len(images))
+    try:
+        with worker_pool(workers) as run:
+            for v, viewpoint in enumerate(viewpoints):
+                rows = np.flatnonzero(images.view == v).tolist()
+                machine = {row: machines[images.pose[row]].solids for row in rows}
+                nearby = next(iter(machine.values()), ())
+                studio = _Studio(
+                    _Place(f"{folder} {v}", viewpoint, nearby, appearance, of_views[v]),
+                    machine,
+                    {row: folder / names[row] for row in rows},
+                    {row: of_images[row] for row in rows},
+                )
+                for _ in run(studio.photograph, rows):
+                    done += 1
+                    progress(STAGE, done, len(images))
+    finally:
+        _scene.cache_clear()
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A camera in its place; two of one key are the same, in whatever process they are."""
+
+    key: str
+    viewpoint: Viewpoint = field(compare=False)
+    machine: tuple[PlacedSolid, ...] = field(compare=False)
+    appearance: Appearance = field(compare=False)
+    rng: np.random.Generator = field(compare=False)
+
+
+@lru_cache(maxsize=1)
+def _scene(place: _Place) -> Scene:
+    """Return the camera in front of its surroundings, painted once in each process."""
+    view = place.viewpoint
+    return prepare_scene(
+        place.machine, view.camera, view.T_base_camera, place.appearance, place.rng
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Studio:
     """A camera in its place, and the machine in the poses that it takes photographs of."""
 
-    viewpoint: Viewpoint
-    parts: tuple[tuple[int, ...], ...]
+    place: _Place
     machines: Mapping[int, tuple[PlacedSolid, ...]]
     paths: Mapping[int, Path]
-    appearance: Appearance
-    rng: np.random.Generator
     sensor_rngs: Mapping[int, np.random.Generator]
 
-    @cached_property
-    def scene(self) -> Scene:
-        """The camera in front of its surroundings."""
-        view = self.viewpoint
-        return prepare_scene(
-            self.machines[self.parts[0][0]],
-            view.camera,
-            view.T_base_camera,
-            self.appearance,
-            self.rng,
-        )
-
-    def photograph(self, part: int) -> int:
-        """Write the photographs of some rows; return how many."""
-        for row in self.parts[part]:
-            self._write(
-                self.paths[row], self.scene.render(self.machines[row], self.sensor_rngs[row])
-            )
-        return len(self.parts[part])
+    def photograph(self, row: int) -> None:
+        """Write the photograph of a row."""
+        image = _scene(self.place).render(self.machines[row], self.sensor_rngs[row])
+        self._write(self.paths[row], image)
 
     def _write(self, path: Path, image: Image) -> None:
         """Write a photograph."""
