@@ -312,6 +312,8 @@ def test_a_killed_study_leaves_no_process_and_is_continued(tmp_path: Path) -> No
         while _processes_of(process.pid):
             assert time.monotonic() < end
             time.sleep(0.1)
+        assert process.stderr is not None
+        assert process.stderr.read() == b""
     n_done = len(_lines(tmp_path))
     assert 20 <= n_done < 401
     assert run_study(Draws(), 400, output=tmp_path).document() == run_study(Draws(), 400).document()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 import warnings
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -111,10 +112,15 @@ def _chunks(runs: Sequence[int], workers: int) -> Iterator[Sequence[int]]:
 
 @contextmanager
 def _without_advice() -> Iterator[None]:
-    """Keep joblib from advising its user where a study is stopped before its end."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"\d+ tasks (which were|have been) ", UserWarning)
-        yield
+    """Keep joblib from advising its user where a study is stopped or killed before its end."""
+    of_processes = "ignore:resource_tracker"  # handed to those that joblib starts
+    sys.warnoptions.append(of_processes)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"\d+ tasks (which were|have been) ", UserWarning)
+            yield
+    finally:
+        sys.warnoptions.remove(of_processes)
 
 
 def _follow(parent: int) -> None:
