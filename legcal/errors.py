@@ -4,7 +4,12 @@ Every message is one sentence a problem: what could not be done, what was found,
 needed, what to do. Errors that describe a file carry all of its problems at once.
 """
 
+import re
+from collections import Counter
 from collections.abc import Sequence
+
+_MOST_ALIKE = 5  # problems of one kind that a message spells out
+_PARTICULAR = re.compile(r"'[^']*'|\S*\d\S*")  # what differs between problems of one kind
 
 
 class LegcalError(Exception):
@@ -13,7 +18,8 @@ class LegcalError(Exception):
     Attributes
     ----------
     problems : tuple of str
-        One sentence for each problem found, in the order in which they were found.
+        One sentence for each problem found, in the order in which they were found. The message
+        has them all but for repetitions of one kind, which it counts after the fifth.
     exit_code : int
         The process exit code of the command line: 1 for a reason in the data, 2 for
         malformed input or wrong use.
@@ -23,10 +29,25 @@ class LegcalError(Exception):
 
     def __init__(self, problems: str | Sequence[str]) -> None:
         self.problems = (problems,) if isinstance(problems, str) else tuple(problems)
-        super().__init__("\n".join(self.problems))
+        super().__init__("\n".join(_shortened(self.problems)))
 
     def __reduce__(self) -> tuple[type, tuple[tuple[str, ...]]]:
         return type(self), (self.problems,)
+
+
+def _shortened(problems: Sequence[str]) -> list[str]:
+    """Return sentences with no more than five of a kind, and how many there are besides."""
+    kinds = [_PARTICULAR.sub("", problem) for problem in problems]
+    total, told = Counter(kinds), Counter[str]()
+    lines = []
+    for kind, problem in zip(kinds, problems, strict=True):
+        told[kind] += 1
+        if told[kind] <= _MOST_ALIKE:
+            lines.append(problem)
+        if told[kind] == _MOST_ALIKE < total[kind]:
+            more = total[kind] - _MOST_ALIKE
+            lines.append(f"... and {more} more like the last one.")
+    return lines
 
 
 class UsageError(LegcalError):

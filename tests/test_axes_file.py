@@ -93,6 +93,8 @@ def test_column_order_and_line_ends_do_not_matter(tmp_path: Path) -> None:
         ({"z": "nan"}, "column z: the axis could not be used: found 'nan', needed a finite number"),
         ({"x": "1_0"}, "column x: the axis could not be used: found '1_0', needed a finite number"),
         ({"theta": "-12"}, "found -12, needed an angle from -3.1416 to 3.1416 rad; write radians"),
+        ({"x": "1e9"}, "column x: the axis could not be used: found 1e+09, needed a coordinate"),
+        ({"z": "-1e300"}, "found -1e+300, needed a coordinate from -1000 to 1000 m; correct it"),
         ({"psi": "1.7"}, "found 1.7, needed an angle from -1.5708 to 1.5708 rad; write radians"),
         ({"sigma_psi": "0"}, "column sigma_psi: the axis could not be used: found 0, needed a sta"),
         ({"sigma_x": "-1e-3"}, "found -0.001, needed a standard deviation from 1e-09 to 1; give"),
@@ -115,6 +117,26 @@ def test_all_problems_are_listed_at_once(tmp_path: Path) -> None:
     with pytest.raises(DatasetError) as refusal:
         _read(path)
     assert len(refusal.value.problems) == 3
+
+
+@pytest.mark.parametrize("cell", ["inf", "-inf", "nan", "x"])
+@pytest.mark.parametrize("name", ["psi", "theta", "x", "sigma_psi"])
+def test_a_cell_that_is_no_number_is_one_problem(tmp_path: Path, name: str, cell: str) -> None:
+    with pytest.raises(DatasetError, match="needed a finite number") as refusal:
+        _read(_edited(_written(tmp_path), 3, **{name: cell}))
+    assert len(refusal.value.problems) == 1
+
+
+def test_a_table_in_degrees_is_said_shortly(tmp_path: Path) -> None:
+    path = _written(tmp_path)
+    for row in range(1, 13):
+        _edited(path, row, theta=str(-90 - row))
+    with pytest.raises(DatasetError) as refusal:
+        _read(path)
+    lines = str(refusal.value).splitlines()
+    assert len(refusal.value.problems) == 12
+    assert len(lines) == 6
+    assert lines[-1] == "... and 7 more like the last one."
 
 
 def test_the_same_leg_twice_in_an_image_is_refused(tmp_path: Path) -> None:

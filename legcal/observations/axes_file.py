@@ -30,6 +30,7 @@ COLUMNS = ("view", "image", "leg", *VALUES, *SIGMAS)
 
 LARGEST_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
 ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
+LARGEST_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
 SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
 LEAST_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
 
@@ -163,7 +164,13 @@ def _numbers(where: str, cells: Mapping[str, str]) -> tuple[list[float], list[st
         f"{where}, column {name}: {start} {found[name]:g}, needed an angle from {-limit:.4f} to "
         f"{limit:.4f} rad; write radians, not degrees."
         for name, limit in LARGEST_ANGLE.items()
-        if abs(found[name]) > limit + ANGLE_ROUNDING
+        if math.isfinite(found[name]) and abs(found[name]) > limit + ANGLE_ROUNDING
+    ]
+    problems += [
+        f"{where}, column {name}: {start} {found[name]:g}, needed a coordinate from "
+        f"{-LARGEST_DISTANCE:g} to {LARGEST_DISTANCE:g} m; correct it, or write metres."
+        for name in ("x", "z")
+        if math.isfinite(found[name]) and abs(found[name]) > LARGEST_DISTANCE
     ]
     least, most = SIGMA_RANGE
     problems += [
