@@ -8,7 +8,8 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
-_MOST_ALIKE = 5  # problems of one kind that a message spells out
+_MANY_ALIKE = 10  # problems of one kind: a message that has more spells out the first few
+_SPELT_OUT = 5
 _PARTICULAR = re.compile(r"'[^']*'|\S*\d\S*")  # what differs between problems of one kind
 
 
@@ -19,7 +20,7 @@ class LegcalError(Exception):
     ----------
     problems : tuple of str
         One sentence for each problem found, in the order in which they were found. The message
-        has them all but for repetitions of one kind, which it counts after the fifth.
+        has them all, but of more than ten of a kind only five and how many there are besides.
     exit_code : int
         The process exit code of the command line: 1 for a reason in the data, 2 for
         malformed input or wrong use.
@@ -36,17 +37,16 @@ class LegcalError(Exception):
 
 
 def _shortened(problems: Sequence[str]) -> list[str]:
-    """Return sentences with no more than five of a kind, and how many there are besides."""
+    """Return sentences; of more than ten of a kind five, and how many there are besides."""
     kinds = [_PARTICULAR.sub("", problem) for problem in problems]
     total, told = Counter(kinds), Counter[str]()
     lines = []
     for kind, problem in zip(kinds, problems, strict=True):
         told[kind] += 1
-        if told[kind] <= _MOST_ALIKE:
+        if total[kind] <= _MANY_ALIKE or told[kind] <= _SPELT_OUT:
             lines.append(problem)
-        if told[kind] == _MOST_ALIKE < total[kind]:
-            more = total[kind] - _MOST_ALIKE
-            lines.append(f"... and {more} more like the last one.")
+        elif told[kind] == _SPELT_OUT + 1:
+            lines.append(f"... and {total[kind] - _SPELT_OUT} more like these.")
     return lines
 
 

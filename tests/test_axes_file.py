@@ -136,7 +136,7 @@ def test_a_table_in_degrees_is_said_shortly(tmp_path: Path) -> None:
     lines = str(refusal.value).splitlines()
     assert len(refusal.value.problems) == 12
     assert len(lines) == 6
-    assert lines[-1] == "... and 7 more like the last one."
+    assert lines[-1] == "... and 7 more like these."
 
 
 def test_the_same_leg_twice_in_an_image_is_refused(tmp_path: Path) -> None:
