@@ -207,3 +207,27 @@ def test_stopping_by_hand_is_no_mistake(
     monkeypatch.setattr("legcal.mechanism.load.load_mechanism", stopped)
     assert run(monkeypatch, "inspect", "hexapod") == 130
     assert "Stopped before the end" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [
+        (("simulate", "hexapod", "-o", ""), "-o"),
+        (("simulate", "hexapod", "-o", "sim", "--poses="), "--poses="),
+        (("simulate", "", "-o", "sim"), "simulate"),
+        (("calibrate", ".", "-o", ""), "-o"),
+        (("calibrate", ".", "--output="), "--output="),
+        (("study", "paper", "-o", ""), "-o"),
+    ],
+)
+def test_an_empty_word_is_not_taken_for_the_current_folder(
+    words: tuple[str, ...],
+    place: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, *words) == 2
+    assert f"found an empty text after '{place}', needed a name" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -14,7 +14,7 @@ import pytest
 
 from legcal.errors import UsageError
 from legcal.files.atomic import write_atomically
-from legcal.report.files import check_destination, result_folder
+from legcal.report.files import check_destination, output_path, result_folder
 
 RESULT = '{"legcal_result": 1}'
 
@@ -235,3 +235,17 @@ def test_folder_without_permission_is_refused(
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(UsageError, match="cannot be written to, needed permission to create"):
         check_destination(tmp_path / "out")
+
+
+def test_an_empty_text_is_no_output_folder() -> None:
+    with pytest.raises(UsageError, match="found an empty text, needed the path of a folder"):
+        output_path("")
+    assert output_path(".") == Path()
+
+
+def test_a_folder_in_the_place_of_a_file_is_refused(out: Path) -> None:
+    (out / "calibrated.urdf").unlink()
+    (out / "calibrated.urdf").mkdir()
+    with pytest.raises(UsageError, match=r"found calibrated\.urdf, which is a folder"):
+        write_result(out, lambda: None)
+    assert (out / "calibrated.urdf").is_dir()

@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Annotated
 
 import typer
@@ -21,7 +23,7 @@ from legcal.cli.noise import noise
 from legcal.cli.output import print_failure
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
-from legcal.errors import LegcalError
+from legcal.errors import LegcalError, UsageError
 from legcal.signals import stopped_by_signals
 from legcal.version import __version__
 
@@ -60,6 +62,16 @@ for command in (inspect, identify, calibrate, evaluate, new, noise, simulate):
 app.add_typer(study, name="study")
 
 
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Refuse an empty word, which as a path would mean the current folder."""
+    for before, word in pairwise(["legcal", *words]):
+        if word == "" or (word.startswith("--") and word.find("=") == len(word) - 1):
+            raise UsageError(
+                f"The command could not be run: found an empty text after '{word or before}', "
+                "needed a name or a value; see that every variable in the command is set."
+            )
+
+
 def main() -> None:
     """Run the command line and exit with 0, 1 (data), 2 (use), 3 (internal) or 130 (stopped)."""
     # Thousands of small matrices: threads inside a product only get in each other's way.
@@ -68,6 +80,7 @@ def main() -> None:
     as_json = "--json" in sys.argv
     try:
         with stopped_by_signals():
+            _refuse_empty(sys.argv[1:])
             code = app(standalone_mode=False)
     except LegcalError as error:
         print_failure(type(error).__name__, str(error), as_json=as_json)

@@ -46,6 +46,22 @@ class OutputKind:
 RESULT = OutputKind("result", "result.json", "legcal_result")
 
 
+def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
+    """Return the path of an output folder; an empty text is none, where a path would be ".".
+
+    Raises
+    ------
+    UsageError
+        If it is empty.
+    """
+    if output == "":
+        raise UsageError(
+            f"The {kind.noun} could not be written: found an empty text, needed the path of a "
+            "folder; name one, '.' for the current folder."
+        )
+    return Path(output)
+
+
 def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
     """Refuse an output folder that holds something else than an earlier output of its kind.
 
