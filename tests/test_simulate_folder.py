@@ -1,10 +1,12 @@
 """The folder of a simulated dataset: what ``--force`` replaces, and what it never touches."""
 
+import io
 import json
 from pathlib import Path
 
 import pytest
-from simulated import files_of, settings
+from rich.console import Console
+from simulated import files_of, settings, small_camera
 
 from legcal.errors import OutOfResources, UsageError
 from legcal.simulation.folder import (
@@ -13,6 +15,7 @@ from legcal.simulation.folder import (
     dataset_folder,
 )
 from legcal.simulation.simulate import simulate
+from legcal.simulation.summary import summary_table
 
 FEW = settings(poses=1, views=1)
 OWN = ("dataset.yaml", "images/c1_p01.png", "models/a.yaml", "truth/models/a.yaml")
@@ -180,3 +183,23 @@ def test_what_cannot_be_written_names_the_folder_that_was_asked_for(tmp_path: Pa
         full(tmp_path / "out")
     assert "legcal-part" not in str(refusal.value)
     assert files_of(tmp_path) == {}
+
+
+def test_an_empty_text_is_no_folder_for_a_dataset() -> None:
+    with pytest.raises(UsageError, match="dataset could not be written: found an empty text"):
+        simulate("hexapod", "", FEW)
+
+
+@pytest.mark.parametrize("images", [1, 2])
+def test_what_can_be_done_next_is_said(images: int, tmp_path: Path) -> None:
+    out = tmp_path / "my set"
+    few = settings(
+        level="photographs", poses=1, views=1, images=images, camera=small_camera(tmp_path)
+    )
+    console = Console(width=400, record=True, file=io.StringIO())
+    console.print(summary_table(simulate("hexapod", out, few)))
+    said = console.export_text()
+    assert f"calibrate with: legcal calibrate '{out}' -o OUT\n" in said
+    truth = out / "truth" / "models" / "hexapod.yaml"
+    assert f"judge with: legcal evaluate OUT/calibrated.yaml '{truth}'\n" in said
+    assert (f"measure noise with: legcal noise '{out}'\n" in said) == (images > 1)

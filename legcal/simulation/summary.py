@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from legcal.simulation.settings import Level
 from legcal.simulation.simulate import SimulatedDataset
 
 
@@ -52,6 +54,7 @@ def summary_table(made: SimulatedDataset) -> RenderableType:
     for name, view in document["views"].items():
         counts = [str(n) for n in view["legs"].values()]
         table.add_row(Text(name), str(view["images"]), *counts)
+    folder = shlex.quote(str(made.folder))
     lines = [
         "Images of each view that show 40 % of a leg or more in one piece.",
         *([_left_out(made.left_out)] if made.left_out else []),
@@ -59,9 +62,18 @@ def summary_table(made: SimulatedDataset) -> RenderableType:
         "its travel.",
         f"\nwritten: {made.folder}",
         f"the true model: {made.truth_path}",
-        f"calibrate with: legcal calibrate {made.folder} -o OUT",
+        f"calibrate with: legcal calibrate {folder} -o OUT",
+        f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(str(made.truth_path))}",
+        *([f"measure noise with: legcal noise {folder}"] if _is_repeated(made) else []),
     ]
     return Group(heading, Text(), table, Text(), *(Text(s, overflow="fold") for s in lines))
+
+
+def _is_repeated(made: SimulatedDataset) -> bool:
+    """Say whether there are several photographs of a pose in a view."""
+    m = made.measurements
+    places = set(zip(m.view.tolist(), m.pose.tolist(), strict=True))
+    return made.level is Level.PHOTOGRAPHS and len(places) < m.n_rows
 
 
 def _left_out(n: int) -> str:
@@ -69,7 +81,7 @@ def _left_out(n: int) -> str:
     return (
         "1 image shows no leg and is left out."
         if n == 1
-        else (f"{n} images show no leg and are left out.")
+        else f"{n} images show no leg and are left out."
     )
 
 
