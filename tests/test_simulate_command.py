@@ -5,6 +5,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from simulated import files_of, settings, small_camera
 
@@ -12,7 +13,7 @@ from legcal import cli
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.simulation.folder import TRUTH_NAME
 from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import ParameterErrors, Spread
+from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread
 from legcal.simulation.settings import Level
 from legcal.simulation.simulate import simulate
 from legcal.simulation.table_noise import TableNoise
@@ -67,7 +68,7 @@ def test_json_is_one_document(
         (("--poses", "-3"), "needed a whole number"),
         (("--poses", "1.5"), "needed a whole number"),
         (("--views", "0"), "found 0 views"),
-        (("--seed", "-1"), "found the seed -1"),
+        (("--seed", "-1"), "found -1 as the seed, needed a whole number of 0 or more"),
         (
             ("--level", "outlines", "--pixel-noise", "-0.1px"),
             "--pixel-noise could not be used: found the negative",
@@ -80,6 +81,15 @@ def test_json_is_one_document(
         (("--error", "axes=2mm"), "needed a number and its unit (deg"),
         (("--error", "joint=2mm"), "did you mean 'joints'?"),
         (("--error", "2mm"), "needed KIND=SIZE"),
+        (
+            ("--error", "joints"),
+            "found 'joints' without a size, needed KIND=SIZE; write",
+        ),
+        (("--error", "joints=2m"), "found '2m', needed 0 to 1m; correct it and its unit"),
+        (("--poses", "1e3"), "found '1e3', neither a whole number nor a file"),
+        (("--poses", "nan"), "found 'nan', neither a whole number nor a file"),
+        (("--encoder-noise", "1m"), "needed at most the shortest travel of a motor, 0.148 m"),
+        (("--level", "outlines", "--pixel-noise", "1e308px"), "needed 0 to 100 px; correct it"),
         (("--views", "2", "--cameras", "c.yaml"), "found both --views and --cameras"),
         (("--poses", "p.csv", "--own-poses"), "found --own-poses with a file of poses"),
         (("--camera", "none.yaml"), "none.yaml: the camera file could not be read"),
@@ -115,6 +125,8 @@ def test_wrong_options_are_refused_in_one_sentence_and_nothing_is_written(
         ("blurr: 1\n", "blurr could not be used: found an unknown key; did you mean 'blur'?"),
         ("blur: many\n", "blur could not be read: found 'many', needed a number"),
         ("blur: -1\n", "found blur = -1"),
+        ("electrons: 1e-300\n", "found electrons = 1e-300, needed a number of at least 1"),
+        ("electrons: .nan\n", "found electrons = nan"),
         ("lights: [{strength: 1}]\n", "lights.0.direction could not be read"),
         ("[1]\n", "needed 'key: value' lines"),
     ],
@@ -138,12 +150,16 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "look.yaml"
-    path.write_text("blur: 0.8\nclutter: 3\nlights:\n  - {direction: [0, 0, 1], strength: 0.5}\n")
+    path.write_text(
+        "blur: 0.8\nclutter: 3\nelectrons: .inf\n"
+        "lights:\n  - {direction: [0, 0, 1], strength: 0.5}\n"
+    )
     words = ("--appearance", path, "--clutter", "7", "--camera", small_camera(tmp_path))
     one = ("--poses", "1", "--views", "1")
     assert run(monkeypatch, "hexapod", "-o", tmp_path / "sim", *one, *words) == 0
     look = json.loads((tmp_path / "sim" / TRUTH_NAME).read_text())["settings"]["appearance"]
     assert (look["blur"], look["clutter"], len(look["lights"])) == (0.8, 7, 1)
+    assert look["electrons"] == "inf"
 
 
 @pytest.mark.parametrize(
@@ -151,6 +167,14 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
     [
         {"sigma_px": -0.1},
         {"sigma_px": float("nan")},
+        {"sigma_px": "0.1px"},
+        {"sigma_px": 1e9},
+        {"readings": 2e-6},
+        {"errors": None},
+        {"errors": ParameterErrors(axes=0.1)},  # type: ignore[arg-type]
+        {"table": TableNoise(psi="0.05")},  # type: ignore[arg-type]
+        {"appearance": "clean"},
+        {"seed": 1.5},
         {"readings": Spread(-1e-6)},
         {"errors": ParameterErrors(axes=Spread(float("inf")))},
         {"table": TableNoise(psi=-1.0)},
@@ -166,6 +190,20 @@ def test_an_appearance_file_is_used_and_options_go_over_it(
 def test_settings_without_sense_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="The dataset could not be simulated: found"):
         settings(**changes)
+
+
+@pytest.mark.parametrize(("size", "distribution"), [("2mm", "uniform"), (1e-3, "flat")])
+def test_spreads_without_sense_are_refused(size: float, distribution: Distribution) -> None:
+    with pytest.raises(UsageError, match=r"found the size .* and the distribution"):
+        Spread(size, distribution)
+
+
+def test_whole_numbers_of_any_type_count(tmp_path: Path) -> None:
+    found = settings(poses=np.int64(2), seed=np.uint8(3), readings=Spread(np.float64(0.0)))
+    assert (found.poses, found.seed) == (2, 3)
+    assert type(found.poses) is type(found.seed) is int
+    with pytest.raises(UsageError, match="found 0 workers, needed a whole number of 1 or more"):
+        simulate("hexapod", tmp_path / "set", found, workers=0)
 
 
 def test_choices_and_paths_may_be_given_as_text() -> None:
@@ -270,6 +308,14 @@ def test_more_cameras_of_a_file_than_images_fit_are_refused(tmp_path: Path) -> N
         UsageError, match=r"found 120000 images \(2 views of 1 poses, 60000 of each"
     ):
         simulate("hexapod", tmp_path / "set", many)
+
+
+def test_a_camera_too_far_away_is_asked_to_come_nearer(tmp_path: Path) -> None:
+    place = "{xyz: [90.0, 0.0, 0.2], quat_xyzw: [-0.5, -0.5, 0.5, 0.5]}"
+    path = tmp_path / "cameras.yaml"
+    path.write_text(f"views: {{c1: {{T_base_camera: {place}}}}}\n")
+    with pytest.raises(NotVisible, match=r"legs are at most \d.* px long .*its place is in metres"):
+        simulate("hexapod", tmp_path / "set", settings(poses=1, views=path))
 
 
 def test_a_machine_without_visible_legs_cannot_be_seen(tmp_path: Path) -> None:

@@ -4,18 +4,20 @@ Fields that it does not name keep their defaults::
 
     blur: 0.8
     clutter: 30
+    electrons: .inf
     lights:
       - {direction: [0.5, -0.8, 1.1], strength: 0.9}
 """
 
 from __future__ import annotations
 
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, fields
+from dataclasses import Field as DataclassField
 from functools import cache
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
-from pydantic import create_model
+from pydantic import Field, create_model
 
 from legcal.files.schema import FileSchema, parse_yaml, read_text, validate
 from legcal.simulation.rendering.appearance import Appearance, Light
@@ -48,7 +50,9 @@ def read_appearance(path: Path) -> Appearance:
 def _schema() -> type[FileSchema]:
     """Return the schema of the file."""
     light = _schema_of(Light, {})
-    return _schema_of(Appearance, {"lights": tuple[light, ...]})  # type: ignore[valid-type]
+    electrons = Annotated[float, Field(allow_inf_nan=True)]  # .inf: no noise
+    other_types = {"lights": tuple[light, ...], "electrons": electrons}  # type: ignore[valid-type]
+    return _schema_of(Appearance, other_types)
 
 
 def _schema_of(described: type[Any], other_types: dict[str, Any]) -> type[FileSchema]:
@@ -58,6 +62,6 @@ def _schema_of(described: type[Any], other_types: dict[str, Any]) -> type[FileSc
     return create_model(described.__name__, __base__=FileSchema, **columns)
 
 
-def _default(field: Field[Any]) -> Any:
+def _default(field: DataclassField[Any]) -> Any:
     """Return the default of a field, or that it must be given."""
     return ... if field.default is MISSING else field.default

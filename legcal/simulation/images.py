@@ -13,7 +13,7 @@ from legcal.geometry.types import IntArray
 from legcal.mechanism.leg import Leg
 from legcal.progress import Report, no_progress
 from legcal.simulation.posed_machine import PosedMachine
-from legcal.simulation.visibility import SEEN, LegView, legs_in_image
+from legcal.simulation.visibility import SEEN, SHORTEST_PX, LegView, legs_in_image
 from legcal.vision.camera import Camera
 
 
@@ -153,6 +153,13 @@ def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegVi
             "cylinders coaxial with the legs; add them."
         )
     most = max(leg.share for view in views for leg in view)
+    if most >= SEEN:
+        longest = max(leg.length_px for view in views for leg in view)
+        return (
+            f"{start} that legs are at most {longest:.1f} px long in them, needed "
+            f"{SHORTEST_PX:g} px of a tube or rod; move the camera nearer (its place is in "
+            "metres), or give it a longer focal length."
+        )
     return (
         f"{start} that no image shows a leg (at best {100.0 * most:.0f} % of one), needed an "
         f"unhidden stretch of {100.0 * SEEN:.0f} % of at least one leg; turn or move the camera."

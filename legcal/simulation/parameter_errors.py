@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from numbers import Real
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of
 
 LARGEST = 1.0  # [m] or [rad]
+ANGLES = ("axes", "twists")
 
 
 class Distribution(StrEnum):
@@ -40,10 +42,25 @@ class Spread:
         [m] or [rad].
     distribution : Distribution
         How they are distributed.
+
+    Raises
+    ------
+    UsageError
+        If the size is no number, or there is no such distribution.
     """
 
     size: float = 0.0
     distribution: Distribution = Distribution.UNIFORM
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.size, Real) or self.distribution not in list(Distribution):
+            raise UsageError(
+                f"A spread could not be used: found the size {self.size!r} and the distribution "
+                f"{self.distribution!r}, needed a number [m, rad] and "
+                f"{' or '.join(Distribution)}; correct it."
+            )
+        object.__setattr__(self, "size", float(self.size))
+        object.__setattr__(self, "distribution", Distribution(self.distribution))
 
 
 @dataclass(frozen=True)
@@ -159,9 +176,10 @@ def _check(errors: ParameterErrors) -> None:
     for kind in KINDS:
         size = getattr(errors, kind).size
         if not (math.isfinite(size) and 0.0 <= size <= LARGEST):
+            scale, unit = (np.rad2deg(1.0), "deg") if kind in ANGLES else (1e3, "mm")
             problems.append(
                 f"The errors of {kind.replace('_', ' ')} could not be drawn: found a size of "
-                f"{size:g}, needed 0 to {LARGEST:g} m or rad; correct it."
+                f"{scale * size:g} {unit}, needed 0 to {scale * LARGEST:.3g} {unit}; correct it."
             )
     if problems:
         raise UsageError(problems)

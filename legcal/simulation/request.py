@@ -13,7 +13,13 @@ from legcal.files.schema import closest, describe
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.appearance_file import read_appearance
 from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread, kinds_of
+from legcal.simulation.parameter_errors import (
+    LARGEST,
+    Distribution,
+    ParameterErrors,
+    Spread,
+    kinds_of,
+)
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.settings import DEFAULT_ERRORS, Level, SimulationSettings
 from legcal.simulation.table_noise import TableNoise
@@ -102,6 +108,11 @@ def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
     given = _poses(request.poses)
     _refuse_contradictions(request, given, nominal)
     _refuse_other_levels(request)
+    if isinstance(given, Path) and not given.exists():
+        raise UsageError(
+            f"--poses could not be used: found {describe(request.poses)}, neither a whole number "
+            "nor a file, needed the number of poses or the path of a CSV; correct it."
+        )
     noise = request.pixel_noise or "0.1px"
     return SimulationSettings(
         level=Level(request.level),
@@ -187,6 +198,11 @@ def _errors(request: Request, nominal: Mechanism) -> ParameterErrors:
             found = ParameterErrors()
             continue
         kind, equals, size = text.partition("=")
+        if kind in _ERROR_KINDS and not size:
+            raise UsageError(
+                f"--error could not be used: found {describe(text)} without a size, needed "
+                f"KIND=SIZE; write {kind}={'2mm' if _ERROR_KINDS[kind][1] is LENGTH else '0.1deg'}."
+            )
         if not equals or kind not in _ERROR_KINDS:
             raise UsageError(
                 f"--error could not be used: found {describe(text)}, needed KIND=SIZE or none, "
@@ -194,6 +210,12 @@ def _errors(request: Request, nominal: Mechanism) -> ParameterErrors:
             )
         fields, units = _ERROR_KINDS[kind]
         spread = _spread(size, units, Distribution.UNIFORM, f"--error {kind}")
+        if spread.size > LARGEST:
+            most = f"{LARGEST / units['deg']:.3g}deg" if "deg" in units else f"{LARGEST:g}m"
+            raise UsageError(
+                f"--error {kind} could not be used: found {describe(size)}, needed 0 to {most}; "
+                "correct it and its unit."
+            )
         if spread.size > 0.0 and not possible & set(fields):
             raise UsageError(
                 f"--error {kind} could not be used: found none in the mechanism "

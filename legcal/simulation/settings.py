@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass, field
 from enum import StrEnum
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ import numpy as np
 from legcal.errors import UsageError
 from legcal.observations.axes_file import SIGMA_RANGE
 from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import KINDS, Distribution, ParameterErrors, Spread
+from legcal.simulation.parameter_errors import KINDS, LARGEST, Distribution, ParameterErrors, Spread
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.table_noise import TableNoise
 
@@ -28,6 +30,7 @@ DEFAULT_ERRORS = ParameterErrors(
 )
 DEFAULT_READINGS = Spread(2e-6, Distribution.NORMAL)
 MOST_IMAGES = 100_000
+MOST_SIGMA_PX = 100.0
 
 
 class Level(StrEnum):
@@ -101,41 +104,58 @@ class SimulationSettings:
         for name in ("poses", "views", "camera"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, Path(getattr(self, name)))
-        counts = {"poses": self.poses, "views": self.views, "images": self.images}
-        problems = [
-            f"The dataset could not be simulated: found {count} {name}, needed a whole number from "
-            f"1 to {MOST_IMAGES}; correct it."
-            for name, count in counts.items()
-            if not isinstance(count, Path) and not _is_count(count)
-        ]
-        spreads = {name: getattr(self.errors, name).size for name in KINDS}
-        noises = {
-            "noise of edge points": self.sigma_px,
-            "noise of readings": self.readings.size,
-            **{f"errors of {name.replace('_', ' ')}": size for name, size in spreads.items()},
-        }
-        problems += [
-            f"The dataset could not be simulated: found {value:g} as the {name}, needed a finite "
-            "number of zero or more; correct it."
-            for name, value in noises.items()
-            if not (math.isfinite(value) and value >= 0.0)
-        ]
-        least, most = SIGMA_RANGE
-        problems += [
-            f"The dataset could not be simulated: found {value:g} as the noise of {name}, needed "
-            f"{least:g} to {most:g}; correct it."
-            for name, value in vars(self.table).items()
-            if not least <= value <= most
-        ]
-        if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and self.seed >= 0):
-            problems.append(
-                f"The dataset could not be simulated: found the seed {self.seed!r}, needed a whole "
-                "number of zero or more; correct it."
-            )
-        if problems:
-            raise UsageError(problems)
+        self._check_kinds()
+        for name in ("poses", "views", "images", "seed"):
+            if not isinstance(getattr(self, name), Path):
+                least, most = (0, None) if name == "seed" else (1, MOST_IMAGES)
+                what = "as the seed" if name == "seed" else name
+                whole = whole_number(what, getattr(self, name), least, most)
+                object.__setattr__(self, name, whole)
+        self._check_sizes()
         n_views, n_poses = (1 if isinstance(x, Path) else x for x in (self.views, self.poses))
         self.check_images(n_views, n_poses)
+
+    def _check_kinds(self) -> None:
+        """Refuse settings that are no settings at all."""
+        kinds: dict[str, tuple[object, type]] = {
+            "errors": (self.errors, ParameterErrors),
+            "readings": (self.readings, Spread),
+            "table": (self.table, TableNoise),
+            "appearance": (self.appearance, Appearance),
+            "sigma_px": (self.sigma_px, Real),
+        }
+        if isinstance(self.errors, ParameterErrors):
+            kinds |= {f"errors.{name}": (getattr(self.errors, name), Spread) for name in KINDS}
+        if isinstance(self.table, TableNoise):
+            kinds |= {f"table.{name}": (x, Real) for name, x in vars(self.table).items()}
+        problems = [
+            f"The dataset could not be simulated: found {found!r} as {name}, needed a "
+            f"{'number' if kind is Real else kind.__name__}; correct it."
+            for name, (found, kind) in kinds.items()
+            if not isinstance(found, kind) or isinstance(found, bool)
+        ]
+        if problems:
+            raise UsageError(problems)
+
+    def _check_sizes(self) -> None:
+        """Refuse numbers out of their limits."""
+        sizes: dict[str, tuple[float, float, float]] = {
+            "noise of edge points": (self.sigma_px, 0.0, MOST_SIGMA_PX),
+            "noise of readings": (self.readings.size, 0.0, LARGEST),
+        }
+        for name in KINDS:
+            size = getattr(self.errors, name).size
+            sizes[f"errors of {name.replace('_', ' ')}"] = (size, 0.0, LARGEST)
+        for name, sigma in vars(self.table).items():
+            sizes[f"noise of {name}"] = (sigma, *SIGMA_RANGE)
+        problems = [
+            f"The dataset could not be simulated: found {value:g} as the {name}, needed {least:g} "
+            f"to {most:g} {_unit(name)}; correct it and its unit."
+            for name, (value, least, most) in sizes.items()
+            if not least <= value <= most
+        ]
+        if problems:
+            raise UsageError(problems)
 
     def check_images(self, n_views: int, n_poses: int) -> None:
         """Refuse more images than a dataset may have.
@@ -170,6 +190,29 @@ def _choice(choices: type[StrEnum], name: str, found: str) -> StrEnum:
     return choices(found)
 
 
-def _is_count(count: object) -> bool:
-    """Say whether something counts images."""
-    return isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= MOST_IMAGES
+def whole_number(name: str, found: object, least: int, most: int | None = None) -> int:
+    """Return a whole number between limits, of whatever type.
+
+    Raises
+    ------
+    UsageError
+        If it is none, or outside.
+    """
+    try:
+        number = least - 1 if isinstance(found, bool) else operator.index(found)  # type: ignore[arg-type]
+    except TypeError:
+        number = least - 1
+    if number < least or (most is not None and number > most):
+        limits = f"of {least} or more" if most is None else f"from {least} to {most}"
+        raise UsageError(
+            f"The dataset could not be simulated: found {found!s:.40} {name}, needed a whole "
+            f"number {limits}; correct it."
+        )
+    return number
+
+
+def _unit(name: str) -> str:
+    """Return the unit of a size, by its name."""
+    if name.endswith("points"):
+        return "px"
+    return "rad" if name.endswith(("axes", "twists", "psi", "theta")) else "m"

@@ -7,15 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.errors import UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements
 from legcal.progress import Report, no_progress
+from legcal.report.files import output_path
 from legcal.report.model_files import write_model
 from legcal.simulation.dataset_files import write_session, write_truth
 from legcal.simulation.extremes import are_extreme
 from legcal.simulation.folder import (
+    SIMULATED,
     TRUTH,
     TRUTH_NAME,
     check_dataset_destination,
@@ -25,7 +28,7 @@ from legcal.simulation.folder import (
 from legcal.simulation.imaged_machine import image_machine
 from legcal.simulation.photographs import take_photographs
 from legcal.simulation.recording import recorded, write_tables
-from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.settings import Level, SimulationSettings, whole_number
 from legcal.simulation.truth import write_true_model
 
 _STREAMS = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs")
@@ -112,9 +115,11 @@ def simulate(
         If a view shows no leg. Nothing is written in any of these cases.
     """
     settings = settings or SimulationSettings()
-    destination = Path(output)
+    destination = output_path(output, SIMULATED)
+    whole_number("workers", workers, 1)
     check_dataset_destination(destination, force=force)
     nominal = model if isinstance(model, Mechanism) else load_mechanism(model)
+    _check_readings(nominal, settings)
     chance = _streams(settings.seed)
     with dataset_folder(destination, force=force) as folder:
         yaml_path, _ = write_model(nominal, folder)
@@ -145,6 +150,17 @@ def simulate(
         left_out=imaged.left_out,
         n_extreme=int(np.sum(are_extreme(truth, readings))),
     )
+
+
+def _check_readings(nominal: Mechanism, settings: SimulationSettings) -> None:
+    """Refuse errors of readings that are larger than what is read."""
+    travel = min((np.ptp(nominal.legs[j].travel) for j in nominal.motors), default=np.inf)
+    if settings.readings.size > travel:
+        raise UsageError(
+            f"The readings could not be simulated: found errors of {settings.readings.size:g} m, "
+            f"needed at most the shortest travel of a motor, {travel:g} m; give them with the "
+            "unit that is meant."
+        )
 
 
 def _streams(seed: int) -> dict[str, np.random.Generator]:

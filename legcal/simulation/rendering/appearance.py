@@ -150,7 +150,8 @@ class Appearance:
         return replace(plain, **changes)  # type: ignore[arg-type]
 
 
-_POSITIVE = ("exposure", "gamma", "electrons")
+_POSITIVE = ("exposure", "gamma")
+_LEAST = {"electrons": 1.0}
 _MOST = {
     "blur": 20.0, "gamma": 10.0, "clutter": 500.0, "cables": 100.0, "limb": 1.0, "texture": 10.0,
     "electrons": math.inf,
@@ -160,11 +161,12 @@ _MOST = {
 def _check_number(name: str, value: float) -> None:
     """Refuse a number that makes no sense."""
     most = _MOST.get(name, 1e6)
-    least = "above" if name in _POSITIVE else "of at least"
-    if not 0.0 <= value <= most or (name in _POSITIVE and value == 0.0):
+    least = _LEAST.get(name, 0.0)
+    words = "above" if name in _POSITIVE else "of at least"
+    if not least <= value <= most or (name in _POSITIVE and value == 0.0):
         raise UsageError(
-            f"The appearance could not be used: found {name} = {value:g}, needed a number {least} "
-            f"0 and at most {most:g}; correct it."
+            f"The appearance could not be used: found {name} = {value:g}, needed a number {words} "
+            f"{least:g} and at most {most:g}; correct it."
         )
 
 
