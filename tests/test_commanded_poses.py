@@ -28,8 +28,8 @@ def test_the_nominal_model_reaches_every_pose_at_its_readings(
     nominal, truth = pair
     home = legcal.singularity(nominal, nominal.home)
     poses = commanded_poses(truth, nominal, 12, np.random.default_rng(0), Sampling.EXTREME)
-    assert len(poses) == len(poses.T_base_platform) == len(poses.readings) == 12
-    for T, q in zip(poses.T_base_platform, poses.readings, strict=True):
+    assert len(poses.configurations) == len(poses.poses) == len(poses.readings) == 12
+    for T, q in zip(poses.poses, poses.readings, strict=True):
         near = legcal.forward_kinematics(nominal, q)
         assert legcal.singularity(nominal, near) >= 0.05 * home
         assert np.linalg.norm(near.translation - T.translation) < 0.1
@@ -43,7 +43,7 @@ def test_poses_that_the_nominal_model_does_not_reach_are_drawn_again(
     monkeypatch.setattr(module, "_reaches", lambda _, q: not np.array_equal(q, readings[1]))
     poses = commanded_poses(truth, nominal, 3, np.random.default_rng(0), Sampling.EXTREME)
     assert np.array_equal(poses.readings[:2], readings[[0, 2]])
-    assert len(poses) == 3
+    assert len(poses.poses) == 3
 
 
 def test_a_machine_far_from_its_model_is_refused(

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.closing import leg_vectors
-from legcal.mechanism.configurations import REGULAR
+from legcal.mechanism.configurations import REGULAR, Configurations
 from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.load import load_mechanism
@@ -24,7 +24,7 @@ from legcal.mechanism.model import Mechanism
 from legcal.mechanism.singularity import side, singularity
 from legcal.simulation.clearance import Clearance, segment_distance
 from legcal.simulation.extremes import JITTER, are_extreme
-from legcal.simulation.motion import SimulatedPoses, draw_poses, given_poses
+from legcal.simulation.motion import draw_poses, given_poses
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel
@@ -32,11 +32,11 @@ LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their
 
 def _drawn(
     mechanism: Mechanism, n: int, sampling: str = "extreme", seed: int = 0
-) -> SimulatedPoses:
+) -> Configurations:
     return draw_poses(mechanism, n, np.random.default_rng(seed), sampling)
 
 
-def _parts(mechanism: Mechanism, poses: SimulatedPoses) -> Array:
+def _parts(mechanism: Mechanism, poses: Configurations) -> Array:
     """Return where the motors are in their travel, from 0 to 1, (n_poses, n_motors)."""
     motors = list(mechanism.motors)
     lower, upper = np.array([mechanism.legs[j].travel for j in motors]).T
@@ -47,11 +47,11 @@ def _parts(mechanism: Mechanism, poses: SimulatedPoses) -> Array:
 def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> None:
     mechanism = load_mechanism(name)
     poses = _drawn(mechanism, 4)
-    assert len(poses) == 4
+    assert len(poses.poses) == 4
     lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
     least = REGULAR * singularity(mechanism, mechanism.home)
     for configuration, readings, T in zip(
-        poses.configurations, poses.readings, poses.T_base_platform, strict=True
+        poses.configurations, poses.readings, poses.poses, strict=True
     ):
         assert np.abs(mechanism.chain.residual(configuration)).max() < 1e-11
         np.testing.assert_allclose(readings, inverse_kinematics(mechanism, T), atol=1e-10)
@@ -214,9 +214,9 @@ def test_legs_do_not_run_through_each_other(tmp_path: Path) -> None:
     thick = _with_radius(0.037, tmp_path)
     assert _penetration(thick, thick.home) < 0.0
     thin = _drawn(load_mechanism("hexapod"), 12)
-    assert max(_penetration(thick, T) for T in thin.T_base_platform) > 2e-3
+    assert max(_penetration(thick, T) for T in thin.poses) > 2e-3
     kept = _drawn(thick, 12)
-    assert max(_penetration(thick, T) for T in kept.T_base_platform) < 0.0
+    assert max(_penetration(thick, T) for T in kept.poses) < 0.0
 
 
 def test_cylinders_that_overlap_at_home_are_not_judged(tmp_path: Path) -> None:
@@ -272,9 +272,7 @@ def test_given_readings_are_reached_in_their_order(name: str, tmp_path: Path) ->
     path = _csv(tmp_path, mechanism, drawn.readings[:, motors])
     found = given_poses(mechanism, path)
     np.testing.assert_allclose(found.readings, drawn.readings, atol=1e-10)
-    for T, T_drawn, q in zip(
-        found.T_base_platform, drawn.T_base_platform, found.readings, strict=True
-    ):
+    for T, T_drawn, q in zip(found.poses, drawn.poses, found.readings, strict=True):
         np.testing.assert_allclose(T.as_matrix(), T_drawn.as_matrix(), atol=1e-9)
         alone = forward_kinematics(mechanism, q).as_matrix()
         np.testing.assert_allclose(T.as_matrix(), alone, atol=1e-9)
@@ -346,7 +344,7 @@ def test_given_readings_a_little_outside_the_travel_are_refused_by_row(tmp_path:
 def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) -> None:
     thick = _with_radius(0.037, tmp_path)
     poses = _drawn(load_mechanism("hexapod"), 12)
-    overlaps = [_penetration(thick, T) for T in poses.T_base_platform]
+    overlaps = [_penetration(thick, T) for T in poses.poses]
     with pytest.raises(DatasetError, match="run through each other there, needed") as caught:
         given_poses(thick, _csv(tmp_path, thick, poses.readings))
     rows = {int(re.findall(r"row (\d+)", problem)[0]) - 1 for problem in caught.value.problems}

@@ -89,7 +89,7 @@ def _check(nominal: Mechanism, folder: Path, seed: int = 3) -> Mechanism:
 def _check_equations(true: Mechanism, legs: tuple[LegGeometry, ...]) -> None:
     """Check the chain's poses and readings against the closed form of the drawn legs."""
     poses = draw_poses(true, 2, np.random.default_rng(0), "workspace")
-    for T, readings in zip(poses.T_base_platform, poses.readings, strict=True):
+    for T, readings in zip(poses.poses, poses.readings, strict=True):
         matrix = T.as_matrix()[None]
         for j, leg in enumerate(legs):
             at = demanded(leg, matrix[:, :3, :3], matrix[:, :3, 3])

@@ -8,12 +8,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
 from legcal.geometry.types import Array
+from legcal.mechanism.configurations import Configurations
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.camera_places import places_around
 from legcal.simulation.cameras import look_at, sample_camera
 from legcal.simulation.dressing import dressed
 from legcal.simulation.images import Viewpoint, take_images
-from legcal.simulation.motion import SimulatedPoses
 from legcal.simulation.posed_machine import PosedMachine, pose_machine
 from legcal.simulation.shapes import Box
 from legcal.simulation.solids import Solid, solids_of
@@ -36,10 +36,10 @@ def posed(name: str, n_poses: int, *more: Solid, bare: bool = True) -> tuple[Pos
     mechanism = machine(name)
     if n_poses == 1:
         home = mechanism.home_configuration[None]
-        poses = SimulatedPoses(home, np.zeros((1, mechanism.n_legs)), (mechanism.home,))
+        poses = Configurations(home, np.zeros((1, mechanism.n_legs)), [mechanism.home])
     else:
         found = legcal.random_configurations(mechanism, n_poses, 0)
-        poses = SimulatedPoses(found.configurations, found.readings, tuple(found.poses))
+        poses = Configurations(found.configurations, found.readings, found.poses)
     shown = solids_of(mechanism) if bare else dressed(mechanism)
     return pose_machine(mechanism, [*shown, *more], poses)
 
@@ -169,7 +169,7 @@ def test_cameras_of_a_machine_far_from_the_origin_stand_around_it() -> None:
         Solid(p.solid.name, None, p.solid.shape, motion * p.T_base_solid) for p in here.solids
     )
     mechanism = machine("hexapod")
-    home = SimulatedPoses(mechanism.home_configuration[None], np.zeros((1, 6)), (mechanism.home,))
+    home = Configurations(mechanism.home_configuration[None], np.zeros((1, 6)), [mechanism.home])
     moved = pose_machine(mechanism, moved_solids, home)[0]
     moved = PosedMachine(
         motion.apply(here.A), motion.apply(here.B), moved.solids, moved.vertices, moved.faces

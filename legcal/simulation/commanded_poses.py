@@ -8,11 +8,12 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
+from legcal.mechanism.configurations import Configurations
 from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.singularity import singularity
 from legcal.progress import Report, no_progress
-from legcal.simulation.motion import Sampling, SimulatedPoses, draw_poses
+from legcal.simulation.motion import Sampling, draw_poses
 
 _REGULAR = 0.05  # of the nominal model's singularity measure at home
 _ROUNDS = 20  # of draws for those that were left out
@@ -25,7 +26,7 @@ def commanded_poses(
     rng: np.random.Generator,
     sampling: Sampling,
     progress: Report = no_progress,
-) -> SimulatedPoses:
+) -> Configurations:
     """Return random poses of a machine that its nominal model reaches at the same readings.
 
     A controller plans with the nominal model. Beside a singularity small errors decide whether
@@ -50,7 +51,7 @@ def commanded_poses(
     DidNotConverge
         If too few are found.
     """
-    kept: list[SimulatedPoses] = []
+    kept: list[Configurations] = []
     missing = n_poses
     for _ in range(_ROUNDS):
         report = partial(_report, progress, n_poses - missing)
@@ -83,19 +84,19 @@ def _reaches(nominal: Mechanism, q: Array) -> bool:
     return singularity(nominal, T) >= _REGULAR * singularity(nominal, nominal.home)
 
 
-def _chosen(poses: SimulatedPoses, index: list[int]) -> SimulatedPoses:
+def _chosen(poses: Configurations, index: list[int]) -> Configurations:
     """Return some of the poses."""
-    return SimulatedPoses(
+    return Configurations(
         poses.configurations[index],
         poses.readings[index],
-        tuple(poses.T_base_platform[i] for i in index),
+        [poses.poses[i] for i in index],
     )
 
 
-def _joined(poses: list[SimulatedPoses]) -> SimulatedPoses:
+def _joined(poses: list[Configurations]) -> Configurations:
     """Return the poses of several sets."""
-    return SimulatedPoses(
+    return Configurations(
         np.concatenate([p.configurations for p in poses]),
         np.concatenate([p.readings for p in poses]),
-        tuple(T for p in poses for T in p.T_base_platform),
+        [T for p in poses for T in p.poses],
     )

@@ -17,11 +17,11 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.geometry.types import Array
+from legcal.mechanism.configurations import Configurations
 from legcal.mechanism.leg import LegKind, main_cylinders
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements, View
 from legcal.simulation.images import Images, Viewpoint
-from legcal.simulation.motion import SimulatedPoses
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
 from legcal.vision.camera_writer import camera_info
@@ -121,7 +121,7 @@ def write_truth(
     settings: SimulationSettings,
     mechanism: Mechanism,
     views: Sequence[Viewpoint],
-    poses: SimulatedPoses,
+    poses: Configurations,
     labels: Sequence[str],
     files: Sequence[str],
 ) -> None:
@@ -162,9 +162,7 @@ def write_truth(
                 "T_base_platform": motion_to_xyz_quat(T),
                 "joints": {name: float(readings[j]) for j, name in sliders},
             }
-            for label, T, readings in zip(
-                labels, poses.T_base_platform, poses.readings, strict=True
-            )
+            for label, T, readings in zip(labels, poses.poses, poses.readings, strict=True)
         },
         "files": list(files),
     }

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.mechanism.configurations import Configurations
 from legcal.mechanism.model import Mechanism
 from legcal.progress import Report
 from legcal.simulation.camera_places import places_around
@@ -17,7 +18,7 @@ from legcal.simulation.commanded_poses import commanded_poses
 from legcal.simulation.dataset_files import pose_labels
 from legcal.simulation.dressing import dressed
 from legcal.simulation.images import Images, Viewpoint, take_images
-from legcal.simulation.motion import SimulatedPoses, given_poses
+from legcal.simulation.motion import given_poses
 from legcal.simulation.posed_machine import PosedMachine, pose_machine
 from legcal.simulation.settings import Level, SimulationSettings
 
@@ -41,7 +42,7 @@ class ImagedMachine:
     """
 
     truth: Mechanism
-    poses: SimulatedPoses
+    poses: Configurations
     labels: tuple[str, ...]
     machines: tuple[PosedMachine, ...]
     views: tuple[Viewpoint, ...]
@@ -85,7 +86,7 @@ def image_machine(
         poses = commanded_poses(
             truth, nominal, n_poses, chance["poses"], settings.sampling, progress
         )
-    settings.check_images(n_views, len(poses) // (1 if shared else n_views))
+    settings.check_images(n_views, len(poses.poses) // (1 if shared else n_views))
     # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
     shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
     machines = pose_machine(truth, dressed(shown), poses)
@@ -101,5 +102,5 @@ def image_machine(
     if settings.level is not Level.PHOTOGRAPHS:
         rows = [row for row in rows if images.seen(row)]
     kept, left_out = images.chosen(rows), len(images) - len(rows)
-    labels = pose_labels(len(poses))
+    labels = pose_labels(len(poses.poses))
     return ImagedMachine(truth, poses, labels, machines, views, kept, left_out)

@@ -8,17 +8,15 @@ over all of the travel, the next are drawn nearer to home.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DatasetError, DidNotConverge, UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.closing import platform_pose, slider_columns
-from legcal.mechanism.configurations import INSIDE, joint_values
+from legcal.mechanism.configurations import INSIDE, Configurations, joint_values
 from legcal.mechanism.following import follow
 from legcal.mechanism.model import Mechanism
 from legcal.progress import Report, no_progress
@@ -37,35 +35,13 @@ class Sampling(StrEnum):
     WORKSPACE = "workspace"
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedPoses:
-    """Poses of a machine.
-
-    Attributes
-    ----------
-    configurations : (n_poses, nq) array
-        Of the closed chain.
-    readings : (n_poses, n_legs) array
-        Joint value of every leg [m], passive ones too; zero for legs of constant length.
-    T_base_platform : tuple of RigidTransform
-        Poses of the platform link in the base link.
-    """
-
-    configurations: Array
-    readings: Array
-    T_base_platform: tuple[RigidTransform, ...]
-
-    def __len__(self) -> int:
-        return len(self.configurations)
-
-
 def draw_poses(
     mechanism: Mechanism,
     n_poses: int,
     rng: np.random.Generator,
     sampling: Sampling | str = Sampling.EXTREME,
     progress: Report = no_progress,
-) -> SimulatedPoses:
+) -> Configurations:
     """Return random poses of a machine.
 
     Parameters
@@ -84,7 +60,7 @@ def draw_poses(
 
     Returns
     -------
-    SimulatedPoses
+    Configurations
 
     Raises
     ------
@@ -120,7 +96,7 @@ def draw_poses(
     return _poses(mechanism, found)
 
 
-def given_poses(mechanism: Mechanism, path: Path) -> SimulatedPoses:
+def given_poses(mechanism: Mechanism, path: Path) -> Configurations:
     """Return the poses at the readings of a CSV: actuated joints in its header, [m] below.
 
     Each is followed from the nearest one that is reached already, or from home.
@@ -134,7 +110,7 @@ def given_poses(mechanism: Mechanism, path: Path) -> SimulatedPoses:
 
     Returns
     -------
-    SimulatedPoses
+    Configurations
         In the order of the rows.
 
     Raises
@@ -190,10 +166,10 @@ def _outside_travel(mechanism: Mechanism, row: Array) -> str | None:
     return None
 
 
-def _poses(mechanism: Mechanism, configurations: list[Array]) -> SimulatedPoses:
+def _poses(mechanism: Mechanism, configurations: list[Array]) -> Configurations:
     """Return closed configurations as poses."""
-    return SimulatedPoses(
+    return Configurations(
         np.array(configurations),
         np.array([joint_values(mechanism, c) for c in configurations]),
-        tuple(platform_pose(mechanism, c) for c in configurations),
+        [platform_pose(mechanism, c) for c in configurations],
     )

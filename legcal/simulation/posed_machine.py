@@ -12,8 +12,8 @@ import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.mechanism.configurations import Configurations
 from legcal.mechanism.model import Mechanism
-from legcal.simulation.motion import SimulatedPoses
 from legcal.simulation.shapes import Box, Cylinder, Shape, Sphere
 from legcal.simulation.solids import PlacedSolid, Solid, link_poses, placed
 
@@ -82,7 +82,7 @@ class PosedMachine:
 
 
 def pose_machine(
-    mechanism: Mechanism, solids: Sequence[Solid], poses: SimulatedPoses
+    mechanism: Mechanism, solids: Sequence[Solid], poses: Configurations
 ) -> tuple[PosedMachine, ...]:
     """Return a machine in every pose.
 
@@ -92,7 +92,7 @@ def pose_machine(
         The true machine.
     solids : sequence of Solid
         What is seen of it.
-    poses : SimulatedPoses
+    poses : Configurations
         Its poses.
     """
     meshes = [_triangles(solid.shape) for solid in solids]
@@ -102,7 +102,7 @@ def pose_machine(
         first += len(mesh.vertices)
     stacked = np.concatenate(faces)
     machines = []
-    for configuration, T in zip(poses.configurations, poses.T_base_platform, strict=True):
+    for configuration, T in zip(poses.configurations, poses.poses, strict=True):
         here = placed(solids, link_poses(mechanism, configuration))
         vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
         B = np.asarray(T.apply(mechanism.B_platform))
