@@ -13,7 +13,6 @@ from legcal.observations.table import read_observations
 from legcal.simulation.parameter_errors import ParameterErrors, Spread
 from legcal.simulation.settings import Level
 from legcal.simulation.simulate import SimulatedDataset, simulate
-from legcal.vision.image_file import read_image
 
 
 @pytest.fixture(scope="module")
@@ -172,27 +171,6 @@ def test_given_cameras_and_lenses_are_used(tmp_path: Path) -> None:
     assert (left.name, left.camera.width, right.name, right.camera.width) == (
         "left", 200, "right", 1024,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["3-rpr", "3-spr", "3-upu-tilted", "6-sps", "hexapod-strut", "nategh-agheli", "tricept"],
-)
-def test_a_small_set_of_photographs_of_every_class(name: str, tmp_path: Path) -> None:
-    camera = small_camera(tmp_path)
-    made = simulate(
-        name,
-        tmp_path / "set",
-        settings(level=Level.PHOTOGRAPHS, poses=1, views=1, camera=camera),
-    )
-    dataset = load_dataset(made.folder)
-    for row in range(dataset.measurements.n_rows):
-        path = dataset.image_path(row)
-        assert path is not None
-        picture = read_image(path, dataset.measurements.views[0].camera)
-        assert picture.shape == (150, 200)
-        assert picture.std() > 5.0
-    assert dataset.mechanism.n_legs == made.truth.n_legs
 
 
 def test_given_poses_are_seen_by_all_views_at_their_readings(tmp_path: Path) -> None:
