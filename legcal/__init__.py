@@ -35,13 +35,20 @@ if TYPE_CHECKING:
     from legcal.pipeline import calibrate
     from legcal.repeatability.noise import measure_noise
     from legcal.report.accuracy import evaluate
+    from legcal.simulation.parameter_errors import ParameterErrors, Spread
+    from legcal.simulation.rendering.appearance import Appearance
     from legcal.simulation.settings import SimulationSettings
     from legcal.simulation.simulate import simulate
+    from legcal.simulation.table_noise import TableNoise
 
 __all__ = [
+    "Appearance",
     "Follower",
     "LegcalError",
+    "ParameterErrors",
     "SimulationSettings",
+    "Spread",
+    "TableNoise",
     "__version__",
     "calibrate",
     "evaluate",
@@ -57,8 +64,12 @@ __all__ = [
 ]
 
 _HOME = {
+    "Appearance": "legcal.simulation.rendering.appearance",
     "Follower": "legcal.mechanism.kinematics",
+    "ParameterErrors": "legcal.simulation.parameter_errors",
     "SimulationSettings": "legcal.simulation.settings",
+    "Spread": "legcal.simulation.parameter_errors",
+    "TableNoise": "legcal.simulation.table_noise",
     "calibrate": "legcal.pipeline",
     "evaluate": "legcal.report.accuracy",
     "forward_kinematics": "legcal.mechanism.kinematics",

@@ -2,12 +2,15 @@
 
 import io
 import json
+import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 from simulated import files_of, settings, small_camera
 
+import legcal
 from legcal.errors import OutOfResources, UsageError
 from legcal.simulation.folder import (
     TRUTH_NAME,
@@ -203,3 +206,22 @@ def test_what_can_be_done_next_is_said(images: int, tmp_path: Path) -> None:
     truth = out / "truth" / "models" / "hexapod.yaml"
     assert f"judge with: legcal evaluate OUT/calibrated.yaml '{truth}'\n" in said
     assert (f"measure noise with: legcal noise '{out}'\n" in said) == (images > 1)
+
+
+def test_the_python_of_the_description_of_simulated_datasets_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    code = text[
+        text.index("    settings = legcal.Sim") : text.index("Metres and radians; `errors`")
+    ]
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"legcal": legcal}
+    exec(textwrap.dedent(code), names)
+    assert names["made"].seen.shape == (60, 6)
+    assert 1e-4 < names["apart"].displacement.mean() < 2e-3
+
+
+@pytest.mark.parametrize("name", legcal.__all__)
+def test_every_public_name_is_found(name: str) -> None:
+    assert getattr(legcal, name) is not None
