@@ -277,6 +277,11 @@ def test_names_in_the_truth_of_a_dataset_do_not_reach_outside_it(tmp_path: Path)
         ),
         ("{xyz: [0.0, 0.0, .inf], quat_xyzw: [0, 0, 0, 1]}", DatasetError, "views.c1"),
         ("{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 2]}", DatasetError, "norm 2"),
+        (
+            "{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 1]}",
+            DatasetError,
+            r"T_base_camera\.quat_xyzw could not be read: found 3 numbers, needed more",
+        ),
     ],
 )
 def test_cameras_that_see_nothing_or_stand_in_the_machine_are_refused(

@@ -284,6 +284,11 @@ def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: 
         case "extra_forbidden":
             hint = closest(str(loc[-1]), _keys_at(schema, loc[:-1]))
             return f"{path}: {place} could not be used: found an unknown key; {hint}"
+        case "missing" if isinstance(loc[-1], int):
+            return (
+                f"{path}: {place.rsplit('.', 1)[0]} could not be read: found {loc[-1]} numbers, "
+                "needed more; add what is missing."
+            )
         case "missing":
             return (
                 f"{path}: {place} could not be read: found no such key, needed it; add "
