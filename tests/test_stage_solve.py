@@ -143,9 +143,7 @@ def test_the_number_of_nonzeros_grows_with_the_number_of_poses_and_no_faster() -
 def test_a_problem_that_ipopt_gives_up_is_refused_with_its_status() -> None:
     x = ca.SX.sym("x", 1)
     problem = _problem("A root", x, ca.sqrt(x) - 1.0, [-1.0])
-    with pytest.raises(
-        DidNotConverge, match=r"A root could not be .*Invalid_Number.*, needed "
-    ):
+    with pytest.raises(DidNotConverge, match=r"A root could not be .*Invalid_Number.*, needed "):
         solve_least_squares(problem)
 
 
