@@ -59,7 +59,7 @@ from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, start_from
-from legcal.report.files import check_destination, output_path
+from legcal.report.destination import check_destination, output_path
 from legcal.report.result import write_result
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import run_steps

@@ -16,7 +16,8 @@ from legcal.dataset.folder import load_dataset
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
 from legcal.files.schema import closest, parse_yaml
 from legcal.mechanism.load import load_mechanism
-from legcal.report.files import check_destination, result_folder
+from legcal.report.destination import check_destination
+from legcal.report.files import result_folder
 
 __all__ = ["folder"]
 

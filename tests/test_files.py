@@ -14,7 +14,8 @@ import pytest
 
 from legcal.errors import UsageError
 from legcal.files.atomic import write_atomically
-from legcal.report.files import check_destination, output_path, result_folder
+from legcal.report.destination import check_destination, output_path
+from legcal.report.files import result_folder
 
 RESULT = '{"legcal_result": 1}'
 

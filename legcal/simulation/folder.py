@@ -16,14 +16,14 @@ from pathlib import Path
 from legcal.dataset.folder import CACHE_NAME, OBSERVATIONS_NAME
 from legcal.errors import UsageError
 from legcal.files.inside import path_problem
-from legcal.report.files import (
+from legcal.report.destination import (
     OutputKind,
     check_destination,
     check_path,
     holds_files,
     in_the_way,
-    result_folder,
 )
+from legcal.report.files import result_folder
 
 AXES_NAME = "axes.csv"
 TRUTH = "truth"

@@ -13,7 +13,7 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements
 from legcal.progress import Report, no_progress
-from legcal.report.files import output_path
+from legcal.report.destination import output_path
 from legcal.report.model_files import write_model
 from legcal.simulation.dataset_files import write_session, write_truth
 from legcal.simulation.extremes import are_extreme
