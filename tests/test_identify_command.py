@@ -115,7 +115,8 @@ def test_weak_directions_and_remedies_are_printed(
     [
         (("hexapod", "--view", "leg1,lge2"), 2, "UsageError", "View 1 could not be used: found 'l"),
         (("hexapod", "--view", "leg1,lge2"), 2, "UsageError", "did you mean 'leg2'?"),
-        (("hexapod", "--view", ""), 2, "UsageError", "found no leg, needed at least one"),
+        (("hexapod", "--view", ""), 2, "UsageError", "found an empty text after '--view'"),
+        (("hexapod", "--view", ","), 2, "UsageError", "found no leg, needed at least one"),
         (("hexapod", "--view", "leg1,,leg2"), 2, "UsageError", "found '', needed a leg"),
         (("hexapod", "--view", "leg1, leg1"), 2, "UsageError", "found leg 'leg1' 2 times"),
         (("hexapod", "--images", "0"), 2, "UsageError", "found 0 images a view"),
