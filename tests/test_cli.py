@@ -231,3 +231,13 @@ def test_an_empty_word_is_not_taken_for_the_current_folder(
     assert run(monkeypatch, *words) == 2
     assert f"found an empty text after '{place}', needed a name" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", [(), ("study",)])
+def test_without_a_command_the_help_is_shown(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, *words) == 2
+    printed = capsys.readouterr()
+    assert "Commands" in printed.out
+    assert printed.err == "legcal: Nothing was done: found no command, needed one of those above.\n"

@@ -291,7 +291,6 @@ def test_the_table_has_80_columns_units_and_the_printed_figures(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "Missing command"),
         (("papers",), "No such command 'papers'"),
         (("paper", "--settings"), "No such option"),
         (("paper", "--runs", "0"), "runs = 0"),

@@ -29,6 +29,7 @@ from legcal.version import __version__
 
 ISSUES = "the issue tracker of legcal"
 INTERRUPTED = 130
+NO_COMMAND = "Nothing was done: found no command, needed one of those above."
 
 app = typer.Typer(
     name="legcal",
@@ -86,9 +87,8 @@ def main() -> None:
         print_failure(type(error).__name__, str(error), as_json=as_json)
         code = error.exit_code
     except usage_error as error:
-        print_failure(
-            "UsageError", getattr(error, "format_message", error.__str__)(), as_json=as_json
-        )
+        message = getattr(error, "format_message", error.__str__)()
+        print_failure("UsageError", message or NO_COMMAND, as_json=as_json)
         code = 2
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED

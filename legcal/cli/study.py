@@ -33,6 +33,7 @@ OutputOption = Annotated[
 
 study = typer.Typer(
     help="Measure on many simulated machines what is claimed; their truth is known.",
+    no_args_is_help=True,
 )
 
 
