@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from legcal.dataset.folder import CACHE_NAME, OBSERVATIONS_NAME
+from legcal.dataset.given_axes import AXES_NAME
 from legcal.errors import UsageError
 from legcal.files.inside import path_problem
 from legcal.report.destination import (
@@ -25,7 +26,6 @@ from legcal.report.destination import (
 )
 from legcal.report.files import result_folder
 
-AXES_NAME = "axes.csv"
 TRUTH = "truth"
 TRUTH_NAME = f"{TRUTH}/truth.json"
 _FOLDERS = ("images", "models", "urdf", TRUTH)

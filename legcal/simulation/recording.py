@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from legcal.dataset.folder import OBSERVATIONS_NAME
+from legcal.dataset.given_axes import AXES_NAME
 from legcal.observations.axes_file import write_axis_table
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.table import write_observations
 from legcal.simulation.dataset_files import image_names, measurements_of
-from legcal.simulation.folder import AXES_NAME, TRUTH
+from legcal.simulation.folder import TRUTH
 from legcal.simulation.hints import rough_pose
 from legcal.simulation.imaged_machine import ImagedMachine
 from legcal.simulation.parameter_errors import Distribution
