@@ -1,9 +1,11 @@
 """The schema of ``dataset.yaml``."""
 
+from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
+from legcal.dataset.wishes import Stated, Wish, read_prior, read_wish
 from legcal.files.motion import MotionEntry
 from legcal.files.schema import FileSchema, Name, Number, Version
 
@@ -26,6 +28,38 @@ class ViewEntry(FileSchema):
         return legs
 
 
+def _can_be_fixed(text: str) -> str:
+    """Refuse a value that a parameter cannot be fixed at."""
+    read_wish("fixed", text, "")
+    return text
+
+
+class ParametersEntry(FileSchema):
+    """What is known of parameters, which are left as they are and which are looked for."""
+
+    priors: dict[Name, Annotated[Stated, BeforeValidator(read_prior)]] = Field(default_factory=dict)
+    fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
+    free: list[Name] = Field(default_factory=list)
+
+    def wishes(self, path: Path) -> tuple[Wish, ...]:
+        """Return what the block asks for; ``path`` is that of the file, for messages."""
+        block = f"{path}: parameters"
+        return (
+            *(
+                read_wish("prior", name, f"{block}.priors.{name}", stated, in_file=True)
+                for name, stated in self.priors.items()
+            ),
+            *(
+                read_wish("fixed", text, f"{block}.fixed '{text}'", in_file=True)
+                for text in self.fixed
+            ),
+            *(
+                read_wish("free", text, f"{block}.free '{text}'", in_file=True)
+                for text in self.free
+            ),
+        )
+
+
 class DatasetEntry(FileSchema):
     """The whole of ``dataset.yaml``."""
 
@@ -34,6 +68,7 @@ class DatasetEntry(FileSchema):
     measurements: str
     encoder_sigma: Annotated[Number, Field(gt=0.0)]
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
+    parameters: ParametersEntry = Field(default_factory=ParametersEntry)
 
     @field_validator("encoder_sigma")
     @classmethod

@@ -10,6 +10,7 @@ import numpy as np
 from legcal.dataset.entry import DatasetEntry, ViewEntry
 from legcal.dataset.given_axes import AXES_NAME, read_given_axes, rows_without_axes
 from legcal.dataset.measurement_table import read_measurements
+from legcal.dataset.wishes import Wish
 from legcal.errors import DatasetError
 from legcal.files.inside import path_problem
 from legcal.files.schema import closest, describe, parse_yaml, read_text, validate
@@ -52,6 +53,8 @@ class Dataset:
     axes : LegAxes or None
         The rows of ``axes.csv`` if there is one, of the legs that the views use. Images are
         then not searched, and there are no observations.
+    wishes : tuple of Wish
+        What the block ``parameters`` asks of parameters by name.
     """
 
     folder: Path
@@ -63,6 +66,7 @@ class Dataset:
     observations: Outlines | None
     notes: tuple[str, ...] = ()
     axes: LegAxes | None = None
+    wishes: tuple[Wish, ...] = ()
 
     def image_path(self, row: int) -> Path | None:
         """Return the image file of a row; None where only outlines are given."""
@@ -192,6 +196,7 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         observations=_read_outlines(folder, mechanism, measurements),
         notes=(*notes, *left_out, *_unused_views(yaml_path, measurements)),
         axes=axes,
+        wishes=entry.parameters.wishes(yaml_path),
     )
     problems = _row_problems(dataset) if check_images else []
     if problems:

@@ -173,7 +173,12 @@ def read_prior(value: object) -> Stated:
         raise ValueError(
             f"found {describe(value)}, needed a value and its sigma; write it like {_EXAMPLE}."
         )
-    return _checked(Stated(float(value[0]), float(value[1])))
+    try:
+        return _checked(Stated(float(value[0]), float(value[1])))
+    except OverflowError as error:
+        raise ValueError(
+            "found a number beyond 1e308, needed a value and its sigma; correct it."
+        ) from error
 
 
 def _read_prior_text(text: str) -> Stated:
@@ -181,7 +186,8 @@ def _read_prior_text(text: str) -> Stated:
     match = _PRIOR.fullmatch(text)
     if match is None:
         raise ValueError(
-            f"found {describe(text.strip())}, needed a value and its sigma; write it like {_EXAMPLE}."
+            f"found {describe(text.strip())}, needed a value and its sigma; write it like "
+            f"{_EXAMPLE}."
         )
     value, unit, sigma, unit_of_sigma = match.groups()
     if unit and not unit_of_sigma:

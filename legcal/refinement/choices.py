@@ -179,8 +179,8 @@ def _misstated(wish: Wish, name: str, parameter: KnownParameter) -> str:
         return ""
     return (
         f"{wish.where} could not be used: found {_with_unit(stated.value, parameter)} for {name}, "
-        f"needed {parameter.least:.4g} to {_with_unit(parameter.most, parameter)}, not so far from "
-        f"the nominal {_with_unit(parameter.nominal, parameter)}; check the number and its unit."
+        f"needed one between {parameter.least:.4g} and {parameter.most:.4g}, not so far from the "
+        f"nominal {_with_unit(parameter.nominal, parameter)}; check the number and its unit."
     )
 
 
@@ -212,8 +212,8 @@ def _contradiction(
     other = next((w.name for w in pair if w.name in known.synonyms), "")
     also = f", which is {other} too," if other else ""  # views that have one camera
     return (
-        f"{name}{also} could not be {done}: found {_quoted(pair[0])} and {_quoted(pair[1])}, needed one "
-        "of them; remove the other."
+        f"{name}{also} could not be {done}: found {_quoted(pair[0])} and {_quoted(pair[1])}, "
+        "needed one of them; remove the other."
     )
 
 
@@ -239,4 +239,4 @@ def _quoted(wish: Wish) -> str:
 
 def _with_unit(value: float, parameter: KnownParameter) -> str:
     """Return a value and its unit."""
-    return f"{value:.6g} {parameter.unit}".rstrip()
+    return f"{value:.4g} {parameter.unit}".rstrip()
