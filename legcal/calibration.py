@@ -11,7 +11,10 @@ from scipy.spatial.transform import RigidTransform
 from legcal.dataset.folder import Dataset
 from legcal.geometry.types import IntArray
 from legcal.mechanism.kinematics import forward_kinematics_many
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import KinematicParameters, parameter_names, radius_name
+from legcal.mechanism.parametrization import geometries, parametrization_of
 from legcal.mechanism.platform import platform_in_base, pose_differences
 from legcal.observations.canonical_order import (
     Order,
@@ -157,7 +160,8 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
     displacement, rotation = pose_differences(solution.T_Rb_Re, nominal)
     change = PlatformError(displacement, rotation)
     sigma = predict_platform_error(
-        solution.parameters,
+        _legs(mechanism, solution.parameters),
+        parametrization_of(mechanism),
         solution.kinematic_covariance,
         mechanism.frame_legs,
         solution.T_Rb_Re,
@@ -165,6 +169,18 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
     return Calibration(
         dataset, solution, steps, change, sigma, _verdict(change, sigma), tuple(notes)
     )
+
+
+def _legs(mechanism: Mechanism, parameters: KinematicParameters) -> list[LegGeometry]:
+    """Return the legs of a mechanism with calibrated joints and offsets."""
+    found = zip(
+        geometries(mechanism),
+        parameters.base_joints,
+        parameters.platform_joints,
+        parameters.offsets,
+        strict=True,
+    )
+    return [replace(leg, A=A, B=B, q0=float(q0)) for leg, A, B, q0 in found]
 
 
 def _verdict(change: PlatformError, sigma: PlatformError) -> Verdict:

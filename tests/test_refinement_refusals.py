@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 from hexapod_session import (
-    FRAME_LEGS,
     PINHOLE,
     TRUTH,
     Session,
@@ -13,21 +12,19 @@ from hexapod_session import (
     joint_errors,
     moved_outlines,
     noisy_outlines,
-    noisy_readings,
     simulate,
 )
 
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.geometry.frames import motion_from_xyz_quat
 from legcal.mechanism.leg import Cylinder, Leg, LegKind
-from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
+from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
 from legcal.refinement import (
     cameras_from_hints,
     fitted_legs,
     platform_poses,
-    predict_platform_error,
     refine,
     refine_from_best,
     start_from,
@@ -219,39 +216,6 @@ def test_legs_of_a_mechanism_bring_names_signs_and_radii() -> None:
     legs = fitted_legs([leg] * 3, (0, 1, 2))
     assert legs.sign.tolist() == [-1, -1, -1]
     assert legs.radii[(2, "leg1_rod")] == 0.01
-
-
-def test_predicted_platform_error_agrees_with_monte_carlo(session: Session) -> None:
-    rng = np.random.default_rng(0)
-    m = noisy_readings(session, rng)
-    found = refine(session.legs, m, noisy_outlines(session, rng), disturbed_start(session))
-    poses = session.T_Rb_Re[:3]
-    covariance = 0.01 * found.kinematic_covariance
-    predicted = predict_platform_error(TRUTH, covariance, FRAME_LEGS, poses)
-    lengths = np.array(
-        [np.linalg.norm(T.apply(TRUTH.platform_joints) - TRUTH.base_joints, axis=1) for T in poses]
-    )
-    q = lengths - TRUTH.offsets
-    shifts, turns = [], []
-    for xi in rng.multivariate_normal(to_vector(TRUTH, FRAME_LEGS), covariance, 300):
-        moved = from_vector(xi, 6, FRAME_LEGS)
-        for T, true in zip(platform_poses(moved, q + moved.offsets, poses), poses, strict=True):
-            shifts.append(np.sum((T.translation - true.translation) ** 2))
-            turns.append((T.rotation * true.rotation.inv()).magnitude() ** 2)
-    rms = np.sqrt(np.mean(np.reshape(shifts, (-1, 3)), axis=0))
-    np.testing.assert_allclose(predicted.displacement, rms, rtol=0.15)
-    turn = np.sqrt(np.mean(np.reshape(turns, (-1, 3)), axis=0))
-    np.testing.assert_allclose(predicted.rotation, turn, rtol=0.15)
-    assert predicted.mean_displacement == pytest.approx(np.sqrt(np.mean(rms**2)), rel=0.1)
-    assert predicted.mean_rotation == pytest.approx(np.sqrt(np.mean(turn**2)), rel=0.1)
-
-
-def test_a_pose_that_readings_do_not_determine_is_refused(session: Session) -> None:
-    offsets = TRUTH.offsets.copy()
-    offsets[5] = np.nan
-    passive = KinematicParameters(TRUTH.base_joints, TRUTH.platform_joints, offsets)
-    with pytest.raises(NotIdentifiable, match="the 5 readings do not determine platform pose 1"):
-        predict_platform_error(passive, np.eye(29), FRAME_LEGS, session.T_Rb_Re[:1])
 
 
 def test_a_passive_leg_needs_no_reading() -> None:

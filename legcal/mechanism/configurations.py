@@ -30,6 +30,8 @@ ON_THE_CHAIN = 7  # draws of eight, where following is quick
 HOPELESS = 20  # configurations in vain, if they are the first
 STRIDE = 0.15  # [rad], and of a leg length
 INSIDE = 1e-12  # [m]
+WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are told
+WORKSPACE_SEED = 20020721
 
 
 class Configurations(NamedTuple):
@@ -92,6 +94,20 @@ def random_configurations(
         np.array([joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
         [platform_pose(mechanism, c) for c in found],
     )
+
+
+def workspace(mechanism: Mechanism) -> Configurations:
+    """Return the configurations that stand for the workspace, the same at every call.
+
+    Errors over the workspace are those at these poses, whether they are predicted or found by
+    comparing two models.
+
+    Raises
+    ------
+    DidNotConverge
+        As :func:`random_configurations`.
+    """
+    return random_configurations(mechanism, WORKSPACE_POSES, WORKSPACE_SEED)
 
 
 def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Iterator[Array]:

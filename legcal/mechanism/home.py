@@ -1,5 +1,8 @@
 """The home pose: found where a file gives none, and settled on what the legs demand."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -15,7 +18,9 @@ from legcal.mechanism.demands import (
     moved,
 )
 from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import in_links
 
 TRIALS = 200
 ENOUGH = 20  # trials, where one of them found a pose above the base
@@ -131,6 +136,42 @@ def settle(
             break  # rounding
         T, best = trial, worst
     return T, (demands.worst() if best > 1e-9 * scale else None)
+
+
+def home_with(
+    mechanism: Mechanism, legs: Sequence[LegGeometry], furthest: float
+) -> RigidTransform | None:
+    """Return the closed pose nearest to home once the legs have other numbers.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+    legs : sequence of LegGeometry
+        Its legs in R_b and R_e, as they are to be; both frames stay where they are.
+    furthest : float
+        By how much home may miss what these legs demand, in leg lengths.
+
+    Returns
+    -------
+    RigidTransform or None
+        T_base_platform; home itself where the legs demand nothing else, None if no closed pose
+        is near.
+    """
+    moved_legs = tuple(
+        replace(
+            leg,
+            A_base=wanted.A,
+            B_platform=wanted.B,
+            q0=wanted.q0,
+            base_axis=wanted.base_axis,
+            platform_axis=wanted.platform_axis,
+            twist=wanted.twist,
+        )
+        for leg, wanted in zip(mechanism.legs, in_links(mechanism, legs), strict=True)
+    )
+    home, problem = settle(replace(mechanism, legs=moved_legs), mechanism.home, furthest)
+    return None if problem is not None else home
 
 
 def _step(jacobian: Array, values: Array, scale: float, damping: float = 0.0) -> Array:

@@ -36,6 +36,28 @@ def moved_legs(
     return tuple(moved)
 
 
+def footed(legs: Sequence[LegGeometry], origin: Array) -> tuple[LegGeometry, ...]:
+    """Return legs with B where models put it on those that are fixed to the platform.
+
+    Nothing depends on where B lies on the line of such a leg; models take the foot of the platform
+    link's origin.
+
+    Parameters
+    ----------
+    legs : sequence of LegGeometry
+        Legs in R_b and R_e.
+    origin : (3,) array
+        Origin of the platform link in R_e [m].
+    """
+    found = []
+    for leg in legs:
+        if leg.platform_joint == "" and leg.platform_axis is not None:
+            along = float((origin - leg.B) @ leg.platform_axis)
+            leg = replace(leg, B=leg.B + along * leg.platform_axis, q0=leg.q0 + along)
+        found.append(leg)
+    return tuple(found)
+
+
 def turned(axis: Array | None, turn: Array) -> Array | None:
     """Return an axis turned by two angles about its :func:`normal_basis`."""
     return None if axis is None else np.asarray(turn_of(axis, turn).apply(axis))

@@ -1,4 +1,11 @@
-"""What the covariance of the parameters means at the platform."""
+"""What errors of the parameters mean at the platform, the motors at their readings: eq (20).
+
+A small change d_xi of the parameters moves the platform by J d_xi at a pose. A covariance C of the
+parameters is one of J C J^T there: the same readings, given to the calibrated model and to the
+true machine, put the platform that far apart. Errors of the readings are not in it.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,23 +14,26 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.parameters import KinematicParameters
-from legcal.mechanism.parametrization import parametrize
+from legcal.mechanism.parametrization import Parametrization
 from legcal.mechanism.sensitivity import pose_sensitivity
 
 
 @dataclass(frozen=True, eq=False)
 class PlatformError:
-    """Predicted errors of the pose of R_e in R_b, one standard deviation.
+    """How far the platform is off at poses, one number a pose.
 
     Attributes
     ----------
     displacement : (n_poses,) array
-        Root mean square displacement of the origin of R_e [m].
+        Displacement of the origin of R_e, the platform joint of the first frame leg [m].
     rotation : (n_poses,) array
-        Root mean square angle of rotation [rad].
+        Angle of rotation [rad].
+
+    Notes
+    -----
+    A predicted error is one standard deviation of the whole vector: the root of the expected
+    square of its length.
     """
 
     displacement: Array
@@ -31,17 +41,28 @@ class PlatformError:
 
     @property
     def mean_displacement(self) -> float:
-        """Root mean square over all poses [m]."""
-        return float(np.sqrt(np.mean(self.displacement**2)))
+        """Mean over the poses [m]."""
+        return float(self.displacement.mean())
 
     @property
     def mean_rotation(self) -> float:
-        """Root mean square over all poses [rad]."""
-        return float(np.sqrt(np.mean(self.rotation**2)))
+        """Mean over the poses [rad]."""
+        return float(self.rotation.mean())
+
+    @property
+    def max_displacement(self) -> float:
+        """Largest of all poses [m]."""
+        return float(self.displacement.max())
+
+    @property
+    def max_rotation(self) -> float:
+        """Largest of all poses [rad]."""
+        return float(self.rotation.max())
 
 
 def predict_platform_error(
-    parameters: KinematicParameters,
+    legs: Sequence[LegGeometry],
+    parametrization: Parametrization,
     covariance: Array,
     frame_legs: Sequence[int],
     T_Rb_Re: Sequence[RigidTransform],
@@ -50,12 +71,14 @@ def predict_platform_error(
 
     Parameters
     ----------
-    parameters : KinematicParameters
-        The calibrated parameters [m].
-    covariance : (n_parameters, n_parameters) array
-        Their covariance [m^2], as in :class:`legcal.refinement.solution.Solution`.
-    frame_legs : sequence of 3 int
-        The legs that define R_b and R_e.
+    legs : sequence of LegGeometry
+        The calibrated legs in R_b and R_e.
+    parametrization : Parametrization
+        Their parameters.
+    covariance : (p, p) array
+        The covariance of these parameters [m^2, m rad, rad^2]; zero for what is known.
+    frame_legs : sequence of int
+        The legs that define R_b and R_e: three in space, two in a plane.
     T_Rb_Re : sequence of RigidTransform
         Platform poses.
 
@@ -68,24 +91,58 @@ def predict_platform_error(
     NotIdentifiable
         If the readings do not determine a pose.
     """
-    legs = _legs(parameters)
-    names = [f"leg{j + 1}" for j in range(len(legs))]
-    J = pose_sensitivity(
-        legs,
-        parametrize(names, legs, frame_legs),
-        frame_legs,
-        np.array([T.rotation.as_matrix() for T in T_Rb_Re]).reshape(-1, 3, 3),
-        np.array([T.translation for T in T_Rb_Re]).reshape(-1, 3),
-    )
-    variance = np.einsum("kia,ab,kib->ki", J, covariance, J, optimize=True)
-    return PlatformError(np.sqrt(variance[:, 3:].sum(axis=1)), np.sqrt(variance[:, :3].sum(axis=1)))
+    J = platform_by_parameters(legs, parametrization, frame_legs, T_Rb_Re)
+    return expected_error(J, covariance)
 
 
-def _legs(parameters: KinematicParameters) -> list[LegGeometry]:
-    """Return legs with point-like joints; those without an offset are passive."""
-    kinds = np.where(np.isfinite(parameters.offsets), LegKind.ACTUATED, LegKind.PASSIVE)
-    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
-    return [
-        LegGeometry("S", "S", LegKind(kind), A, B, float(q0))
-        for (A, B), kind, q0 in zip(joints, kinds, parameters.offsets, strict=True)
-    ]
+def platform_by_parameters(
+    legs: Sequence[LegGeometry],
+    parametrization: Parametrization,
+    frame_legs: Sequence[int],
+    T_Rb_Re: Sequence[RigidTransform],
+) -> Array:
+    """Return the derivative of platform poses by the parameters, (n_poses, 6, p).
+
+    Rotation vectors in R_b come first [rad], displacements of the origin of R_e second [m].
+
+    Raises
+    ------
+    NotIdentifiable
+        If the readings do not determine a pose.
+    """
+    R = np.array([T.rotation.as_matrix() for T in T_Rb_Re]).reshape(-1, 3, 3)
+    t = np.array([T.translation for T in T_Rb_Re]).reshape(-1, 3)
+    return pose_sensitivity(legs, parametrization, frame_legs, R, t)
+
+
+def expected_error(by_parameters: Array, covariance: Array) -> PlatformError:
+    """Return one standard deviation of the platform at poses.
+
+    Parameters
+    ----------
+    by_parameters : (n_poses, 6, p) array
+        From :func:`platform_by_parameters`.
+    covariance : (p, p) array
+        Of the parameters.
+    """
+    variance = np.sum((by_parameters @ covariance) * by_parameters, axis=2)
+    return PlatformError(_root_of_sum(variance[:, 3:]), _root_of_sum(variance[:, :3]))
+
+
+def moved_by(by_parameters: Array, change: Array) -> PlatformError:
+    """Return how far a small change of the parameters moves the platform at poses.
+
+    Parameters
+    ----------
+    by_parameters : (n_poses, 6, p) array
+        From :func:`platform_by_parameters`.
+    change : (p,) array
+        Of the parameters [m, rad].
+    """
+    motion = (by_parameters @ change) ** 2
+    return PlatformError(_root_of_sum(motion[:, 3:]), _root_of_sum(motion[:, :3]))
+
+
+def _root_of_sum(squares: Array) -> Array:
+    """Return the root of sums of squares, (n_poses,), which rounding may leave below zero."""
+    return np.asarray(np.sqrt(np.maximum(squares.sum(axis=1), 0.0)))

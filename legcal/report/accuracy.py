@@ -15,15 +15,17 @@ from scipy.spatial.transform import RigidTransform
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
+from legcal.mechanism.configurations import (
+    WORKSPACE_POSES,
+    WORKSPACE_SEED,
+    random_configurations,
+)
 from legcal.mechanism.kinematics import forward_kinematics, forward_kinematics_many
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 from legcal.mechanism.platform import platform_in_base, pose_differences
 
-N_RANDOM_POSES = 100
-_SEED = 20020721
 _ROUNDS = 20  # of drawing again what the reference does not reach
 _HOPELESS = 10  # poses that it does not reach, if they are the first
 
@@ -179,13 +181,13 @@ def _random_poses(
     mechanism: Mechanism, reference: Mechanism
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
     """Return platform poses of both models at the same random readings inside the travel."""
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(WORKSPACE_SEED)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
     for turn in range(_ROUNDS):
         if turn > 0 and not poses:
             break
-        count = N_RANDOM_POSES - len(poses) if turn > 0 else _HOPELESS
+        count = WORKSPACE_POSES - len(poses) if turn > 0 else _HOPELESS
         drawn = random_configurations(mechanism, count, rng)
         for q, T in zip(drawn.readings, drawn.poses, strict=True):
             try:
@@ -193,10 +195,10 @@ def _random_poses(
             except DidNotConverge:  # the reference cannot have these lengths at the same time
                 continue
             poses.append(T)
-        if len(poses) == N_RANDOM_POSES:
+        if len(poses) == WORKSPACE_POSES:
             return poses, reference_poses
     raise DidNotConverge(
-        f"The models could not be compared: only {len(poses)} of {N_RANDOM_POSES} random poses "
+        f"The models could not be compared: only {len(poses)} of {WORKSPACE_POSES} random poses "
         "inside the travel could be reached by both; compare at the readings of a dataset with "
         "--dataset."
     )

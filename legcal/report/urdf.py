@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
-from legcal.geometry.frames import roll_pitch_yaw
+from legcal.geometry.frames import motion_to_xyz_quat, roll_pitch_yaw
 from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.load import load_mechanism
@@ -103,11 +104,14 @@ def write_urdf(mechanism: Mechanism, legs: Sequence[LegGeometry], destination: P
     destination.write_bytes(patch_origins(mechanism.urdf.content, changed))
 
 
-def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: str) -> None:
+def write_calibrated_yaml(
+    mechanism: Mechanism, destination: Path, urdf_name: str, home: RigidTransform | None = None
+) -> None:
     """Write the mechanism's YAML with ``legcal.urdf`` naming the calibrated file.
 
-    Every other character stays as it was; the key is added where the file does not have it. A
-    mechanism of another format, or without a block ``legcal``, gets a YAML with all it needs.
+    Every other character stays as it was, but for the numbers of ``legcal.home`` where home moves;
+    the key is added where the file does not have it. A mechanism of another format, or without a
+    block ``legcal``, gets a YAML with all it needs.
 
     Parameters
     ----------
@@ -117,11 +121,16 @@ def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: st
         The file to write, beside the calibrated URDF.
     urdf_name : str
         The calibrated URDF, relative to ``destination``.
+    home : RigidTransform, optional
+        T_base_platform where the calibrated legs close, if not where the nominal ones do.
     """
     if not _is_written_down(mechanism):
-        destination.write_bytes(mechanism_text(mechanism, urdf_name).encode("utf-8"))
+        there = mechanism if home is None else replace(mechanism, home=home)
+        destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
         return
     text = mechanism.yaml_path.read_bytes().decode("utf-8")
+    if home is not None:
+        text = _with_home(text, home)
     value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
     block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
     written = None if block is None else _entry(block, "urdf")
@@ -132,6 +141,19 @@ def write_calibrated_yaml(mechanism: Mechanism, destination: Path, urdf_name: st
         separator = ", " if block.flow_style else "\n" + " " * first.column
         text = f"{text[: first.index]}urdf: {value}{separator}{text[first.index :]}"
     destination.write_bytes(text.encode("utf-8"))
+
+
+def _with_home(text: str, home: RigidTransform) -> str:
+    """Return the text of a YAML with other numbers in ``legcal.home``, if it has one."""
+    written = _entry(_entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal"), "home")
+    numbers = []
+    for key, values in motion_to_xyz_quat(home).items():
+        entry = _entry(written, key)
+        if isinstance(entry, yaml.SequenceNode):
+            numbers += list(zip(entry.value, values, strict=True))
+    for node, value in sorted(numbers, key=lambda number: -number[0].start_mark.index):
+        text = text[: node.start_mark.index] + repr(value) + text[node.end_mark.index :]
+    return text
 
 
 def _is_written_down(mechanism: Mechanism) -> bool:

@@ -7,16 +7,15 @@ zero stays zero.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from numbers import Real
 
 import numpy as np
 
 from legcal.errors import UsageError
-from legcal.geometry.types import Array
 from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import moved_legs
+from legcal.mechanism.leg_steps import footed, moved_legs
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of
 
@@ -149,7 +148,7 @@ def draw_errors(
         step[i] = spread.size * unit[i]
     moved = moved_legs(legs, found.place, step)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
-    return tuple(_footed(leg, origin) for leg in moved)
+    return footed(moved, origin)
 
 
 def _spread(errors: ParameterErrors, name: str) -> Spread:
@@ -159,15 +158,6 @@ def _spread(errors: ParameterErrors, name: str) -> Spread:
         return Spread()
     found: Spread = getattr(errors, _FIELDS[kind])
     return found
-
-
-def _footed(leg: LegGeometry, origin: Array) -> LegGeometry:
-    """Return a leg, B where the platform link's origin has its foot if the leg is fixed to it."""
-    if leg.platform_joint != "" or leg.platform_axis is None:
-        return leg
-    along = float((origin - leg.B) @ leg.platform_axis)
-    q0 = leg.q0 + along
-    return replace(leg, B=leg.B + along * leg.platform_axis, q0=q0)
 
 
 def _check(errors: ParameterErrors) -> None:

@@ -15,11 +15,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass
-from legcal.mechanism.home import settle
+from legcal.mechanism.home import home_with
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import in_links
 from legcal.report.model_files import mechanism_text, model_name
 from legcal.report.urdf import check_closes, write_urdf
 from legcal.report.urdf_patch import patch_radii
@@ -67,7 +66,7 @@ def write_true_model(
     for _ in range(DRAWS):
         legs = draw_errors(nominal, errors, rng)
         radii = draw_radii(nominal, errors.radii, of_radii)
-        home = _home(nominal, legs)
+        home = home_with(nominal, legs, FURTHEST)
         if home is None:
             problems["legs that do not meet near home"] += 1
             continue
@@ -133,24 +132,6 @@ def _places(nominal: Mechanism, folder: Path) -> tuple[Path, Path]:
     """Return where the files of the true model stand."""
     name = model_name(nominal)
     return folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
-
-
-def _home(nominal: Mechanism, legs: Sequence[LegGeometry]) -> RigidTransform | None:
-    """Return the closed pose nearest to the nominal home, or None if there is none."""
-    moved = tuple(
-        replace(
-            leg,
-            A_base=wanted.A,
-            B_platform=wanted.B,
-            q0=wanted.q0,
-            base_axis=wanted.base_axis,
-            platform_axis=wanted.platform_axis,
-            twist=wanted.twist,
-        )
-        for leg, wanted in zip(nominal.legs, in_links(nominal, legs), strict=True)
-    )
-    home, problem = settle(replace(nominal, legs=moved), nominal.home, FURTHEST)
-    return None if problem is not None else home
 
 
 def _class_of(mechanism: Mechanism) -> tuple[object, ...]:
