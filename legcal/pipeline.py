@@ -15,7 +15,7 @@ Everything runs in an order of rows, views and legs that does not depend on the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration import Calibration, Steps, in_file_order, judge
 from legcal.dataset.cache import DetectionPlan, fingerprint, plan_dataset, store_outlines
 from legcal.dataset.folder import Dataset, load_dataset
+from legcal.dataset.wishes import Wish, wishes_of_call
 from legcal.detection.observe import (
     Photographs,
     Scene,
@@ -55,8 +56,11 @@ from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import reject_unused_legs
 from legcal.progress import Report, no_progress
+from legcal.refinement.choices import Choices
+from legcal.refinement.known_parameters import known_parameters
 from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.refine import refine_from_best
+from legcal.refinement.resolution import resolve
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, start_from
 from legcal.report.destination import check_destination, output_path
@@ -74,6 +78,9 @@ def calibrate(
     criteria: Criteria = "default",
     use_cache: bool = True,
     workers: int = 1,
+    priors: Mapping[str, tuple[float, float] | str] | Sequence[str] = (),
+    fixed: Sequence[str] = (),
+    free: Sequence[str] = (),
 ) -> Calibration:
     """Compute joint positions and offsets of a mechanism from a dataset.
 
@@ -92,6 +99,15 @@ def calibrate(
     workers : int
         Search the images in that many processes. With more than one, the program that calls
         this must be safe to import (``if __name__ == "__main__":``).
+    priors : mapping or sequence of str
+        What is known of parameters: (value, sigma) in SI units or pixels, or text such as
+        ``420±0.1 mm``, by name or pattern; or texts that begin with ``NAME=``. These three
+        win over what ``dataset.yaml`` says.
+    fixed : sequence of str
+        Names or patterns of parameters left at nominal, or ``NAME=VALUE``.
+    free : sequence of str
+        Names or patterns of parameters to look for that are fixed otherwise (intrinsics,
+        twists), and of radii to look for without a prior.
 
     Returns
     -------
@@ -109,17 +125,20 @@ def calibrate(
     DidNotConverge
         If no solver reached its tolerance. Nothing is written in any of these cases.
     UsageError
-        If ``output`` holds something else.
+        If ``output`` holds something else, or ``priors``, ``fixed`` and ``free`` name what is no
+        parameter or contradict each other.
     """
     if output is not None:
         check_destination(output_path(output))
+    wishes = wishes_of_call(priors, fixed, free)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    choices = _choices(dataset, wishes)
     _refuse_other_legs(dataset.mechanism)
     left_open = check_identifiable(dataset)
     with worker_pool(workers) as run:
-        work = _workpiece(dataset, run, criteria, use_cache=use_cache)
+        work = _workpiece(dataset, run, criteria, choices, use_cache=use_cache)
         outlines, steps, solution = _observe_and_fit(work, progress)
-    notes = [*dataset.notes, *left_open, *_keep_outlines(work, outlines)]
+    notes = [*dataset.notes, *choices.notes, *left_open, *_keep_outlines(work, outlines)]
     calibration = judge(
         dataset,
         in_file_order(solution, work.order, dataset),
@@ -162,6 +181,7 @@ class _Workpiece:
     axes: LegAxes | None
     run: Run
     criteria: Criteria
+    choices: Choices
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -187,11 +207,21 @@ class _Workpiece:
         return forward_kinematics_many(self.mechanism, q)
 
 
-def _workpiece(dataset: Dataset, run: Run, criteria: Criteria, *, use_cache: bool) -> _Workpiece:
+def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
+    """Return what dataset and run choose of the parameters."""
+    views, axes_given = dataset.measurements.views, dataset.axes is not None
+    known = known_parameters(dataset.mechanism, views, axes_given=axes_given)
+    return resolve([*dataset.wishes, *wishes], known)
+
+
+def _workpiece(
+    dataset: Dataset, run: Run, criteria: Criteria, choices: Choices, *, use_cache: bool
+) -> _Workpiece:
     """Put a dataset into the order of work, and see which images are still to be searched."""
     names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, names)
-    current = fingerprint(dataset, detection_settings())
+    # Doubtful images are searched again near the fit, which depends on the choices.
+    current = fingerprint(dataset, detection_settings() | choices.document())
     plan = plan_dataset(dataset, current if use_cache else "")
     return _Workpiece(
         dataset=dataset,
@@ -203,6 +233,7 @@ def _workpiece(dataset: Dataset, run: Run, criteria: Criteria, *, use_cache: boo
         axes=None if dataset.axes is None else reorder_axes(dataset.axes, order),
         run=run,
         criteria=criteria,
+        choices=choices,
     )
 
 

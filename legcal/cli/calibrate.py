@@ -22,6 +22,9 @@ class Criteria(StrEnum):
     LITERAL = "literal"
 
 
+_PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
+
+
 def calibrate(
     dataset: Annotated[
         Path, typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
@@ -37,6 +40,31 @@ def calibrate(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Detect again, even where a cached detection fits.")
     ] = False,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE±SIGMA",
+            help="What is known already: leg1.length=0.4200±0.0001, or 420+-0.1mm.",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None,
+    fix: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[=VALUE]",
+            help="Leave as the model has it, or at a value.",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Look for what is fixed otherwise (camera, twists), and for radii without a "
+            "prior.",
+            rich_help_panel=_PARAMETERS,
+        ),
+    ] = None,
 ) -> None:
     """Compute the calibrated model from images and encoder readings."""
     from legcal.pipeline import calibrate as run
@@ -51,6 +79,9 @@ def calibrate(
             criteria=criteria.value,
             use_cache=not fresh,
             workers=min(processors(), MOST_WORKERS),
+            priors=prior or (),
+            fixed=fix or (),
+            free=free or (),
         )
     if as_json:
         print_json(result_document(calibration))
