@@ -43,8 +43,8 @@ def calibrate(
     prior: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=VALUE±SIGMA",
-            help="What is known already: leg1.length=0.4200±0.0001, or 420+-0.1mm.",
+            metavar="NAME=VALUE+-SIGMA",
+            help="What is known already: leg1.length=0.4200+-0.0001, or 420+-0.1mm.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
