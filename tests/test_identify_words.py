@@ -2,13 +2,8 @@
 
 import pytest
 
-from legcal.identify.words import (
-    describe_direction,
-    joined,
-    leg_labels,
-    legs_in_words,
-    views_in_words,
-)
+from legcal.identify.words import legs_in_words, views_in_words
+from legcal.mechanism.parameter_words import describe_direction, joined, leg_labels
 
 LEGS = ("leg1", "leg2", "leg3", "leg4")
 
@@ -30,6 +25,10 @@ LEGS = ("leg1", "leg2", "leg3", "leg4")
         ),
         (("leg1.base_axis.1", "leg1.base_axis.2"), "angles 1 and 2 of base axis of leg 1"),
         (("leg2.twist", "leg3.twist"), "twists of legs 2 and 3 together"),
+        (("leg2.radius.rod", "leg2.radius.tube"), "radius of leg 2"),
+        (("leg3.radius.rod", "c1.fx"), "radius of leg 3 and fx of camera c1 together"),
+        (("c1.fy", "c2.fx", "c1.fx"), "fx and fy of camera c1 and fx of camera c2 together"),
+        (("leg1.left.k1",), "k1 of camera leg1.left"),
         (
             ("leg1.offset", "leg1.base.x", "leg2.base.y", "leg3.base.z", "leg4.platform.x"),
             "offset of leg 1, x of base joint 1, y of base joint 2 and 2 more such changes "

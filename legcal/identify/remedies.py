@@ -17,7 +17,8 @@ from legcal.identify.ranks import Analysis, missing, scattered
 from legcal.identify.recommend import Recommendation
 from legcal.identify.session import Session
 from legcal.identify.weak import WeakDirection, undetermined
-from legcal.identify.words import joined, legs_in_words, views_in_words
+from legcal.identify.words import legs_in_words, views_in_words
+from legcal.mechanism.parameter_words import joined
 
 _MOST_OF_A_KIND = 2
 _MOST_TRIED = 8  # of a kind

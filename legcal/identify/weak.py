@@ -12,7 +12,7 @@ from legcal.geometry.types import Array, IntArray
 from legcal.identify.elimination import compress
 from legcal.identify.session import Session
 from legcal.identify.steps import LARGEST_SIGMA
-from legcal.identify.words import describe_direction
+from legcal.mechanism.parameter_words import describe_direction
 from legcal.mechanism.sensitivity import pose_sensitivity
 
 _ERROR = 1e-3  # [m], the largest component of a direction whose effect is told

@@ -10,7 +10,8 @@ from rich.text import Text
 
 from legcal.identify.analysis import Identifiability
 from legcal.identify.weak import Ranks, WeakDirection
-from legcal.identify.words import joined, leg_labels, legs_in_words, views_in_words
+from legcal.identify.words import legs_in_words, views_in_words
+from legcal.mechanism.parameter_words import joined, leg_labels
 
 _CONDITIONS = {
     "eq12": "base joints and axes (12)",

@@ -1,0 +1,95 @@
+"""Parameters and combinations of them in words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+_MOST_GROUPS = 4  # of joints in one direction
+_NOUN = {
+    "base": ("base joint", "base joints"),
+    "platform": ("platform joint", "platform joints"),
+    "offset": ("offset of leg", "offsets of legs"),
+    "length": ("length of leg", "lengths of legs"),
+    "base_axis": ("base axis of leg", "base axes of legs"),
+    "platform_axis": ("platform axis of leg", "platform axes of legs"),
+    "twist": ("twist of leg", "twists of legs"),
+    "radius": ("radius of leg", "radii of legs"),
+    "": ("camera", "cameras"),
+}
+
+
+def joined(words: Sequence[str]) -> str:
+    """Return words as a list in a sentence."""
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
+    """Return what to call each leg after the word leg: its number where its name is one."""
+    numbers = [re.fullmatch(r"[Ll]eg[_-]?(\d+)", name) for name in leg_names]
+    labels = {
+        name: match.group(1) if match else name
+        for name, match in zip(leg_names, numbers, strict=True)
+    }
+    return labels if len(set(labels.values())) == len(labels) else {name: name for name in labels}
+
+
+def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
+    """Return a combination of parameters in words.
+
+    Parameters
+    ----------
+    parameters : sequence of str
+        Names of the parameters that change.
+    leg_names : sequence of str
+        All legs.
+
+    Returns
+    -------
+    str
+        ``z of platform joints 2 and 4 together``, ``offset of leg 3``, ``fx of camera c1``.
+    """
+    coordinates: dict[tuple[str, str], list[str]] = {}
+    for name in parameters:
+        owner, kind, which = _split(name, leg_names)
+        coordinates.setdefault((kind, owner), []).append(which)
+    groups: dict[tuple[str, str], list[str]] = {}
+    for (kind, owner), found in coordinates.items():
+        axes = joined(sorted(found))
+        if kind == "radius":  # a tube and a rod of one leg
+            axes = ""
+        elif kind.endswith("_axis"):
+            axes = f"angle{'s' * (len(found) > 1)} {axes}"
+        groups.setdefault((kind, axes), []).append(owner)
+    phrases = []
+    for (kind, axes), owners in groups.items():
+        noun = _NOUN[kind][len(owners) > 1]
+        ordered = _labelled(owners, leg_names)
+        phrases.append(f"{axes + ' of ' if axes else ''}{noun} {joined(ordered)}")
+    if len(phrases) > _MOST_GROUPS:
+        more = len(phrases) - _MOST_GROUPS + 1
+        phrases = [*phrases[: _MOST_GROUPS - 1], f"{more} more such changes"]
+    together = " together" if len(coordinates) > 1 else ""
+    return f"{joined(phrases)}{together}"
+
+
+def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
+    """Return what to call legs, in their order, or cameras."""
+    labels = leg_labels(leg_names)
+    legs = [labels[name] for name in leg_names if name in owners]
+    return [*legs, *(owner for owner in owners if owner not in leg_names)]
+
+
+def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
+    """Return leg, kind and coordinate of a parameter, or view, nothing and coordinate.
+
+    Names of legs may contain dots.
+    """
+    leg = max((n for n in leg_names if name.startswith(f"{n}.")), key=len, default="")
+    kind, _, which = name[len(leg) + 1 :].partition(".")
+    if leg and kind in _NOUN:
+        return leg, kind, which
+    view, _, which = name.rpartition(".")
+    return view, "", which
