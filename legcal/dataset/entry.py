@@ -5,9 +5,10 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from legcal.dataset.wishes import Stated, Wish, read_prior, read_wish
+from legcal.dataset.wishes import Wish, read_wish
 from legcal.files.motion import MotionEntry
 from legcal.files.schema import FileSchema, Name, Number, Version
+from legcal.files.stated import Stated, read_prior
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
 

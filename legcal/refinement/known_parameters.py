@@ -167,6 +167,10 @@ def _no_parameters(mechanism: Mechanism) -> dict[str, str]:
                     if is_zero
                     else "a coordinate on which nothing depends"
                 )
+        angles = ("base_axis.1", "base_axis.2", "platform_axis.1", "platform_axis.2", "twist")
+        names = [f"{leg.name}.{angle}" for angle in angles]
+        reason = f"an angle that is no parameter of a leg of type {leg.type} in this machine"
+        others |= {name: reason for name in names if name not in known}
         others |= _other_lengths(leg)
     return others
 
