@@ -62,7 +62,7 @@ def test_the_true_model_foretells_images_to_their_noise(name: str) -> None:
     assert found.wrong <= 1
     assert set(found.rms_px_of_view) == {"c1", "c2", "c3"}
     # What is left at the platform is the noise of the outlines alone.
-    assert len(found.displacement) >= 10
+    assert len(found.displacement) >= 7
     squares = (found.displacement / found.expected_displacement) ** 2
     assert 0.4 < squares.mean() < 1.8
     assert 0.2 < np.mean((found.rotation / found.expected_rotation) ** 2) < 1.8
@@ -75,9 +75,9 @@ def test_a_wrong_model_does_not(name: str) -> None:
     legs = (replace(first, B=first.B + np.array([1e-3, -1e-3, 0.0])), *truth.model.legs[1:])
     found = _compared(truth, replace(truth.model, legs=legs), truth.outlines)
     at_platform = found.at_platform
-    assert found.wrong > 20
+    assert found.wrong > 10
     assert at_platform is not None
-    assert at_platform.displacement > 1.5 * at_platform.expected_displacement
+    assert at_platform.displacement > 2.0 * at_platform.expected_displacement
 
 
 @pytest.mark.parametrize("name", MACHINES)
@@ -91,8 +91,8 @@ def test_poses_by_outlines_do_not_depend_on_where_they_are_looked_for(name: str)
         poses_by_outlines(truth.model, foretold, whitening, poses, 4.5)
         for poses in (truth.poses, [away * T for T in truth.poses])
     )
-    assert near.known.sum() >= 10
-    for k in np.flatnonzero(near.known):
+    assert near.known.sum() >= 7
+    for k in np.flatnonzero(near.known & far.known):
         apart = near.T_Rb_Re[k].inv() * far.T_Rb_Re[k]
         sigma = np.sqrt(np.trace(near.covariance[k, 3:, 3:]))
         assert np.linalg.norm(apart.translation) < 1e-2 * sigma

@@ -5,8 +5,9 @@ Where legs have R or U joints or constant lengths, the poses keep what these dem
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -22,7 +23,8 @@ _STEP = 1e-6  # [rad, m] of the differences
 _EXACT = 1e-7  # [m]: what the mechanism itself demands
 _ROBUST_STEPS, _STEPS = 10, 5
 _WIDTH = 3.0  # whitened distance at which an outline starts to count less
-_KNOWN = 0.1  # of a leg's length: a pose known worse is none
+_KNOWN = 0.03  # [rad], or of a leg's length: a pose known worse is none
+_FURTHEST = 0.1  # [rad], or of a leg's length, in one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,28 +70,67 @@ def poses_by_outlines(
         Whitened distance beyond which an outline does not count.
     """
     R, t = arrays(T_Rb_Re)
-    normal = np.zeros((len(t), 6, 6))
+    length = _mean_length(model.legs, T_Rb_Re)
+    everything, _ = _normal(model, foretold, whitening, R, t, np.ones_like)
+    known = _is_known(everything, model.frame_legs, length)
     for step in range(_ROBUST_STEPS + _STEPS):
-        r, J = _linearized(foretold, whitening, R, t)
-        norm = np.linalg.norm(r, axis=1)
-        weight = 1.0 / (1.0 + (norm / _WIDTH) ** 2)
-        if step >= _ROBUST_STEPS:
-            weight = np.where(norm < rejection, 1.0, 0.0)
-        normal, gradient = _demands(model.legs, R, t)
-        np.add.at(normal, foretold.pose, weight[:, None, None] * (J.swapaxes(1, 2) @ J))
-        np.add.at(gradient, foretold.pose, weight[:, None] * np.einsum("nri,nr->ni", J, r))
+        weight_of = _soft if step < _ROBUST_STEPS else partial(_hard, rejection)
+        normal, gradient = _normal(model, foretold, whitening, R, t, weight_of)
         change = -np.einsum("kij,kj->ki", _inverse(normal, model.frame_legs), gradient)
+        change[~known] = 0.0
+        reach = np.linalg.norm(change * np.repeat([1.0, 1.0 / length], 3), axis=1, keepdims=True)
+        change *= np.minimum(1.0, _FURTHEST / np.maximum(reach, 1e-300))
         R = Rotation.from_rotvec(change[:, :3]).as_matrix() @ R
         t = t + change[:, 3:]
+    known &= _is_known(normal, model.frame_legs, length)
     covariance = _inverse(normal, model.frame_legs)
-    length = np.mean(
-        [np.linalg.norm(T.apply(leg.B) - leg.A) for T in T_Rb_Re for leg in model.legs]
-    )
-    spread = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
-    turn = np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2))
-    known = (spread < _KNOWN * length) & (turn < _KNOWN) & _has_rank(normal, model.frame_legs)
     together = RigidTransform.from_components(t, Rotation.from_matrix(R))
     return ShownPoses(tuple(together[k] for k in range(len(t))), covariance, known)
+
+
+def _soft(norm: Array) -> Array:
+    """Return weights that fall with the whitened distance."""
+    return np.asarray(1.0 / (1.0 + (norm / _WIDTH) ** 2))
+
+
+def _hard(rejection: float, norm: Array) -> Array:
+    """Return weights that are one up to a whitened distance."""
+    return np.where(norm < rejection, 1.0, 0.0)
+
+
+def _mean_length(legs: Sequence[LegGeometry], T_Rb_Re: Sequence[RigidTransform]) -> float:
+    """Return the mean length of the legs at poses [m]."""
+    A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
+    return float(np.mean([np.linalg.norm(T.apply(B) - A, axis=1) for T in T_Rb_Re]))
+
+
+def _normal(
+    model: FittedModel,
+    foretold: ForetoldOutlines,
+    whitening: Array,
+    R: Array,
+    t: Array,
+    weight_of: Callable[[Array], Array],
+) -> tuple[Array, Array]:
+    """Return normal matrix and gradient of each pose, outlines weighted by their distance."""
+    r, J = _linearized(foretold, whitening, R, t)
+    weight = weight_of(np.linalg.norm(r, axis=1))
+    normal, gradient = _demands(model.legs, R, t)
+    np.add.at(normal, foretold.pose, weight[:, None, None] * (J.swapaxes(1, 2) @ J))
+    np.add.at(gradient, foretold.pose, weight[:, None] * np.einsum("nri,nr->ni", J, r))
+    return normal, gradient
+
+
+def _is_known(normal: Array, frame_legs: Sequence[int], length: float) -> BoolArray:
+    """Return which poses are determined well enough to mean anything."""
+    covariance = _inverse(normal, frame_legs)
+    columns = np.ix_(range(len(normal)), freedoms(frame_legs), freedoms(frame_legs))
+    has_rank = np.linalg.eigvalsh(normal[columns])[:, 0] > 1.0  # better than a metre or radian
+    turn, shift = (
+        np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    return np.asarray(has_rank & (shift < _KNOWN * length) & (turn < _KNOWN))
 
 
 def _linearized(
@@ -130,9 +171,3 @@ def _inverse(normal: Array, frame_legs: Sequence[int]) -> Array:
     inverse = np.zeros_like(normal)
     inverse[columns] = np.linalg.pinv(normal[columns], rcond=1e-15, hermitian=True)
     return inverse
-
-
-def _has_rank(normal: Array, frame_legs: Sequence[int]) -> BoolArray:
-    """Return which normal matrices determine all freedoms of the platform."""
-    columns = np.ix_(range(len(normal)), freedoms(frame_legs), freedoms(frame_legs))
-    return np.asarray(np.linalg.eigvalsh(normal[columns])[:, 0] > 1.0)  # [m, rad]: no worse
