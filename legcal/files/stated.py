@@ -61,7 +61,7 @@ def read_prior(value: object) -> Stated:
             f"found {describe(value)}, needed a value and its sigma; write it like {EXAMPLE}."
         )
     try:
-        return _checked(Stated(float(value[0]), float(value[1])))
+        return _prior(float(value[0]), float(value[1]))
     except OverflowError as error:
         raise ValueError(
             "found a number beyond 1e308, needed a value and its sigma; correct it."
@@ -82,15 +82,13 @@ def _read_prior_text(text: str) -> Stated:
             f"found {describe(text.strip())}, needed the unit of sigma too; write it at "
             f"the end, like {EXAMPLE}."
         )
-    by_value, by_sigma = (
-        read_value(value + (unit or unit_of_sigma)),
-        read_value(sigma + unit_of_sigma),
-    )
-    if by_value.dimension != by_sigma.dimension:
+    mean = read_value(value + (unit or unit_of_sigma))
+    spread = read_value(sigma + unit_of_sigma)
+    if mean.dimension != spread.dimension:
         raise ValueError(
             f"found {describe(text.strip())}, needed units of one kind; write both in one unit."
         )
-    return _checked(Stated(by_value.value, by_sigma.value, by_value.dimension))
+    return _prior(mean.value, spread.value, mean.dimension)
 
 
 def read_value(text: str) -> Stated:
@@ -117,12 +115,11 @@ def _in_si(number: float, unit: str) -> float:
     return number / per_one if math.isclose(per_one * size, 1.0, rel_tol=1e-12) else number * size
 
 
-def _checked(stated: Stated) -> Stated:
+def _prior(value: float, sigma: float, dimension: str = "") -> Stated:
     """Return a prior if its numbers make one."""
-    sigma = stated.sigma
-    if not math.isfinite(stated.value):
-        raise ValueError(f"found the value {stated.value:g}, needed a finite one; correct it.")
-    if sigma is None or not math.isfinite(sigma) or sigma <= 0.0:
+    if not math.isfinite(value):
+        raise ValueError(f"found the value {value:g}, needed a finite one; correct it.")
+    if not math.isfinite(sigma) or sigma <= 0.0:
         raise ValueError(
             f"found the sigma {sigma:g}, needed a finite one above zero; give one standard "
             "deviation, or fix the parameter."
@@ -132,7 +129,7 @@ def _checked(stated: Stated) -> Stated:
             f"found the sigma {sigma:g}, needed at least {SMALLEST_SIGMA:g}; fix the parameter at "
             "the value instead."
         )
-    return stated
+    return Stated(value, sigma, dimension)
 
 
 def _is_number(value: object) -> bool:
