@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from legcal.geometry.types import Array
 from legcal.identify.conditions import (
     Condition,
     count_conditions,
     three_legs_at_once,
     two_directions,
 )
+from legcal.identify.known import known_rows
 from legcal.identify.planned import THIN, planned_session
 from legcal.identify.ranks import Analysis, StepRank
 from legcal.identify.recommend import Recommendation, recommend
@@ -24,6 +26,7 @@ from legcal.mechanism.home_travel import NEAR, legs_outside
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.notes import singular_note
 from legcal.mechanism.parametrization import geometries
+from legcal.refinement.choices import NO_CHOICES, Choices
 
 if TYPE_CHECKING:
     from legcal.dataset.folder import Dataset
@@ -155,13 +158,15 @@ def identifiability(
     return _judge(mechanism, session, recommendation, replanning)
 
 
-def identifiability_of_dataset(dataset: Dataset) -> Identifiability:
+def identifiability_of_dataset(dataset: Dataset, choices: Choices = NO_CHOICES) -> Identifiability:
     """Judge what a dataset can tell: its readings, its cameras and the legs of its views.
 
     Parameters
     ----------
     dataset : Dataset
         Nothing is detected: every view is taken to show the legs that it names, or all.
+    choices : Choices
+        Parameters that are fixed or known from elsewhere, and twists that are looked for.
 
     Raises
     ------
@@ -170,7 +175,9 @@ def identifiability_of_dataset(dataset: Dataset) -> Identifiability:
     """
     from legcal.identify.recorded import recorded_session
 
-    report = _judge(dataset.mechanism, recorded_session(dataset), None, None)
+    twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
+    session = recorded_session(dataset, twists=twists)
+    report = _judge(dataset.mechanism, session, None, None, known_rows(session, choices))
     if dataset.mechanism.is_determined:
         return report
     note = "The readings do not give the poses of the images: random ones stand for them."
@@ -182,9 +189,10 @@ def _judge(
     session: Session,
     recommendation: tuple[Recommendation, ...] | None,
     replanning: Replanning | None,
+    known: Array | None = None,
 ) -> Identifiability:
     """Return the report on a session."""
-    analysis = Analysis(session)
+    analysis = Analysis(session, known=known)
     conditions = conditions_of(mechanism, session)
     staged, full = analysis.staged, analysis.full
     enough = staged.complete and full.complete

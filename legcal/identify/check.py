@@ -6,9 +6,10 @@ from legcal.dataset.folder import Dataset
 from legcal.errors import NotIdentifiable
 from legcal.identify.analysis import Identifiability, identifiability_of_dataset
 from legcal.identify.weak import Ranks
+from legcal.refinement.choices import NO_CHOICES, Choices
 
 
-def check_identifiable(dataset: Dataset) -> tuple[str, ...]:
+def check_identifiable(dataset: Dataset, choices: Choices = NO_CHOICES) -> tuple[str, ...]:
     """Return what a dataset leaves open that does no harm, one sentence each.
 
     Parameters
@@ -16,13 +17,15 @@ def check_identifiable(dataset: Dataset) -> tuple[str, ...]:
     dataset : Dataset
         Its views are taken to show the legs that they name, or all: what even then stays open
         cannot be found.
+    choices : Choices
+        Parameters that are fixed or known from elsewhere: they are no longer open.
 
     Raises
     ------
     NotIdentifiable
         If a direction that moves the platform is not determined by everything at once.
     """
-    report = identifiability_of_dataset(dataset)
+    report = identifiability_of_dataset(dataset, choices)
     if not report.identifiable:
         raise NotIdentifiable(_refusal(dataset, report))
     notes = []
@@ -47,7 +50,7 @@ def _refusal(dataset: Dataset, report: Identifiability) -> str:
         f"{dataset.folder}: the parameters cannot be identified: found that these views and poses "
         f"determine {report.full.rank} of {report.full.of} at best and leave open "
         f"{_directions(report.full, harmless=False)}, needed everything that moves the platform; "
-        f"{remedy}."
+        f"{remedy}, or state what is known of them with --prior."
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from legcal.geometry.types import Array, IntArray
 from legcal.identify import literal, steps
+from legcal.identify.elimination import compress
 from legcal.identify.full import WhitenedDemands, demands_of, image_rows, information
 from legcal.identify.session import Session
 from legcal.identify.weak import (
@@ -51,14 +52,17 @@ class Analysis:
         The session.
     common_cameras : bool
         Whether a calibration board on the base ties the cameras to each other.
+    known : (m, p) array or None
+        What is known of the parameters without looking, as whitened rows [1/m].
     """
 
     session: Session
     common_cameras: bool = False
+    known: Array | None = None
 
     def elsewhere(self, session: Session, poses: IntArray) -> Analysis:
         """Return the analysis of other images of the same machine, at some of the same poses."""
-        other = Analysis(session, self.common_cameras)
+        other = Analysis(session, self.common_cameras, self.known)
         other.__dict__.update(motion=self.motion, demands=self.demands.at(poses))
         return other
 
@@ -104,9 +108,10 @@ class Analysis:
     @cached_property
     def information(self) -> Array:
         """Everything at once, (p, p)."""
-        return information(
+        found = information(
             self.session, self.images, self.demands, common_cameras=self.common_cameras
         )
+        return found if self.known is None else compress(np.concatenate([found, self.known]))
 
     @cached_property
     def motion(self) -> PlatformMotion:

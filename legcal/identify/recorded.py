@@ -14,7 +14,7 @@ from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.parametrization import parametrization_of
 
 
-def recorded_session(dataset: Dataset) -> Session:
+def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
     """Return the session of a dataset.
 
     Where readings do not give its poses, random ones inside the travel take their place.
@@ -24,6 +24,8 @@ def recorded_session(dataset: Dataset) -> Session:
     dataset : Dataset
         A view is taken to show the legs that have axes in it; without a table of axes those
         that it names, or all.
+    twists : bool
+        Count the twists of legs among the parameters.
 
     Raises
     ------
@@ -41,7 +43,7 @@ def recorded_session(dataset: Dataset) -> Session:
     else:
         travel = travel_of(mechanism)
         R, t = random_poses(legs, mechanism.frame_legs, home, travel, m.n_poses, rng)
-    parametrization = parametrization_of(mechanism)
+    parametrization = parametrization_of(mechanism, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
         more = random_poses(
