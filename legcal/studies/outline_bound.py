@@ -19,7 +19,6 @@ from legcal.geometry.types import Array, IntArray
 from legcal.identify.elimination import compress, eliminate
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.leg_steps import moved_legs
-from legcal.mechanism.parameters import radius_name
 from legcal.mechanism.sensitivity import freedoms, pose_equations
 from legcal.simulation.silhouette import silhouette
 from legcal.studies.closed_poses import moved_poses
@@ -77,9 +76,8 @@ def bound_of(design: OutlineDesign, sigma_q: float, radius_sigma: float) -> Boun
     known[:, n_cameras + n_parameters :] = np.diag(1.0 / (radius_sigma * radius))
     rows.append(known)
     left = compress(eliminate(np.concatenate(rows)[None], n_cameras))
-    names = (*parametrization.names, *(radius_name(design.leg_names[j], p) for j, p in parts))
     units = (*parametrization.units, *("m" for _ in parts))
-    return Bound(names, units, _inverse(left, names))
+    return Bound(design.names, units, _inverse(left, design.names))
 
 
 def _rows_of_poses(design: OutlineDesign, sigma_q: float) -> list[Array]:

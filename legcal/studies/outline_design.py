@@ -18,6 +18,7 @@ from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parameters import radius_name
 from legcal.mechanism.parametrization import Parametrization, geometries, parametrize
 from legcal.mechanism.platform import platform_in_base
 from legcal.observations.outlines import Outlines
@@ -89,6 +90,12 @@ class OutlineDesign:
     def parametrization(self) -> Parametrization:
         """The kinematic parameters."""
         return parametrize(self.leg_names, self.legs, self.frame_legs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what is to be found: the kinematic parameters, then the radii observed."""
+        radii = (radius_name(self.leg_names[leg], part) for leg, part in self.parts)
+        return (*self.parametrization.names, *radii)
 
     @property
     def parts(self) -> tuple[tuple[int, str], ...]:
