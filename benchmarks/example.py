@@ -13,6 +13,7 @@ import numpy as np
 
 from legcal import calibrate, load_dataset, load_mechanism
 from legcal.calibration import Calibration
+from legcal.mechanism.leg_geometry import point_like_legs
 from legcal.mechanism.parameters import KinematicParameters, to_vector
 from legcal.mechanism.platform import pose_differences
 from legcal.observations.leg_axes import axes_from_outlines
@@ -31,7 +32,11 @@ def platform_error(
     first_row = np.unique(measurements.pose, return_index=True)[1]
     driven = mechanism.sign * measurements.q[first_row]
     near = calibration.solution.T_Rb_Re
-    poses, true_poses = (platform_poses(p, driven + p.offsets, near) for p in (parameters, truth))
+    frame_legs = mechanism.frame_legs
+    poses, true_poses = (
+        platform_poses(point_like_legs(p), driven + p.offsets, near, frame_legs)
+        for p in (parameters, truth)
+    )
     displacement, rotation = pose_differences(poses, true_poses)
     return float(displacement.mean()), float(rotation.mean())
 

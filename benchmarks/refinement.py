@@ -19,11 +19,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from axes_session import axes_session
 from hexapod_session import disturbed_start, noisy_outlines, noisy_readings, simulate
+from legcal.refinement.repeated import average_images, bound, build_axes_fit, solve_again
+from legcal.refinement.solve import polish, solve
 
 from legcal.refinement import build_fit, refine
 from legcal.refinement.noise import NoiseModel
-from legcal.refinement.repeated import average_images, bound, build_axes_fit, solve_again
-from legcal.refinement.solve import polish, solve
 
 REPEATS = 5
 

@@ -62,7 +62,7 @@ from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.resolution import resolve
 from legcal.refinement.solution import Solution
-from legcal.refinement.start import Start, start_from
+from legcal.refinement.start import Start, start_from, with_joints
 from legcal.report.destination import check_destination, output_path
 from legcal.report.result import write_result
 from legcal.stages.nominal import Criteria
@@ -198,7 +198,7 @@ class _Workpiece:
     @cached_property
     def fitted_legs(self) -> FittedLegs:
         """The legs as the fit sees them."""
-        return fitted_legs(self.mechanism.legs, self.mechanism.frame_legs)
+        return fitted_legs(self.mechanism)
 
     @cached_property
     def nominal_poses(self) -> list[RigidTransform]:
@@ -281,7 +281,7 @@ def _steps_and_fit(
     progress("Fit of everything", 0, 1)
     starts = _starts(work, outlines, scene, steps)
     solution = refine_from_best(
-        work.fitted_legs, work.measurements, outlines, starts, axes=work.axes
+        work.fitted_legs, work.measurements, outlines, starts, axes=work.axes, choices=work.choices
     )
     progress("Fit of everything", 1, 1)
     return steps, solution
@@ -307,12 +307,14 @@ def _starts(work: _Workpiece, outlines: Outlines, scene: Scene, steps: Steps) ->
     rough = [None if T is None else T.inv() * T_base_Rb for T in scene.T_base_camera]
     staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
     nominal_cameras = _cameras(work, outlines, rough, staged, steps)
-    starts = [(work.mechanism.parameters, nominal_cameras, "nominal")]
+    nominal = work.fitted_legs.nominal
+    starts = [(nominal, nominal_cameras, "nominal")]
     if steps.parameters is not None:
-        starts.append((steps.parameters, _cameras(work, outlines, staged, rough, steps), "staged"))
+        found = with_joints(nominal, steps.parameters)
+        starts.append((found, _cameras(work, outlines, staged, rough, steps), "staged"))
     return [
-        start_from(parameters, work.measurements, work.fitted_legs, cameras, platform, label)
-        for parameters, cameras, label in starts
+        start_from(legs, work.measurements, work.fitted_legs, cameras, platform, label)
+        for legs, cameras, label in starts
     ]
 
 

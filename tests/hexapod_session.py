@@ -6,6 +6,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, IntArray
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parameters import (
     KinematicParameters,
     free_coordinates,
@@ -96,10 +98,19 @@ def simulate(
         nearest = np.sort(np.argsort(ends_of_legs[0][:, 2])[:legs_seen])
         blocks.append((row, nearest, ends_of_legs[0][nearest], ends_of_legs[1][nearest]))
     outlines = _outlines(blocks, camera, radius, sigma_px)
-    legs = FittedLegs(
-        names, np.ones(6, dtype=np.intp), FRAME_LEGS, {(i, "rod"): RADIUS for i in range(6)}
-    )
+    radii = {(i, "rod"): RADIUS for i in range(6)}
+    sign = np.ones(6, dtype=np.intp)
+    legs = FittedLegs(names, geometry_of(TRUTH), sign, FRAME_LEGS, radii)
     return Session(legs, measurements, outlines, TRUTH, T_cameras, tuple(poses))
+
+
+def geometry_of(parameters: KinematicParameters) -> tuple[LegGeometry, ...]:
+    """Return legs with point-like joints."""
+    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
+    return tuple(
+        LegGeometry("S", "S", LegKind.ACTUATED, A, B, float(q0))
+        for (A, B), q0 in zip(joints, parameters.offsets, strict=True)
+    )
 
 
 def moved_outlines(outlines: Outlines, camera: Camera, offsets_px: Array) -> Outlines:
@@ -143,7 +154,7 @@ def disturbed_start(
     xi = to_vector(session.truth, FRAME_LEGS)
     xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
     return Start(
-        from_vector(xi, 6, FRAME_LEGS),
+        geometry_of(from_vector(xi, 6, FRAME_LEGS)),
         tuple(_shaken(T, camera, angle, rng) for T in session.T_camera_Rb),
         tuple(_shaken(T, camera, angle, rng) for T in session.T_Rb_Re),
         "nominal",

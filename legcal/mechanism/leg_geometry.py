@@ -7,8 +7,11 @@ to the platform in any frame of the platform.
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import JointLetter, Leg, LegKind, PlatformLetter
+from legcal.mechanism.parameters import KinematicParameters
 
 N_LOCAL = 12  # A, B, length, base axis 1 and 2, platform axis 1 and 2, twist
 
@@ -81,4 +84,14 @@ def geometry_of(leg: Leg) -> LegGeometry:
         leg.base_axis,
         leg.platform_axis,
         leg.twist,
+    )
+
+
+def point_like_legs(parameters: KinematicParameters) -> tuple[LegGeometry, ...]:
+    """Return actuated legs with point-like joints; those without an offset are passive."""
+    kinds = [LegKind.PASSIVE if np.isnan(q0) else LegKind.ACTUATED for q0 in parameters.offsets]
+    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
+    return tuple(
+        LegGeometry("S", "S", kind, A, B, float(q0))
+        for (A, B), kind, q0 in zip(joints, kinds, parameters.offsets, strict=True)
     )

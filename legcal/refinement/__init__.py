@@ -1,8 +1,9 @@
 """Beyond the paper: one fit of everything at once, in the image."""
 
+from legcal.refinement.build import build_fit
 from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.platform_error import PlatformError, predict_platform_error
-from legcal.refinement.refine import build_fit, refine, refine_from_best
+from legcal.refinement.refine import refine, refine_from_best, solve_fit
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, cameras_from_hints, platform_poses, start_from
@@ -21,5 +22,6 @@ __all__ = [
     "predict_platform_error",
     "refine",
     "refine_from_best",
+    "solve_fit",
     "start_from",
 ]

@@ -2,67 +2,88 @@
 
 import dataclasses
 
-import casadi as ca
 import numpy as np
 
+from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.parameters import radius_name
 from legcal.observations.outlines import Outlines
-from legcal.refinement.covariance import uncertainty
-from legcal.refinement.inputs import inputs_of
-from legcal.refinement.legs import FittedLegs
+from legcal.refinement.covariance import named_covariance, worst_directions
+from legcal.refinement.determinacy import Held, named_units
+from legcal.refinement.linearize import Linearization, linearize, offsets_of
 from legcal.refinement.loss import width_to_k
+from legcal.refinement.minimise import robust_cost
 from legcal.refinement.noise import NoiseModel
-from legcal.refinement.normal import Linearization, information, linearize
+from legcal.refinement.normal import NormalEquations, information
+from legcal.refinement.priors import named_values
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.rounds import Fit, offsets_of
+from legcal.refinement.rounds import Fit
 from legcal.refinement.settings import RefinementSettings
-from legcal.refinement.shared_errors import shared_errors
-from legcal.refinement.solution import Solution
+from legcal.refinement.solution import Solution, Status
 from legcal.refinement.state import State
 
-_SIGNIFICANT = 5.0  # standard deviations of chi2
+_SIGNIFICANT = 5.0  # standard deviations of chi2, or between a prior and the measurements
+_INDEPENDENT = 1e-9  # of a prior's variance: what the measurements must take off it to be asked
 
 
 def assemble_solution(
     problem: FitProblem,
     fit: Fit,
-    legs: FittedLegs,
+    held: Held,
     outlines: Outlines,
     label: str,
     settings: RefinementSettings,
 ) -> Solution:
-    """Put together what was found."""
-    names = estimated_names(problem, legs)
-    claimed, k = problem.outlines.covariance, width_to_k(settings.loss_width)
-    whitening = fit.noise.whitening(claimed, fit.accepted)
-    linear = linearize(problem, fit.state, whitening)
-    normal = information(problem, linear, k)
-    shared = shared_errors(problem, linear, normal, whitening)
-    known = uncertainty(problem, normal, names, machine_size(fit.state), shared.covariance)
-    offsets = offsets_of(problem, fit.state)
+    """Put together what was found.
+
+    Raises
+    ------
+    NotIdentifiable
+        If the outlines that are left do not determine the parameters.
+    DidNotConverge
+        If a stated prior contradicts the measurements.
+    """
+    state, k = fit.state, width_to_k(settings.loss_width)
+    linear = fit.minimum.linear
+    normal = information(problem, state, linear, k)
+    covariance = named_covariance(problem, state, normal)
+    _refuse_contradicted_priors(problem, state, covariance)
+    values, status = _values(problem, state), _status(problem, held)
+    names = tuple(name for name in values if status[name] == "estimated")
+    where = [problem.named.index(name) for name in names]
+    estimated = covariance[np.ix_(where, where)]
+    offsets = offsets_of(problem, state)
     used = offsets[fit.accepted]
-    n_residuals = used.size + len(problem.readings) + len(problem.radius_prior.mean)
-    n_residuals += linear.axis_r.size
-    parts = problem.layout.parts
-    chi2, dof = _chi2(linear), n_residuals - problem.layout.size
+    n_residuals = used.size + len(problem.readings) + len(problem.priors) + linear.axes.r.size
+    chi2, dof = _chi2(linear), n_residuals - problem.n_unknowns + len(held.basis)
+    units = dict(zip(problem.named, problem.named_units, strict=True))
+    units |= dict(
+        zip(problem.legs.parametrization.names, problem.legs.parametrization.units, strict=True)
+    )
     return Solution(
-        parameters=fit.state.parameters,
-        T_camera_Rb=fit.state.T_camera_Rb,
-        T_Rb_Re=fit.state.T_Rb_Re,
-        radii=dict(zip(parts, fit.state.radii.tolist(), strict=True)),
-        names=(*names, *(radius_name(legs.names[leg], part) for leg, part in parts)),
-        covariance=known.covariance,
-        sigma=np.sqrt(np.diagonal(known.covariance)),
-        weak=known.weak,
-        cost=comparable_cost(problem, fit.state, settings),
+        legs=state.legs,
+        T_camera_Rb=state.T_camera_Rb,
+        cameras=state.cameras,
+        T_Rb_Re=state.T_Rb_Re,
+        radii=dict(zip(problem.layout.parts, state.radii.tolist(), strict=True)),
+        parametrization=problem.legs.parametrization,
+        values=values,
+        units={name: units.get(name, "m") for name in values},
+        status=status,
+        names=names,
+        covariance=estimated,
+        sigma=np.sqrt(np.diagonal(estimated)),
+        kinematic_covariance=_of_kinematic(problem, normal),
+        weak=worst_directions(estimated, names, named_units(problem, state)[where]),
+        held=held.directions,
+        cost=comparable_cost(problem, state, settings),
         chi2=chi2,
         dof=dof,
         rms_px=float(np.sqrt(np.mean(used**2))) if used.size else None,
-        rms_axes=float(np.sqrt(np.mean(linear.axis_r**2))) if linear.axis_r.size else None,
+        rms_axes=float(np.sqrt(np.mean(linear.axes.r**2))) if linear.axes.r.size else None,
         noise=fit.noise,
-        shared_bias_px=shared.bias_px,
-        shared_tilt_px=shared.tilt_px,
+        biases=_biases(problem, state),
+        sensitivities=(),
         outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
@@ -70,13 +91,51 @@ def assemble_solution(
     )
 
 
-def machine_size(state: State) -> float:
-    """Return the largest joint coordinate [m]."""
-    return float(max(np.abs(state.base_joints).max(), np.abs(state.platform_joints).max()))
+def comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:
+    """Return the robust cost of all observations with their claimed covariances."""
+    whitening = NoiseModel().whitening(problem.outlines.covariance)
+    return robust_cost(linearize(problem, state, whitening), width_to_k(settings.loss_width))
+
+
+def _values(problem: FitProblem, state: State) -> dict[str, float]:
+    """Return the values of all parameters: kinematic, radii, and intrinsics that are unknown."""
+    legs, layout = problem.legs, problem.layout
+    names = (radius_name(legs.names[leg], part) for leg, part in layout.parts)
+    values = dict(
+        zip(legs.parametrization.names, legs.vector(state.legs).tolist(), strict=True)
+    ) | dict(zip(names, state.radii.tolist(), strict=True))
+    named = zip(problem.named, named_values(state, layout, legs).tolist(), strict=True)
+    biases = {problem.named[i] for i in layout.bias}
+    return values | {name: value for name, value in named if name not in biases}
+
+
+def _status(problem: FitProblem, held: Held) -> dict[str, Status]:
+    """Return the status of every parameter."""
+    legs = problem.legs
+    names = [radius_name(legs.names[leg], part) for leg, part in problem.layout.parts]
+    biases = {problem.named[i] for i in problem.layout.bias}
+    status: dict[str, Status] = dict.fromkeys((*legs.parametrization.names, *names), "fixed")
+    status |= {name: "estimated" for name in problem.named if name not in biases}
+    return status | dict.fromkeys(held.names, "weak")
+
+
+def _of_kinematic(problem: FitProblem, normal: NormalEquations) -> Array:
+    """Return the covariance of steps of all kinematic parameters, fixed ones too."""
+    position = problem.layout.kinematic
+    free = position < problem.layout.size
+    wide = np.zeros((len(position), len(position)))
+    n = problem.layout.n_kinematic
+    wide[np.ix_(free, free)] = normal.kept_covariance()[:n, :n]
+    return wide
+
+
+def _biases(problem: FitProblem, state: State) -> dict[str, float]:
+    names = [problem.named[i] for i in problem.layout.bias]
+    return dict(zip(names, state.biases.tolist(), strict=True))
 
 
 def _chi2(linear: Linearization) -> float:
-    parts = (linear.outline_r, linear.encoder_r, linear.prior_r, linear.axis_r)
+    parts = (linear.outlines.r, linear.readings.r, linear.prior_r, linear.axes.r)
     return float(sum(np.sum(part**2) for part in parts))
 
 
@@ -91,12 +150,33 @@ def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
     )
 
 
-def comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:
-    """Return the robust cost of all observations with their claimed covariances."""
-    whitening = NoiseModel().whitening(problem.outlines.covariance)
-    inputs = inputs_of(problem, state, whitening, width_to_k(settings.loss_width))
-    zero = ca.DM.zeros(problem.layout.size)
-    return float(problem.cost(zero, *[np.asfortranarray(part.T) for part in inputs]))
+def _refuse_contradicted_priors(problem: FitProblem, state: State, covariance: Array) -> None:
+    """Raise DidNotConverge if what somebody stated cannot be true beside the measurements.
+
+    An estimate with a prior has the covariance s; without it, it would differ from the mean by
+    sigma^2 / (sigma^2 - s) times what it does, with the variance sigma^4 / (sigma^2 - s).
+    """
+    values = named_values(state, problem.layout, problem.legs)
+    problems = []
+    for i, mean, sigma in zip(
+        problem.priors.position, problem.priors.mean, problem.priors.sigma, strict=True
+    ):
+        name = problem.named[i]
+        taken = sigma**2 - covariance[i, i]
+        if name not in problem.choices.priors or taken < _INDEPENDENT * sigma**2:
+            continue
+        apart = abs(values[i] - mean) / np.sqrt(taken)
+        if apart > _SIGNIFICANT:
+            alone = mean + (values[i] - mean) * sigma**2 / taken
+            unit = problem.named_units[i]
+            problems.append(
+                f"The prior of {name} contradicts the measurements: it says {mean:.6g} +- "
+                f"{sigma:.2g} {unit}, they say {alone:.6g} {unit}, {apart:.0f} standard "
+                f"deviations apart; at most {_SIGNIFICANT:g} are believed; correct the prior or "
+                "leave it out."
+            )
+    if problems:
+        raise DidNotConverge(problems)
 
 
 def _with_rejections(
@@ -110,11 +190,3 @@ def _with_rejections(
         used[row] = False
         reason[row] = f"disagrees with the fit by {worst[i]:.1f} px"
     return dataclasses.replace(outlines, used=used, reason=tuple(reason))
-
-
-def estimated_names(problem: FitProblem, legs: FittedLegs) -> tuple[str, ...]:
-    """Return the names of the kinematic parameters that are unknowns of the fit."""
-    is_free = problem.layout.offset < problem.layout.size
-    joints = legs.parameter_names[: -legs.n_legs]
-    offsets = legs.parameter_names[-legs.n_legs :]
-    return (*joints, *(name for name, free in zip(offsets, is_free, strict=True) if free))

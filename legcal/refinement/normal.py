@@ -1,6 +1,6 @@
-"""The normal equations in NumPy, with the platform poses eliminated (Schur complement).
+"""The normal equations, with the platform poses eliminated (Schur complement).
 
-Every measurement depends on one pose at most, so the poses' 6 x 6 blocks are eliminated all at
+Every measurement depends on one pose at most, so the poses' small blocks are eliminated all at
 once, and what is left is as small as the mechanism and its cameras. Blocks that are singular
 (a pose or a camera that too little was measured of) are inverted on their range only: they
 then neither move nor carry information.
@@ -9,129 +9,150 @@ then neither move nor carry information.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve, null_space
 
-from legcal.geometry.types import Array, IntArray
-from legcal.refinement.inputs import evaluate_jacobian, inputs_of
-from legcal.refinement.loss import curvature, efficiency, weights
+from legcal.geometry.types import Array, BoolArray
+from legcal.refinement.constraints import Tangent, tangent
+from legcal.refinement.linearize import Linearization
+from legcal.refinement.loss import efficiency
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.residuals import axis_residual, encoder_residual, outline_residual
+from legcal.refinement.rows import Sums, summed
 from legcal.refinement.state import State
 
 _RANGE = 1e-13  # eigenvalues below this part of the largest are rounding
-
-
-@dataclass(frozen=True, eq=False)
-class Linearization:
-    """Whitened residuals and their Jacobians at a state; unknowns in mm and mrad.
-
-    Attributes
-    ----------
-    outline_r, outline_J : (n, 2) and (n, 2, 19) array
-    encoder_r, encoder_J : (n, 1) and (n, 1, 13) array
-    prior_r, prior_J : (n,) array
-        Residuals of the prior, and their derivatives by their own unknown.
-    axis_r, axis_J : (n, 4) and (n, 4, 18) array
-    """
-
-    outline_r: Array
-    outline_J: Array
-    encoder_r: Array
-    encoder_J: Array
-    prior_r: Array
-    prior_J: Array
-    axis_r: Array
-    axis_J: Array
+_SAFE = 1e-9  # a scaled block with a pivot below may be singular
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """N x = -g with N = [[U, W], [W^T, V]]: kept unknowns first, then one block for each pose.
 
+    Poses move inside their constraints: V, W and g_pose belong to coordinates y of
+    :class:`legcal.refinement.constraints.Tangent`.
+
     Attributes
     ----------
     U : (n_kept, n_kept) array
-    W : (n_poses, n_kept, 6) array
-    V_inverse : (n_poses, 6, 6) array
-    g_kept, g_pose : (n_kept,) and (n_poses, 6) array
+    W : (n_poses, n_kept, f) array
+    V : (n_poses, f, f) array
+    g_kept, g_pose : (n_kept,) and (n_poses, f) array
         Gradient of the cost.
+    tangent : Tangent or None
+        What the constraints leave; None where poses are free.
+    held : (w, n_kept) array
+        Directions that stay.
     """
 
     U: Array
     W: Array
-    V_inverse: Array
+    V: Array
     g_kept: Array
     g_pose: Array
+    tangent: Tangent | None
+    held: Array
+
+    @cached_property
+    def V_inverse(self) -> Array:
+        """The inverses of the poses' blocks on their range, (n_poses, f, f)."""
+        return inverse_on_range(self.V)
 
     def reduced(self) -> Array:
         """Return the normal matrix (n_kept, n_kept) of the kept unknowns: U - W V^-1 W^T."""
-        S = self.U - np.einsum("kap,kpq,kbq->ab", self.W, self.V_inverse, self.W, optimize=True)
+        S = self.U - _coupled(self.W @ self.V_inverse, self.W)
         return np.asarray(0.5 * (S + S.T))
 
-    def step(self) -> Array:
-        """Return the Gauss-Newton step x; directions that nothing determines stay."""
-        eliminated = np.einsum("kpq,kq->kp", self.V_inverse, self.g_pose)
-        right = -self.g_kept + np.einsum("kap,kp->a", self.W, eliminated)
-        kept = inverse_on_range(self.reduced()) @ right
-        pose = -eliminated - np.einsum("kpq,kaq,a->kp", self.V_inverse, self.W, kept, optimize=True)
-        return np.concatenate([kept, pose.ravel()])
+    def kept_covariance(self) -> Array:
+        """Return the inverse of the reduced matrix, held directions left out."""
+        S = self.reduced()
+        if len(self.held) == 0:
+            return inverse_on_range(S)
+        N = null_space(self.held)
+        return np.asarray(N @ inverse_on_range(N.T @ S @ N) @ N.T)
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """Return a Levenberg-Marquardt step and the fall of the cost that it promises.
+
+        Parameters
+        ----------
+        damping : float
+            Part of the diagonal that is added to it.
+
+        Returns
+        -------
+        x : (size,) array
+            Changes of all unknowns.
+        fall : float
+        """
+        V = _damped(self.V, damping)
+        V_inverse = np.linalg.inv(V)
+        WV = self.W @ V_inverse
+        U = _damped(self.U, damping)
+        S = U - _coupled(WV, self.W)
+        right = -self.g_kept + np.einsum("kap,kp->a", WV, self.g_pose)
+        kept = self._solved(S, right)
+        y = -(V_inverse @ (self.g_pose + np.einsum("kap,a->kp", self.W, kept))[..., None])[..., 0]
+        linear = float(self.g_kept @ kept + np.sum(self.g_pose * y))
+        extra = float(
+            np.sum(np.diagonal(U - self.U) * kept**2)
+            + np.sum(np.einsum("kpp->kp", V - self.V) * y**2)
+        )
+        pose = y if self.tangent is None else _carried(self.tangent, kept, y)
+        return np.concatenate([kept, pose.ravel()]), 0.5 * (extra - linear)
+
+    def _solved(self, S: Array, right: Array) -> Array:
+        """Return S^-1 right in the complement of what is held."""
+        if len(self.held):
+            N = null_space(self.held)
+            return np.asarray(N @ _solve(N.T @ S @ N, N.T @ right))
+        return _solve(S, right)
 
 
-def linearize(problem: FitProblem, state: State, whitening: Array) -> Linearization:
-    """Return residuals and Jacobians of all measurements at a state."""
-    of_outlines, of_readings, _, of_axes = inputs_of(problem, state, whitening, 0.0)
-    prior = problem.radius_prior
-    return Linearization(
-        *evaluate_jacobian(outline_residual(), of_outlines),
-        *evaluate_jacobian(encoder_residual(), of_readings),
-        (state.radii - prior.mean) / prior.sigma,
-        1e-3 / prior.sigma,
-        *evaluate_jacobian(axis_residual(), of_axes),
-    )
-
-
-def normal_equations(problem: FitProblem, linear: Linearization, k: float) -> NormalEquations:
+def normal_equations(
+    problem: FitProblem, state: State, linear: Linearization, k: float
+) -> NormalEquations:
     """Return the normal equations of the robust cost, with the loss's true curvature.
 
     Parameters
     ----------
     problem : FitProblem
+    state : State
+        Where *linear* was taken.
     linear : Linearization
     k : float
         Narrowness of the loss on outlines and axes, 0 for plain least squares.
-
-    Returns
-    -------
-    NormalEquations
     """
-    outlines, axes = (
-        _robust_blocks(r, J, k)
-        for r, J in ((linear.outline_r, linear.outline_J), (linear.axis_r, linear.axis_J))
-    )
-    return _assembled(problem, linear, outlines, axes)
+    kinds = [
+        (problem.outline_places, linear.outlines.softened(k)),
+        (problem.reading_places, linear.readings),
+        (problem.axis_places, linear.axes.softened(k)),
+    ]
+    sums = summed(kinds, problem.layout.n_kept, problem.layout.n_poses)
+    return _constrained(problem, state, linear, sums)
 
 
-def information(problem: FitProblem, linear: Linearization, k: float) -> NormalEquations:
+def information(
+    problem: FitProblem, state: State, linear: Linearization, k: float
+) -> NormalEquations:
     """Return the normal equations whose inverse is the covariance of the unknowns.
 
     Parameters
     ----------
-    problem : FitProblem
-    linear : Linearization
+    problem, state, linear
+        As in :func:`normal_equations`.
     k : float
         Narrowness of the loss, which does not keep all information of outlines and axes
         (:func:`legcal.refinement.loss.efficiency`); 0 for what the data hold.
-
-    Returns
-    -------
-    NormalEquations
     """
-    outlines, axes = (
-        (efficiency(k, J.shape[1]) * (np.swapaxes(J, -1, -2) @ J), np.zeros(J.shape[::2]))
-        for J in (linear.outline_J, linear.axis_J)
-    )
-    return _assembled(problem, linear, outlines, axes)
+    kinds = [
+        (problem.outline_places, linear.outlines.scaled(np.sqrt(efficiency(k, 2)))),
+        (problem.reading_places, linear.readings),
+        (problem.axis_places, linear.axes.scaled(np.sqrt(efficiency(k, 4)))),
+    ]
+    sums = summed(kinds, problem.layout.n_kept, problem.layout.n_poses)
+    return _constrained(problem, state, linear, sums)
 
 
 def inverse_on_range(S: Array) -> Array:
@@ -139,69 +160,79 @@ def inverse_on_range(S: Array) -> Array:
 
     The matrices are scaled to unit diagonal first, so that units do not matter.
     """
-    diagonal = np.einsum("...ii->...i", S)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    value, vector = np.linalg.eigh(scale[..., :, None] * S * scale[..., None, :])
+    flat = S.reshape(-1, *S.shape[-2:])
+    scale = _scale(flat)
+    scaled = scale[:, :, None] * flat * scale[:, None, :]
+    inverse = np.empty_like(scaled)
+    safe = _is_safe(scaled)
+    inverse[safe] = np.linalg.inv(scaled[safe])
+    value, vector = np.linalg.eigh(scaled[~safe])
     kept = value > _RANGE * value[..., -1:]
-    inverse = np.where(kept, 1.0, 0.0) / np.where(kept, value, 1.0)
-    scaled = scale[..., :, None] * vector
-    return np.asarray((scaled * inverse[..., None, :]) @ np.swapaxes(scaled, -1, -2))
+    reciprocal = np.where(kept, 1.0, 0.0) / np.where(kept, value, 1.0)
+    inverse[~safe] = (vector * reciprocal[..., None, :]) @ np.swapaxes(vector, -1, -2)
+    return np.asarray((scale[:, :, None] * inverse * scale[:, None, :]).reshape(S.shape))
 
 
-def _robust_blocks(r: Array, J: Array, k: float) -> tuple[Array, Array]:
-    """Return each measurement's share in the normal matrix and in the gradient."""
-    w = weights(np.sum(r**2, axis=-1), k)
-    MJ = curvature(r, k) @ J
-    return np.swapaxes(J, -1, -2) @ MJ, np.einsum("nri,nr,n->ni", J, r, w)
+def _is_safe(scaled: Array) -> BoolArray:
+    """Say which matrices of unit diagonal are far from singular."""
+    try:
+        L = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        return np.zeros(len(scaled), dtype=np.bool_)
+    return np.asarray(np.einsum("kii->ki", L).min(axis=1, initial=1.0) ** 2 > _SAFE)
 
 
-def _assembled(
-    problem: FitProblem,
-    linear: Linearization,
-    outlines: tuple[Array, Array],
-    axes: tuple[Array, Array],
+def _scale(S: Array) -> Array:
+    """Return what scales diagonals (..., n) to one; one where they are zero."""
+    diagonal = np.einsum("...ii->...i", S)
+    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)))
+
+
+def _constrained(
+    problem: FitProblem, state: State, linear: Linearization, sums: Sums
 ) -> NormalEquations:
-    """Sum the blocks of all measurements into the blocks of the normal equations."""
-    layout, n_poses = problem.layout, len(problem.layout.pose)
-    n_kept = layout.n_kept
-    U = np.zeros((n_kept + 1) ** 2)
-    W = np.zeros(n_poses * (n_kept + 1) * 6)
-    V = np.zeros((n_poses, 36))
-    g_kept, g_pose = np.zeros(n_kept + 1), np.zeros((n_poses, 6))
-    J = linear.encoder_J
-    kinds = [
-        (problem.outline_index, problem.outlines.pose, *outlines),
-        (
-            problem.encoder_index,
-            problem.readings.pose,
-            np.swapaxes(J, -1, -2) @ J,
-            np.einsum("nri,nr->ni", J, linear.encoder_r),
-        ),
-        (problem.axis_index, problem.axes.pose, *axes),
-    ]
-    for index, pose, blocks, gradients in kinds:
-        m = index.shape[1] - 6
-        at = np.minimum(index[:, :m], n_kept)  # what is fixed collects in the last row
-        U += _summed((at[:, :, None] * (n_kept + 1) + at[:, None, :]), blocks[:, :m, :m], len(U))
-        place = (pose[:, None] * (n_kept + 1) + at)[:, :, None] * 6 + np.arange(6)
-        W += _summed(place, blocks[:, :m, m:], len(W))
-        np.add.at(V, pose, blocks[:, m:, m:].reshape(-1, 36))
-        g_kept += _summed(at, gradients[:, :m], n_kept + 1)
-        np.add.at(g_pose, pose, gradients[:, m:])
-    U_matrix = U.reshape(n_kept + 1, n_kept + 1)[:n_kept, :n_kept].copy()
-    position = problem.radius_prior.position
-    U_matrix[position, position] += linear.prior_J**2
-    g_kept[position] += linear.prior_J * linear.prior_r
-    return NormalEquations(
-        U_matrix,
-        W.reshape(n_poses, n_kept + 1, 6)[:, :n_kept],
-        inverse_on_range(V.reshape(n_poses, 6, 6)),
-        g_kept[:n_kept],
-        g_pose,
-    )
+    """Add the priors, and put motions inside the constraints in place of poses."""
+    U = sums.U + linear.prior_J.T @ linear.prior_J
+    g_kept = sums.g_kept + linear.prior_J.T @ linear.prior_r
+    W, V, g_pose = sums.W, sums.V, sums.g_pose
+    motion = tangent(state, problem.layout, problem.legs.frame_legs)
+    if motion is not None:
+        Z, Q = motion.Z, motion.Q
+        coupled = _coupled(W, np.swapaxes(Q, 1, 2))
+        VQ = V @ Q
+        U = U + coupled + coupled.T + _coupled(np.swapaxes(Q, 1, 2), np.swapaxes(VQ, 1, 2))
+        g_kept = g_kept + np.einsum("kpa,kp->a", Q, g_pose)
+        W = (W + np.swapaxes(VQ, 1, 2)) @ Z
+        V = np.swapaxes(Z, 1, 2) @ V @ Z
+        g_pose = np.einsum("kpf,kp->kf", Z, g_pose)
+    return NormalEquations(U, W, V, g_kept, g_pose, motion, problem.held)
 
 
-def _summed(place: IntArray, value: Array, size: int) -> Array:
-    """Sum values into a vector at their places."""
-    sums = np.bincount(place.ravel(), weights=value.ravel(), minlength=size)
-    return np.asarray(sums, dtype=np.float64)
+def _coupled(left: Array, right: Array) -> Array:
+    """Return the sum over poses of left right^T, both (n_poses, n_kept, f)."""
+    n = left.shape[1]
+    a = np.moveaxis(left, 1, 0).reshape(n, -1)
+    return np.asarray(a @ np.moveaxis(right, 1, 0).reshape(n, -1).T)
+
+
+def _damped(M: Array, damping: float) -> Array:
+    """Return matrices with a part of their diagonal added to it; one where it is zero."""
+    diagonal = np.einsum("...ii->...i", M)
+    added = np.where(diagonal > 0.0, damping * diagonal, 1.0)
+    return np.asarray(M + added[..., None] * np.eye(M.shape[-1]))
+
+
+def _solve(S: Array, right: Array) -> Array:
+    """Return S^-1 right for a positive definite S, scaled; least squares where it is not."""
+    scale = _scale(S)
+    scaled = scale[:, None] * S * scale
+    try:
+        found = cho_solve(cho_factor(scaled, check_finite=False), scale * right)
+    except np.linalg.LinAlgError:
+        found = inverse_on_range(scaled) @ (scale * right)
+    return np.asarray(scale * found)
+
+
+def _carried(motion: Tangent, kept: Array, y: Array) -> Array:
+    """Return the motions of poses (n_poses, 6) for steps of kept unknowns and inside them."""
+    return np.asarray(np.einsum("kpf,kf->kp", motion.Z, y) + np.einsum("kpa,a->kp", motion.Q, kept))

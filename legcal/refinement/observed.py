@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.errors import DatasetError
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.geometry.types import Array, IntArray
+from legcal.mechanism.leg import LegKind
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.refinement.legs import FittedLegs
@@ -25,14 +26,19 @@ class ObservedOutlines:
         Indices; ``radius`` counts in ``parts``.
     feet : (n, 2, 2) array
         Points of the measured outline at both ends of the used piece, on the sensor plane.
-    J_inverse_transposed : (n, 2, 2, 2) array
-        Inverse transposed derivative of pixels at these points [1/px].
-    epsilon : (n,) array
-        +1 or -1 of eq (5).
+    pixels : (n, 2, 2) array
+        The same points in the image [px].
+    constants : (n, 9) array
+        What the residual needs besides: the inverse transposed derivative of pixels at
+        these points [1/px], column by column, and epsilon of eq (5).
     covariance : (n, 2, 2) array
         Claimed covariance of the offsets at both ends [px^2].
     parts : tuple of (int, str)
         Leg index and part of each radius, sorted by leg and name.
+    bias_index : (n, c) array of int
+        The shared shifts that each outline has a part in.
+    bias_shift : (n, c, 2) array
+        How far one pixel of each shifts both ends [px].
     """
 
     index: IntArray
@@ -41,10 +47,17 @@ class ObservedOutlines:
     pose: IntArray
     radius: IntArray
     feet: Array
-    J_inverse_transposed: Array
-    epsilon: Array
+    pixels: Array
+    constants: Array
     covariance: Array
     parts: tuple[tuple[int, str], ...]
+    bias_index: IntArray
+    bias_shift: Array
+
+    @property
+    def epsilon(self) -> Array:
+        """+1 or -1 of eq (5), (n,)."""
+        return np.asarray(self.constants[:, 8])
 
     def __len__(self) -> int:
         return len(self.index)
@@ -101,24 +114,29 @@ def observed_outlines(
     ]
     if problems:
         raise DatasetError(problems)
-    feet = np.zeros((len(index), 2, 2))
-    J_inverse_transposed = np.zeros((len(index), 2, 2, 2))
+    feet, pixels = np.zeros((len(index), 2, 2)), np.zeros((len(index), 2, 2))
+    constants = np.empty((len(index), 9))
+    constants[:, 8] = EPSILON[outlines.edge[index] - 1]
     for v in np.unique(view):
-        of_view = view == v
-        feet[of_view], J_inverse_transposed[of_view] = feet_of_ends(
-            measurements.views[v].camera, outlines.h[index][of_view], outlines.ends[index][of_view]
-        )
+        camera, of_view = measurements.views[v].camera, np.flatnonzero(view == v)
+        at = index[of_view]
+        feet[of_view], lens = feet_of_ends(camera, outlines.h[at], outlines.ends[at])
+        constants[of_view, :8] = np.swapaxes(lens, -1, -2).reshape(-1, 8)
+        pixels[of_view] = camera.distort(feet[of_view])
+    numbers = {part: i for i, part in enumerate(parts)}
     return ObservedOutlines(
         index,
         leg,
         view,
         measurements.pose[row],
-        np.array([parts.index(key) for key in keys], dtype=np.intp),
+        np.array([numbers[key] for key in keys], dtype=np.intp),
         feet,
-        J_inverse_transposed,
-        EPSILON[outlines.edge[index] - 1],
+        pixels,
+        constants,
         covariance,
         parts,
+        np.zeros((len(index), 0), dtype=np.intp),
+        np.zeros((len(index), 0, 2)),
     )
 
 
@@ -151,16 +169,12 @@ def feet_of_ends(camera: Camera, h: Array, ends: Array) -> tuple[Array, Array]:
 def readings(measurements: Measurements, legs: FittedLegs) -> Readings:
     """Return the encoder readings, one row of them for each platform pose.
 
-    Images of one pose share one reading: that of the first row. Passive legs have none.
+    Images of one pose share one reading: that of the first row. Legs without a motor have none.
     """
     length = legs.sign * measurements.q[measurements.first_rows]
-    pose, leg = np.nonzero(np.isfinite(length))
+    actuated = np.array([leg.kind is LegKind.ACTUATED for leg in legs.nominal], dtype=np.bool_)
+    pose, leg = np.nonzero(np.isfinite(length) & actuated)
     return Readings(leg, pose, length[pose, leg], measurements.sigma_q)
-
-
-def has_offset(measurements: Measurements) -> BoolArray:
-    """Return which legs have readings (n_legs,): passive ones have none."""
-    return np.asarray(np.isfinite(measurements.q).any(axis=0))
 
 
 def _bad_covariances(

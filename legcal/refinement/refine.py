@@ -10,65 +10,30 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
-from legcal.refinement.assembly import (
-    assemble_solution,
-    comparable_cost,
-    estimated_names,
-    machine_size,
-)
-from legcal.refinement.covariance import check_counts, uncertainty
+from legcal.refinement.assembly import assemble_solution, comparable_cost
+from legcal.refinement.build import build_fit
+from legcal.refinement.choices import NO_CHOICES, Choices
+from legcal.refinement.constraints import on_constraints
+from legcal.refinement.determinacy import Held, held_at_nominal, open_directions
 from legcal.refinement.legs import FittedLegs
+from legcal.refinement.linearize import linearize
+from legcal.refinement.loss import width_to_k
+from legcal.refinement.minimise import Minimum
 from legcal.refinement.noise import NoiseModel
-from legcal.refinement.normal import information, linearize
-from legcal.refinement.observed import has_offset, observed_outlines, readings
-from legcal.refinement.observed_axes import observed_axes
-from legcal.refinement.problem import FitProblem, Prior, build_problem
-from legcal.refinement.rounds import first_minimum, fit_in_rounds
+from legcal.refinement.normal import information
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.rounds import Fit, first_minimum, fit_in_rounds
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start
-from legcal.refinement.state import State, lay_out
+from legcal.refinement.state import State
 
 _LARGEST_RADIUS_CHANGE = 0.5
 _EQUAL_COSTS = 1e-6  # relative: the same minimum
-
-
-def build_fit(
-    legs: FittedLegs,
-    measurements: Measurements,
-    outlines: Outlines,
-    settings: RefinementSettings = DEFAULT_SETTINGS,
-    *,
-    axes: LegAxes | None = None,
-) -> FitProblem:
-    """Build the fit of everything without solving it; arguments as in :func:`refine`.
-
-    Raises
-    ------
-    NotIdentifiable
-        If there are fewer equations than unknowns.
-    DatasetError
-        If an outline or an axis cannot be used.
-    """
-    observed = observed_outlines(outlines, measurements, legs)
-    lines = observed_axes(axes, measurements, legs)
-    encoders = readings(measurements, legs)
-    seen = np.zeros(len(measurements.views), dtype=np.bool_)
-    seen[observed.view] = seen[lines.view] = True
-    layout = lay_out(
-        legs.frame_legs, has_offset(measurements), observed.parts, seen, measurements.n_poses
-    )
-    mean = np.array([legs.radii[part] for part in observed.parts])
-    prior = Prior(layout.radius, mean, settings.radius_sigma * mean)
-    problem = build_problem(layout, observed, encoders, prior, lines, settings.max_iterations)
-    check_counts(problem, measurements.n_rows)
-    return problem
 
 
 def refine(
@@ -79,6 +44,7 @@ def refine(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
+    choices: Choices = NO_CHOICES,
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii to all data at once.
 
@@ -97,6 +63,8 @@ def refine(
     axes : LegAxes, optional
         Measured axes, beside outlines or instead of them (give
         :func:`legcal.observations.sets.no_outlines`). Their covariances are taken as they are.
+    choices : Choices
+        Parameters that are fixed, freed or known beforehand.
 
     Returns
     -------
@@ -111,20 +79,19 @@ def refine(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    problem = build_fit(legs, measurements, outlines, settings, axes=axes)
-    return solve_fit(problem, legs, outlines, start, settings)
+    problem = build_fit(legs, measurements, outlines, settings, axes=axes, choices=choices)
+    return solve_fit(problem, outlines, start, settings)
 
 
 def solve_fit(
     problem: FitProblem,
-    legs: FittedLegs,
     outlines: Outlines,
     start: Start,
     settings: RefinementSettings = DEFAULT_SETTINGS,
 ) -> Solution:
     """Solve a fit that :func:`build_fit` built; otherwise the same as :func:`refine`."""
-    candidate = _candidate(problem, legs, start, settings)
-    return _refined(problem, legs, outlines, candidate, settings)
+    candidate = _candidate(problem, start, settings)
+    return _refined(problem, outlines, candidate, settings)
 
 
 def refine_from_best(
@@ -135,6 +102,7 @@ def refine_from_best(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
+    choices: Choices = NO_CHOICES,
 ) -> Solution:
     """Fit everything from several starts and keep the lowest cost.
 
@@ -147,13 +115,13 @@ def refine_from_best(
     NotIdentifiable, DidNotConverge
         If no start leads to a fit.
     """
-    problem = build_fit(legs, measurements, outlines, settings, axes=axes)
+    problem = build_fit(legs, measurements, outlines, settings, axes=axes, choices=choices)
     candidates: list[_Candidate] = []
     notes: list[str] = []
     failures: list[LegcalError] = []
     for start in starts:
         try:
-            candidate = _candidate(problem, legs, start, settings)
+            candidate = _candidate(problem, start, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
             notes.append(f"The start {start.label} was skipped. {failure}")
@@ -163,7 +131,7 @@ def refine_from_best(
         candidates.insert(place, candidate)
     for candidate in candidates:
         try:
-            found = _refined(problem, legs, outlines, candidate, settings)
+            found = _refined(problem, outlines, candidate, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
             notes.append(f"The start {candidate.label} was given up. {failure}")
@@ -182,51 +150,77 @@ class _Candidate:
     """A first minimum."""
 
     label: str
-    state: State
+    minimum: Minimum
     cost: float
-    iterations: int
 
 
-def _candidate(
-    problem: FitProblem, legs: FittedLegs, start: Start, settings: RefinementSettings
-) -> _Candidate:
+def _candidate(problem: FitProblem, start: Start, settings: RefinementSettings) -> _Candidate:
     """Return the first minimum that a start leads to."""
-    begin = start.state(problem.radius_prior.mean)
+    begin = problem.begin(start)
     try:
-        state, iterations = first_minimum(problem, begin, settings)
+        found = first_minimum(*_held_at_start(problem, begin), settings)
     except DidNotConverge:
-        _refuse_undetermined(problem, legs, begin)
+        _refuse_undetermined(problem, begin)
         raise
-    cost = comparable_cost(problem, state, settings)
-    return _Candidate(start.label, state, cost, iterations)
+    cost = comparable_cost(problem, found.state, settings)
+    return _Candidate(start.label, found, cost)
+
+
+def _held_at_start(problem: FitProblem, begin: State) -> tuple[FitProblem, State]:
+    """Return problem and state with what the measurements seem to leave open held, for now."""
+    begin = on_constraints(begin, problem.legs.frame_legs)
+    linear = linearize(problem, begin, NoiseModel().whitening(problem.outlines.covariance))
+    try:
+        held = open_directions(problem, begin, information(problem, begin, linear, 0.0))
+    except NotIdentifiable:  # by accident of the start, or to be said of the minimum
+        return problem, begin
+    return held_at_nominal(problem, begin, held) if len(held.basis) else (problem, begin)
 
 
 def _refined(
     problem: FitProblem,
-    legs: FittedLegs,
     outlines: Outlines,
     candidate: _Candidate,
     settings: RefinementSettings,
 ) -> Solution:
     """Work out a first minimum with a problem that is already built."""
+    first = candidate.minimum
+    k = width_to_k(settings.loss_width)
+    held = open_directions(problem, first.state, information(problem, first.state, first.linear, k))
+    free, state = problem, first.state
+    if len(held.basis):
+        problem, state = held_at_nominal(problem, state, held)
     try:
-        fit = fit_in_rounds(problem, candidate.state, candidate.iterations, settings)
+        fit = fit_in_rounds(problem, state, first.iterations, settings)
     except DidNotConverge:
-        _refuse_undetermined(problem, legs, candidate.state)
+        _refuse_undetermined(free, state)
         raise
-    _refuse_other_radii(problem, fit.state, legs)
-    return assemble_solution(problem, fit, legs, outlines, candidate.label, settings)
+    _refuse_other_radii(problem, fit.state)
+    _refuse_lost(free, fit, held, k)
+    return assemble_solution(problem, fit, held, outlines, candidate.label, settings)
 
 
-def _refuse_undetermined(problem: FitProblem, legs: FittedLegs, state: State) -> None:
+def _refuse_undetermined(problem: FitProblem, state: State) -> None:
     """Raise NotIdentifiable if that is why there is no minimum to converge to."""
     linear = linearize(problem, state, NoiseModel().whitening(problem.outlines.covariance))
-    normal = information(problem, linear, 0.0)
-    uncertainty(problem, normal, estimated_names(problem, legs), machine_size(state))
+    open_directions(problem, state, information(problem, state, linear, 0.0))
 
 
-def _refuse_other_radii(problem: FitProblem, state: State, legs: FittedLegs) -> None:
+def _refuse_lost(problem: FitProblem, fit: Fit, held: Held, k: float) -> None:
+    """Raise NotIdentifiable if what was rejected leaves a direction open that was not before."""
+    normal = information(problem, fit.state, fit.minimum.linear, k)
+    left = open_directions(problem, fit.state, normal)
+    if len(left.basis) > len(held.basis):
+        raise NotIdentifiable(
+            "The fit is not determined: found that the outlines which agree with it leave "
+            f"{', '.join(left.directions)} open, needed what the rejected ones showed; correct "
+            "these, or add images."
+        )
+
+
+def _refuse_other_radii(problem: FitProblem, state: State) -> None:
     """Raise DidNotConverge if the fit needs radii that are not those of the legs at all."""
+    legs = problem.legs
     problems = [
         f"The fit of everything ended with a radius of {1e3 * radius:.2f} mm for "
         f"{legs.names[leg]}.{part}, the model has {1e3 * legs.radii[leg, part]:.2f} mm; they must "

@@ -1,19 +1,18 @@
 """The residuals of the fit, one small pure CasADi function for each kind of measurement.
 
-Every function takes ``(local, data)``: *local* are the unknowns that one measurement
-depends on, as changes in mm and mrad around a reference; *data* holds that reference, what was
-measured and its weight. The last entry of *data* is the narrowness k of the robust loss
-(:mod:`legcal.refinement.loss`); residuals do not use it. Rotations are changed by Cayley's map,
-which is the rotation vector to second order, has no singularity short of half a turn
-and needs no trigonometry.
+Each takes ``(local, data)``: *local* are the quantities that one measurement depends on, *data*
+what was measured. How these quantities depend on the unknowns (joints, cameras, platform poses)
+is in :mod:`legcal.refinement.linearize`.
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
+from typing import Any
 
 import casadi as ca
+import numpy as np
 
-UNIT = 1e-3  # [m] or [rad] for one unit of a local unknown: mm and mrad
+from legcal.geometry.types import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +23,11 @@ class Residual:
     ----------
     name : str
     n_local, n_data, n_rows : int
-        Sizes of the unknowns, of the data and of the whitened residual.
+        Sizes of what it depends on, of the data and of the residual.
     function : casadi.Function
-        (local, data) -> whitened residual.
+        (local, data) -> residual.
+    jacobian : casadi.Function
+        (local, data) -> residual and its dense Jacobian by *local*.
     """
 
     name: str
@@ -34,22 +35,22 @@ class Residual:
     n_data: int
     n_rows: int
     function: ca.Function
+    jacobian: ca.Function
 
+    def evaluate(self, local: Array, data: Array) -> tuple[Array, Array]:
+        """Return residuals (n, n_rows) and Jacobians (n, n_rows, n_local) of n measurements.
 
-def rotation_of(w: ca.SX) -> ca.SX:
-    """Return Cayley's rotation matrix of a small rotation vector [rad]."""
-    g = w / 2.0
-    K = ca.skew(g)
-    return ca.SX.eye(3) + 2.0 / (1.0 + ca.sumsqr(g)) * (K + K @ K)
-
-
-def moved_frame(change: ca.SX, reference: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return rotation and translation of a frame changed by (w, t) around its reference.
-
-    The reference is the rotation matrix, column by column, and the translation [m].
-    """
-    R = rotation_of(UNIT * change[:3]) @ ca.reshape(reference[:9], 3, 3)
-    return R, reference[9:12] + UNIT * change[3:6]
+        Parameters
+        ----------
+        local : (n, n_local) array
+        data : (n, n_data) array
+        """
+        n = len(local)
+        r = np.zeros((n, self.n_rows))
+        by_local = np.zeros((n, self.n_local, self.n_rows))  # CasADi stores column by column
+        if n:
+            _fill(_mapped(self.name, self.jacobian, n), [local, data], [r, by_local])
+        return r, np.swapaxes(by_local, 1, 2)
 
 
 def outline_of_leg(A: ca.SX, B: ca.SX, radius: ca.SX, epsilon: ca.SX) -> ca.SX:
@@ -72,95 +73,93 @@ def offset_in_image(h: ca.SX, xy: ca.SX, J_inverse_transposed: ca.SX) -> ca.SX:
 
 
 @cache
-def outline_offsets() -> ca.Function:
-    """Return (local, data) -> distances [px] of the predicted outline from both measured ends.
+def outline_residual() -> Residual:
+    """Return the distances [px] of the predicted outline from both ends of the measured one.
 
-    local (19): A, B, radius, camera (w, t), platform pose (w, t). data (48): their references (3,
-    3, 1, 12, 12), feet of the two ends (2 x 2), J^-T there (2 x 4, column by column),
-    epsilon; T00, T10, T11 of the whitening matrix and k, which this function leaves unused.
+    local (11): A and B in the camera frame, radius [m], both ends on the sensor plane. data (9):
+    J^-T at the ends (2 x 4, column by column), epsilon.
     """
-    local, data = ca.SX.sym("local", 19), ca.SX.sym("data", 48)
-    A = data[0:3] + UNIT * local[0:3]
-    B = data[3:6] + UNIT * local[3:6]
-    radius = data[6] + UNIT * local[6]
-    R_camera, t_camera = moved_frame(local[7:13], data[7:19])
-    R_pose, t_pose = moved_frame(local[13:19], data[19:31])
-    A_camera = R_camera @ A + t_camera
-    B_camera = R_camera @ (R_pose @ B + t_pose) + t_camera
-    h = outline_of_leg(A_camera, B_camera, radius, data[43])
+    local, data = ca.SX.sym("local", 11), ca.SX.sym("data", 9)
+    h = outline_of_leg(local[0:3], local[3:6], local[6], data[8])
     offsets = [
         offset_in_image(
             h,
-            data[31 + 2 * end : 33 + 2 * end],
-            ca.reshape(data[35 + 4 * end : 39 + 4 * end], 2, 2),
+            local[7 + 2 * end : 9 + 2 * end],
+            ca.reshape(data[4 * end : 4 + 4 * end], 2, 2),
         )
         for end in range(2)
     ]
-    return ca.Function("outline_offsets", [local, data], [ca.vertcat(*offsets)])
-
-
-@cache
-def outline_residual() -> Residual:
-    """Return the whitened offsets of an outline, T times the offsets, T lower triangular."""
-    local, data = ca.SX.sym("local", 19), ca.SX.sym("data", 48)
-    offsets = outline_offsets()(local, data)
-    whitened = ca.vertcat(
-        data[44] * offsets[0],
-        data[45] * offsets[0] + data[46] * offsets[1],
-    )
-    return Residual("outline", 19, 48, 2, ca.Function("outline", [local, data], [whitened]))
+    return _residual("outline", local, data, ca.vertcat(*offsets))
 
 
 @cache
 def axis_residual() -> Residual:
-    """Return how far a leg's predicted axis is from a measured one, whitened.
+    """Return how far a leg's predicted axis is from a measured one: alpha1, alpha2, beta1, beta2.
 
-    It is T times (alpha1, alpha2, beta1, beta2). The measured axis passes through M along e1 x e2.
-    alpha is the predicted direction in e1 and e2, over its part along the axis; beta is where
-    the predicted axis meets the plane through M with these directions, from M.
+    The measured axis passes through M along e1 x e2. alpha is the predicted direction in e1 and
+    e2, over its part along the axis; beta is where the predicted axis meets the plane through
+    M with these directions, from M [m].
 
-    local (18): A, B, camera (w, t), platform pose (w, t). data (50): their references (3, 3, 12,
-    12), M, e1, e2; the lower triangle of the whitening T, column by column, and k.
+    local (6): A and B in the camera frame [m]. data (9): M, e1, e2.
     """
-    local, data = ca.SX.sym("local", 18), ca.SX.sym("data", 50)
-    A = data[0:3] + UNIT * local[0:3]
-    B = data[3:6] + UNIT * local[3:6]
-    R_camera, t_camera = moved_frame(local[6:12], data[6:18])
-    R_pose, t_pose = moved_frame(local[12:18], data[18:30])
-    A_camera = R_camera @ A + t_camera
-    leg = R_camera @ (R_pose @ B + t_pose) + t_camera - A_camera
-    M, e1, e2 = data[30:33], data[33:36], data[36:39]
-    basis = ca.horzcat(e1, e2).T
-    slope = leg / ca.dot(ca.cross(e1, e2), leg)
-    to_A = A_camera - M
-    beta = basis @ (to_A - slope * ca.dot(ca.cross(e1, e2), to_A))
-    T = ca.SX(ca.Sparsity.lower(4), data[39:49])
-    whitened = T @ ca.vertcat(basis @ slope, beta)
-    return Residual("axis", 18, 50, 4, ca.Function("axis", [local, data], [whitened]))
+    local, data = ca.SX.sym("local", 6), ca.SX.sym("data", 9)
+    A, leg = local[0:3], local[3:6] - local[0:3]
+    M, e1, e2 = data[0:3], data[3:6], data[6:9]
+    basis, along = ca.horzcat(e1, e2).T, ca.cross(e1, e2)
+    slope = leg / ca.dot(along, leg)
+    to_A = A - M
+    beta = basis @ (to_A - slope * ca.dot(along, to_A))
+    return _residual("axis", local, data, ca.vertcat(basis @ slope, beta))
 
 
 @cache
 def encoder_residual() -> Residual:
-    """Return the whitened closure of a leg, (|R B + t - A| - sign q - q0) / sigma_q.
+    """Return the closure of a leg, |AB| - sign q - q0 [m].
 
-    local (13): A, B, q0, platform pose. data (22): references (3, 3, 1, 12), sign * q, 1 / sigma,
-    k.
+    local (7): A and B in R_b, q0 [m]. data (1): sign * q [m].
     """
-    local, data = ca.SX.sym("local", 13), ca.SX.sym("data", 22)
-    A = data[0:3] + UNIT * local[0:3]
-    B = data[3:6] + UNIT * local[3:6]
-    q0 = data[6] + UNIT * local[6]
-    R, t = moved_frame(local[7:13], data[7:19])
-    closure = (ca.norm_2(R @ B + t - A) - data[19] - q0) * data[20]
-    return Residual("encoder", 13, 22, 1, ca.Function("encoder", [local, data], [closure]))
+    local, data = ca.SX.sym("local", 7), ca.SX.sym("data", 1)
+    closure = ca.norm_2(local[3:6] - local[0:3]) - data - local[6]
+    return _residual("encoder", local, data, closure)
 
 
 @cache
 def prior_residual() -> Residual:
-    """Return the whitened distance of one unknown from its prior.
+    """Return the distance of an unknown from its prior in standard deviations.
 
-    local (1): the unknown. data (3): reference minus mean, 1 / sigma, k.
+    local (1): the unknown. data (2): mean, 1 / sigma.
     """
-    local, data = ca.SX.sym("local", 1), ca.SX.sym("data", 3)
-    distance = (data[0] + UNIT * local[0]) * data[1]
-    return Residual("prior", 1, 3, 1, ca.Function("prior", [local, data], [distance]))
+    local, data = ca.SX.sym("local", 1), ca.SX.sym("data", 2)
+    return _residual("prior", local, data, (local - data[0]) * data[1])
+
+
+def _residual(name: str, local: ca.SX, data: ca.SX, r: ca.SX) -> Residual:
+    """Return a kind of measurement with its Jacobian."""
+    options = {"cse": True}
+    by_local = ca.densify(ca.jacobian(r, local))
+    return Residual(
+        name,
+        local.size1(),
+        data.size1(),
+        r.size1(),
+        ca.Function(name, [local, data], [r], options),
+        ca.Function(f"{name}_jacobian", [local, data], [r, by_local], options),
+    )
+
+
+@lru_cache(maxsize=64)
+def _mapped(name: str, function: ca.Function, n: int) -> ca.Function:
+    """Return a function over n measurements; the name only tells functions apart."""
+    return function.map(n)
+
+
+def _fill(function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:
+    """Evaluate on NumPy's memory, row by row of measurements, without copies."""
+    buffer: Any
+    buffer, evaluate = function.buffer()
+    kept = [np.ascontiguousarray(array, dtype=np.float64) for array in inputs]
+    for i, array in enumerate(kept):
+        buffer.set_arg(i, array.data)
+    for i, array in enumerate(outputs):
+        buffer.set_res(i, array.data)
+    evaluate()

@@ -6,60 +6,42 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
-from legcal.refinement.covariance import explained_share
-from legcal.refinement.inputs import evaluate, inputs_of
+from legcal.refinement.influence import explained_share
+from legcal.refinement.linearize import linearize, offsets_of
 from legcal.refinement.loss import width_to_k
+from legcal.refinement.minimise import Minimum, minimise
 from legcal.refinement.noise import NoiseModel, estimate_noise, noise_of_the_median
-from legcal.refinement.normal import information, linearize
+from legcal.refinement.normal import information
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.residuals import axis_residual, outline_residual
 from legcal.refinement.settings import RefinementSettings
-from legcal.refinement.solve import polish, solve
 from legcal.refinement.state import State
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A state with the noise and the outlines that it was fitted with."""
+    """A minimum with the noise and the outlines that it was fitted with."""
 
-    state: State
+    minimum: Minimum
     noise: NoiseModel
     accepted: BoolArray
     iterations: int
 
+    @property
+    def state(self) -> State:
+        """Where the fit ended."""
+        return self.minimum.state
 
-def first_minimum(
-    problem: FitProblem, begin: State, settings: RefinementSettings
-) -> tuple[State, int]:
-    """Solve with all observations and claimed covariances: wide at first, then as all fits do.
 
-    Parameters
-    ----------
-    problem : FitProblem
-    begin : State
-        Where to start.
-    settings : RefinementSettings
-
-    Returns
-    -------
-    state : State
-        A minimum that depends on the start only if there are several.
-    iterations : int
-        Of IPOPT.
+def first_minimum(problem: FitProblem, begin: State, settings: RefinementSettings) -> Minimum:
+    """Solve with all observations and claimed covariances.
 
     Raises
     ------
     DidNotConverge
-        If a solve fails.
+        If the solver does not come to rest.
     """
-    claimed, noise = problem.outlines.covariance, NoiseModel()
-    whitening = noise.whitening(claimed)
-    s = noise.squared_norms(offsets_of(problem, begin), claimed)
-    norms = np.sqrt(np.concatenate([s, squared_axis_norms(problem, begin)]))
-    wide = max(settings.loss_width, float(np.median(norms))) if len(norms) else 1.0
-    state, iterations = solve(problem, begin, whitening, width_to_k(wide))
-    state, more = solve(problem, state, whitening, width_to_k(settings.loss_width))
-    return state, iterations + more
+    whitening = NoiseModel().whitening(problem.outlines.covariance)
+    return minimise(problem, begin, whitening, settings.loss_width, settings.max_iterations)
 
 
 def fit_in_rounds(
@@ -88,28 +70,30 @@ def fit_in_rounds(
     DidNotConverge
         If a solve fails, or most outlines or axes disagree with what was found.
     """
-    claimed, k, state = problem.outlines.covariance, width_to_k(settings.loss_width), first
-    accepted, noise = np.ones(len(claimed), dtype=np.bool_), NoiseModel()
+    claimed, noise = problem.outlines.covariance, NoiseModel()
+    accepted = np.ones(len(claimed), dtype=np.bool_)
+    state = first
+
+    def solved() -> Minimum:
+        whitening = noise.whitening(claimed, accepted)
+        return minimise(problem, state, whitening, settings.loss_width, settings.max_iterations)
+
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
         noise = noise_of_the_median(offsets_of(problem, state)[before], claimed[before])
         accepted = _accepted(problem, state, noise, settings)
         if np.array_equal(before, accepted):
             break
-        state, more = solve(problem, state, noise.whitening(claimed, accepted), k)
-        iterations += more
-    for _ in range(settings.noise_rounds if len(claimed) else 0):
+        minimum = solved()
+        state, iterations = minimum.state, iterations + minimum.iterations
+    for _ in range(settings.noise_rounds if len(claimed) else 1):
         noise = _noise(problem, state, noise, accepted, settings)
         accepted = _accepted(problem, state, noise, settings)
-        whitening = noise.whitening(claimed, accepted)
-        state, more = solve(problem, state, whitening, k)
-        state = polish(problem, state, whitening, k)
-        iterations += more
-    if len(claimed) == 0:
-        state = polish(problem, state, noise.whitening(claimed), k)
+        minimum = solved()
+        state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
-    _refuse_disagreeing_axes(squared_axis_norms(problem, state), settings)
-    return Fit(state, noise, accepted, iterations)
+    _refuse_disagreeing_axes(minimum.linear.axes.squared_norms, settings)
+    return Fit(minimum, noise, accepted, iterations)
 
 
 def _noise(
@@ -124,25 +108,12 @@ def _noise(
         return noise
     claimed = problem.outlines.covariance
     linear = linearize(problem, state, noise.whitening(claimed, accepted))
-    normal = information(problem, linear, width_to_k(settings.loss_width))
+    normal = information(problem, state, linear, width_to_k(settings.loss_width))
     L = np.linalg.cholesky(noise.covariance(claimed))
-    explained = L @ explained_share(problem, linear, normal) @ np.swapaxes(L, -1, -2)
-    offsets = np.einsum("nij,nj->ni", L, linear.outline_r)
+    share = explained_share(problem.outline_places, linear.outlines, normal)
+    explained = L @ share @ np.swapaxes(L, -1, -2)
+    offsets = np.einsum("nij,nj->ni", L, linear.outlines.r)
     return estimate_noise(offsets[accepted], explained[accepted], claimed[accepted])
-
-
-def offsets_of(problem: FitProblem, state: State) -> Array:
-    """Return the offsets (n, 2) [px] of all outlines at a state."""
-    unit = np.broadcast_to(np.eye(2), (len(problem.outlines), 2, 2))
-    return evaluate(outline_residual(), inputs_of(problem, state, unit, 0.0)[0])
-
-
-def squared_axis_norms(problem: FitProblem, state: State) -> Array:
-    """Return the squared whitened norms (n,) of all axes at a state."""
-    unused = np.zeros((len(problem.outlines), 2, 2))
-    return np.asarray(
-        np.sum(evaluate(axis_residual(), inputs_of(problem, state, unused, 0.0)[3]) ** 2, axis=-1)
-    )
 
 
 def _accepted(

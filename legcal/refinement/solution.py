@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.parametrization import Parametrization
 from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import WeakDirection
 from legcal.refinement.noise import NoiseModel
+from legcal.vision.camera import Camera
+
+Status = Literal["estimated", "fixed", "weak"]
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """What a mistake in what was taken as known would do to the kinematic parameters.
+
+    Attributes
+    ----------
+    what : str
+        The mistake, in words.
+    step : (p,) array
+        Step of all kinematic parameters from the fitted legs [m, rad].
+    """
+
+    what: str
+    step: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,23 +44,41 @@ class Solution:
 
     Attributes
     ----------
-    parameters : KinematicParameters
-        Joints in R_b and R_e, and offsets [m].
+    legs : tuple of LegGeometry
+        The legs in R_b and R_e.
     T_camera_Rb : tuple of RigidTransform
         Camera poses, one a view. A view that shows nothing keeps that of the start.
+    cameras : tuple of Camera
+        The cameras of the views, with the intrinsics that the fit was asked for.
     T_Rb_Re : tuple of RigidTransform
         Platform poses.
     radii : dict
         Radius [m] for each (leg index, part) that was observed.
+    parametrization : Parametrization
+        All kinematic parameters.
+    values : mapping
+        Value of every parameter by its name [m, rad, px]: kinematic ones, observed radii, then the
+        intrinsics that the fit was asked for. Axes are angles from the nominal axis.
+    units : mapping
+        Their units.
+    status : mapping
+        ``estimated``; ``fixed`` at its value; or ``weak``: part of a direction that the
+        measurements leave open and that does not move the platform, held at nominal along it.
     names : tuple of str
-        Names of the estimated parameters: the kinematic ones in the order of
-        ``parameters.to_vector``, then the radii in the order of ``radii``.
+        The estimated parameters, in the order of ``values``.
     covariance : (n, n) array
-        Their covariance [m^2], with cameras and poses unknown.
+        Their covariance, with cameras and poses unknown.
     sigma : (n,) array
-        Their standard deviations [m].
+        Their standard deviations.
+    kinematic_covariance : (p, p) array
+        Covariance of steps of all kinematic parameters from the fitted legs, as
+        :func:`legcal.mechanism.leg_steps.moved_legs` and
+        :func:`legcal.mechanism.sensitivity.pose_sensitivity` have them (axes turn about the
+        vectors of where they are); zero where they are fixed, and along what is held.
     weak : tuple of WeakDirection
-        The directions known worst, worst first.
+        The directions of the estimated parameters known worst, worst first.
+    held : tuple of str
+        The directions that are held at nominal.
     cost : float
         Robust cost over all observations that came in, rejected ones too, with their claimed
         covariances: comparable between fits of the same data.
@@ -50,42 +93,59 @@ class Solution:
         deviations; None if there are none.
     noise : NoiseModel
         The estimated errors of outlines; ``noise.bias_px`` is tau.
-    shared_bias_px, shared_tilt_px : float
-        Standard deviations [px] of errors that all images of one edge of a leg in a view share;
-        0 where the residuals do not show them. They are part of ``covariance``.
+    biases : mapping
+        Shifts of outlines that several share, by name [px]: those that the residuals show.
+    sensitivities : tuple of Sensitivity
+        What mistakes in cameras and radii would do.
     outlines : Outlines
         The table that came in, with what the fit rejected and why.
     start : str
         Label of the start that led here.
     iterations : int
-        Of IPOPT, all rounds.
+        Steps of the solver, all rounds.
     notes : tuple of str
         What else a reader should know, one sentence each.
     """
 
-    parameters: KinematicParameters
+    legs: tuple[LegGeometry, ...]
     T_camera_Rb: tuple[RigidTransform, ...]
+    cameras: tuple[Camera, ...]
     T_Rb_Re: tuple[RigidTransform, ...]
     radii: dict[tuple[int, str], float]
+    parametrization: Parametrization
+    values: Mapping[str, float]
+    units: Mapping[str, str]
+    status: Mapping[str, Status]
     names: tuple[str, ...]
     covariance: Array
     sigma: Array
+    kinematic_covariance: Array
     weak: tuple[WeakDirection, ...]
+    held: tuple[str, ...]
     cost: float
     chi2: float
     dof: int
     rms_px: float | None
     rms_axes: float | None
     noise: NoiseModel
-    shared_bias_px: float
-    shared_tilt_px: float
+    biases: Mapping[str, float]
+    sensitivities: tuple[Sensitivity, ...]
     outlines: Outlines
     start: str
     iterations: int
     notes: tuple[str, ...] = ()
 
     @property
-    def kinematic_covariance(self) -> Array:
-        """Covariance of the kinematic parameters alone [m^2]."""
-        n = len(self.names) - len(self.radii)
-        return self.covariance[:n, :n]
+    def parameters(self) -> KinematicParameters:
+        """Joint centres, and offsets or constant lengths; NaN for passive legs [m]."""
+        return joints_of(self.legs)
+
+
+def joints_of(legs: tuple[LegGeometry, ...]) -> KinematicParameters:
+    """Return joint centres, and offsets or constant lengths; NaN for passive legs [m]."""
+    lengths = [np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs]
+    return KinematicParameters(
+        np.array([leg.A for leg in legs]),
+        np.array([leg.B for leg in legs]),
+        np.array(lengths),
+    )

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DatasetError
 from legcal.geometry.types import Array
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.leg_steps import moved_legs
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.sensitivity import freedoms
 from legcal.observations.measurements import Measurements
+from legcal.refinement.constraints import pose_rows
 from legcal.refinement.legs import FittedLegs
-from legcal.refinement.state import State, motions, turned
+from legcal.refinement.state import components, motions, turned
 
 _MAX_ITERATIONS = 60
 _STEP = 1e-12  # [m, rad]
 _LARGEST_TURN = 0.3  # [rad] in one step
+_TURNS = 4  # steps that put axes where they are wanted; each squares what is left
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +31,8 @@ class Start:
 
     Attributes
     ----------
-    parameters : KinematicParameters
+    legs : tuple of LegGeometry
+        The legs in R_b and R_e.
     T_camera_Rb : tuple of RigidTransform
         Camera poses, one a view.
     T_Rb_Re : tuple of RigidTransform
@@ -35,25 +41,14 @@ class Start:
         Where it comes from: ``nominal`` or ``staged``.
     """
 
-    parameters: KinematicParameters
+    legs: tuple[LegGeometry, ...]
     T_camera_Rb: tuple[RigidTransform, ...]
     T_Rb_Re: tuple[RigidTransform, ...]
     label: str
 
-    def state(self, radii: Array) -> State:
-        """Return the state of the fit with these radii [m]."""
-        return State(
-            self.parameters.base_joints,
-            self.parameters.platform_joints,
-            self.parameters.offsets,
-            radii,
-            *_arrays(self.T_camera_Rb),
-            *_arrays(self.T_Rb_Re),
-        )
-
 
 def start_from(
-    parameters: KinematicParameters,
+    geometry: Sequence[LegGeometry],
     measurements: Measurements,
     legs: FittedLegs,
     T_camera_Rb: Sequence[RigidTransform],
@@ -64,8 +59,8 @@ def start_from(
 
     Parameters
     ----------
-    parameters : KinematicParameters
-        Joints and offsets, nominal or from the four steps [m].
+    geometry : sequence of LegGeometry
+        The legs, nominal or from the four steps, in R_b and R_e.
     measurements : Measurements
     legs : FittedLegs
     T_camera_Rb : sequence of RigidTransform
@@ -79,9 +74,34 @@ def start_from(
     -------
     Start
     """
-    lengths = legs.sign * measurements.q[measurements.first_rows] + parameters.offsets
-    poses = platform_poses(parameters, lengths, T_Rb_Re)
-    return Start(parameters, tuple(T_camera_Rb), poses, label)
+    q0 = np.array([leg.q0 for leg in geometry])
+    lengths = legs.sign * measurements.q[measurements.first_rows] + q0
+    poses = platform_poses(geometry, lengths, T_Rb_Re, legs.frame_legs)
+    return Start(tuple(geometry), tuple(T_camera_Rb), poses, label)
+
+
+def with_joints(
+    geometry: Sequence[LegGeometry], parameters: KinematicParameters
+) -> tuple[LegGeometry, ...]:
+    """Return legs with other joint centres and offsets; passive legs keep theirs."""
+    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
+    return tuple(
+        replace(leg, A=A, B=B, q0=leg.q0 if np.isnan(q0) else float(q0))
+        for leg, (A, B), q0 in zip(geometry, joints, parameters.offsets, strict=True)
+    )
+
+
+def with_values(
+    geometry: Sequence[LegGeometry], legs: FittedLegs, values: Mapping[int, float]
+) -> tuple[LegGeometry, ...]:
+    """Return legs some of whose parameters, by their number, have given values [m, rad]."""
+    moved = tuple(geometry)
+    where = list(values)
+    for _ in range(_TURNS if where else 0):
+        step = np.zeros(len(legs.parametrization))
+        step[where] = np.array(list(values.values())) - legs.vector(moved)[where]
+        moved = moved_legs(moved, legs.parametrization.place, step)
+    return moved
 
 
 def cameras_from_hints(
@@ -108,40 +128,48 @@ def cameras_from_hints(
 
 
 def platform_poses(
-    parameters: KinematicParameters, lengths: Array, T_Rb_Re: Sequence[RigidTransform]
+    geometry: Sequence[LegGeometry],
+    lengths: Array,
+    T_Rb_Re: Sequence[RigidTransform],
+    frame_legs: Sequence[int],
 ) -> tuple[RigidTransform, ...]:
     """Return the platform poses at which the legs have given lengths, all at once.
 
     Where no pose has these lengths (parameters far from the truth) the pose with the least
-    squares of the length errors is returned: a fit can still start there.
+    squares of what the legs demand is returned: a fit can still start there.
 
     Parameters
     ----------
-    parameters : KinematicParameters
-        Joints [m].
+    geometry : sequence of LegGeometry
+        The legs in R_b and R_e.
     lengths : (n_poses, n_legs) array
-        Leg lengths [m]; NaN where unknown.
+        Leg lengths [m] of actuated legs; NaN where unknown. Others are not looked at.
     T_Rb_Re : sequence of RigidTransform
         Poses nearby, in the right assembly mode.
+    frame_legs : sequence of int
+        The legs that define R_b and R_e.
 
     Returns
     -------
     tuple of RigidTransform
         T_Rb_Re.
     """
-    R, t = _arrays(T_Rb_Re)
-    known = np.isfinite(lengths)
-    wanted = np.where(known, lengths, 0.0)
+    free = list(freedoms(frame_legs))
+    reading = lengths - np.array([leg.q0 for leg in geometry])
+    R, t = components(T_Rb_Re)
     damping = np.full(len(R), 1e-6)
-    error, J = _length_errors(parameters, R, t, wanted, known)
+    error, J = _misses(geometry, reading, R, t)
     cost = np.sum(error**2, axis=1)
     for _ in range(_MAX_ITERATIONS):
-        N = np.swapaxes(J, -1, -2) @ J + damping[:, None, None] * np.eye(6)
-        step = -np.linalg.solve(N, np.einsum("kli,kl->ki", J, error)[..., None])[..., 0]
+        J_free = J[:, :, free]
+        N = np.swapaxes(J_free, -1, -2) @ J_free + damping[:, None, None] * np.eye(len(free))
+        step = np.zeros((len(t), 6))
+        gradient = np.einsum("kli,kl->ki", J_free, error)
+        step[:, free] = -np.linalg.solve(N, gradient[..., None])[..., 0]
         turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
         step *= np.minimum(1.0, _LARGEST_TURN / np.maximum(turn, 1e-300))
         R_next, t_next = turned(R, step[:, :3]), t + step[:, 3:]
-        error_next, J_next = _length_errors(parameters, R_next, t_next, wanted, known)
+        error_next, J_next = _misses(geometry, reading, R_next, t_next)
         cost_next = np.sum(error_next**2, axis=1)
         better = cost_next <= cost
         damping = np.where(better, np.maximum(damping * 0.1, 1e-14), damping * 10.0)
@@ -152,19 +180,11 @@ def platform_poses(
     return motions(R, t)
 
 
-def _length_errors(
-    parameters: KinematicParameters, R: Array, t: Array, wanted: Array, known: Array
+def _misses(
+    geometry: Sequence[LegGeometry], reading: Array, R: Array, t: Array
 ) -> tuple[Array, Array]:
-    """Return length errors (n_poses, n_legs) [m] and their derivatives (n_poses, n_legs, 6)."""
-    arm = np.einsum("kij,lj->kli", R, parameters.platform_joints)
-    leg = arm + t[:, None, :] - parameters.base_joints
-    length = np.linalg.norm(leg, axis=-1)
-    u = leg / length[..., None]
-    J = np.concatenate([np.cross(arm, u), u], axis=-1)
-    return np.where(known, length - wanted, 0.0), J * known[..., None]
-
-
-def _arrays(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
-    """Return rotation matrices and translations of motions."""
-    T = np.array([T.as_matrix() for T in motions]).reshape(-1, 4, 4)
-    return T[:, :3, :3].copy(), T[:, :3, 3].copy()
+    """Return how far all rows are from met (n_poses, m) [m] and their derivatives by the pose."""
+    rows = pose_rows(geometry, R, t)
+    wanted = np.where(rows.measured, reading[:, rows.leg], 0.0)
+    known = np.isfinite(wanted)
+    return np.where(known, rows.values - wanted, 0.0), rows.by_pose * known[..., None]

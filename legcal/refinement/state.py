@@ -1,111 +1,20 @@
-"""Where the fit stands, and where each unknown sits in the vector that a solver sees.
-
-The solver sees only changes x around a reference state, in mm and mrad, so that nothing is
-singular and rounding is relative to the change. The vector is kinematic parameters, radii,
-cameras, platform poses, in this order.
-"""
+"""Where the fit stands: values of everything that it moves."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.mechanism.parameters import KinematicParameters, free_coordinates
-from legcal.refinement.residuals import UNIT
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Positions of the unknowns in x; ``size`` marks what is no unknown.
-
-    Attributes
-    ----------
-    base, platform : (n_legs, 3) array of int
-        Joint coordinates; those that are zero by the definition of the frame are no unknowns.
-    offset : (n_legs,) array of int
-        Offsets; those of legs without an encoder are no unknowns.
-    radius : (n_radii,) array of int
-        Radii, one for each of ``parts``.
-    camera : (n_views, 6) array of int
-        Rotation and translation of each camera; cameras that show nothing are no unknowns.
-    pose : (n_poses, 6) array of int
-        Rotation and translation of each platform pose.
-    parts : tuple of (int, str)
-        Leg index and part of each radius.
-    size : int
-        Number of unknowns.
-    """
-
-    base: IntArray
-    platform: IntArray
-    offset: IntArray
-    radius: IntArray
-    camera: IntArray
-    pose: IntArray
-    parts: tuple[tuple[int, str], ...]
-    size: int
-
-    @property
-    def kinematic(self) -> IntArray:
-        """Positions of the kinematic parameters, in the order of ``parameters.to_vector``."""
-        ordered = np.concatenate([self.base.ravel(), self.platform.ravel(), self.offset])
-        return ordered[ordered < self.size]
-
-    @property
-    def n_kept(self) -> int:
-        """Number of unknowns other than platform poses; they come first."""
-        return self.size - self.pose.size
-
-
-def lay_out(
-    frame_legs: Sequence[int],
-    has_offset: BoolArray,
-    parts: Sequence[tuple[int, str]],
-    camera_is_seen: BoolArray,
-    n_poses: int,
-) -> Layout:
-    """Return the layout of the unknowns.
-
-    Parameters
-    ----------
-    frame_legs : sequence of 3 int
-        The legs that define R_b and R_e.
-    has_offset : (n_legs,) array of bool
-        Which legs have an encoder or a constant length.
-    parts : sequence of (int, str)
-        Leg index and part of each radius.
-    camera_is_seen : (n_views,) array of bool
-        Which views have outlines or axes.
-    n_poses : int
-        Number of platform poses.
-
-    Returns
-    -------
-    Layout
-    """
-    free = free_coordinates(len(has_offset), frame_legs)
-    masks = [
-        free,
-        free,
-        has_offset,
-        np.ones(len(parts), dtype=np.bool_),
-        np.repeat(camera_is_seen[:, None], 6, axis=1),
-        np.ones((n_poses, 6), dtype=np.bool_),
-    ]
-    size = int(sum(mask.sum() for mask in masks))
-    positions, first = [], 0
-    for mask in masks:
-        position = np.full(mask.shape, size, dtype=np.intp)
-        count = int(mask.sum())
-        position[mask] = np.arange(first, first + count)
-        positions.append(position)
-        first += count
-    base, platform, offset, radius, camera, pose = positions
-    return Layout(base, platform, offset, radius, camera, pose, tuple(parts), size)
+from legcal.geometry.types import Array
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.leg_steps import moved_legs
+from legcal.refinement.layout import Layout
+from legcal.vision.camera import Camera
+from legcal.vision.intrinsics import intrinsic_names, intrinsic_values, with_intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,31 +23,43 @@ class State:
 
     Attributes
     ----------
-    base_joints, platform_joints : (n_legs, 3) array
-        A in R_b and B in R_e [m].
-    offsets : (n_legs,) array
-        q0 [m]; NaN for legs without one.
+    legs : tuple of LegGeometry
+        The legs in R_b and R_e.
     radii : (n_radii,) array
         Radii [m] of the layout's parts.
+    biases : (n_biases,) array
+        Shifts of outlines that several of them share [px].
+    cameras : tuple of Camera
+        The intrinsics of each view.
     R_camera, t_camera : (n_views, 3, 3) and (n_views, 3) array
         Rotation and translation [m] of T_camera_Rb.
     R_pose, t_pose : (n_poses, 3, 3) and (n_poses, 3) array
         Rotation and translation [m] of T_Rb_Re.
     """
 
-    base_joints: Array
-    platform_joints: Array
-    offsets: Array
+    legs: tuple[LegGeometry, ...]
     radii: Array
+    biases: Array
+    cameras: tuple[Camera, ...]
     R_camera: Array
     t_camera: Array
     R_pose: Array
     t_pose: Array
 
-    @property
-    def parameters(self) -> KinematicParameters:
-        """The kinematic parameters."""
-        return KinematicParameters(self.base_joints, self.platform_joints, self.offsets)
+    @cached_property
+    def A(self) -> Array:
+        """Base joint centres in R_b, (n_legs, 3) [m]."""
+        return np.array([leg.A for leg in self.legs])
+
+    @cached_property
+    def B(self) -> Array:
+        """Platform joint centres in R_e, (n_legs, 3) [m]."""
+        return np.array([leg.B for leg in self.legs])
+
+    @cached_property
+    def lengths(self) -> Array:
+        """Offsets and constant lengths, (n_legs,) [m]."""
+        return np.array([leg.q0 for leg in self.legs])
 
     @property
     def T_camera_Rb(self) -> tuple[RigidTransform, ...]:
@@ -151,19 +72,41 @@ class State:
         return motions(self.R_pose, self.t_pose)
 
     def moved(self, x: Array, layout: Layout) -> State:
-        """Return the state after a change x [mm, mrad] of its unknowns."""
-        change = np.append(UNIT * x, 0.0)
-        camera, pose = change[layout.camera], change[layout.pose]
+        """Return the state after a change x of its unknowns [m, rad, px]."""
+        change = np.append(x, 0.0)
+        legs = self.legs
+        if np.any(layout.place < layout.size):
+            legs = moved_legs(legs, layout.place, x)
+        camera, pose = change[layout.camera], x[layout.n_kept :].reshape(-1, 6)
         return State(
-            self.base_joints + change[layout.base],
-            self.platform_joints + change[layout.platform],
-            self.offsets + change[layout.offset],
+            legs,
             self.radii + change[layout.radius],
+            self.biases + change[layout.bias],
+            _changed(self.cameras, change[layout.intrinsic], layout.intrinsic_keys),
             turned(self.R_camera, camera[:, :3]),
             self.t_camera + camera[:, 3:],
             turned(self.R_pose, pose[:, :3]),
             self.t_pose + pose[:, 3:],
         )
+
+
+def _changed(
+    cameras: tuple[Camera, ...], change: Array, keys: tuple[str, ...]
+) -> tuple[Camera, ...]:
+    """Return cameras whose intrinsics have changed by (n_views, n_keys)."""
+    if not np.any(change):
+        return cameras
+    changed = []
+    for camera, by in zip(cameras, change, strict=True):
+        moved = dict(zip(keys, by.tolist(), strict=True))
+        values = {key: intrinsic_of(camera, key) + d for key, d in moved.items() if d != 0.0}
+        changed.append(with_intrinsics(camera, values))
+    return tuple(changed)
+
+
+def intrinsic_of(camera: Camera, key: str) -> float:
+    """Return one number of a camera by its name."""
+    return float(intrinsic_values(camera)[intrinsic_names(camera).index(key)])
 
 
 def cayley(w: Array) -> Array:
@@ -189,3 +132,9 @@ def motions(R: Array, t: Array) -> tuple[RigidTransform, ...]:
         return ()
     together = RigidTransform.from_components(t, Rotation.from_matrix(R))
     return tuple(together[i] for i in range(len(R)))
+
+
+def components(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
+    """Return rotation matrices and translations of motions."""
+    T = np.array([T.as_matrix() for T in motions]).reshape(-1, 4, 4)
+    return T[:, :3, :3].copy(), T[:, :3, 3].copy()

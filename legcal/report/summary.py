@@ -13,7 +13,7 @@ from rich.text import Text
 from legcal.calibration import Calibration
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.platform import pose_differences
-from legcal.refinement.start import platform_poses
+from legcal.refinement.start import platform_poses, with_joints
 from legcal.report.result import result_document
 
 
@@ -82,7 +82,10 @@ def _apart(calibration: Calibration, parameters: KinematicParameters) -> tuple[f
     near, mechanism = calibration.solution.T_Rb_Re, calibration.dataset.mechanism
     measurements = calibration.dataset.measurements
     lengths = mechanism.sign * measurements.q[measurements.first_rows] + parameters.offsets
-    displacement, rotation = pose_differences(platform_poses(parameters, lengths, near), near)
+    legs = with_joints(calibration.solution.legs, parameters)
+    displacement, rotation = pose_differences(
+        platform_poses(legs, lengths, near, mechanism.frame_legs), near
+    )
     return float(displacement.mean()), float(rotation.mean())
 
 

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import lru_cache
 
-import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
+from legcal.mechanism.leg_geometry import point_like_legs
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations.leg_axes import LegAxes
-from legcal.observations.measurements import Measurements
+from legcal.observations.sets import no_outlines
+from legcal.refinement.bound import average_images, bound
+from legcal.refinement.build import build_fit
 from legcal.refinement.legs import FittedLegs
-from legcal.refinement.repeated import (
-    AxesFit,
-    average_images,
-    bound,
-    build_axes_fit,
-    solve_again,
-)
+from legcal.refinement.refine import refine
 from legcal.refinement.start import Start, cameras_from_hints, start_from
 from legcal.simulation.forward import follow_from_home
 from legcal.simulation.machine import Machine
@@ -49,17 +43,17 @@ def one_fit(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
     """
     measurements = session.measurements
     axes = average_images(session.axes, measurements)
-    fit = _fit_of(nominal, measurements, axes)
+    legs = _legs(nominal)
     lengths = nominal.sign * measurements.q[measurements.first_rows] + nominal.parameters.offsets
     start = start_from(
-        nominal.parameters,
+        legs.nominal,
         measurements,
-        fit.legs,
+        legs,
         cameras_from_hints(measurements, RigidTransform.identity()),
         tuple(follow_from_home(nominal, lengths).T_Rb_Re),
         "nominal",
     )
-    return solve_again(fit, measurements, axes, start).parameters
+    return refine(legs, measurements, no_outlines(), start, axes=axes).parameters
 
 
 def bound_covariance(session: SimulatedSession, exact: LegAxes) -> Array:
@@ -78,14 +72,15 @@ def bound_covariance(session: SimulatedSession, exact: LegAxes) -> Array:
         In the order of ``parameters.to_vector`` [m^2]; cameras and platform poses are unknown.
     """
     axes = average_images(exact, session.measurements)
-    fit = _fit_of(session.machine, session.measurements, axes)
+    legs = _legs(session.machine)
+    problem = build_fit(legs, session.measurements, no_outlines(), axes=axes)
     truth = Start(
-        session.machine.parameters,
+        legs.nominal,
         tuple(camera.T_Rb_camera.inv() for camera in session.cameras),
         tuple(session.T_Rb_Re),
         "truth",
     )
-    return bound(fit, session.measurements, axes, truth).covariance
+    return bound(problem, truth)
 
 
 ESTIMATORS: dict[str, Estimator] = {
@@ -95,37 +90,7 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def _fit_of(machine: Machine, measurements: Measurements, axes: LegAxes) -> AxesFit:
-    """Return the fit of axes, built once for all sessions that show the same legs and poses."""
-    shown = np.column_stack([axes.leg, measurements.view[axes.row], measurements.pose[axes.row]])
-    return _built(
-        _Structure(
-            machine.leg_names,
-            machine.frame_legs,
-            tuple(machine.sign.tolist()),
-            shown.tobytes(),
-            (machine, measurements, axes),
-        )
-    )
-
-
-@dataclass(frozen=True)
-class _Structure:
-    """What fits of sessions share, and a session to build one of.
-
-    The legs, and which leg at which pose is in which view; the session makes no difference.
-    """
-
-    leg_names: tuple[str, ...]
-    frame_legs: tuple[int, ...]
-    sign: tuple[int, ...]
-    shown: bytes
-    session: tuple[Machine, Measurements, LegAxes] = field(compare=False)
-
-
-@lru_cache(maxsize=1)  # it may be large
-def _built(structure: _Structure) -> AxesFit:
-    """Return the fit of a structure."""
-    machine, measurements, axes = structure.session
-    legs = FittedLegs(machine.leg_names, machine.sign, machine.frame_legs, {})
-    return build_axes_fit(legs, measurements, axes)
+def _legs(machine: Machine) -> FittedLegs:
+    """Return the legs of a machine as the fit sees them."""
+    legs = point_like_legs(machine.parameters)
+    return FittedLegs(machine.leg_names, legs, machine.sign, machine.frame_legs, {})

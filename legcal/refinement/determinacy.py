@@ -1,0 +1,168 @@
+"""What the measurements leave open: refused where it moves the platform, held at nominal where not.
+
+A direction of the parameters that is known worse than to a tenth of a leg, angles counted at the
+length of a leg, is not known at all: no nominal model is that bad, and a linearised
+covariance means nothing there. One that does not move the platform is left alone much
+earlier, where a nominal model may well know it better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legcal.errors import NotIdentifiable
+from legcal.geometry.types import Array
+from legcal.mechanism.directions import SHOWN, sparse_basis, split_by_motion
+from legcal.mechanism.sensitivity import pose_sensitivity
+from legcal.refinement.covariance import direction
+from legcal.refinement.normal import NormalEquations, inverse_on_range
+from legcal.refinement.priors import named_jacobian
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.start import with_values
+from legcal.refinement.state import State
+
+_LARGEST_SIGMA = 0.1  # of the mean leg length
+_HELD_SIGMA = 0.01  # of it, where the platform does not move
+_HARMLESS = 0.01  # of the change of the parameters: the platform hardly moves
+_OTHERS = 0.05  # of a direction that is not kinematic: more, and it is not a matter of the legs
+_REMEDY = "add images from other directions, of other legs or at poses that differ more"
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Directions of the parameters that are open and do not move the platform.
+
+    Attributes
+    ----------
+    basis : (w, n_named) array
+        In the values of named unknowns, each over its unit, orthonormal.
+    unit : (n_named,) array
+        A metre of each named unknown in its own unit.
+    directions : tuple of str
+        The directions in words.
+    names : tuple of str
+        The parameters that are part of one.
+    """
+
+    basis: Array
+    unit: Array
+    directions: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+
+
+def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> Held:
+    """Return the open directions that do no harm.
+
+    Parameters
+    ----------
+    problem : FitProblem
+        Without anything held.
+    state : State
+    normal : NormalEquations
+        From :func:`legcal.refinement.normal.information` at the state.
+
+    Raises
+    ------
+    NotIdentifiable
+        If an open direction moves the platform, or belongs to a camera or a radius.
+    """
+    names, unit, length = problem.named, named_units(problem, state), mean_length(state)
+    S = _of_values(problem, state, normal)
+    unseen = [name for name, row in zip(names, S, strict=True) if not np.any(row)]
+    scaled = unit[:, None] * S * unit
+    value, vector = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    n_open, n_poor = (
+        int(np.sum(value * (sigma * length) ** 2 < 1.0)) for sigma in (_LARGEST_SIGMA, _HELD_SIGMA)
+    )
+    basis, poor = vector[:, :n_open].T, vector[:, :n_poor].T
+    n = problem.layout.n_kinematic
+    others = np.flatnonzero((basis[:, n:] ** 2).sum(axis=1) > _OTHERS**2)
+    if len(others):
+        basis = basis[others]
+    else:
+        motion = _motion(problem, state, unit)
+        basis, _ = split_by_motion(motion, basis, length, _HARMLESS)
+        _, harmless = split_by_motion(motion, poor, length, _HARMLESS)
+    if len(basis):
+        raise NotIdentifiable(_refusal(names, sparse_basis(basis)[0], len(basis), unseen))
+    rows = sparse_basis(harmless)
+    shown = np.abs(rows) > SHOWN * np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
+    return Held(
+        harmless,
+        unit,
+        tuple(str(direction(row, names, 0.0)) for row in rows),
+        tuple(names[i] for i in np.flatnonzero(shown.any(axis=0))),
+    )
+
+
+def held_at_nominal(problem: FitProblem, state: State, held: Held) -> tuple[FitProblem, State]:
+    """Return the problem with these directions held, and the state with them at nominal."""
+    layout, legs = problem.layout, problem.legs
+    n = layout.n_kinematic
+    by_x = named_jacobian(state, layout, legs)
+    rows = np.zeros((len(held.basis), layout.n_kept))
+    rows[:, : len(by_x)] = (held.basis / held.unit) @ by_x
+    orthonormal = np.linalg.qr(rows.T)[0].T
+    away = (legs.vector(state.legs) - legs.vector(legs.nominal))[layout.kinematic < layout.size]
+    along = held.basis[:, :n] @ (away / held.unit[:n])
+    wanted = legs.vector(state.legs)[layout.kinematic < layout.size]
+    wanted = wanted - held.unit[:n] * (along @ held.basis[:, :n])
+    where = np.flatnonzero(layout.kinematic < layout.size).tolist()
+    moved = with_values(state.legs, legs, dict(zip(where, wanted.tolist(), strict=True)))
+    return replace(problem, held=orthonormal), replace(state, legs=moved)
+
+
+def named_units(problem: FitProblem, state: State) -> Array:
+    """Return a metre of each named unknown in its own unit: angles at the mean leg length."""
+    length = mean_length(state)
+    focal = float(np.mean([camera.K[0, 0] for camera in state.cameras]))
+    of = {"m": 1.0, "rad": 1.0 / length, "px": focal / length, "": 1.0 / length}
+    return np.array([of[unit] for unit in problem.named_units])
+
+
+def mean_length(state: State) -> float:
+    """Return the mean distance of the joints of a leg over the poses [m]."""
+    ends = np.einsum("kij,lj->kli", state.R_pose, state.B) + state.t_pose[:, None]
+    return float(np.linalg.norm(ends - state.A, axis=-1).mean())
+
+
+def _of_values(problem: FitProblem, state: State, normal: NormalEquations) -> Array:
+    """Return the normal matrix of the values of named unknowns, all else unknown; biases too."""
+    S, layout = normal.reduced(), problem.layout
+    n = layout.n_named
+    if n < len(S):
+        S = S[:n, :n] - S[:n, n:] @ inverse_on_range(S[n:, n:]) @ S[n:, :n]
+    back = np.linalg.inv(named_jacobian(state, layout, problem.legs))
+    return np.asarray(back.T @ S @ back)
+
+
+def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
+    """Return how the platform moves (k, 6, n_named) by a metre of each named unknown."""
+    legs, layout = problem.legs, problem.layout
+    try:
+        by = pose_sensitivity(
+            state.legs, legs.parametrization, legs.frame_legs, state.R_pose, state.t_pose
+        )
+    except NotIdentifiable:
+        return None
+    motion = np.zeros((len(by), 6, len(unit)))
+    free = layout.kinematic < layout.size
+    n = layout.n_kinematic
+    motion[..., :n] = by[..., free] @ np.linalg.inv(named_jacobian(state, layout, legs))[:n, :n]
+    return motion * unit
+
+
+def _refusal(names: tuple[str, ...], row: Array, n_open: int, unseen: list[str]) -> str:
+    """Return why the fit cannot be trusted."""
+    if unseen:
+        return (
+            f"The fit is not determined: no measurement depends on {', '.join(unseen)}; every leg "
+            "needs readings or outlines; add images that show it."
+        )
+    return (
+        f"The fit is not determined: found {n_open} of {len(names)} directions of the parameters "
+        f"that the measurements leave open and that matter, such as {direction(row, names, 0.0)}, "
+        f"needed all to a tenth of a leg; {_REMEDY}, or state what is known with a prior."
+    )

@@ -1,0 +1,146 @@
+"""From a state to residuals and derivatives: the chain rule around the residuals.
+
+A measurement in the image depends on both ends of a leg in the camera frame; these depend on
+joints, camera and platform pose. Rotations change by Cayley's map from the left: a camera turns in
+its own frame, a platform about the origin of R_e in the directions of R_b.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.types import Array, IntArray
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.residuals import axis_residual, encoder_residual, outline_residual
+from legcal.refinement.rows import Rows
+from legcal.refinement.state import State
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """Whitened residuals of all kinds at a state.
+
+    Attributes
+    ----------
+    outlines, readings, axes : Rows
+        Two, one and four rows a measurement.
+    prior_r, prior_J : (n,) and (n, n_kept) array
+    """
+
+    outlines: Rows
+    readings: Rows
+    axes: Rows
+    prior_r: Array
+    prior_J: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """Both ends of legs in the camera frame, and what their derivatives are made of."""
+
+    A: Array  # (n, 3) from the camera, in its directions, and B likewise
+    B: Array
+    A_turned: Array  # without the camera's place
+    B_turned: Array
+    arm: Array  # (n, 3) from the origin of R_e to B, in R_b
+    R_camera: Array  # (n, 3, 3)
+    R_pose: Array
+
+    def by_unknowns(self, by_A: Array, by_B: Array) -> tuple[Array, Array]:
+        """Return derivatives by A, B, camera (n, q, 12) and by the pose (n, q, 6)."""
+        a, b = by_A @ self.R_camera, by_B @ self.R_camera
+        turn = _cross(self.A_turned[:, None], by_A) + _cross(self.B_turned[:, None], by_B)
+        J = np.concatenate([a, b @ self.R_pose, turn, by_A + by_B], axis=-1)
+        return J, np.concatenate([_cross(self.arm[:, None], b), b], axis=-1)
+
+
+def linearize(problem: FitProblem, state: State, whitening: Array) -> Linearization:
+    """Return whitened residuals and derivatives of all measurements at a state.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    state : State
+    whitening : (n_outlines, 2, 2) array
+        Lower triangular T of each outline: T C T^T = 1 [1/px]; zero leaves an outline out.
+    """
+    r, J = problem.priors.linearize(state, problem.legs)
+    return Linearization(
+        outline_rows(problem, state).whitened(whitening),
+        _reading_rows(problem, state),
+        _axis_rows(problem, state),
+        r,
+        J,
+    )
+
+
+def outline_rows(problem: FitProblem, state: State) -> Rows:
+    """Return the offsets (n, 2) [px] of all outlines with their derivatives."""
+    o = problem.outlines
+    ends = _ends_in_camera(state, o.leg, o.view, o.pose)
+    xy, by_intrinsics = problem.measured_ends(state)
+    n = len(o)
+    local = np.concatenate([ends.A, ends.B, state.radii[o.radius, None], xy.reshape(n, 4)], axis=1)
+    r, slope = outline_residual().evaluate(local, o.constants)
+    J, J_pose = ends.by_unknowns(slope[..., :3], slope[..., 3:6])
+    columns = [J, slope[..., 6:7]]
+    if o.bias_index.shape[1]:
+        r = r - np.einsum("nc,ncq->nq", state.biases[o.bias_index], o.bias_shift)
+        columns.append(-np.swapaxes(o.bias_shift, 1, 2))
+    if by_intrinsics.shape[-1]:
+        along = slope[..., 7:].reshape(n, 2, 2, 2)  # by (end, coordinate)
+        columns.append(np.einsum("nqec,neck->nqk", along, by_intrinsics))
+    return Rows(r, np.concatenate(columns, axis=-1), J_pose)
+
+
+def offsets_of(problem: FitProblem, state: State) -> Array:
+    """Return the offsets (n, 2) [px] of all outlines at a state."""
+    return outline_rows(problem, state).r
+
+
+def _reading_rows(problem: FitProblem, state: State) -> Rows:
+    """Return the whitened closures of all legs with readings."""
+    e = problem.readings
+    arm = np.einsum("nij,nj->ni", state.R_pose[e.pose], state.B[e.leg])
+    local = np.column_stack(
+        [state.A[e.leg], state.t_pose[e.pose] + arm, state.lengths[e.leg]],
+    )
+    r, slope = encoder_residual().evaluate(local, e.length[:, None])
+    b = slope[..., 3:6]
+    J = np.concatenate([slope[..., :3], b @ state.R_pose[e.pose], slope[..., 6:]], axis=-1)
+    J_pose = np.concatenate([_cross(arm[:, None], b), b], axis=-1)
+    return Rows(r / e.sigma, J / e.sigma, J_pose / e.sigma)
+
+
+def _axis_rows(problem: FitProblem, state: State) -> Rows:
+    """Return the whitened residuals of all measured axes."""
+    a = problem.axes
+    ends = _ends_in_camera(state, a.leg, a.view, a.pose)
+    r, slope = axis_residual().evaluate(
+        np.concatenate([ends.A, ends.B], axis=1),
+        np.concatenate([a.M, a.basis.reshape(-1, 6)], axis=1),
+    )
+    return Rows(r, *ends.by_unknowns(slope[..., :3], slope[..., 3:])).whitened(a.whitening)
+
+
+def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _Ends:
+    """Return both ends of legs in the camera frames of views at poses."""
+    R_camera, R_pose, t = state.R_camera[view], state.R_pose[pose], state.t_camera[view]
+    arm = _times(R_pose, state.B[leg])
+    A = _times(R_camera, state.A[leg])
+    B = _times(R_camera, state.t_pose[pose] + arm)
+    return _Ends(A + t, B + t, A, B, arm, R_camera, R_pose)
+
+
+def _times(R: Array, v: Array) -> Array:
+    """Return R v of rows, (n, 3)."""
+    return np.asarray((R @ v[..., None])[..., 0])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return vector products along the last axis; np.cross is slow."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    i, j, k = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * k - z * j, z * i - x * k, x * j - y * i], axis=-1)

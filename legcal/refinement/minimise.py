@@ -1,0 +1,155 @@
+"""Levenberg-Marquardt on everything at once, platform poses eliminated and kept on constraints.
+
+Steps are those of Gauss-Newton, with the loss's true curvature, damped where they do not lower the
+cost. While most measurements are far off, the loss is a few times as wide as their median
+distance: nearly plain squares for them, and still no place for those that are wrong altogether.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array
+from legcal.refinement.constraints import on_constraints
+from legcal.refinement.linearize import Linearization, linearize
+from legcal.refinement.loss import cost_of, width_to_k
+from legcal.refinement.normal import normal_equations
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.state import State
+
+_FIRST_DAMPING = 1e-6
+_LEAST_DAMPING = 1e-10
+_MOST_DAMPING = 1e8
+_SMALLEST_FALL = 1e-12  # of the cost, in squared standard deviations: the minimum is reached
+_ROUNDING = 1e-13  # of the cost: below, its fall is not seen
+_LARGEST_TURN = 0.3  # [rad] in one step
+_MEDIANS = 5.0  # width of the loss while most measurements are beyond its final one
+_SLOW = 0.5  # of the cost: a step that lowers it by less has done what this loss can do
+_NARROWING = 0.8  # of the width: smaller changes of the median do not change the loss
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """A minimum of the robust cost.
+
+    Attributes
+    ----------
+    state : State
+    linear : Linearization
+        There.
+    cost : float
+    iterations : int
+        Steps that were tried.
+    """
+
+    state: State
+    linear: Linearization
+    cost: float
+    iterations: int
+
+
+def minimise(
+    problem: FitProblem,
+    state: State,
+    whitening: Array,
+    width: float,
+    max_iterations: int = 100,
+) -> Minimum:
+    """Minimise the robust cost from a state.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    state : State
+        Where to start.
+    whitening : (n_outlines, 2, 2) array
+        Weights of the outlines, as in :func:`legcal.refinement.linearize.linearize`.
+    width : float
+        Whitened distance at which the loss turns from quadratic to linear; infinite for none.
+    max_iterations : int
+        Steps to try.
+
+    Raises
+    ------
+    DidNotConverge
+        If no step lowers the cost although it is not at rest, or the steps do not come to an end.
+    """
+    state = on_constraints(state, problem.legs.frame_legs)
+    linear = linearize(problem, state, whitening)
+    wide = _width(linear, width, np.inf)
+    damping, fall_before = _FIRST_DAMPING, np.inf
+    for iteration in range(1, max_iterations + 1):
+        k = width_to_k(wide)
+        cost = robust_cost(linear, k)
+        step, promised = normal_equations(problem, state, linear, k).step(damping)
+        trial = _tried(problem, state, step)
+        if trial is not None:
+            linear_there = linearize(problem, trial, whitening)
+            fall = cost - robust_cost(linear_there, k)
+            at_rest = promised < _SMALLEST_FALL + _ROUNDING * cost
+            if np.isfinite(fall) and (fall > 0.0 or at_rest):
+                state, linear = trial, linear_there
+                damping = _next(damping, fall / max(promised, 1e-300))
+                narrower = wide
+                if fall < _SLOW * cost:
+                    narrower = _width(linear, width, wide)
+                rate = promised / fall_before if np.isfinite(fall_before) else 1.0
+                expected = promised * min(rate, 1.0)
+                if narrower == wide and (at_rest or expected < _SMALLEST_FALL):
+                    return Minimum(state, linear, robust_cost(linear, k), iteration)
+                fall_before = promised if narrower == wide else np.inf
+                wide = narrower
+                continue
+        damping *= 10.0
+        fall_before = np.inf
+        if damping > _MOST_DAMPING:
+            break
+    raise DidNotConverge(
+        "The fit of everything did not converge: found a cost that still falls by "
+        f"{promised:.2g} a step after {iteration} steps, needed a minimum; start nearer to the "
+        "truth (joints to 5 mm, cameras to 2 cm and 2 deg) and check the camera poses, the "
+        "readings and that outlines or axes are those of the right legs."
+    )
+
+
+def robust_cost(linear: Linearization, k: float) -> float:
+    """Return the cost: the loss of outlines and axes, half the squares of readings and priors."""
+    plain = np.sum(linear.readings.r**2) + np.sum(linear.prior_r**2)
+    robust = (cost_of(rows.squared_norms, k) for rows in (linear.outlines, linear.axes))
+    return float(0.5 * plain + sum(robust))
+
+
+def _width(linear: Linearization, width: float, before: float) -> float:
+    """Return the width of the loss: some medians while most measurements are far off."""
+    norms = np.concatenate([linear.outlines.squared_norms, linear.axes.squared_norms])
+    norms = norms[norms > 0.0]
+    median = float(np.sqrt(np.median(norms))) if len(norms) else 0.0
+    wanted = width if median <= width else _MEDIANS * median
+    return wanted if wanted == width or wanted < _NARROWING * before else before
+
+
+def _next(damping: float, gain: float) -> float:
+    """Return the damping after a step that gave that part of what it promised."""
+    if gain > 0.75:
+        return max(0.1 * damping, _LEAST_DAMPING)
+    return damping if gain > 0.25 else 4.0 * damping
+
+
+def _tried(problem: FitProblem, state: State, step: Array) -> State | None:
+    """Return the state after a step, shortened where it turns too far; None if it leads nowhere."""
+    if not np.all(np.isfinite(step)):
+        return None
+    layout = problem.layout
+    turns = [step[layout.n_kept :].reshape(-1, 6)[:, :3].ravel()]
+    turns += [step[layout.camera[layout.camera[:, 0] < layout.size][:, :3]].ravel()]
+    largest = float(np.abs(np.concatenate(turns)).max(initial=0.0))
+    moved = state.moved(step * min(1.0, _LARGEST_TURN / max(largest, 1e-300)), layout)
+    if np.any(moved.radii <= 0.0):
+        return None
+    try:
+        return on_constraints(moved, problem.legs.frame_legs)
+    except DidNotConverge:
+        return None

@@ -1,0 +1,94 @@
+"""The unknowns that have names, and what is known of them beforehand.
+
+Named are kinematic parameters, radii, biases and intrinsics; they stand first in x. Their values
+are what a user means by their names: an axis is two angles from the nominal one, whereas its
+unknowns are turns of where it is now.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.types import Array, IntArray
+from legcal.mechanism.leg_steps import moved_legs
+from legcal.refinement.layout import Layout
+from legcal.refinement.legs import FittedLegs
+from legcal.refinement.residuals import prior_residual
+from legcal.refinement.state import State, intrinsic_of
+
+_STEP = 1e-6  # [rad], of central differences
+_AXES = slice(7, 11)  # among the numbers of a leg
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """Gaussian priors on single named unknowns.
+
+    Attributes
+    ----------
+    layout : Layout
+    position : (n,) array of int
+        Positions in x.
+    mean, sigma : (n,) array
+        Means and standard deviations [m, rad, px].
+    """
+
+    layout: Layout
+    position: IntArray
+    mean: Array
+    sigma: Array
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def linearize(self, state: State, legs: FittedLegs) -> tuple[Array, Array]:
+        """Return whitened residuals (n,) and derivatives (n, n_kept) of all priors."""
+        value = named_values(state, self.layout, legs)[self.position]
+        data = np.column_stack([self.mean, 1.0 / self.sigma])
+        r, slope = prior_residual().evaluate(value[:, None], data)
+        J = np.zeros((len(self), self.layout.n_kept))
+        if len(self):
+            by_x = named_jacobian(state, self.layout, legs)[self.position]
+            J[:, : by_x.shape[1]] = slope[:, 0] * by_x
+        return r[:, 0], J
+
+
+def named_values(state: State, layout: Layout, legs: FittedLegs) -> Array:
+    """Return the values of the named unknowns, (n_named,), in the order of x."""
+    kinematic = legs.vector(state.legs)[layout.kinematic < layout.size]
+    radii = state.radii[layout.radius < layout.size]
+    return np.concatenate([kinematic, radii, state.biases, _intrinsics(state, layout)])
+
+
+def named_jacobian(state: State, layout: Layout, legs: FittedLegs) -> Array:
+    """Return the derivative (n_named, n_named) of the values of named unknowns by x.
+
+    It is one but for axes.
+    """
+    J = np.eye(layout.n_named)
+    free = layout.kinematic < layout.size
+    for x in layout.place[:, _AXES].ravel():
+        if x < layout.size:
+            step = np.zeros(layout.size)
+            step[x] = _STEP
+            ahead, behind = (
+                legs.vector(moved_legs(state.legs, layout.place, sign * step))
+                for sign in (1.0, -1.0)
+            )
+            J[: layout.n_kinematic, x] = ((ahead - behind) / (2.0 * _STEP))[free]
+    return J
+
+
+def _intrinsics(state: State, layout: Layout) -> Array:
+    """Return the values of the intrinsics that are unknowns, in their order."""
+    positions, first = np.unique(layout.intrinsic, return_index=True)
+    n_keys = max(len(layout.intrinsic_keys), 1)
+    return np.array(
+        [
+            intrinsic_of(state.cameras[place // n_keys], layout.intrinsic_keys[place % n_keys])
+            for position, place in zip(positions.tolist(), first.tolist(), strict=True)
+            if position < layout.size
+        ]
+    )
