@@ -22,6 +22,7 @@ from legcal.observations.canonical_order import (
     reorder_measurements,
     restore_outlines,
 )
+from legcal.refinement.held_out import HeldOut
 from legcal.refinement.platform_error import PlatformError, predict_platform_error
 from legcal.refinement.solution import Solution
 
@@ -98,6 +99,8 @@ class Calibration:
         Whether to use it.
     notes : tuple of str
         What else a reader should know.
+    held_out : HeldOut or None
+        What images that were kept aside say of the fit; None where there are none.
     """
 
     dataset: Dataset
@@ -107,6 +110,7 @@ class Calibration:
     sigma: PlatformError
     verdict: Verdict
     notes: tuple[str, ...]
+    held_out: HeldOut | None = None
 
 
 def permuted(parameters: KinematicParameters, legs: IntArray) -> KinematicParameters:

@@ -22,7 +22,9 @@ LAYERS = (
     "calibration",
     "repeatability",
     "report",
+    "workpiece",
     "pipeline",
+    "check",
     "cli",
 )
 SIMULATED = {"simulation", "studies"}  # what knows the truth
