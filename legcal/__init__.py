@@ -26,6 +26,7 @@ from legcal.errors import LegcalError
 from legcal.version import __version__
 
 if TYPE_CHECKING:
+    from legcal.checking import check
     from legcal.dataset.folder import load_dataset
     from legcal.identify.analysis import identifiability
     from legcal.mechanism.configurations import random_configurations
@@ -51,6 +52,7 @@ __all__ = [
     "TableNoise",
     "__version__",
     "calibrate",
+    "check",
     "evaluate",
     "forward_kinematics",
     "identifiability",
@@ -71,6 +73,7 @@ _HOME = {
     "Spread": "legcal.simulation.parameter_errors",
     "TableNoise": "legcal.simulation.table_noise",
     "calibrate": "legcal.pipeline",
+    "check": "legcal.checking",
     "evaluate": "legcal.report.accuracy",
     "forward_kinematics": "legcal.mechanism.kinematics",
     "identifiability": "legcal.identify.analysis",

@@ -24,7 +24,7 @@ LAYERS = (
     "report",
     "workpiece",
     "pipeline",
-    "check",
+    "checking",
     "cli",
 )
 SIMULATED = {"simulation", "studies"}  # what knows the truth

@@ -11,6 +11,7 @@ import typer
 from legcal.cli.options import JsonOption
 from legcal.cli.output import print_json, print_table
 from legcal.cli.processors import processors
+from legcal.errors import UsageError
 
 MOST_WORKERS = 4  # processes that search images; each takes about 150 MB
 
@@ -22,6 +23,7 @@ class Criteria(StrEnum):
     LITERAL = "literal"
 
 
+_TESTS = "Tests of a result"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
 
 
@@ -30,8 +32,9 @@ def calibrate(
         Path, typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="The result folder to write.")
-    ],
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT", help="The result folder to write."),
+    ] = None,
     as_json: JsonOption = False,
     criteria: Annotated[
         Criteria,
@@ -65,8 +68,56 @@ def calibrate(
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
+    holdout: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PART",
+            help="Keep this part of the images aside (0.2: a fifth) and tell how well the fit of "
+            "the others foretells them.",
+            rich_help_panel=_TESTS,
+        ),
+    ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RESULT",
+            help="Has it moved? Test the result folder of an earlier calibration with the images "
+            "of DATASET; nothing is written. Exit 1 if something has moved.",
+            rich_help_panel=_TESTS,
+        ),
+    ] = None,
+    significance: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help="Of --check: probability of a false alarm; 0.01 without it.",
+            rich_help_panel=_TESTS,
+        ),
+    ] = None,
 ) -> None:
-    """Compute the calibrated model from images and encoder readings."""
+    """Compute the calibrated model from images and encoder readings, or check an earlier one."""
+    others = {
+        "--output": output,
+        "--prior": prior,
+        "--fix": fix,
+        "--free": free,
+        "--holdout": holdout,
+        "--fresh": fresh or None,
+    }
+    if check is not None:
+        _refuse("--check", [name for name, value in others.items() if value is not None])
+        _check(dataset, check, significance, as_json=as_json)
+        return
+    if significance is not None:
+        raise UsageError(
+            "The significance could not be used: found --significance without --check, needed the "
+            "result to test; name it or leave the significance out."
+        )
+    if output is None:
+        raise UsageError(
+            "The calibration could not be run: found no --output (-o), needed the result folder to "
+            "write; name one, or the result to test with --check."
+        )
     from legcal.pipeline import calibrate as run
     from legcal.report.progress_bars import progress_on_stderr
     from legcal.report.result import result_document
@@ -82,6 +133,7 @@ def calibrate(
             priors=prior or (),
             fixed=fix or (),
             free=free or (),
+            holdout=holdout,
         )
     if as_json:
         print_json(result_document(calibration))
@@ -91,3 +143,34 @@ def calibrate(
         print_table(summary(calibration, output))
     if not calibration.verdict.trustworthy:
         raise typer.Exit(1)
+
+
+def _check(dataset: Path, result: Path, significance: float | None, *, as_json: bool) -> None:
+    """Test an earlier result with new images."""
+    from legcal.checking import SIGNIFICANCE, check
+    from legcal.report.check_report import check_summary
+    from legcal.report.progress_bars import progress_on_stderr
+
+    with progress_on_stderr() as progress:
+        found = check(
+            dataset,
+            result,
+            significance=SIGNIFICANCE if significance is None else significance,
+            progress=progress,
+            workers=min(processors(), MOST_WORKERS),
+        )
+    if as_json:
+        print_json(found.document())
+    else:
+        print_table(check_summary(found))
+    if found.movement.moved:
+        raise typer.Exit(1)
+
+
+def _refuse(option: str, others: list[str]) -> None:
+    """Refuse options beside one that does not go with them."""
+    if others:
+        raise UsageError(
+            f"The command could not be run: found {', '.join(others)} beside {option}, which "
+            "writes nothing and takes all of it from the earlier result; leave one of them out."
+        )

@@ -1,0 +1,234 @@
+"""Has it moved? A few new images of a machine against the result of an earlier calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from legcal.dataset.folder import Dataset, load_dataset
+from legcal.errors import DatasetError, UsageError
+from legcal.geometry.types import Array
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import (
+    Parametrization,
+    geometries,
+    parametrization_of,
+    vector_of,
+)
+from legcal.mechanism.sensitivity import pose_sensitivity
+from legcal.progress import Report, no_progress
+from legcal.refinement.changes import possible_changes
+from legcal.refinement.choices import Choices, Prior
+from legcal.refinement.file_order import in_file_order
+from legcal.refinement.foretold import arrays
+from legcal.refinement.held_out import PlatformPair
+from legcal.refinement.known_parameters import known_parameters
+from legcal.refinement.moved import difference, judge_movement
+from legcal.refinement.solution import Solution
+from legcal.report.check_report import Check
+from legcal.report.earlier_result import EarlierResult, read_result
+from legcal.workers import worker_pool
+from legcal.workpiece import observe_and_fit, workpiece
+
+SIGNIFICANCE = 0.01
+_LARGEST_SIGNIFICANCE = 0.5
+_PLAUSIBLE = 0.03  # [rad], or of the mean leg length: what may have moved
+
+
+def check(
+    source: str | Path | Dataset,
+    result: str | Path,
+    *,
+    significance: float = SIGNIFICANCE,
+    progress: Report = no_progress,
+    workers: int = 1,
+) -> Check:
+    """Test with a few new images whether an earlier calibration still holds.
+
+    Parameters
+    ----------
+    source : path or Dataset
+        The new images, of cameras anywhere. Nothing is written beside them.
+    result : path
+        The folder that the earlier calibration wrote.
+    significance : float
+        Probability of a false alarm.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+    workers : int
+        Search the images in that many processes.
+
+    Returns
+    -------
+    Check
+
+    Raises
+    ------
+    UsageError
+        If the significance is none.
+    DatasetError, ModelError, OutOfClass
+        If images or result are malformed, or of different machines.
+    NotVisible, NotIdentifiable, DidNotConverge
+        If the new images cannot be fitted, or say nothing.
+    """
+    check_significance(significance)
+    earlier = read_result(result)
+    dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    dataset = _as_calibrated(dataset, earlier)
+    known = _known(dataset, earlier)
+    with worker_pool(workers) as run:
+        work = workpiece(dataset, run, None, _choices(dataset, earlier, known), use_cache=True)
+        found = observe_and_fit(work, np.arange(dataset.measurements.n_rows), progress)
+    solution = in_file_order(found.solution, found.part.order, dataset)
+    return _compare(dataset, earlier, solution, known, significance)
+
+
+def check_significance(significance: float) -> None:
+    """Refuse a significance that is none.
+
+    Raises
+    ------
+    UsageError
+        If it is not between 0 and 0.5.
+    """
+    if not 0.0 < significance <= _LARGEST_SIGNIFICANCE:
+        raise UsageError(
+            f"The earlier result could not be tested: found the significance {significance:g}, "
+            f"needed a probability above 0 and up to {_LARGEST_SIGNIFICANCE:g} (0.01 gives one "
+            "false alarm in a hundred checks); correct it."
+        )
+
+
+class _Known:
+    """The parameters that may have moved, where they were, and how far they may be now."""
+
+    def __init__(self, names: Sequence[str], old: Array, plausible: Array, covariance: Array):
+        self.names, self.old, self.plausible, self.covariance = names, old, plausible, covariance
+
+
+def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
+    """Return new images with the calibrated model in place of the one that they name."""
+    given, calibrated = dataset.mechanism, earlier.mechanism
+    different = ""
+    if sorted(given.leg_names) != sorted(calibrated.leg_names):
+        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(given.leg_names)}"
+    else:
+        calibrated = calibrated.with_leg_order(given.leg_names)
+        different = _difference(calibrated, given)
+    if different:
+        raise DatasetError(
+            f"{earlier.folder}: the earlier result could not be tested with {dataset.folder}: "
+            f"found the result of another machine, with {different}, needed one of the same; give "
+            "the result that belongs to these images."
+        )
+    return replace(dataset, mechanism=calibrated, wishes=())
+
+
+def _difference(calibrated: Mechanism, given: Mechanism) -> str:
+    """Return what differs between two models of the same legs, nothing if they are one machine."""
+    for one, other in zip(calibrated.legs, given.legs, strict=True):
+        here, there = (f"{leg.name} ({leg.kind}, {leg.type})" for leg in (one, other))
+        if here != there:
+            return f"the leg {here}, not {there}"
+        if one.prismatic != other.prismatic:
+            return f"the joint {one.prismatic}, not {other.prismatic}"
+    frames = [[m.leg_names[j] for j in m.frame_legs] for m in (calibrated, given)]
+    if frames[0] != frames[1]:
+        return f"base_frame {', '.join(frames[0])}, not {', '.join(frames[1])}"
+    return ""
+
+
+def _known(dataset: Dataset, earlier: EarlierResult) -> _Known:
+    """Return what the earlier result says of the parameters that are compared."""
+    mechanism = dataset.mechanism
+    legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    values = vector_of(found, legs, legs)
+    compared = {*earlier.names, *earlier.weak}
+    chosen = [i for i, name in enumerate(found.names) if name in compared]
+    names = [found.names[i] for i in chosen]
+    length = float(np.mean([np.linalg.norm(vector) for vector in _leg_vectors(mechanism)]))
+    plausible = np.array([_PLAUSIBLE * (length if found.units[i] == "m" else 1.0) for i in chosen])
+    covariance = np.zeros((len(names), len(names)))
+    weak = [i for i, name in enumerate(names) if name not in earlier.names]
+    covariance[weak, weak] = plausible[weak] ** 2
+    place = [earlier.names.index(name) for name in names if name in earlier.names]
+    at = [i for i, name in enumerate(names) if name in earlier.names]
+    covariance[np.ix_(at, at)] = earlier.covariance[np.ix_(place, place)]
+    return _Known(names, values[chosen], plausible, covariance)
+
+
+def _leg_vectors(mechanism: Mechanism) -> Array:
+    """Return the vectors from A to B at home, (n_legs, 3) [m]."""
+    return np.asarray(mechanism.home.apply(mechanism.B_platform) - mechanism.A_base)
+
+
+def _choices(dataset: Dataset, earlier: EarlierResult, known: _Known) -> Choices:
+    """Return priors that leave room for whatever may have moved."""
+    priors = {
+        name: Prior(float(mean), float(sigma))
+        for name, mean, sigma in zip(known.names, known.old, known.plausible, strict=True)
+    }
+    cameras = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
+    for name, parameter in cameras.items():
+        for other, (nominal, value, sigma) in earlier.intrinsics.items():
+            same = name.rsplit(".", 1)[1] == other.rsplit(".", 1)[1]
+            if parameter.kind == "intrinsic" and same and parameter.nominal == nominal:
+                priors[name] = Prior(value, sigma)
+    return Choices(fixed=frozenset(earlier.fixed), priors=priors)
+
+
+def _compare(
+    dataset: Dataset,
+    earlier: EarlierResult,
+    solution: Solution,
+    known: _Known,
+    significance: float,
+) -> Check:
+    """Return what the fit of the new images says against the earlier result."""
+    where = [solution.names.index(name) for name in known.names]
+    values = np.array([solution.values[name] for name in known.names])
+    covariance = solution.covariance[np.ix_(where, where)]
+    found = difference(values, covariance, known.plausible, known.old, known.covariance)
+    mechanism = dataset.mechanism
+    legs, parametrization = geometries(mechanism), solution.parametrization
+    columns = [parametrization.names.index(name) for name in known.names]
+    changes = possible_changes(
+        mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
+    )
+    movement = judge_movement(found, solution.dof, changes, significance)
+    J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *arrays(solution.T_Rb_Re))[
+        :, :, columns
+    ]
+    # Priors pull what was found to the earlier result by 1 - G.
+    G = np.eye(len(values)) - covariance / known.plausible**2
+    spread = G @ covariance + G @ known.covariance @ G.T
+    shift = J @ (values - known.old)
+    variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
+    at_platform = PlatformPair(
+        _rms(shift[:, 3:] ** 2),
+        _rms(variance[:, 3:]),
+        _rms(shift[:, :3] ** 2),
+        _rms(variance[:, :3]),
+    )
+    notes = (*dataset.notes, *solution.notes)
+    return Check(dataset, earlier, solution, movement, at_platform, notes)
+
+
+def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:
+    """Return some of the parameters."""
+    place = np.full(parametrization.place.shape, -1, dtype=np.intp)
+    for new, old in enumerate(columns):
+        place[parametrization.place == old] = new
+    return Parametrization(
+        tuple(parametrization.names[i] for i in columns),
+        tuple(parametrization.units[i] for i in columns),
+        place,
+    )
+
+
+def _rms(squares: Array) -> float:
+    """Return the root of the mean over poses of sums of squares (k, 3)."""
+    return float(np.sqrt(np.mean(squares.sum(axis=1))))

@@ -1,0 +1,204 @@
+"""A result folder that an earlier calibration wrote, read back."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from legcal.errors import DatasetError, ModelError, OutOfClass
+from legcal.files.schema import Number, Version, describe, read_text, validate
+from legcal.geometry.types import Array
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
+from legcal.report.axis_turns import calibrated_axis, nominal_axes, turns_between
+
+RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
+_SAME = 1e-9  # [m]: rounding of files
+_SYMMETRIC = 1e-6  # relative
+
+_Axis = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+class _Row(BaseModel):
+    """A row of the parameters."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    name: str
+    value: Number
+    nominal: Number
+    sigma: Annotated[Number, Field(gt=0.0)] | None
+    unit: str
+    status: Literal["estimated", "fixed", "weak"]
+
+
+class _Document(BaseModel):
+    """What is needed of ``result.json``; there is more in it."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    legcal_result: Version
+    status: Literal["converged"]
+    legs: list[str]
+    parameters: Annotated[list[_Row], Field(min_length=1)]
+    nominal_axes: dict[str, dict[str, _Axis]]
+    covariance: list[list[Number]]
+
+
+@dataclass(frozen=True, eq=False)
+class EarlierResult:
+    """An earlier calibration.
+
+    Attributes
+    ----------
+    folder : Path
+        Where it lies.
+    mechanism : Mechanism
+        The calibrated model.
+    names : tuple of str
+        The estimated kinematic parameters.
+    covariance : (n, n) array
+        Their covariance; axes count from the calibrated ones [m, rad].
+    fixed : tuple of str
+        Kinematic parameters that were fixed.
+    weak : tuple of str
+        Kinematic parameters of which the calibration says nothing.
+    intrinsics : mapping
+        (nominal value, value, sigma) of intrinsics that were looked for, by name.
+    """
+
+    folder: Path
+    mechanism: Mechanism
+    names: tuple[str, ...]
+    covariance: Array
+    fixed: tuple[str, ...]
+    weak: tuple[str, ...]
+    intrinsics: Mapping[str, tuple[float, float, float]]
+
+
+def read_result(given: str | Path) -> EarlierResult:
+    """Return the result in a folder that ``legcal calibrate`` wrote.
+
+    Parameters
+    ----------
+    given : str or Path
+        The folder, or ``result.json`` in it.
+
+    Raises
+    ------
+    DatasetError
+        If it is no such folder, damaged, or put together from several.
+    """
+    path = Path(given)
+    path = path if path.name == RESULT_NAME and not os.path.isdir(path) else path / RESULT_NAME
+    document = _read_document(path)
+    try:
+        mechanism = load_mechanism(path.parent / MODEL_NAME)
+    except (ModelError, OutOfClass) as error:
+        raise DatasetError(error.problems) from error
+    if sorted(document.legs) != sorted(mechanism.leg_names):
+        found = f"the legs {', '.join(document.legs)} in {RESULT_NAME}"
+        needed = f"{', '.join(mechanism.leg_names)} as in {MODEL_NAME} beside it"
+        raise DatasetError(_refused(path, found, needed))
+    return _assembled(path, document, mechanism.with_leg_order(document.legs))
+
+
+def _read_document(path: Path) -> _Document:
+    """Return what the document says."""
+    content = read_text(path, "result of an earlier calibration")
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(_refused(path, "no JSON", "the document of a calibration")) from error
+    if not isinstance(found, dict) or "legcal_result" not in found:
+        what = "another document" if isinstance(found, dict) else describe(found)
+        raise DatasetError(_refused(path, what, "one with 'legcal_result: 1'"))
+    return validate(_Document, found, path)
+
+
+def _assembled(path: Path, document: _Document, mechanism: Mechanism) -> EarlierResult:
+    """Return the result, its parts compared with each other."""
+    rows = document.parameters
+    estimated = [row for row in rows if row.status == "estimated"]
+    covariance = _covariance(path, estimated, document.covariance)
+    values = {row.name: row.value for row in rows}
+    _check_same_model(path, document, values, mechanism)
+    known = set(parametrization_of(mechanism, twists=True).names)
+    kinematic = [i for i, row in enumerate(estimated) if row.name in known]
+    names = tuple(estimated[i].name for i in kinematic)
+    turns = turns_between(document.nominal_axes, values, names)
+    return EarlierResult(
+        folder=path.parent,
+        mechanism=mechanism,
+        names=names,
+        covariance=turns @ covariance[np.ix_(kinematic, kinematic)] @ turns.T,
+        fixed=tuple(r.name for r in rows if r.status == "fixed" and r.name in known),
+        weak=tuple(r.name for r in rows if r.status == "weak" and r.name in known),
+        intrinsics={
+            row.name: (row.nominal, row.value, row.sigma)
+            for row in estimated
+            if row.name not in known and ".radius." not in row.name and row.sigma is not None
+        },
+    )
+
+
+def _check_same_model(
+    path: Path, document: _Document, values: Mapping[str, float], mechanism: Mechanism
+) -> None:
+    """Refuse a document whose parameters are not those of the model beside it."""
+    legs, known = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    numbers = dict(zip(known.names, vector_of(known, legs, legs).tolist(), strict=True))
+    other = [
+        name
+        for name, number in numbers.items()
+        if "_axis." not in name and not abs(values.get(name, number) - number) <= _SAME
+    ]
+    other += [name for name in numbers if name not in values and not name.endswith(".twist")]
+    for side, axes in nominal_axes(mechanism.leg_names, legs).items():
+        for leg, axis in axes.items():
+            nominal = document.nominal_axes.get(side, {}).get(leg)
+            if nominal is None or not _is_axis(calibrated_axis(nominal, leg, side, values), axis):
+                other.append(f"the {side} axis of {leg}")
+    if other:
+        found = f"other values of {', '.join(other[:3])}" + " and more" * (len(other) > 3)
+        raise DatasetError(_refused(path, found, f"those of {MODEL_NAME} beside it"))
+
+
+def _is_axis(found: Array, axis: Sequence[float]) -> bool:
+    """Say whether an axis, a line, is another."""
+    return bool(np.linalg.norm(np.cross(found, axis)) < _SAME)
+
+
+def _covariance(path: Path, estimated: Sequence[_Row], found: list[list[Any]]) -> Array:
+    """Return the covariance, refused where it is none of the estimated parameters."""
+    n = len(estimated)
+    needed = f"a covariance of the {n} estimated parameters that fits their sigmas"
+    if n == 0 or len(found) != n or any(len(row) != n for row in found):
+        shape = f"{len(found)} rows of {len(found[0]) if found else 0} numbers"
+        raise DatasetError(_refused(path, shape, needed))
+    covariance = np.array(found)
+    sigma = np.array([row.sigma or 0.0 for row in estimated])
+    scaled = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
+    good = (
+        bool(np.all(sigma > 0.0))
+        and bool(np.abs(scaled - scaled.T).max() < _SYMMETRIC)
+        and bool(np.abs(np.diagonal(scaled) - 1.0).max() < _SYMMETRIC)
+        and bool(np.linalg.eigvalsh(scaled)[0] > -_SYMMETRIC)
+    )
+    if not good:
+        raise DatasetError(_refused(path, "another matrix", needed))
+    return covariance
+
+
+def _refused(path: Path, found: str, needed: str) -> str:
+    """Return why a result could not be read."""
+    return (
+        f"{path}: the result of the earlier calibration could not be read: found {found}, needed "
+        f"{needed}; give the folder that legcal calibrate wrote."
+    )
