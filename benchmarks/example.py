@@ -62,9 +62,10 @@ def main() -> None:
     for name, parameters in rows.items():
         dX, dE = platform_error(calibration, parameters, truth)
         print(f"{name:32s} {1e3 * dX:8.3f} mm {np.degrees(dE):8.4f} deg")
-    sigma = calibration.sigma
-    dX, dE = 1e3 * sigma.mean_displacement, np.degrees(sigma.mean_rotation)
-    print(f"{'predicted for the fit, 1 sigma':32s} {dX:8.3f} mm {dE:8.4f} deg")
+    if calibration.platform is not None:  # the motors determine the pose
+        sigma = calibration.platform.sigma
+        dX, dE = 1e3 * sigma.mean_displacement, np.degrees(sigma.mean_rotation)
+        print(f"{'predicted for the fit, 1 sigma':32s} {dX:8.3f} mm {dE:8.4f} deg")
     error = to_vector(solution.parameters, mechanism.frame_legs) - to_vector(
         truth, mechanism.frame_legs
     )

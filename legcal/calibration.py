@@ -10,20 +10,11 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.dataset.folder import Dataset
 from legcal.geometry.types import IntArray
-from legcal.mechanism.kinematics import forward_kinematics_many
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parameters import KinematicParameters, parameter_names, radius_name
-from legcal.mechanism.parametrization import geometries, parametrization_of
-from legcal.mechanism.platform import platform_in_base, pose_differences
-from legcal.observations.canonical_order import (
-    Order,
-    inverse,
-    reorder_measurements,
-    restore_outlines,
-)
+from legcal.mechanism.parameters import KinematicParameters
+from legcal.observations.canonical_order import Order, inverse
 from legcal.refinement.held_out import HeldOut
-from legcal.refinement.platform_error import PlatformError, predict_platform_error
+from legcal.refinement.known_parameters import known_parameters
+from legcal.refinement.platform_accuracy import PlatformAccuracy, platform_accuracy
 from legcal.refinement.solution import Solution
 
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
@@ -55,7 +46,7 @@ class Steps:
         legs, views = inverse(order.legs), inverse(order.views)
         return replace(
             self,
-            parameters=None if self.parameters is None else permuted(self.parameters, legs),
+            parameters=None if self.parameters is None else _permuted(self.parameters, legs),
             T_Rb_camera=None
             if self.T_Rb_camera is None
             else tuple(self.T_Rb_camera[v] for v in views.tolist()),
@@ -90,11 +81,9 @@ class Calibration:
         The fit of everything: parameters, covariance, cameras, platform poses, radii.
     steps : Steps
         What the four steps gave.
-    change : PlatformError
-        How far the platform of the calibrated model is from that of the nominal one, at the
-        readings of the dataset [m, rad].
-    sigma : PlatformError
-        Predicted error of the calibrated platform there, one standard deviation [m, rad].
+    platform : PlatformAccuracy or None
+        What the platform of the calibrated model does differently, and how well that is known;
+        None where the motors do not determine its pose.
     verdict : Verdict
         Whether to use it.
     notes : tuple of str
@@ -106,49 +95,10 @@ class Calibration:
     dataset: Dataset
     solution: Solution
     steps: Steps
-    change: PlatformError
-    sigma: PlatformError
+    platform: PlatformAccuracy | None
     verdict: Verdict
     notes: tuple[str, ...]
     held_out: HeldOut | None = None
-
-
-def permuted(parameters: KinematicParameters, legs: IntArray) -> KinematicParameters:
-    """Return parameters whose leg k is leg ``legs[k]`` of the given ones."""
-    return KinematicParameters(
-        parameters.base_joints[legs], parameters.platform_joints[legs], parameters.offsets[legs]
-    )
-
-
-def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solution:
-    """Return a solution found in the order of work, in the order of the dataset's files."""
-    mechanism = dataset.mechanism
-    legs, views = inverse(order.legs), inverse(order.views)
-    estimated = set(solution.names)
-    by_leg = {int(leg): k for k, leg in enumerate(legs)}
-    radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
-    radii = dict(sorted(radii.items()))
-    names = tuple(
-        name
-        for name in (
-            *parameter_names(mechanism.leg_names, mechanism.frame_legs),
-            *(radius_name(mechanism.leg_names[leg], part) for leg, part in radii),
-        )
-        if name in estimated
-    )
-    where = np.array([solution.names.index(name) for name in names], dtype=np.intp)
-    poses = _poses_in_file_order(order, dataset)
-    return replace(
-        solution,
-        parameters=permuted(solution.parameters, legs),
-        T_camera_Rb=tuple(solution.T_camera_Rb[v] for v in views.tolist()),
-        T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in poses.tolist()),
-        radii=radii,
-        names=names,
-        covariance=solution.covariance[np.ix_(where, where)],
-        sigma=solution.sigma[where],
-        outlines=restore_outlines(solution.outlines, order),
-    )
 
 
 def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[str]) -> Calibration:
@@ -156,46 +106,57 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
 
     The improvement that the fit predicts is the distance between the nominal and the
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
-    standard deviations.
+    standard deviations. Where readings do not determine a pose, it is that of the parameters.
     """
-    mechanism = dataset.mechanism
-    q = dataset.measurements.q[dataset.measurements.first_rows]
-    nominal = [platform_in_base(mechanism, T) for T in forward_kinematics_many(mechanism, q)]
-    displacement, rotation = pose_differences(solution.T_Rb_Re, nominal)
-    change = PlatformError(displacement, rotation)
-    sigma = predict_platform_error(
-        _legs(mechanism, solution.parameters),
-        parametrization_of(mechanism),
+    mechanism, measurements = dataset.mechanism, dataset.measurements
+    platform = platform_accuracy(
+        mechanism,
+        solution.legs,
+        solution.parametrization,
         solution.kinematic_covariance,
-        mechanism.frame_legs,
+        measurements.q[measurements.first_rows],
         solution.T_Rb_Re,
+        solution.sensitivities,
     )
-    return Calibration(
-        dataset, solution, steps, change, sigma, _verdict(change, sigma), tuple(notes)
-    )
+    if platform is None:
+        verdict = _verdict_on_parameters(dataset, solution)
+    else:
+        verdict = _verdict_on_platform(platform)
+    return Calibration(dataset, solution, steps, platform, verdict, tuple(notes))
 
 
-def _legs(mechanism: Mechanism, parameters: KinematicParameters) -> list[LegGeometry]:
-    """Return the legs of a mechanism with calibrated joints and offsets."""
-    found = zip(
-        geometries(mechanism),
-        parameters.base_joints,
-        parameters.platform_joints,
-        parameters.offsets,
-        strict=True,
-    )
-    return [replace(leg, A=A, B=B, q0=float(q0)) for leg, A, B, q0 in found]
-
-
-def _verdict(change: PlatformError, sigma: PlatformError) -> Verdict:
+def _verdict_on_platform(platform: PlatformAccuracy) -> Verdict:
     """Compare the change of the platform with its uncertainty, in displacement."""
-    improvement, one_sigma = change.mean_displacement, sigma.mean_displacement
+    change, sigma = platform.change, platform.sigma
     found = (
-        f"the platform moves by {1e3 * improvement:.3f} mm / "
+        f"the platform moves by {1e3 * change.mean_displacement:.3f} mm / "
         f"{np.degrees(change.mean_rotation):.4f} deg against the nominal model, known to "
-        f"{1e3 * one_sigma:.3f} mm / {np.degrees(sigma.mean_rotation):.4f} deg (1 sigma)"
+        f"{1e3 * sigma.mean_displacement:.3f} mm / {np.degrees(sigma.mean_rotation):.4f} deg "
+        "(1 sigma)"
     )
-    if improvement > TRUSTED_SIGMAS * one_sigma:
+    return _verdict(change.mean_displacement, sigma.mean_displacement, found)
+
+
+def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
+    """Compare the change of joints and lengths with their uncertainty."""
+    known = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
+    lengths = [
+        (solution.values[name] - known[name].nominal, sigma)
+        for name, sigma in zip(solution.names, solution.sigma.tolist(), strict=True)
+        if known[name].kind == "kinematic" and known[name].unit == "m"
+    ]
+    change, sigma = np.sqrt(np.mean(np.square(lengths or [(0.0, 0.0)]), axis=0)).tolist()
+    found = (
+        f"joints and lengths change by {1e3 * change:.3f} mm against the nominal model, known to "
+        f"{1e3 * sigma:.3f} mm (1 sigma, both rms); the motors do not determine the pose of the "
+        "platform, so that no error of it is told"
+    )
+    return _verdict(change, sigma, found)
+
+
+def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
+    """Return what an improvement with a standard deviation is worth."""
+    if improvement > TRUSTED_SIGMAS * sigma:
         return Verdict(True, f"Calibrated: {found}.")
     return Verdict(
         False,
@@ -204,10 +165,8 @@ def _verdict(change: PlatformError, sigma: PlatformError) -> Verdict:
     )
 
 
-def _poses_in_file_order(order: Order, dataset: Dataset) -> IntArray:
-    """Return for every pose of the dataset its number in the order of work."""
-    pose = dataset.measurements.pose
-    worked = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
-    found = np.empty(dataset.measurements.n_poses, dtype=np.intp)
-    found[pose] = worked
-    return found
+def _permuted(parameters: KinematicParameters, legs: IntArray) -> KinematicParameters:
+    """Return parameters whose leg k is leg ``legs[k]`` of the given ones."""
+    return KinematicParameters(
+        parameters.base_joints[legs], parameters.platform_joints[legs], parameters.offsets[legs]
+    )

@@ -49,9 +49,10 @@ def test_photographs_bring_the_platform_within_a_quarter_of_a_millimetre(
 
 
 def test_the_verdict_is_positive_and_the_change_is_known_well(example_run: Run) -> None:
-    calibration = example_run.calibration
-    assert calibration.verdict.trustworthy
-    assert calibration.change.mean_displacement > 2.0 * calibration.sigma.mean_displacement
+    verdict, platform = example_run.calibration.verdict, example_run.calibration.platform
+    assert verdict.trustworthy
+    assert platform is not None
+    assert platform.change.mean_displacement > 2.0 * platform.sigma.mean_displacement
 
 
 def test_the_result_document_has_what_the_format_says(example_run: Run) -> None:

@@ -3,48 +3,48 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import Calibration
 from legcal.dataset.folder import OBSERVATIONS_NAME
 from legcal.errors import DidNotConverge
 from legcal.geometry.frames import motion_to_xyz_quat
-from legcal.mechanism.parameters import KinematicParameters, parameter_names, radius_name, to_vector
+from legcal.mechanism.home import home_with
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.parameter_words import describe_direction
+from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 from legcal.observations.table import write_observations
 from legcal.report.files import result_folder
-from legcal.report.urdf import reload_and_check, write_calibrated_urdf, write_calibrated_yaml
+from legcal.report.parameter_rows import parameter_rows
+from legcal.report.platform_document import platform_document
+from legcal.report.urdf import reload_and_check, write_calibrated_yaml, write_urdf
 
-_RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m]
+_RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m, rad]
+_FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what calibrated legs demand
 
 
 def result_document(calibration: Calibration) -> dict[str, Any]:
     """Return the document of ``result.json``."""
     solution, mechanism = calibration.solution, calibration.dataset.mechanism
-    measurements, axes = calibration.dataset.measurements, calibration.dataset.axes
-    used = solution.outlines.row[solution.outlines.used] if axes is None else axes.row
-    placed = np.unique(measurements.view[used]).tolist()
     return {
         "legcal_result": 1,
         "status": "converged",
         "verdict": calibration.verdict.sentence,
         "trustworthy": calibration.verdict.trustworthy,
         "legs": list(mechanism.leg_names),
-        **_joints(solution.parameters),
-        "base_axes": {},
-        "platform_axes": {},
-        "parameters": _parameter_rows(calibration),
+        **_geometry(mechanism.leg_names, solution.legs),
+        "parameters": [asdict(row) for row in parameter_rows(calibration)],
         "covariance": solution.covariance.tolist(),
-        "views": {
-            measurements.views[v].name: {
-                "T_base_camera": motion_to_xyz_quat(
-                    mechanism.T_base_Rb * solution.T_camera_Rb[v].inv()
-                )
-            }
-            for v in placed
-        },
+        "weakest": _weakest(calibration),
+        "held": list(solution.held),
+        "views": _views(calibration),
         "stages": {"staged": _steps(calibration)},
         "residuals": {
             "chi2": solution.chi2,
@@ -53,13 +53,7 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
             "rms_axes": solution.rms_axes,
         },
         "start": solution.start,
-        "platform": {
-            "poses": len(calibration.change.displacement),
-            "change_dX_m": calibration.change.mean_displacement,
-            "change_dE_rad": calibration.change.mean_rotation,
-            "sigma_dX_m": calibration.sigma.mean_displacement,
-            "sigma_dE_rad": calibration.sigma.mean_rotation,
-        },
+        "platform": platform_document(calibration),
         "notes": list(calibration.notes),
     }
 
@@ -77,78 +71,103 @@ def write_result(calibration: Calibration, destination: Path) -> None:
     DidNotConverge
         If the written model does not load as what was computed.
     """
-    dataset = calibration.dataset
+    dataset, solution = calibration.dataset, calibration.solution
     with result_folder(destination, stale=[Path(OBSERVATIONS_NAME)]) as folder:
         urdf, yaml = folder / "calibrated.urdf", folder / "calibrated.yaml"
-        write_calibrated_urdf(dataset.mechanism, calibration.solution.parameters, urdf)
-        write_calibrated_yaml(dataset.mechanism, yaml, urdf.name)
-        _check_written(yaml, calibration)
+        write_urdf(dataset.mechanism, solution.legs, urdf)
+        write_calibrated_yaml(dataset.mechanism, yaml, urdf.name, _home(calibration))
+        _check_written(yaml, solution.legs)
         document = json.dumps(result_document(calibration), indent=1, allow_nan=False)
         (folder / "result.json").write_text(document + "\n", encoding="utf-8")
         if dataset.axes is None:
             write_observations(
                 folder / OBSERVATIONS_NAME,
-                calibration.solution.outlines,
+                solution.outlines,
                 dataset.measurements,
                 dataset.mechanism.leg_names,
             )
 
 
-def _check_written(yaml: Path, calibration: Calibration) -> None:
+def _home(calibration: Calibration) -> RigidTransform | None:
+    """Return where the calibrated legs close near home, None if at home itself."""
+    mechanism = calibration.dataset.mechanism
+    home = home_with(mechanism, calibration.solution.legs, _FURTHEST)
+    if home is None:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: the calibrated model could not be written: found no closed "
+            "pose of its legs near legcal.home, needed one; check legcal.home and the nominal "
+            "model; nothing was written."
+        )
+    return None if home is mechanism.home else home
+
+
+def _check_written(yaml: Path, legs: Sequence[LegGeometry]) -> None:
     """Load what was written; it must be the model that was computed, and close."""
     written = reload_and_check(yaml)
-    expected = to_vector(calibration.solution.parameters, written.frame_legs)
-    found = to_vector(written.parameters, written.frame_legs)
-    known = ~(np.isnan(found) & np.isnan(expected))  # passive legs have no offset
-    off = float(np.abs(found - expected)[known].max())
+    found = parametrization_of(written, twists=True)
+    apart = vector_of(found, geometries(written), legs) - vector_of(found, legs, legs)
+    off = float(np.abs(apart).max())
     if not off <= _RELOADED:
         raise DidNotConverge(
             f"The calibrated model could not be written: loaded again, its parameters differ by "
-            f"{off:.1e} m from the computed ones; at most {_RELOADED:.0e} m is allowed; nothing "
-            "was written; please report this."
+            f"{off:.1e} m or rad from the computed ones; at most {_RELOADED:.0e} is allowed; "
+            "nothing was written; please report this."
         )
 
 
-def _joints(parameters: KinematicParameters) -> dict[str, Any]:
+def _geometry(names: Sequence[str], legs: Sequence[LegGeometry]) -> dict[str, Any]:
+    """Return what the legs are in R_b and R_e."""
+    named = list(zip(names, legs, strict=True))
     return {
-        "base_joints": parameters.base_joints.tolist(),
-        "platform_joints": parameters.platform_joints.tolist(),
-        "offsets": [None if np.isnan(q0) else q0 for q0 in parameters.offsets.tolist()],
+        "base_joints": [leg.A.tolist() for leg in legs],
+        "platform_joints": [leg.B.tolist() for leg in legs],
+        "offsets": [None if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs],
+        "base_axes": {n: leg.base_axis.tolist() for n, leg in named if leg.base_axis is not None},
+        "platform_axes": {
+            n: leg.platform_axis.tolist() for n, leg in named if leg.platform_axis is not None
+        },
+        "twists": {name: leg.twist for name, leg in named if leg.twist is not None},
+    }
+
+
+def _weakest(calibration: Calibration) -> list[dict[str, Any]]:
+    """Return the combinations of parameters that are known worst."""
+    leg_names = calibration.dataset.mechanism.leg_names
+    return [
+        {
+            "direction": describe_direction([name for name, _ in weak.parts], leg_names),
+            "parameters": [name for name, _ in weak.parts],
+            "components": [component for _, component in weak.parts],
+            "sigma_m": weak.sigma,
+        }
+        for weak in calibration.solution.weak
+    ]
+
+
+def _views(calibration: Calibration) -> dict[str, Any]:
+    """Return where the cameras stand whose images show a leg."""
+    solution, dataset = calibration.solution, calibration.dataset
+    measurements = dataset.measurements
+    outlines, axes = solution.outlines, dataset.axes
+    shown = outlines.row[outlines.used] if axes is None else axes.row
+    T_base_Rb = dataset.mechanism.T_base_Rb
+    return {
+        measurements.views[v].name: {
+            "T_base_camera": motion_to_xyz_quat(T_base_Rb * solution.T_camera_Rb[v].inv())
+        }
+        for v in np.unique(measurements.view[shown]).tolist()
     }
 
 
 def _steps(calibration: Calibration) -> dict[str, Any]:
+    """Return what the four steps gave, or why they gave nothing."""
     steps = calibration.steps
     if steps.parameters is None:
         return {"failure": steps.failure}
-    return {**_joints(steps.parameters), "diagnostics": list(steps.diagnostics)}
-
-
-def _parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    mechanism, solution = calibration.dataset.mechanism, calibration.solution
-    nominal_radii = {
-        (j, part): radius
-        for j, leg in enumerate(mechanism.legs)
-        for part, radius in leg.radius_of_part.items()
+    found = steps.parameters
+    return {
+        "base_joints": found.base_joints.tolist(),
+        "platform_joints": found.platform_joints.tolist(),
+        "offsets": [None if np.isnan(q0) else q0 for q0 in found.offsets.tolist()],
+        "diagnostics": list(steps.diagnostics),
     }
-    names = (
-        *parameter_names(mechanism.leg_names, mechanism.frame_legs),
-        *(radius_name(mechanism.leg_names[leg], part) for leg, part in solution.radii),
-    )
-    values = to_vector(solution.parameters, mechanism.frame_legs).tolist()
-    nominal = to_vector(mechanism.parameters, mechanism.frame_legs).tolist()
-    values += solution.radii.values()
-    nominal += (nominal_radii[key] for key in solution.radii)
-    sigma_of = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
-    return [
-        {
-            "name": name,
-            "value": value,
-            "nominal": start,
-            "sigma": sigma_of.get(name),
-            "unit": "m",
-            "status": "estimated" if name in sigma_of else "fixed",
-        }
-        for name, value, start in zip(names, values, nominal, strict=True)
-        if not np.isnan(value)  # the offset of a passive leg
-    ]

@@ -11,37 +11,64 @@ from rich.table import Table
 from rich.text import Text
 
 from legcal.calibration import Calibration
-from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.parameter_words import describe_direction
+from legcal.mechanism.parametrization import geometries
 from legcal.mechanism.platform import pose_differences
-from legcal.refinement.start import platform_poses, with_joints
-from legcal.report.result import result_document
+from legcal.refinement.platform_accuracy import poses_at_readings
+from legcal.refinement.platform_error import PlatformError
+from legcal.refinement.start import with_joints
+from legcal.report.parameter_rows import ParameterRow, parameter_rows
+
+_SHOWN = {  # what tables show a unit in: its size, its name, and digits
+    "m": (1e3, "mm", 4),
+    "rad": (float(np.degrees(1.0)), "deg", 4),
+    "px": (1.0, "px", 3),
+    "": (1.0, "", 6),
+}
 
 
 def summary(calibration: Calibration, output: Path) -> RenderableType:
-    """Return the table of parameters in mm, and what it means."""
-    document = result_document(calibration)
-    table = Table(box=None, pad_edge=False)
-    table.add_column("parameter [mm]")
-    for column in ("nominal", "calibrated", "change", "sigma"):
-        table.add_column(column, justify="right")
-    for row in document["parameters"]:
-        value, nominal, sigma = (1e3 * (row[key] or 0.0) for key in ("value", "nominal", "sigma"))
-        shown = f"{sigma:.4f}" if row["sigma"] is not None else row["status"]
-        table.add_row(
-            row["name"], f"{nominal:.4f}", f"{value:.4f}", f"{value - nominal:+.4f}", shown
-        )
+    """Return the table of parameters in mm, degrees and pixels, and what it means."""
     lines = [
         *(f"Note: {note}" for note in calibration.notes),
         _observation_line(calibration),
         _steps_line(calibration),
         _fit_line(calibration),
+        *_direction_lines(calibration),
+        *_platform_lines(calibration),
         f"Written to {output}.",
     ]
     verdict = Text(
         calibration.verdict.sentence,
         style="bold green" if calibration.verdict.trustworthy else "bold red",
     )
-    return Group(table, Text(), *(Text(line) for line in lines), verdict)
+    return Group(
+        _table(parameter_rows(calibration)), Text(), *(Text(line) for line in lines), verdict
+    )
+
+
+def _table(rows: list[ParameterRow]) -> Table:
+    """Return one line a parameter."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("parameter")
+    for column in ("nominal", "calibrated", "change", "sigma"):
+        table.add_column(column, justify="right")
+    table.add_column("unit")
+    table.add_column("status")
+    for row in rows:
+        scale, unit, digits = _SHOWN[row.unit]
+        value, nominal = scale * row.value, scale * row.nominal
+        sigma = "" if row.sigma is None else f"{scale * row.sigma:.{digits}f}"
+        table.add_row(
+            row.name,
+            f"{nominal:.{digits}f}",
+            f"{value:.{digits}f}",
+            f"{value - nominal:+.{digits}f}",
+            sigma,
+            unit,
+            "" if row.status == "estimated" else row.status,
+        )
+    return table
 
 
 def _observation_line(calibration: Calibration) -> str:
@@ -69,24 +96,20 @@ def _steps_line(calibration: Calibration) -> str:
     steps = calibration.steps
     if steps.parameters is None:
         return f"The four steps alone gave no result: {steps.failure}"
-    displacement, rotation = _apart(calibration, steps.parameters)
     left_out = f" They left out {len(steps.diagnostics)} axes or joints." * bool(steps.diagnostics)
-    return (
-        f"The four steps alone end {1e3 * displacement:.3f} mm / {np.degrees(rotation):.3f} deg "
-        f"from the fit at the platform.{left_out}"
-    )
-
-
-def _apart(calibration: Calibration, parameters: KinematicParameters) -> tuple[float, float]:
-    """Return how far the platform with these parameters is from that of the fit [m, rad]."""
-    near, mechanism = calibration.solution.T_Rb_Re, calibration.dataset.mechanism
-    measurements = calibration.dataset.measurements
-    lengths = mechanism.sign * measurements.q[measurements.first_rows] + parameters.offsets
-    legs = with_joints(calibration.solution.legs, parameters)
+    if calibration.platform is None:
+        return f"The four steps alone gave a result, which the fit ends.{left_out}"
+    mechanism, measurements = calibration.dataset.mechanism, calibration.dataset.measurements
+    near, q = calibration.solution.T_Rb_Re, measurements.q[measurements.first_rows]
+    staged = with_joints(geometries(mechanism), steps.parameters)
     displacement, rotation = pose_differences(
-        platform_poses(legs, lengths, near, mechanism.frame_legs), near
+        poses_at_readings(mechanism, staged, q, near),
+        poses_at_readings(mechanism, calibration.solution.legs, q, near),
     )
-    return float(displacement.mean()), float(rotation.mean())
+    return (
+        f"The four steps alone end {1e3 * displacement.mean():.3f} mm / "
+        f"{np.degrees(rotation.mean()):.3f} deg from the fit at the platform.{left_out}"
+    )
 
 
 def _fit_line(calibration: Calibration) -> str:
@@ -99,4 +122,37 @@ def _fit_line(calibration: Calibration) -> str:
     return (
         f"The fit of everything started from the {solution.start} model: chi2 {solution.chi2:.1f} "
         f"for {', '.join([f'{solution.dof} degrees of freedom', *residuals])}."
+    )
+
+
+def _direction_lines(calibration: Calibration) -> list[str]:
+    """Return which combinations of parameters are known worst, and which are held."""
+    solution, names = calibration.solution, calibration.dataset.mechanism.leg_names
+    worst = [
+        f"{describe_direction([name for name, _ in weak.parts], names)} ({1e3 * weak.sigma:.3f} mm)"
+        for weak in solution.weak
+    ]
+    lines = [f"Known worst (1 sigma): {'; '.join(worst)}."] if worst else []
+    return [*lines, *(f"Held at nominal: {held}." for held in solution.held)]
+
+
+def _platform_lines(calibration: Calibration) -> list[str]:
+    """Return the predicted error of the platform, and what would add to it."""
+    platform = calibration.platform
+    if platform is None:
+        return []
+    parts = [f"at the {len(platform.sigma.displacement)} poses {_mean_and_most(platform.sigma)}"]
+    if platform.workspace is not None:
+        parts.append(f"over the workspace {_mean_and_most(platform.workspace)}")
+    lines = [f"Predicted error of the platform (1 sigma): {'; '.join(parts)}."]
+    for found in platform.effects:
+        lines.append(f"{found.what} would move the platform by {_mean_and_most(found.error)}.")
+    return lines
+
+
+def _mean_and_most(error: PlatformError) -> str:
+    """Return mean and maximum in words."""
+    return (
+        f"{1e3 * error.mean_displacement:.3f} mm / {np.degrees(error.mean_rotation):.4f} deg, "
+        f"at most {1e3 * error.max_displacement:.3f} mm / {np.degrees(error.max_rotation):.4f} deg"
     )

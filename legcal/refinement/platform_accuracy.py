@@ -1,0 +1,150 @@
+"""What a fit means at the platform: what it changes there, and how well that is known.
+
+Errors over the workspace are those at a hundred poses all over the travel, the same at which
+``legcal evaluate`` compares two models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DidNotConverge
+from legcal.geometry.types import Array
+from legcal.mechanism.configurations import workspace
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import Parametrization, geometries
+from legcal.mechanism.platform import platform_in_base, pose_differences
+from legcal.refinement.platform_error import (
+    PlatformError,
+    expected_error,
+    moved_by,
+    platform_by_parameters,
+)
+from legcal.refinement.solution import Sensitivity
+from legcal.refinement.start import platform_poses
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What a mistake in something that counts as known would do to the platform.
+
+    Attributes
+    ----------
+    what : str
+        The mistake: ``a focal length 1 % longer``.
+    error : PlatformError
+        How far the platform would move, over the workspace; at the readings of the dataset where
+        that is not known.
+    """
+
+    what: str
+    error: PlatformError
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformAccuracy:
+    """What a fit means at the platform; angles and distances as in :class:`PlatformError`.
+
+    Attributes
+    ----------
+    change : PlatformError
+        From the nominal to the calibrated platform at the readings of every pose.
+    sigma : PlatformError
+        Predicted error of the calibrated platform there, one standard deviation.
+    workspace : PlatformError or None
+        The same at poses all over the travel; None where the model cannot reach them.
+    effects : tuple of Effect
+        What mistakes in what counts as known would do.
+    """
+
+    change: PlatformError
+    sigma: PlatformError
+    workspace: PlatformError | None
+    effects: tuple[Effect, ...]
+
+
+def platform_accuracy(
+    mechanism: Mechanism,
+    legs: Sequence[LegGeometry],
+    parametrization: Parametrization,
+    covariance: Array,
+    q: Array,
+    T_Rb_Re: Sequence[RigidTransform],
+    sensitivities: Sequence[Sensitivity] = (),
+) -> PlatformAccuracy | None:
+    """Return what calibrated legs mean at the platform.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal machine.
+    legs : sequence of LegGeometry
+        Its calibrated legs in R_b and R_e.
+    parametrization : Parametrization
+        Their parameters.
+    covariance : (p, p) array
+        The covariance of these [m^2, m rad, rad^2]; zero for what is held.
+    q : (n_poses, n_legs) array
+        The readings of the dataset [m].
+    T_Rb_Re : sequence of RigidTransform
+        The platform there, as fitted.
+    sensitivities : sequence of Sensitivity
+        What mistakes in what counts as known would do to the parameters.
+
+    Returns
+    -------
+    PlatformAccuracy or None
+        None where the motors do not determine the pose.
+
+    Raises
+    ------
+    NotIdentifiable
+        If the readings of a pose do not determine it: the machine is singular there.
+    """
+    if not mechanism.is_determined:
+        return None
+
+    def follow(poses: Sequence[RigidTransform]) -> Array:
+        """Return how calibrated poses move with the parameters."""
+        return platform_by_parameters(legs, parametrization, mechanism.frame_legs, poses)
+
+    calibrated = poses_at_readings(mechanism, legs, q, T_Rb_Re)
+    nominal = poses_at_readings(mechanism, geometries(mechanism), q, T_Rb_Re)
+    here, poses = follow(calibrated), _workspace_poses(mechanism, legs)
+    everywhere = None if poses is None else follow(poses)
+    judged = here if everywhere is None else everywhere
+    return PlatformAccuracy(
+        PlatformError(*pose_differences(calibrated, nominal)),
+        expected_error(here, covariance),
+        None if everywhere is None else expected_error(everywhere, covariance),
+        tuple(Effect(s.what, moved_by(judged, s.step)) for s in sensitivities),
+    )
+
+
+def _workspace_poses(
+    mechanism: Mechanism, legs: Sequence[LegGeometry]
+) -> Sequence[RigidTransform] | None:
+    """Return where calibrated legs put the platform at readings all over the travel."""
+    try:
+        drawn = workspace(mechanism)
+    except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
+        return None
+    nearby = [platform_in_base(mechanism, T) for T in drawn.poses]
+    return poses_at_readings(mechanism, legs, drawn.readings, nearby)
+
+
+def poses_at_readings(
+    mechanism: Mechanism,
+    legs: Sequence[LegGeometry],
+    q: Array,
+    nearby: Sequence[RigidTransform],
+) -> tuple[RigidTransform, ...]:
+    """Return T_Rb_Re of legs at readings (n_poses, n_legs), near known poses."""
+    q0 = [np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs]
+    return platform_poses(legs, mechanism.sign * q + q0, nearby, mechanism.frame_legs)
