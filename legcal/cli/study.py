@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,6 +55,49 @@ def paper(
 
     noise = TableNoise.in_radians() if radians else TableNoise()
     _run(PaperStudy(noise), runs, seed, workers, output, as_json=as_json)
+
+
+MachineOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--machine",
+        metavar="NAME",
+        help="6-spu-noncoplanar, 6-spu-coplanar, 3-upu-tilted or 3-rpr; may be repeated, all "
+        "without it.",
+    ),
+]
+
+
+@study.command()
+def bound(
+    runs: RunsOption = 2000,
+    machine: MachineOption = None,
+    seed: SeedOption = 0,
+    workers: WorkersOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare the errors of a calibration, and its sigmas, with the Cramer-Rao bound."""
+    from legcal.studies.bound import EXPERIMENT, BoundStudy
+
+    chosen = replace(EXPERIMENT, machines=tuple(machine)) if machine else EXPERIMENT
+    _run(BoundStudy(chosen), runs, seed, workers, output, as_json=as_json)
+
+
+@study.command()
+def convergence(
+    runs: RunsOption = 100,
+    machine: MachineOption = None,
+    seed: SeedOption = 0,
+    workers: WorkersOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Count where calibrations end that start 5 mm and 3 deg off in everything."""
+    from legcal.studies.convergence import EXPERIMENT, ConvergenceStudy
+
+    chosen = replace(EXPERIMENT, machines=tuple(machine)) if machine else EXPERIMENT
+    _run(ConvergenceStudy(chosen), runs, seed, workers, output, as_json=as_json)
 
 
 def _run(
