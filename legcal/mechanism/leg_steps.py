@@ -21,7 +21,9 @@ def moved_legs(
     padded = np.append(step, 0.0)
     moved = []
     for leg, local in zip(legs, padded[place], strict=True):
-        twist = twist_after(leg, turn_of(leg.platform_axis, local[9:11]))
+        twist = leg.twist
+        if twist is not None:
+            twist = twist_after(leg, turn_of(leg.platform_axis, local[9:11]))
         moved.append(
             replace(
                 leg,

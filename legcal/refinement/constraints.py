@@ -71,7 +71,7 @@ class Tangent:
     ----------
     Z : (n_poses, 6, f) array
         Basis of the motions at rest parameters; zero columns where a pose has fewer.
-    Q : (n_poses, 6, n_kept) array
+    Q : (n_kept, n_poses, 6) array
         Motion by each unknown other than poses.
     """
 
@@ -141,10 +141,10 @@ def tangent(state: State, layout: Layout, frame_legs: Sequence[int]) -> Tangent 
     free = list(freedoms(frame_legs))
     n_poses = layout.n_poses
     rows = _binding(state.legs, state.R_pose, state.t_pose)
-    Q = np.zeros((n_poses, 6, layout.n_kept + 1))
+    Q = np.zeros((layout.n_kept + 1, n_poses, 6))
     if len(rows.leg) == 0:
         Z = np.broadcast_to(np.eye(6)[:, free], (n_poses, 6, len(free))).copy()
-        return Tangent(Z, Q[..., :-1])
+        return Tangent(Z, Q[:-1])
     _, s, vt = np.linalg.svd(rows.by_pose[:, :, free])
     n = s.shape[1]
     held = s > _RANK * s[:, :1]
@@ -157,8 +157,8 @@ def tangent(state: State, layout: Layout, frame_legs: Sequence[int]) -> Tangent 
     inverse[:, free] = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
     for i, leg in enumerate(rows.leg):
         place = np.minimum(layout.place[leg], layout.n_kept)
-        Q[:, :, place] -= inverse[:, :, i, None] * rows.by_local[:, None, i]
-    return Tangent(Z, Q[..., :-1])
+        Q[place] -= rows.by_local[:, i].T[..., None] * inverse[None, :, :, i]
+    return Tangent(Z, Q[:-1])
 
 
 def n_bonds(leg: LegGeometry) -> int:

@@ -19,9 +19,9 @@ def reduced_jacobian(where: Places, rows: Rows, normal: NormalEquations) -> Arra
     J_pose = rows.J_pose
     motion, pose = normal.tangent, where.pose
     if motion is not None:
-        G = G + J_pose @ motion.Q[pose]
+        G = G + J_pose @ np.moveaxis(motion.Q, 0, 2)[pose]
         J_pose = J_pose @ motion.Z[pose]
-    follow = normal.V_inverse @ np.swapaxes(normal.W, -1, -2)
+    follow = normal.V_inverse @ np.moveaxis(normal.W, 0, 2)
     return np.asarray(G - J_pose @ follow[pose])
 
 

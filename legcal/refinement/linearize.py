@@ -48,8 +48,14 @@ class _Ends:
     R_camera: Array  # (n, 3, 3)
     R_pose: Array
 
-    def by_unknowns(self, by_A: Array, by_B: Array) -> tuple[Array, Array]:
-        """Return derivatives by A, B, camera (n, q, 12) and by the pose (n, q, 6)."""
+    def with_radius(self, slope: Array) -> tuple[Array, Array]:
+        """Return the same with what comes after the ends: radius, biases, intrinsics."""
+        J, J_pose = self.by_unknowns(slope[..., :6])
+        return np.concatenate([J, slope[..., 6:]], axis=-1), J_pose
+
+    def by_unknowns(self, slope: Array) -> tuple[Array, Array]:
+        """Return derivatives by A, B, camera and by the pose from those by both ends."""
+        by_A, by_B = slope[..., :3], slope[..., 3:6]
         a, b = by_A @ self.R_camera, by_B @ self.R_camera
         turn = _cross(self.A_turned[:, None], by_A) + _cross(self.B_turned[:, None], by_B)
         J = np.concatenate([a, b @ self.R_pose, turn, by_A + by_B], axis=-1)
@@ -82,17 +88,18 @@ def outline_rows(problem: FitProblem, state: State) -> Rows:
     ends = _ends_in_camera(state, o.leg, o.view, o.pose)
     xy, by_intrinsics = problem.measured_ends(state)
     n = len(o)
-    local = np.concatenate([ends.A, ends.B, state.radii[o.radius, None], xy.reshape(n, 4)], axis=1)
+    radius = state.radii[o.radius, None]
+    local = np.concatenate([ends.A, ends.B, radius, xy.reshape(n, 4)], axis=1)
     r, slope = outline_residual().evaluate(local, o.constants)
-    J, J_pose = ends.by_unknowns(slope[..., :3], slope[..., 3:6])
-    columns = [J, slope[..., 6:7]]
-    if o.bias_index.shape[1]:
-        r = r - np.einsum("nc,ncq->nq", state.biases[o.bias_index], o.bias_shift)
-        columns.append(-np.swapaxes(o.bias_shift, 1, 2))
-    if by_intrinsics.shape[-1]:
-        along = slope[..., 7:].reshape(n, 2, 2, 2)  # by (end, coordinate)
-        columns.append(np.einsum("nqec,neck->nqk", along, by_intrinsics))
-    return Rows(r, np.concatenate(columns, axis=-1), J_pose)
+    if not o.bias_index.shape[1] and not by_intrinsics.shape[-1]:
+        return Rows(r, slope[..., :7], ends.with_radius)
+    r = r - np.einsum("nc,ncq->nq", state.biases[o.bias_index], o.bias_shift)
+    along = slope[..., 7:].reshape(n, 2, 2, 2)  # by (end, coordinate)
+    others = [
+        -np.swapaxes(o.bias_shift, 1, 2),
+        np.einsum("nqec,neck->nqk", along, by_intrinsics),
+    ]
+    return Rows(r, np.concatenate([slope[..., :7], *others], axis=-1), ends.with_radius)
 
 
 def offsets_of(problem: FitProblem, state: State) -> Array:
@@ -103,15 +110,17 @@ def offsets_of(problem: FitProblem, state: State) -> Array:
 def _reading_rows(problem: FitProblem, state: State) -> Rows:
     """Return the whitened closures of all legs with readings."""
     e = problem.readings
-    arm = np.einsum("nij,nj->ni", state.R_pose[e.pose], state.B[e.leg])
-    local = np.column_stack(
-        [state.A[e.leg], state.t_pose[e.pose] + arm, state.lengths[e.leg]],
-    )
+    arm = _arms(state)[e.pose, e.leg]
+    R_pose = state.R_pose[e.pose]
+    local = np.column_stack([state.A[e.leg], state.t_pose[e.pose] + arm, state.lengths[e.leg]])
     r, slope = encoder_residual().evaluate(local, e.length[:, None])
-    b = slope[..., 3:6]
-    J = np.concatenate([slope[..., :3], b @ state.R_pose[e.pose], slope[..., 6:]], axis=-1)
-    J_pose = np.concatenate([_cross(arm[:, None], b), b], axis=-1)
-    return Rows(r / e.sigma, J / e.sigma, J_pose / e.sigma)
+
+    def chain(slope: Array) -> tuple[Array, Array]:
+        b = slope[..., 3:6]
+        J = np.concatenate([slope[..., :3], b @ R_pose, slope[..., 6:]], axis=-1)
+        return J, np.concatenate([_cross(arm[:, None], b), b], axis=-1)
+
+    return Rows(r, slope, chain).scaled(1.0 / e.sigma)
 
 
 def _axis_rows(problem: FitProblem, state: State) -> Rows:
@@ -122,16 +131,21 @@ def _axis_rows(problem: FitProblem, state: State) -> Rows:
         np.concatenate([ends.A, ends.B], axis=1),
         np.concatenate([a.M, a.basis.reshape(-1, 6)], axis=1),
     )
-    return Rows(r, *ends.by_unknowns(slope[..., :3], slope[..., 3:])).whitened(a.whitening)
+    return Rows(r, slope, ends.by_unknowns).whitened(a.whitening)
 
 
 def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _Ends:
     """Return both ends of legs in the camera frames of views at poses."""
-    R_camera, R_pose, t = state.R_camera[view], state.R_pose[pose], state.t_camera[view]
-    arm = _times(R_pose, state.B[leg])
-    A = _times(R_camera, state.A[leg])
+    R_camera, t = state.R_camera[view], state.t_camera[view]
+    arm = _arms(state)[pose, leg]
+    A = (state.A @ np.swapaxes(state.R_camera, 1, 2))[view, leg]
     B = _times(R_camera, state.t_pose[pose] + arm)
-    return _Ends(A + t, B + t, A, B, arm, R_camera, R_pose)
+    return _Ends(A + t, B + t, A, B, arm, R_camera, state.R_pose[pose])
+
+
+def _arms(state: State) -> Array:
+    """Return what leads from the origin of R_e to B in R_b, (n_poses, n_legs, 3)."""
+    return np.asarray(state.B @ np.swapaxes(state.R_pose, 1, 2))
 
 
 def _times(R: Array, v: Array) -> Array:

@@ -5,6 +5,7 @@ pseudo-Huber loss of width k^-1/2: s / 2 for small s, linear in the distance far
 plain least squares for k = 0. No residual, however wrong, pulls with more than that width.
 """
 
+from functools import cache
 from math import gamma
 
 import numpy as np
@@ -27,6 +28,7 @@ def cost_of(s: Array, k: float) -> float:
     return float(np.sum(s / (1.0 + np.sqrt(1.0 + k * s))))
 
 
+@cache
 def efficiency(k: float, m: int = 2) -> float:
     """Return the information that the loss keeps of m Gaussian residuals, 1 for k = 0.
 

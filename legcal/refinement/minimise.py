@@ -27,7 +27,7 @@ _SMALLEST_FALL = 1e-12  # of the cost, in squared standard deviations: the minim
 _ROUNDING = 1e-13  # of the cost: below, its fall is not seen
 _LARGEST_TURN = 0.3  # [rad] in one step
 _MEDIANS = 5.0  # width of the loss while most measurements are beyond its final one
-_SLOW = 0.5  # of the cost: a step that lowers it by less has done what this loss can do
+_SLOW = 0.5  # of the cost: if the next step lowers it by less, this loss has done its work
 _NARROWING = 0.8  # of the width: smaller changes of the median do not change the loss
 
 
@@ -93,11 +93,11 @@ def minimise(
             if np.isfinite(fall) and (fall > 0.0 or at_rest):
                 state, linear = trial, linear_there
                 damping = _next(damping, fall / max(promised, 1e-300))
-                narrower = wide
-                if fall < _SLOW * cost:
-                    narrower = _width(linear, width, wide)
                 rate = promised / fall_before if np.isfinite(fall_before) else 1.0
                 expected = promised * min(rate, 1.0)
+                narrower = wide
+                if expected < _SLOW * (cost - fall):
+                    narrower = _width(linear, width, wide)
                 if narrower == wide and (at_rest or expected < _SMALLEST_FALL):
                     return Minimum(state, linear, robust_cost(linear, k), iteration)
                 fall_before = promised if narrower == wide else np.inf

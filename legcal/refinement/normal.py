@@ -36,7 +36,7 @@ class NormalEquations:
     Attributes
     ----------
     U : (n_kept, n_kept) array
-    W : (n_poses, n_kept, f) array
+    W : (n_kept, n_poses, f) array
     V : (n_poses, f, f) array
     g_kept, g_pose : (n_kept,) and (n_poses, f) array
         Gradient of the cost.
@@ -61,7 +61,7 @@ class NormalEquations:
 
     def reduced(self) -> Array:
         """Return the normal matrix (n_kept, n_kept) of the kept unknowns: U - W V^-1 W^T."""
-        S = self.U - _coupled(self.W @ self.V_inverse, self.W)
+        S = self.U - _coupled(_by_pose(self.W, self.V_inverse), self.W)
         return np.asarray(0.5 * (S + S.T))
 
     def kept_covariance(self) -> Array:
@@ -87,13 +87,14 @@ class NormalEquations:
         fall : float
         """
         V = _damped(self.V, damping)
-        V_inverse = np.linalg.inv(V)
-        WV = self.W @ V_inverse
+        V_inverse: Array = np.linalg.inv(V)
+        WV = _by_pose(self.W, V_inverse)
         U = _damped(self.U, damping)
         S = U - _coupled(WV, self.W)
-        right = -self.g_kept + np.einsum("kap,kp->a", WV, self.g_pose)
+        right = -self.g_kept + _flat(WV) @ self.g_pose.ravel()
         kept = self._solved(S, right)
-        y = -(V_inverse @ (self.g_pose + np.einsum("kap,a->kp", self.W, kept))[..., None])[..., 0]
+        pull = self.g_pose + (kept @ _flat(self.W)).reshape(self.g_pose.shape)
+        y = -(V_inverse @ pull[..., None])[..., 0]
         linear = float(self.g_kept @ kept + np.sum(self.g_pose * y))
         extra = float(
             np.sum(np.diagonal(U - self.U) * kept**2)
@@ -198,21 +199,30 @@ def _constrained(
     motion = tangent(state, problem.layout, problem.legs.frame_legs)
     if motion is not None:
         Z, Q = motion.Z, motion.Q
-        coupled = _coupled(W, np.swapaxes(Q, 1, 2))
-        VQ = V @ Q
-        U = U + coupled + coupled.T + _coupled(np.swapaxes(Q, 1, 2), np.swapaxes(VQ, 1, 2))
-        g_kept = g_kept + np.einsum("kpa,kp->a", Q, g_pose)
-        W = (W + np.swapaxes(VQ, 1, 2)) @ Z
+        coupled, QV = _coupled(W, Q), _by_pose(Q, V)
+        U = U + coupled + coupled.T + _coupled(Q, QV)
+        g_kept = g_kept + _flat(Q) @ g_pose.ravel()
+        W = _by_pose(W + QV, Z)
         V = np.swapaxes(Z, 1, 2) @ V @ Z
         g_pose = np.einsum("kpf,kp->kf", Z, g_pose)
     return NormalEquations(U, W, V, g_kept, g_pose, motion, problem.held)
 
 
 def _coupled(left: Array, right: Array) -> Array:
-    """Return the sum over poses of left right^T, both (n_poses, n_kept, f)."""
-    n = left.shape[1]
-    a = np.moveaxis(left, 1, 0).reshape(n, -1)
-    return np.asarray(a @ np.moveaxis(right, 1, 0).reshape(n, -1).T)
+    """Return the sum over poses of left right^T, both (n_kept, n_poses, f)."""
+    return np.asarray(_flat(left) @ _flat(right).T)
+
+
+def _flat(W: Array) -> Array:
+    """Return what couples unknowns to poses as one matrix (n_kept, n_poses f)."""
+    return W.reshape(len(W), -1)
+
+
+def _by_pose(W: Array, blocks: Array) -> Array:
+    """Return W (n_kept, n_poses, f) times the block (n_poses, f, h) of each pose."""
+    found = np.empty((*W.shape[:2], blocks.shape[2]))
+    np.matmul(W.swapaxes(0, 1), blocks, out=found.swapaxes(0, 1))
+    return found
 
 
 def _damped(M: Array, damping: float) -> Array:
@@ -235,4 +245,4 @@ def _solve(S: Array, right: Array) -> Array:
 
 def _carried(motion: Tangent, kept: Array, y: Array) -> Array:
     """Return the motions of poses (n_poses, 6) for steps of kept unknowns and inside them."""
-    return np.asarray(np.einsum("kpf,kf->kp", motion.Z, y) + np.einsum("kpa,a->kp", motion.Q, kept))
+    return np.asarray(np.einsum("kpf,kf->kp", motion.Z, y) + np.einsum("akp,a->kp", motion.Q, kept))

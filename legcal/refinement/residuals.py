@@ -49,17 +49,19 @@ class Residual:
         r = np.zeros((n, self.n_rows))
         by_local = np.zeros((n, self.n_local, self.n_rows))  # CasADi stores column by column
         if n:
-            _fill(_mapped(self.name, self.jacobian, n), [local, data], [r, by_local])
+            _fill(_mapped(self, n), [local, data], [r, by_local])
         return r, np.swapaxes(by_local, 1, 2)
 
 
 def outline_of_leg(A: ca.SX, B: ca.SX, radius: ca.SX, epsilon: ca.SX) -> ca.SX:
-    """Return the outline h of the cylinder about AB seen from the origin, eqs (1) and (3)."""
-    u = (B - A) / ca.norm_2(B - A)
-    foot = A - u * ca.dot(u, A)
-    distance = ca.norm_2(foot)
-    sine = radius / distance
-    return ca.sqrt(1.0 - sine**2) * ca.cross(u, A) / distance + epsilon * sine * foot / distance
+    """Return the outline h of the cylinder about AB seen from the origin, eqs (1) and (3).
+
+    Its length is that of A x B squared, of no matter for a line. With n = A x B and D = B - A eq (3)
+    is h = epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2) up to that, without a division.
+    """
+    n, D = ca.cross(A, B), B - A
+    depth = ca.sqrt(ca.dot(n, n) - radius**2 * ca.dot(D, D))
+    return epsilon * radius * ca.cross(D, n) - depth * n
 
 
 def offset_in_image(h: ca.SX, xy: ca.SX, J_inverse_transposed: ca.SX) -> ca.SX:
@@ -148,9 +150,9 @@ def _residual(name: str, local: ca.SX, data: ca.SX, r: ca.SX) -> Residual:
 
 
 @lru_cache(maxsize=64)
-def _mapped(name: str, function: ca.Function, n: int) -> ca.Function:
-    """Return a function over n measurements; the name only tells functions apart."""
-    return function.map(n)
+def _mapped(residual: Residual, n: int) -> ca.Function:
+    """Return the Jacobian over n measurements."""
+    return residual.jacobian.map(n)
 
 
 def _fill(function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:

@@ -7,7 +7,9 @@ summed by constant sparse matrices that are built once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -23,28 +25,42 @@ class Rows:
     ----------
     r : (n, q) array
         Residuals.
-    J : (n, q, m) array
-        Derivatives by the unknowns of the kind's :class:`Places`.
-    J_pose : (n, q, 6) array
-        Derivatives by rotation [rad] and displacement [m] of the platform.
+    slope : (n, q, l) array
+        Derivatives by what the residuals depend on directly.
+    chain : callable
+        Turns slopes into derivatives J by unknowns and J_pose by poses.
     """
 
     r: Array
-    J: Array
-    J_pose: Array
+    slope: Array
+    chain: Callable[[Array], tuple[Array, Array]]
+
+    @cached_property
+    def _derivatives(self) -> tuple[Array, Array]:
+        return self.chain(self.slope)
 
     @property
+    def J(self) -> Array:
+        """Derivatives by the unknowns of the kind's :class:`Places`, (n, q, m)."""
+        return self._derivatives[0]
+
+    @property
+    def J_pose(self) -> Array:
+        """Derivatives by rotation [rad] and displacement [m] of the platform, (n, q, 6)."""
+        return self._derivatives[1]
+
+    @cached_property
     def squared_norms(self) -> Array:
         """Squared norms of the residuals, (n,)."""
         return np.asarray(np.einsum("nq,nq->n", self.r, self.r))
 
     def whitened(self, T: Array) -> Rows:
         """Return the rows times lower triangular T (n, q, q)."""
-        return Rows((T @ self.r[..., None])[..., 0], T @ self.J, T @ self.J_pose)
+        return Rows((T @ self.r[..., None])[..., 0], T @ self.slope, self.chain)
 
     def scaled(self, factor: float) -> Rows:
         """Return the rows times a number."""
-        return Rows(factor * self.r, factor * self.J, factor * self.J_pose)
+        return Rows(factor * self.r, factor * self.slope, self.chain)
 
     def softened(self, k: float) -> Rows:
         """Return rows whose plain squares have gradient and curvature of the robust loss.
@@ -57,13 +73,10 @@ class Rows:
         s = self.squared_norms
         root = np.sqrt(1.0 + k * s)
         along = (1.0 - 1.0 / root) / np.maximum(s, 1e-300)
-
-        def soften(J: Array) -> Array:
-            part = along[:, None] * np.einsum("nq,nqm->nm", self.r, J)
-            softer = J - self.r[..., None] * part[:, None]
-            return np.asarray(softer / np.sqrt(root)[:, None, None])
-
-        return Rows(np.sqrt(root)[:, None] * self.r, soften(self.J), soften(self.J_pose))
+        part = along[:, None] * np.einsum("nq,nqm->nm", self.r, self.slope)
+        slope = self.slope - self.r[..., None] * part[:, None]
+        slope /= np.sqrt(root)[:, None, None]
+        return Rows(np.sqrt(root)[:, None] * self.r, slope, self.chain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +91,7 @@ class Places:
     n_kept, n_poses : int
     groups : tuple of (array of int, array of int)
         Measurements that depend on the same unknowns, and these.
-    to_kept : sparse (n_poses (n_kept + 1), n m) array
+    to_kept : sparse ((n_kept + 1) n_poses, n m) array
         Sums what couples unknowns to poses.
     to_pose : sparse (n_poses, n) array
         Sums over the measurements of a pose.
@@ -103,7 +116,7 @@ def places(index: IntArray, pose: IntArray, n_kept: int, n_poses: int) -> Places
         members = np.split(order, np.cumsum(np.bincount(group.ravel()))[:-1])
     else:
         columns, members = index, []
-    row = (pose[:, None] * (n_kept + 1) + index).ravel()
+    row = (index * n_poses + pose[:, None]).ravel()
     ones = np.ones(n * m)
     return Places(
         index,
@@ -111,7 +124,7 @@ def places(index: IntArray, pose: IntArray, n_kept: int, n_poses: int) -> Places
         n_kept,
         n_poses,
         tuple(zip(members, columns, strict=True)),
-        csr_array((ones, (row, np.arange(n * m))), shape=(n_poses * (n_kept + 1), n * m)),
+        csr_array((ones, (row, np.arange(n * m))), shape=((n_kept + 1) * n_poses, n * m)),
         csr_array((ones[:n], (pose, np.arange(n))), shape=(n_poses, n)),
     )
 
@@ -123,7 +136,7 @@ class Sums:
     Attributes
     ----------
     U : (n_kept, n_kept) array
-    W : (n_poses, n_kept, 6) array
+    W : (n_kept, n_poses, 6) array
     V : (n_poses, 6, 6) array
     g_kept, g_pose : (n_kept,) and (n_poses, 6) array
     """
@@ -138,7 +151,7 @@ class Sums:
 def summed(kinds: list[tuple[Places, Rows]], n_kept: int, n_poses: int) -> Sums:
     """Sum the measurements of all kinds."""
     U, g_kept = np.zeros((n_kept + 1, n_kept + 1)), np.zeros(n_kept + 1)
-    W = np.zeros((n_poses * (n_kept + 1), 6))
+    W = np.zeros(((n_kept + 1) * n_poses, 6))
     V, g_pose = np.zeros((n_poses, 36)), np.zeros((n_poses, 6))
     for where, rows in kinds:
         n, _, m = rows.J.shape
@@ -154,7 +167,7 @@ def summed(kinds: list[tuple[Places, Rows]], n_kept: int, n_poses: int) -> Sums:
         g_pose += where.to_pose @ np.einsum("nqi,nq->ni", J_pose, rows.r)
     return Sums(
         U[:n_kept, :n_kept],
-        W.reshape(n_poses, n_kept + 1, 6)[:, :n_kept],
+        W.reshape(n_kept + 1, n_poses, 6)[:n_kept],
         V.reshape(n_poses, 6, 6),
         g_kept[:n_kept],
         g_pose,
