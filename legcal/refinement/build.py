@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import IntArray
 from legcal.mechanism.parameters import radius_name
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
+from legcal.refinement.biases import SharedShifts
 from legcal.refinement.choices import NO_CHOICES, Choices
 from legcal.refinement.covariance import check_counts
 from legcal.refinement.layout import Layout, lay_out
@@ -29,27 +30,6 @@ from legcal.vision.intrinsics import (
     shared_cameras,
     with_intrinsics,
 )
-
-
-@dataclass(frozen=True, eq=False)
-class EdgeBiases:
-    """Shifts of outlines that several of them share, random with known variances.
-
-    Attributes
-    ----------
-    names : tuple of str, length b
-    sigma : (b,) array
-        Their standard deviations [px].
-    index : (n, c) array of int
-        Which of them each outline has a part in.
-    shift : (n, c, 2) array
-        How far one pixel of each moves both ends [px].
-    """
-
-    names: tuple[str, ...]
-    sigma: Array
-    index: IntArray
-    shift: Array
 
 
 def build_fit(
@@ -86,7 +66,7 @@ def build_fit(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    asked = (*choices.free, *choices.priors)
+    asked = (*choices.free, *choices.priors, *choices.values)
     legs = replace(legs, twists=any(name.endswith(".twist") for name in asked))
     observed = observed_outlines(outlines, measurements, legs)
     lines = observed_axes(axes, measurements, legs)
@@ -137,13 +117,13 @@ def build_fit(
     return problem
 
 
-def with_biases(problem: FitProblem, biases: EdgeBiases) -> FitProblem:
+def with_biases(problem: FitProblem, biases: SharedShifts) -> FitProblem:
     """Return a problem in which outlines share unknown shifts, in place of those it had.
 
     Parameters
     ----------
     problem : FitProblem
-    biases : EdgeBiases
+    biases : SharedShifts
     """
     old = problem.layout
     n_old, n_new = len(old.bias), len(biases.names)
@@ -178,7 +158,7 @@ def with_biases(problem: FitProblem, biases: EdgeBiases) -> FitProblem:
             layout,
             np.concatenate([moved(priors.position[known]), layout.bias]),
             np.concatenate([priors.mean[known], np.zeros(n_new)]),
-            np.concatenate([priors.sigma[known], biases.sigma]),
+            np.concatenate([priors.sigma[known], biases.sigmas]),
         ),
         named=_inserted(problem.named, biases.names, first, n_old),
         named_units=_inserted(problem.named_units, ("px",) * n_new, first, n_old),

@@ -35,6 +35,8 @@ class ObservedOutlines:
         Claimed covariance of the offsets at both ends [px^2].
     parts : tuple of (int, str)
         Leg index and part of each radius, sorted by leg and name.
+    views : tuple of str
+        Names of the views.
     bias_index : (n, c) array of int
         The shared shifts that each outline has a part in.
     bias_shift : (n, c, 2) array
@@ -51,6 +53,7 @@ class ObservedOutlines:
     constants: Array
     covariance: Array
     parts: tuple[tuple[int, str], ...]
+    views: tuple[str, ...]
     bias_index: IntArray
     bias_shift: Array
 
@@ -135,6 +138,7 @@ def observed_outlines(
         constants,
         covariance,
         parts,
+        tuple(view.name for view in measurements.views),
         np.zeros((len(index), 0), dtype=np.intp),
         np.zeros((len(index), 0, 2)),
     )

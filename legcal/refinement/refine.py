@@ -10,6 +10,8 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
@@ -187,17 +189,19 @@ def _refined(
     first = candidate.minimum
     k = width_to_k(settings.loss_width)
     held = open_directions(problem, first.state, information(problem, first.state, first.linear, k))
-    free, state = problem, first.state
-    if len(held.basis):
-        problem, state = held_at_nominal(problem, state, held)
+    free, state, iterations = problem, first.state, first.iterations
     try:
-        fit = fit_in_rounds(problem, state, first.iterations, settings)
+        if len(held.basis):
+            problem, state = held_at_nominal(problem, state, held)
+            there = first_minimum(problem, state, settings)
+            state, iterations = there.state, iterations + there.iterations
+        fit = fit_in_rounds(problem, state, iterations, settings)
     except DidNotConverge:
         _refuse_undetermined(free, state)
         raise
     _refuse_other_radii(problem, fit.state)
-    _refuse_lost(free, fit, held, k)
-    return assemble_solution(problem, fit, held, outlines, candidate.label, settings)
+    _refuse_lost(fit, held, k)
+    return assemble_solution(fit.problem, fit, held, outlines, candidate.label, settings)
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
@@ -206,8 +210,9 @@ def _refuse_undetermined(problem: FitProblem, state: State) -> None:
     open_directions(problem, state, information(problem, state, linear, 0.0))
 
 
-def _refuse_lost(problem: FitProblem, fit: Fit, held: Held, k: float) -> None:
+def _refuse_lost(fit: Fit, held: Held, k: float) -> None:
     """Raise NotIdentifiable if what was rejected leaves a direction open that was not before."""
+    problem = dataclasses.replace(fit.problem, held=np.zeros((0, fit.problem.layout.n_kept)))
     normal = information(problem, fit.state, fit.minimum.linear, k)
     left = open_directions(problem, fit.state, normal)
     if len(left.basis) > len(held.basis):

@@ -1,4 +1,4 @@
-"""The rounds of a fit: solve wide, reject what disagrees, estimate the noise, solve again."""
+"""The rounds of a fit: solve wide, reject what disagrees, estimate the errors, solve again."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,8 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
+from legcal.refinement.bias_scores import scores_of_shifts, with_shifts
+from legcal.refinement.biases import N_KINDS, SharedShifts, estimated_shifts, possible_shifts
 from legcal.refinement.influence import explained_share
 from legcal.refinement.linearize import linearize, offsets_of
 from legcal.refinement.loss import width_to_k
@@ -19,10 +21,23 @@ from legcal.refinement.state import State
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A minimum with the noise and the outlines that it was fitted with."""
+    """A minimum with the errors and the outlines that it was fitted with.
 
+    Attributes
+    ----------
+    problem : FitProblem
+        With the shifts that outlines share, if they do.
+    minimum : Minimum
+    noise : NoiseModel
+    shifts : SharedShifts
+    accepted : (n_outlines,) array of bool
+    iterations : int
+    """
+
+    problem: FitProblem
     minimum: Minimum
     noise: NoiseModel
+    shifts: SharedShifts
     accepted: BoolArray
     iterations: int
 
@@ -72,7 +87,8 @@ def fit_in_rounds(
     """
     claimed, noise = problem.outlines.covariance, NoiseModel()
     accepted = np.ones(len(claimed), dtype=np.bool_)
-    state = first
+    possible = possible_shifts(problem.outlines, problem.legs.names)
+    state, shifts = first, possible.of_sizes(np.zeros(N_KINDS))
 
     def solved() -> Minimum:
         whitening = noise.whitening(claimed, accepted)
@@ -87,13 +103,29 @@ def fit_in_rounds(
         minimum = solved()
         state, iterations = minimum.state, iterations + minimum.iterations
     for _ in range(settings.noise_rounds if len(claimed) else 1):
+        errors_before = _sizes(noise, shifts)
         noise = _noise(problem, state, noise, accepted, settings)
         accepted = _accepted(problem, state, noise, settings)
         minimum = solved()
         state, iterations = minimum.state, iterations + minimum.iterations
+        if not accepted.any():
+            break
+        whitening = noise.whitening(claimed, accepted)
+        shifts = estimated_shifts(possible, *scores_of_shifts(problem, state, whitening, possible))
+        if len(shifts) or len(state.biases):
+            problem, state = with_shifts(problem, state, shifts)
+            minimum = solved()
+            state, iterations = minimum.state, iterations + minimum.iterations
+        if np.allclose(_sizes(noise, shifts), errors_before, rtol=settings.settled, atol=1e-3):
+            break
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
     _refuse_disagreeing_axes(minimum.linear.axes.squared_norms, settings)
-    return Fit(minimum, noise, accepted, iterations)
+    return Fit(problem, minimum, noise, shifts, accepted, iterations)
+
+
+def _sizes(noise: NoiseModel, shifts: SharedShifts) -> Array:
+    """Return all standard deviations of errors in one vector."""
+    return np.array([noise.scale, noise.bias_px, noise.tilt_px, *shifts.sigma])
 
 
 def _noise(

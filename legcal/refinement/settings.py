@@ -18,7 +18,9 @@ class RefinementSettings:
     rejection_rounds : int
         Rounds, at most, until the rejected outlines stay the same.
     noise_rounds : int
-        Rounds of noise estimation after that.
+        Rounds, at most, in which the errors of outlines are estimated after that.
+    settled : float
+        Relative change of these below which the rounds end.
     axis_disagreement : float
         Whitened distance of an axis beyond which it disagrees; a fit in which most do is
         refused. Sigmas that are too small by less are told by chi2 alone.
@@ -32,7 +34,8 @@ class RefinementSettings:
     loss_width: float = 3.0
     rejection: float = 4.5
     rejection_rounds: int = 6
-    noise_rounds: int = 2
+    noise_rounds: int = 6
+    settled: float = 0.02
     axis_disagreement: float = 20.0
     largest_rms_px: float = 3.0
     max_iterations: int = 100

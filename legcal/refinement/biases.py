@@ -1,0 +1,143 @@
+"""Errors that outlines share: which shifts there may be, and how large, by the residuals.
+
+Shading moves an edge of a leg alike in all images of a camera, a little differently where the leg
+stands elsewhere in the image; blur moves many edges. Such errors do not average out over images.
+So groups of outlines have unknown shifts, random with variances that restricted maximum
+likelihood finds in the residuals. Where these are white there are none.
+
+Shifts that move both edges of a leg inwards show in the residuals; those that move a leg
+sideways do not, since the fit follows, and they are what moves joints. Edges that err
+independently do both, and one variance serves both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.types import Array, IntArray
+from legcal.refinement.observed import ObservedOutlines
+from legcal.refinement.variances import Effects, estimate_variances
+
+N_KINDS = 6
+_LEAST_GAIN = 25.0  # of white residuals, one set in 20,000 gains that much
+_MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
+
+
+@dataclass(frozen=True, eq=False)
+class SharedShifts:
+    """Shifts that outlines share, random with known variances.
+
+    Attributes
+    ----------
+    names : tuple of str, length b
+        ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
+        ``c1.leg1.rod.edge1.bias`` of an edge in a view, and ``.bias_x``, how it changes along x.
+    kind : (b,) array of int
+        0 and 1 for bias and tilt of many edges, 2 and 3 of one edge in a view, 4 and 5 of how
+        these change with its place in the image.
+    sigma : (N_KINDS,) array
+        Standard deviation of each kind [px].
+    index : (n, c) array of int
+        Which of them each outline has a part in.
+    shift : (n, c, 2) array
+        How far one pixel of each moves both ends along the normal of the line [px].
+    """
+
+    names: tuple[str, ...]
+    kind: IntArray
+    sigma: Array
+    index: IntArray
+    shift: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviation of each shift [px], (b,)."""
+        return np.asarray(self.sigma[self.kind])
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def of_sizes(self, sigma: Array) -> SharedShifts:
+        """Return shifts with these standard deviations, without those where it is zero."""
+        kept = sigma[self.kind] > 0.0
+        number = np.cumsum(kept) - 1
+        columns = kept[self.index].all(axis=0)  # all shifts of a column are of one kind
+        return SharedShifts(
+            tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept),
+            self.kind[kept],
+            sigma,
+            number[self.index[:, columns]],
+            self.shift[:, columns],
+        )
+
+
+def possible_shifts(outlines: ObservedOutlines, leg_names: Sequence[str]) -> SharedShifts:
+    """Return all shifts that outlines may share, with a standard deviation of one pixel.
+
+    Shifts of many edges are inward; those of one edge change along x and y of the image by
+    one unit a standard deviation of the places of all outlines in their groups.
+
+    Parameters
+    ----------
+    outlines : ObservedOutlines
+    leg_names : sequence of str
+    """
+    o = outlines
+    parts = [f"{leg_names[leg]}.{part}" for leg, part in o.parts]
+    edge = np.where(o.epsilon > 0.0, 1, 2)
+    found, group = np.unique(np.column_stack([o.view, o.radius, edge]), axis=0, return_inverse=True)
+    group = group.ravel()
+    inward, one = o.epsilon, np.ones(len(o))
+    place = _places_in_groups(o.pixels.mean(axis=1), group)
+    edges = [f"{o.views[v]}.{parts[p]}.edge{e}" for v, p, e in found.tolist()]
+    levels = [
+        (("all",), np.zeros(len(o), dtype=np.intp), inward, "", 0),
+        (o.views, o.view, inward, "", 0),
+        (parts, o.radius, inward, "", 0),
+        (edges, group, one, "", 2),
+        (edges, group, place[:, 0], "_x", 4),
+        (edges, group, place[:, 1], "_y", 4),
+    ]
+    names: list[str] = []
+    kind, index, shift = [], [], []
+    for owners, member, weight, suffix, first_kind in levels:
+        for mode, (name, ends) in enumerate(_MODES):
+            index.append(member + len(names))
+            shift.append(weight[:, None] * np.array(ends))
+            names += [f"{owner}.{name}{suffix}" for owner in owners]
+            kind += [first_kind + mode] * len(owners)
+    return SharedShifts(
+        tuple(names),
+        np.array(kind),
+        np.ones(N_KINDS),
+        np.stack(index, axis=1),
+        np.stack(shift, axis=1),
+    )
+
+
+def estimated_shifts(possible: SharedShifts, z: Array, K: Array) -> SharedShifts:
+    """Return the shifts that the residuals show: none at all where they are white.
+
+    Parameters
+    ----------
+    possible : SharedShifts
+    z, K : (b,) and (b, b) array
+        Scores of all of them and their covariance, as :class:`legcal.refinement.variances.Effects`
+        has them [1/px, 1/px^2].
+    """
+    variances, _ = estimate_variances(Effects(z, K, possible.kind), _LEAST_GAIN)
+    return possible.of_sizes(np.sqrt(variances))
+
+
+def _places_in_groups(places: Array, group: IntArray) -> Array:
+    """Return places (n, 2) from the middle of their groups, over the spread of all of them."""
+    if len(places) == 0:
+        return places
+    counts = np.bincount(group)
+    middle = np.stack([np.bincount(group, weights=x) / counts for x in places.T], axis=1)
+    away = places - middle[group]
+    spread = float(np.sqrt(np.mean(away**2)))
+    return np.asarray(away / spread if spread > 0.0 else np.zeros_like(away))
