@@ -18,6 +18,7 @@ from legcal.refinement.normal import NormalEquations, information
 from legcal.refinement.priors import named_values
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.rounds import Fit
+from legcal.refinement.sensitivity import sensitivities
 from legcal.refinement.settings import RefinementSettings
 from legcal.refinement.solution import Solution, Status
 from legcal.refinement.state import State
@@ -45,6 +46,7 @@ def assemble_solution(
     """
     state, k = fit.state, width_to_k(settings.loss_width)
     linear = fit.minimum.linear
+    whitening = fit.noise.whitening(problem.outlines.covariance, fit.accepted)
     normal = information(problem, state, linear, k)
     covariance = named_covariance(problem, state, normal)
     _refuse_contradicted_priors(problem, state, covariance)
@@ -83,7 +85,7 @@ def assemble_solution(
         rms_axes=float(np.sqrt(np.mean(linear.axes.r**2))) if linear.axes.r.size else None,
         noise=fit.noise,
         biases=_biases(problem, state),
-        sensitivities=(),
+        sensitivities=sensitivities(problem, state, linear, normal, whitening, k),
         outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,

@@ -55,6 +55,15 @@ def response(where: Places, rows: Rows, normal: NormalEquations, change: Array) 
     (n_kept, c) array
         Changes of the kept unknowns.
     """
-    G = reduced_jacobian(where, rows, normal)
-    gradient = np.einsum("nqk,nqc->kc", G, change, optimize=True)
+    n, n_changes = len(change), change.shape[-1]
+    gradient = np.zeros((where.n_kept + 1, n_changes))
+    for member, column in where.groups:
+        gradient[column] += np.einsum("nqm,nqc->mc", rows.J[member], change[member], optimize=True)
+    gradient = gradient[:-1]
+    of_pose = np.einsum("nqi,nqc->nic", rows.J_pose, change).reshape(n, 6 * n_changes)
+    of_pose = (where.to_pose @ of_pose).reshape(where.n_poses, 6, n_changes)
+    if normal.tangent is not None:
+        gradient += np.einsum("akp,kpc->ac", normal.tangent.Q, of_pose, optimize=True)
+        of_pose = np.swapaxes(normal.tangent.Z, 1, 2) @ of_pose
+    gradient -= np.einsum("akf,kfc->ac", normal.W, normal.V_inverse @ of_pose, optimize=True)
     return np.asarray(-normal.kept_covariance() @ gradient)

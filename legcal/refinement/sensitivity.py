@@ -1,0 +1,145 @@
+"""What the fit would have found if something that it took as known were mistaken.
+
+A mistake changes residuals: a longer focal length puts what is seen elsewhere on the sensor
+plane, a thicker leg has its outlines further apart, and a prior pulls elsewhere. The fit follows by
+one Gauss-Newton step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legcal.geometry.types import Array
+from legcal.refinement.influence import response
+from legcal.refinement.linearize import Linearization, offsets_of
+from legcal.refinement.loss import efficiency
+from legcal.refinement.normal import NormalEquations
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.solution import Sensitivity
+from legcal.refinement.state import State, intrinsic_of
+from legcal.vision.intrinsics import undistort_derivatives
+
+_PART = 1e-3  # of a mistake that is tried: its effect is told to first order
+_OF_RADII = 0.01
+
+
+@dataclass(frozen=True)
+class _Mistake:
+    """A mistake in cameras: a part of some of their numbers, and pixels in others."""
+
+    what: str
+    relative: Mapping[str, float]
+    added: Mapping[str, float]
+
+
+_OF_CAMERAS = (
+    _Mistake("a focal length 1 % longer", {"fx": 0.01, "fy": 0.01}, {}),
+    _Mistake("a principal point 0.1 px further right", {}, {"cx": 0.1}),
+    _Mistake("a principal point 0.1 px further down", {}, {"cy": 0.1}),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """How residuals change with a mistake.
+
+    Attributes
+    ----------
+    what : str
+        The mistake.
+    offsets : (n, 2) array
+        Change of the offsets of outlines [px].
+    priors : (n_priors,) array
+        Change of the means of priors [m, rad, px].
+    """
+
+    what: str
+    offsets: Array
+    priors: Array
+
+
+def sensitivities(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    normal: NormalEquations,
+    whitening: Array,
+    k: float,
+) -> tuple[Sensitivity, ...]:
+    """Return what mistakes in cameras and radii would do to the kinematic parameters.
+
+    What the fit looked for without a prior is not taken as known; a mistake in nothing else is
+    left out. So are all of them where axes were measured in place of outlines.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    state : State
+        Where the fit ended.
+    linear : Linearization
+        There.
+    normal : NormalEquations
+        There: :func:`legcal.refinement.normal.information`.
+    whitening : (n_outlines, 2, 2) array
+        What *linear* was taken with.
+    k : float
+        What *normal* was taken with.
+    """
+    changes = [*(_in_cameras(problem, state, m) for m in _OF_CAMERAS), _in_radii(problem, state)]
+    changes = [c for c in changes if c.offsets.any() or c.priors.any()]
+    if not changes:
+        return ()
+    offsets = efficiency(k, 2) * whitening @ np.stack([c.offsets for c in changes], axis=-1)
+    pulls = np.column_stack([c.priors for c in changes]) / problem.priors.sigma[:, None]
+    steps = response(problem.outline_places, linear.outlines, normal, offsets)
+    steps += normal.kept_covariance() @ linear.prior_J.T @ pulls
+    padded = np.vstack([steps, np.zeros(len(changes))])
+    kinematic = padded[np.minimum(problem.layout.kinematic, problem.layout.n_kept)]
+    return tuple(Sensitivity(c.what, kinematic[:, i]) for i, c in enumerate(changes))
+
+
+def _in_cameras(problem: FitProblem, state: State, mistake: _Mistake) -> _Change:
+    """Return what a mistake in all cameras changes."""
+    layout, o = problem.layout, problem.outlines
+    moved = np.zeros(o.feet.shape)
+    priors = np.zeros(len(problem.priors))
+    for v in np.unique(o.view).tolist():
+        camera, of_view = state.cameras[v], o.view == v
+        steps = {k: part * intrinsic_of(camera, k) for k, part in mistake.relative.items()}
+        steps |= mistake.added
+        places = dict(zip(layout.intrinsic_keys, layout.intrinsic[v].tolist(), strict=True))
+        for name, step in steps.items():
+            priors[problem.priors.position == places.get(name, -1)] = step
+        fixed = [name for name in steps if places.get(name, layout.size) >= layout.size]
+        slopes = undistort_derivatives(camera, o.pixels[of_view], fixed)
+        moved[of_view] = slopes @ np.array([steps[name] for name in fixed])
+    return _Change(mistake.what, _offsets_change(problem, state, moved), priors)
+
+
+def _in_radii(problem: FitProblem, state: State) -> _Change:
+    """Return what a mistake in all radii of the model changes."""
+    layout = problem.layout
+    steps = _OF_RADII * np.array([problem.legs.radii[part] for part in layout.parts])
+    priors = np.zeros(len(problem.priors))
+    for x, step in zip(layout.radius.tolist(), steps.tolist(), strict=True):
+        priors[problem.priors.position == x] = step
+    fixed = np.where(layout.radius >= layout.size, steps, 0.0)
+    thicker = replace(state, radii=state.radii + _PART * fixed)
+    offsets = (offsets_of(problem, thicker) - offsets_of(problem, state)) / _PART
+    return _Change("radii 1 % larger", offsets, priors)
+
+
+def _offsets_change(problem: FitProblem, state: State, moved: Array) -> Array:
+    """Return how offsets (n, 2) [px] change as measured ends (n, 2, 2) move [sensor plane]."""
+    feet, _ = problem.measured_ends(state)
+    fixed = replace(problem.layout, intrinsic_keys=())
+
+    def offsets(part: float) -> Array:
+        """Return the offsets once the ends have moved a part of the way."""
+        seen = replace(problem.outlines, feet=feet + part * moved)
+        return offsets_of(replace(problem, outlines=seen, layout=fixed), state)
+
+    return np.asarray((offsets(_PART) - offsets(0.0)) / _PART)
