@@ -56,7 +56,7 @@ def scores_of_shifts(
     normal = normal_equations(problem, state, linear, 0.0)
     S = normal.reduced()
     following = (normal.V_inverse @ normal.g_pose[..., None])[..., 0]
-    g = normal.g_kept - np.einsum("kap,kp->a", normal.W, following)
+    g = normal.g_kept - np.einsum("akp,kp->a", normal.W, following)
     bias = problem.layout.bias
     others = np.setdiff1d(np.arange(len(S)), bias)
     of_prior = 1.0 / possible.sigmas**2
