@@ -83,4 +83,5 @@ def normal_basis(u: Array) -> Array:
     axis = np.eye(3)[np.argmin(np.round(np.abs(u), 9), axis=-1)]  # ties are not left to rounding
     e1 = axis - u * np.sum(u * axis, axis=-1, keepdims=True)
     e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
-    return np.stack([e1, np.cross(u, e1)], axis=-2)
+    e2 = u[..., [1, 2, 0]] * e1[..., [2, 0, 1]] - u[..., [2, 0, 1]] * e1[..., [1, 2, 0]]
+    return np.stack([e1, e2], axis=-2)  # np.cross is slow on single vectors

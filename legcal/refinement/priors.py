@@ -7,12 +7,13 @@ unknowns are turns of where it is now.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.leg_steps import moved_legs
+from legcal.mechanism.parametrization import vector_of
 from legcal.refinement.layout import Layout
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.residuals import prior_residual
@@ -50,8 +51,10 @@ class Priors:
         r, slope = prior_residual().evaluate(value[:, None], data)
         J = np.zeros((len(self), self.layout.n_kept))
         if len(self):
-            by_x = named_jacobian(state, self.layout, legs)[self.position]
-            J[:, : by_x.shape[1]] = slope[:, 0] * by_x
+            by_x = np.eye(self.layout.n_named)
+            if np.any(self.position < self.layout.n_kinematic):
+                by_x = named_jacobian(state, self.layout, legs)
+            J[:, : len(by_x)] = slope[:, 0] * by_x[self.position]
         return r[:, 0], J
 
 
@@ -69,15 +72,18 @@ def named_jacobian(state: State, layout: Layout, legs: FittedLegs) -> Array:
     """
     J = np.eye(layout.n_named)
     free = layout.kinematic < layout.size
-    for x in layout.place[:, _AXES].ravel():
-        if x < layout.size:
-            step = np.zeros(layout.size)
-            step[x] = _STEP
-            ahead, behind = (
-                legs.vector(moved_legs(state.legs, layout.place, sign * step))
-                for sign in (1.0, -1.0)
-            )
-            J[: layout.n_kinematic, x] = ((ahead - behind) / (2.0 * _STEP))[free]
+    for j, leg in enumerate(state.legs):
+        place, nominal = layout.place[[j]], legs.nominal[j : j + 1]
+        own = replace(legs.parametrization, place=legs.parametrization.place[[j]])
+        for x in place[0, _AXES]:
+            if x < layout.size:
+                step = np.zeros(layout.size)
+                step[x] = _STEP
+                ahead, behind = (
+                    vector_of(own, moved_legs((leg,), place, sign * step), nominal)
+                    for sign in (1.0, -1.0)
+                )
+                J[: layout.n_kinematic, x] = ((ahead - behind) / (2.0 * _STEP))[free]
     return J
 
 
