@@ -180,7 +180,7 @@ def vector_of(
                 [leg.q0],
                 _turn(leg.base_axis, start.base_axis),
                 _turn(leg.platform_axis, start.platform_axis),
-                [_near(leg.twist, start.twist)],
+                [_twist(leg, start)],
             ]
         )
         vector[place[place >= 0]] = local[place >= 0]
@@ -230,8 +230,42 @@ def _turn(axis: Array | None, nominal: Array | None) -> Array:
     return np.asarray(normal_basis(nominal) @ (scale * turn))
 
 
-def _near(twist: float | None, nominal: float | None) -> float:
-    """Return the twist, an angle between lines, nearest to the nominal one [rad]."""
-    if twist is None or nominal is None:
+def tied_twist(leg: LegGeometry, nominal: LegGeometry, twist: float) -> float | None:
+    """Return the twist of a leg that had another one where its platform axis was nominal [rad].
+
+    The axis went from there by the smallest rotation: what is tied to it has turned about it on any
+    other way.
+    """
+    turn = turn_between(nominal.platform_axis, leg.platform_axis)
+    return twist_after(replace(nominal, twist=twist), turn)
+
+
+def tied_twist_slope(leg: LegGeometry, nominal: LegGeometry) -> Array:
+    """Return the derivative (2,) of :func:`tied_twist` by turns of the platform axis.
+
+    Beyond the turn that :func:`twist_after` knows: the angle by which the nominal axis, the leg's
+    and the turned one, as corners of a spherical triangle, exceed pi.
+    """
+    u, n = leg.platform_axis, nominal.platform_axis
+    if u is None or n is None or leg.platform_joint != "":
+        return np.zeros(2)
+    n = n if n @ u > 0.0 else -n
+    e1, e2 = normal_basis(u)
+    return np.array([-e2, e1]) @ np.cross(n, u) / (1.0 + float(n @ u))
+
+
+def _twist(leg: LegGeometry, nominal: LegGeometry) -> float:
+    """Return the twist that a leg has with its axes turned back, nearest to the nominal one [rad].
+
+    Twists are angles between lines.
+    """
+    twist = twist_after(leg, turn_between(nominal.platform_axis, leg.platform_axis).inv())
+    if twist is None or nominal.twist is None:
         return 0.0
-    return float(twist - np.pi * np.round((twist - nominal) / np.pi))
+    return float(twist - np.pi * np.round((twist - nominal.twist) / np.pi))
+
+
+def turn_between(nominal: Array | None, axis: Array | None) -> Rotation:
+    """Return the smallest rotation that takes a nominal axis to an axis, both as lines."""
+    angles = _turn(axis, nominal)
+    return Rotation.from_rotvec(np.zeros(3) if nominal is None else angles @ normal_basis(nominal))

@@ -18,14 +18,17 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.equations import demanded
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_geometry import Demand, LegGeometry
+from legcal.mechanism.parametrization import tied_twist_slope
 from legcal.mechanism.sensitivity import freedoms
 from legcal.refinement.layout import Layout
+from legcal.refinement.legs import FittedLegs
 from legcal.refinement.state import State, turned
 
 _RANK = 1e-7  # of the largest singular value
 _MET = 1e-13  # [m]
 _NEARLY_MET = 1e-10  # [m], of demands that cannot all be met to rounding
 _MAX_STEPS = 20
+_PLATFORM_AXIS, _TWIST = slice(9, 11), 11  # among the numbers of a leg
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,11 +137,11 @@ def on_constraints(state: State, frame_legs: Sequence[int]) -> State:
     )
 
 
-def tangent(state: State, layout: Layout, frame_legs: Sequence[int]) -> Tangent | None:
+def tangent(state: State, layout: Layout, legs: FittedLegs) -> Tangent | None:
     """Return the motions of poses that the constraints leave; None where all are free."""
-    if not is_constrained(state.legs, frame_legs):
+    if not is_constrained(state.legs, legs.frame_legs):
         return None
-    free = list(freedoms(frame_legs))
+    free = list(freedoms(legs.frame_legs))
     n_poses = layout.n_poses
     rows = _binding(state.legs, state.R_pose, state.t_pose)
     Q = np.zeros((layout.n_kept + 1, n_poses, 6))
@@ -157,7 +160,11 @@ def tangent(state: State, layout: Layout, frame_legs: Sequence[int]) -> Tangent 
     inverse[:, free] = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
     for i, leg in enumerate(rows.leg):
         place = np.minimum(layout.place[leg], layout.n_kept)
-        Q[place] -= rows.by_local[:, i].T[..., None] * inverse[None, :, :, i]
+        by_local = rows.by_local[:, i]
+        if place[_TWIST] == layout.n_kept:
+            slope = tied_twist_slope(state.legs[leg], legs.nominal[leg])
+            by_local[:, _PLATFORM_AXIS] += by_local[:, [_TWIST]] * slope
+        Q[place] -= by_local.T[..., None] * inverse[None, :, :, i]
     return Tangent(Z, Q[:-1])
 
 

@@ -111,7 +111,7 @@ def held_at_nominal(problem: FitProblem, state: State, held: Held) -> tuple[FitP
     wanted = wanted - held.unit[:n] * (along @ held.basis[:, :n])
     where = np.flatnonzero(layout.kinematic < layout.size).tolist()
     moved = with_values(state.legs, legs, dict(zip(where, wanted.tolist(), strict=True)))
-    return replace(problem, held=orthonormal), replace(state, legs=moved)
+    return replace(problem, held=orthonormal), replace(state, legs=problem.tied(moved))
 
 
 def named_units(problem: FitProblem, state: State) -> Array:

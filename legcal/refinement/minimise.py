@@ -7,7 +7,7 @@ distance: nearly plain squares for them, and still no place for those that are w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -149,6 +149,7 @@ def _tried(problem: FitProblem, state: State, step: Array) -> State | None:
     moved = state.moved(step * min(1.0, _LARGEST_TURN / max(largest, 1e-300)), layout)
     if np.any(moved.radii <= 0.0):
         return None
+    moved = replace(moved, legs=problem.tied(moved.legs))
     try:
         return on_constraints(moved, problem.legs.frame_legs)
     except DidNotConverge:

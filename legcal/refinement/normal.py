@@ -196,7 +196,7 @@ def _constrained(
     U = sums.U + linear.prior_J.T @ linear.prior_J
     g_kept = sums.g_kept + linear.prior_J.T @ linear.prior_r
     W, V, g_pose = sums.W, sums.V, sums.g_pose
-    motion = tangent(state, problem.layout, problem.legs.frame_legs)
+    motion = tangent(state, problem.layout, problem.legs)
     if motion is not None:
         Z, Q = motion.Z, motion.Q
         coupled, QV = _coupled(W, Q), _by_pose(Q, V)

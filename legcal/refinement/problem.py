@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.mechanism.parametrization import tied_twist
 from legcal.mechanism.sensitivity import freedoms
 from legcal.refinement.choices import Choices
 from legcal.refinement.constraints import n_bonds
@@ -100,13 +102,26 @@ class FitProblem:
             if layout.kinematic[i] >= layout.size
         }
         return State(
-            with_values(start.legs, legs, at),
+            self.tied(with_values(start.legs, legs, at)),
             self.first.radii,
             np.zeros(len(layout.bias)),
             self.first.cameras,
             *components(start.T_camera_Rb),
             *components(start.T_Rb_Re),
         )
+
+    def tied(self, geometry: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
+        """Return legs whose fixed twists are where they are fixed, whatever turned the axes.
+
+        Turning an axis away and back on another way leaves what is tied to it turned about it.
+        """
+        moved = list(geometry)
+        for j, (leg, nominal) in enumerate(zip(geometry, self.legs.nominal, strict=True)):
+            is_free = self.layout.place[j, -1] < self.layout.size
+            if nominal.twist is not None and leg.platform_joint == "" and not is_free:
+                fixed = self.choices.values.get(f"{self.legs.names[j]}.twist", nominal.twist)
+                moved[j] = replace(leg, twist=tied_twist(leg, nominal, fixed))
+        return tuple(moved)
 
     def measured_ends(self, state: State) -> tuple[Array, Array]:
         """Return the ends of outlines on the sensor plane, and how they move with intrinsics.
