@@ -26,7 +26,7 @@ from legcal.refinement.file_order import in_file_order
 from legcal.refinement.foretold import arrays
 from legcal.refinement.held_out import PlatformPair
 from legcal.refinement.known_parameters import known_parameters
-from legcal.refinement.moved import difference, judge_movement
+from legcal.refinement.moved import difference, judge_movement, noise_dof
 from legcal.refinement.solution import Solution
 from legcal.report.check_report import Check
 from legcal.report.earlier_result import EarlierResult, read_result
@@ -191,20 +191,22 @@ def _compare(
     where = [solution.names.index(name) for name in known.names]
     values = np.array([solution.values[name] for name in known.names])
     covariance = solution.covariance[np.ix_(where, where)]
-    found = difference(values, covariance, known.plausible, known.old, known.covariance)
+    worse = _earlier_noise(solution, earlier)
+    found = difference(values, covariance, known.plausible, known.old, known.covariance, worse)
+    dof = noise_dof(solution.dof, covariance, known.plausible) if worse == 1.0 else earlier.dof
     mechanism = dataset.mechanism
     legs, parametrization = geometries(mechanism), solution.parametrization
     columns = [parametrization.names.index(name) for name in known.names]
     changes = possible_changes(
         mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
     )
-    movement = judge_movement(found, solution.dof, changes, significance)
+    movement = judge_movement(found, dof, changes, significance)
     J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *arrays(solution.T_Rb_Re))[
         :, :, columns
     ]
     # Priors pull what was found to the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / known.plausible**2
-    spread = G @ covariance + G @ known.covariance @ G.T
+    spread = worse * G @ covariance + G @ known.covariance @ G.T
     shift = J @ (values - known.old)
     variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
     at_platform = PlatformPair(
@@ -215,6 +217,18 @@ def _compare(
     )
     notes = (*dataset.notes, *solution.notes)
     return Check(dataset, earlier, solution, movement, at_platform, notes)
+
+
+def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
+    """Return how many times the variance by the new images is that by the earlier ones, or one."""
+    claimed = solution.outlines.covariance[solution.outlines.used]
+    if len(claimed) == 0:
+        return 1.0
+    now, then = (
+        float(np.mean(np.trace(noise.covariance(claimed), axis1=1, axis2=2)))
+        for noise in (solution.noise, earlier.noise)
+    )
+    return max(then / now, 1.0)
 
 
 def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:

@@ -94,7 +94,12 @@ class Difference:
 
 
 def difference(
-    values: Array, covariance: Array, prior: Array, old: Array, known: Array
+    values: Array,
+    covariance: Array,
+    prior: Array,
+    old: Array,
+    known: Array,
+    worse: float = 1.0,
 ) -> Difference:
     """Return what new images say against the earlier result.
 
@@ -110,6 +115,9 @@ def difference(
         Parameters of the earlier result.
     known : (p, p) array
         Their covariance.
+    worse : float
+        How many times the variance of the outlines is at least what a few new images make of it:
+        theirs alone may look small by chance.
 
     Raises
     ------
@@ -132,8 +140,25 @@ def difference(
     return Difference(
         directions,
         vectors[:, tells].T @ score / weight[tells],
-        np.diag(1.0 / weight[tells]) + directions @ known @ directions.T,
+        np.diag(worse / weight[tells]) + directions @ known @ directions.T,
     )
+
+
+def noise_dof(dof: int, covariance: Array, prior: Array) -> int:
+    """Return the degrees of freedom that tell of the noise in a fit with wide priors.
+
+    Parameters
+    ----------
+    dof : int
+        Residuals, those of priors among them, less unknowns.
+    covariance : (p, p) array
+        Of the parameters that have the priors.
+    prior : (p,) array
+        Standard deviations of the priors.
+    """
+    # A prior that the images outdo has no residual of its own.
+    outdone = len(prior) - float(np.trace(covariance / prior**2))
+    return max(round(dof - outdone), 1)
 
 
 def judge_movement(

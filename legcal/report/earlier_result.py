@@ -18,6 +18,7 @@ from legcal.geometry.types import Array
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
+from legcal.refinement.noise import NoiseModel
 from legcal.report.axis_turns import calibrated_axis, nominal_axes, turns_between
 
 RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
@@ -39,6 +40,23 @@ class _Row(BaseModel):
     status: Literal["estimated", "fixed", "weak"]
 
 
+class _Noise(BaseModel):
+    """The noise of the outlines."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    scale: Annotated[Number, Field(gt=0.0)]
+    bias_px: Annotated[Number, Field(ge=0.0)]
+    tilt_px: Annotated[Number, Field(ge=0.0)]
+
+
+class _Residuals(BaseModel):
+    """What was left of the observations."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    dof: int
+    noise: _Noise
+
+
 class _Document(BaseModel):
     """What is needed of ``result.json``; there is more in it."""
 
@@ -49,6 +67,7 @@ class _Document(BaseModel):
     parameters: Annotated[list[_Row], Field(min_length=1)]
     nominal_axes: dict[str, dict[str, _Axis]]
     covariance: list[list[Number]]
+    residuals: _Residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +90,10 @@ class EarlierResult:
         Kinematic parameters of which the calibration says nothing.
     intrinsics : mapping
         (nominal value, value, sigma) of intrinsics that were looked for, by name.
+    noise : NoiseModel
+        The noise of its outlines.
+    dof : int
+        Degrees of freedom that it is known from.
     """
 
     folder: Path
@@ -80,6 +103,8 @@ class EarlierResult:
     fixed: tuple[str, ...]
     weak: tuple[str, ...]
     intrinsics: Mapping[str, tuple[float, float, float]]
+    noise: NoiseModel
+    dof: int
 
 
 def read_result(given: str | Path) -> EarlierResult:
@@ -145,6 +170,8 @@ def _assembled(path: Path, document: _Document, mechanism: Mechanism) -> Earlier
             for row in estimated
             if row.name not in known and ".radius." not in row.name and row.sigma is not None
         },
+        noise=NoiseModel(**document.residuals.noise.model_dump()),
+        dof=document.residuals.dof,
     )
 
 

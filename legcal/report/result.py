@@ -21,7 +21,9 @@ from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parameter_words import describe_direction
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 from legcal.observations.table import write_observations
+from legcal.report.axis_turns import nominal_axes
 from legcal.report.files import result_folder
+from legcal.report.held_out_report import held_out_document
 from legcal.report.parameter_rows import parameter_rows
 from legcal.report.platform_document import platform_document
 from legcal.report.urdf import reload_and_check, write_calibrated_yaml, write_urdf
@@ -40,6 +42,7 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
         "trustworthy": calibration.verdict.trustworthy,
         "legs": list(mechanism.leg_names),
         **_geometry(mechanism.leg_names, solution.legs),
+        "nominal_axes": nominal_axes(mechanism.leg_names, geometries(mechanism)),
         "parameters": [asdict(row) for row in parameter_rows(calibration)],
         "covariance": solution.covariance.tolist(),
         "weakest": _weakest(calibration),
@@ -51,9 +54,11 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
             "dof": solution.dof,
             "rms_px": solution.rms_px,
             "rms_axes": solution.rms_axes,
+            "noise": asdict(solution.noise),
         },
         "start": solution.start,
         "platform": platform_document(calibration),
+        **_held_out(calibration),
         "notes": list(calibration.notes),
     }
 
@@ -86,6 +91,12 @@ def write_result(calibration: Calibration, destination: Path) -> None:
                 dataset.measurements,
                 dataset.mechanism.leg_names,
             )
+
+
+def _held_out(calibration: Calibration) -> dict[str, Any]:
+    """Return what images that were kept aside say, nothing where there are none."""
+    held_out = calibration.held_out
+    return {} if held_out is None else {"holdout": held_out_document(held_out)}
 
 
 def _home(calibration: Calibration) -> RigidTransform | None:

@@ -17,6 +17,7 @@ from legcal.mechanism.platform import pose_differences
 from legcal.refinement.platform_accuracy import poses_at_readings
 from legcal.refinement.platform_error import PlatformError
 from legcal.refinement.start import with_joints
+from legcal.report.held_out_report import held_out_lines
 from legcal.report.parameter_rows import ParameterRow, parameter_rows
 
 _SHOWN = {  # what tables show a unit in: its size, its name, and digits
@@ -36,6 +37,7 @@ def summary(calibration: Calibration, output: Path) -> RenderableType:
         _fit_line(calibration),
         *_direction_lines(calibration),
         *_platform_lines(calibration),
+        *([] if calibration.held_out is None else held_out_lines(calibration.held_out)),
         f"Written to {output}.",
     ]
     verdict = Text(
