@@ -31,7 +31,6 @@ from legcal.refinement import (
     refine,
     refine_from_best,
 )
-from legcal.refinement.noise import NoiseModel, estimate_noise, noise_of_the_median
 
 
 @pytest.fixture(scope="module")
@@ -156,88 +155,6 @@ def test_a_rejected_outline_carries_the_reason(session: Session) -> None:
     assert found.outlines.reason[7] == "disagrees with the fit by 3.2 px"
     assert np.flatnonzero(~found.outlines.used).tolist() == [7]
     assert np.abs(joint_errors(found.parameters)).max() < 1e-9
-
-
-def test_a_bias_common_to_both_ends_is_told_from_noise_at_each() -> None:
-    rng = np.random.default_rng(2)
-    C = np.tile(np.array([[0.010, 0.003], [0.003, 0.008]]), (4000, 1, 1))
-    L = np.linalg.cholesky(C)
-    offsets = 1.5 * np.einsum("nij,nj->ni", L, rng.standard_normal((4000, 2)))
-    offsets += 0.3 * rng.standard_normal((4000, 1))
-    noise = estimate_noise(offsets, np.zeros((4000, 2, 2)), C)
-    assert noise.scale == pytest.approx(1.5, rel=0.05)
-    assert noise.bias_px == pytest.approx(0.3, rel=0.05)
-
-
-def test_an_error_opposite_at_both_ends_is_told_from_noise_at_each() -> None:
-    rng = np.random.default_rng(2)
-    C = np.tile(0.01 * np.eye(2), (4000, 1, 1))
-    offsets = 0.05 * rng.standard_normal((4000, 2))
-    offsets += 0.2 * rng.standard_normal((4000, 1)) * np.array([1.0, -1.0])
-    for noise in (
-        estimate_noise(offsets, np.zeros((4000, 2, 2)), C),
-        noise_of_the_median(offsets, C),
-    ):
-        assert noise.scale == pytest.approx(0.5, rel=0.06)
-        assert noise.tilt_px == pytest.approx(0.2, rel=0.06)
-        assert noise.bias_px == 0.0
-
-
-def test_wrong_outlines_hardly_move_the_noise_of_the_median() -> None:
-    rng = np.random.default_rng(2)
-    C = np.tile(0.01 * np.eye(2), (4000, 1, 1))
-    offsets = 0.1 * rng.standard_normal((4000, 2)) + 0.3 * rng.standard_normal((4000, 1))
-    clean = noise_of_the_median(offsets, C)
-    offsets[:800] += rng.uniform(2.0, 30.0, (800, 1))
-    dirty = noise_of_the_median(offsets, C)
-    assert clean.bias_px == pytest.approx(0.3, rel=0.1)
-    assert dirty.bias_px < 1.6 * clean.bias_px
-    assert dirty.scale == pytest.approx(1.0, rel=0.1)
-
-
-def test_biased_outlines_widen_the_covariance(session: Session) -> None:
-    rng = np.random.default_rng(3)
-    measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
-    start = disturbed_start(session)
-    plain = refine(session.legs, measurements, outlines, start)
-    bias = 0.3 * rng.standard_normal((len(outlines), 1)) * np.ones(2)
-    biased = refine(session.legs, measurements, moved_outlines(outlines, PINHOLE, bias), start)
-    assert biased.noise.bias_px == pytest.approx(0.3, abs=0.05)
-    assert biased.noise.scale == pytest.approx(1.0, abs=0.15)
-    assert biased.chi2 / biased.dof == pytest.approx(1.0, abs=0.1)
-    assert np.all(biased.sigma > plain.sigma)
-    assert NoiseModel().bias_px == 0.0
-
-
-def test_errors_that_all_images_share_are_noticed_and_widen_the_covariance() -> None:
-    session = simulate(10, legs_seen=5, sigma_px=0.05)
-    o = session.outlines
-    view = session.measurements.view[o.row]
-    group = np.unique(np.column_stack([view, o.leg, o.edge]), axis=0, return_inverse=True)[1]
-    start = disturbed_start(session)
-    normalised, biases, tilts = [], [], []
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
-        bias, tilt = 0.06 * rng.standard_normal((2, group.max() + 1))
-        shared = np.column_stack([bias - tilt, bias + tilt])[group.ravel()]
-        moved = moved_outlines(outlines, PINHOLE, shared)
-        found = refine(session.legs, measurements, moved, start)
-        error = joint_errors(found.parameters)
-        normalised.append(error @ np.linalg.solve(found.kinematic_covariance, error) / len(error))
-        biases.append(found.shared_bias_px)
-        tilts.append(found.shared_tilt_px)
-    assert np.mean(biases) == pytest.approx(0.06, rel=0.3)
-    assert np.mean(tilts) == pytest.approx(0.06, rel=0.3)
-    assert 0.6 < np.mean(normalised) < 1.5
-
-
-def test_independent_errors_are_not_taken_for_shared_ones(
-    small: Session, noisy: tuple[Measurements, Outlines]
-) -> None:
-    found = refine(small.legs, *noisy, disturbed_start(small))
-    assert found.shared_bias_px == 0.0
-    assert found.shared_tilt_px == 0.0
 
 
 def assert_same(one: Solution, other: Solution, tolerance: float) -> None:

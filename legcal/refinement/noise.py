@@ -24,6 +24,7 @@ _SMALLEST_SCALE = 0.1
 _LEAST_GAIN = 12.0  # twice the log-likelihood: of white offsets, one set in 4,000 gains that much
 _MAX_STEPS = 100
 _SETTLED = 1e-9
+_ALIKE = 1e-10  # of the largest singular value: kinds of noise that cannot be told apart
 
 
 @dataclass(frozen=True)
@@ -140,9 +141,8 @@ def _fitted(moments: Array, claimed: Array, *, bias: bool, tilt: bool) -> NoiseM
         weighted = [inverse @ shape for shape in shapes]
         weighted_moments = inverse @ moments
         information = np.array([[_product(a, b) for b in weighted] for a in weighted])
-        found = np.linalg.solve(
-            information, np.array([_product(a, weighted_moments) for a in weighted])
-        )
+        right = np.array([_product(a, weighted_moments) for a in weighted])
+        found = np.linalg.lstsq(information, right, rcond=_ALIKE)[0]
         before, variances = variances, np.maximum(found, least)
         if np.allclose(variances, before, rtol=_SETTLED, atol=_SETTLED * variances[0]):
             break
