@@ -1,13 +1,19 @@
-"""Build and solve time of the fit of everything, for 45 and 450 images, and of one of axes.
+"""Build time, solve time and memory of the fit of everything, beside what SciPy needs for it.
 
-Run from the project's folder: ``python benchmarks/refinement.py``. The session is that of
-the tests: a hexapod, three views, four legs seen in each image, outlines with 0.1 px noise. The
-start is wrong by 2 mm in every parameter, 5 mm and 0.6 degrees in every camera and pose.
+Run from the project's folder: ``python benchmarks/refinement.py [--scipy-images 45 450]``. The
+session is that of the tests: a hexapod, three views, four legs seen in each image, outlines with
+0.1 px noise. The start is wrong by 2 mm in every parameter, 5 mm and 0.6 degrees in every camera
+and pose.
 
-The fit of axes is that of section 4.3: 45 poses, three images each, the noise of Table 1; built
-once and solved for other data, as Monte Carlo studies do.
+``solve`` is one minimum of plain least squares from that start; ``refine`` is all of it, with the
+robust loss, rejections, noise and covariance. Every size runs in a process of its own, whose
+largest memory is that of building and solving. SciPy gets the same residuals, written in NumPy in
+``plain_fit.py``, and must end in the same minimum.
 """
 
+import argparse
+import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -17,79 +23,83 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from axes_session import axes_session
 from hexapod_session import disturbed_start, noisy_outlines, noisy_readings, simulate
-from legcal.refinement.repeated import average_images, bound, build_axes_fit, solve_again
-from legcal.refinement.solve import polish, solve
+from plain_fit import PlainFit
 
-from legcal.refinement import build_fit, refine
+from legcal.refinement import build_fit, solve_fit
+from legcal.refinement.minimise import minimise
 from legcal.refinement.noise import NoiseModel
 
+SIZES = (45, 450, 4500)
 REPEATS = 5
+SAME = 1e-9  # [m]
 
 
-def shortest_ms(call: Callable[[], object]) -> float:
+def shortest_ms(call: Callable[[], object], repeats: int = REPEATS) -> float:
     """Return the shortest of several durations of a call [ms]."""
     durations = []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         begin = time.perf_counter()
         call()
         durations.append(time.perf_counter() - begin)
     return 1e3 * min(durations)
 
 
-def measure(n_poses_per_view: int) -> None:
-    """Print one row: sizes and times of a session."""
-    session = simulate(n_poses_per_view)
+def measure(n_images: int, with_scipy: bool) -> None:
+    """Print one row: sizes and times of a session; then what SciPy needs."""
+    session = simulate(n_images // 3)
     rng = np.random.default_rng(0)
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
     start = disturbed_start(session)
-    begin = time.perf_counter()
+    building = shortest_ms(lambda: build_fit(session.legs, measurements, outlines))
     problem = build_fit(session.legs, measurements, outlines)
-    first_build = 1e3 * (time.perf_counter() - begin)
-    again = shortest_ms(lambda: build_fit(session.legs, measurements, outlines))
-    state = start.state(problem.radius_prior.mean)
     whitening = NoiseModel().whitening(problem.outlines.covariance)
-    found, iterations = solve(problem, state, whitening, 0.0)
-    once = shortest_ms(lambda: solve(problem, state, whitening, 0.0))
-    rounding = shortest_ms(lambda: polish(problem, found, whitening, 0.0))
-    whole = shortest_ms(lambda: refine(session.legs, measurements, outlines, start))
+    begin = problem.begin(start)
+    found = minimise(problem, begin, whitening, np.inf)
+    solving = shortest_ms(lambda: minimise(problem, begin, whitening, np.inf))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    whole = shortest_ms(lambda: solve_fit(problem, outlines, start), 2)
     print(
-        f"{measurements.n_rows:6d} {problem.layout.size:9d} {problem.n_equations:10d} "
-        f"{first_build:12.0f} {again:12.0f} {once:9.0f} {iterations:11d} {rounding:10.0f} "
-        f"{whole:10.0f}"
+        f"{n_images:6d} {problem.n_unknowns:9d} {problem.n_equations:10d} {building:9.1f} "
+        f"{solving:9.1f} {found.iterations:6d} {solving / n_images:13.3f} {whole:10.0f} "
+        f"{memory:8.0f}",
+        flush=True,
     )
-
-
-def measure_axes() -> None:
-    """Print the times of a fit of axes, of all images and of the mean of each pose's images."""
-    session = axes_session(15, 3)
-    measurements, every = session.noisy(0)
-    start, truth = session.start(), session.truth
-    print("axes  average/ms  build/ms  solve again/ms  bound/ms")
-    for axes in (every, average_images(every, measurements)):
-        fit = build_axes_fit(session.legs, measurements, axes)
-        times = [
-            shortest_ms(call)
-            for call in (
-                lambda: average_images(every, measurements),
-                lambda axes=axes: build_axes_fit(session.legs, measurements, axes),
-                lambda fit=fit, axes=axes: solve_again(fit, measurements, axes, start),
-                lambda fit=fit, axes=axes: bound(fit, measurements, axes, truth),
-            )
-        ]
-        print("{:4d} {:11.1f} {:9.0f} {:15.0f} {:9.0f}".format(len(axes), *times))
+    if not with_scipy:
+        return
+    plain = PlainFit(problem, begin, whitening)
+    ours = np.concatenate([found.state.A.ravel(), found.state.B.ravel(), found.state.lengths])
+    kinds = {"2-point, sparse": True} | ({"2-point": False} if n_images < 100 else {})
+    for kind, sparse in kinds.items():
+        begin_s = time.perf_counter()
+        theirs = plain.solve(sparse=sparse)
+        took = 1e3 * (time.perf_counter() - begin_s)
+        apart = float(np.abs(plain.joints_and_offsets(theirs.x) - ours).max())
+        verdict = "the same minimum" if apart < SAME else "ANOTHER MINIMUM"
+        print(
+            f"       SciPy {kind}: {took:.0f} ms, {took / solving:.0f} times ours; {verdict}: "
+            f"{apart:.1e} m apart, cost {theirs.cost:.9g} and {found.cost:.9g}",
+            flush=True,
+        )
 
 
 def main() -> None:
-    """Print the tables."""
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--images", type=int, help="only this size, in this process")
+    parser.add_argument("--scipy-images", type=int, nargs="*", default=[45, 450])
+    chosen = parser.parse_args()
+    if chosen.images:
+        measure(chosen.images, chosen.images in chosen.scipy_images)
+        return
     print(
-        "images  unknowns  equations  build 1st/ms  build 2nd/ms  solve/ms  iterations  polish/ms  "
-        "refine/ms"
+        "images  unknowns  equations  build/ms  solve/ms  steps  solve/image/ms  refine/ms  peak/MB"
     )
-    for n_poses_per_view in (15, 150):
-        measure(n_poses_per_view)
-    measure_axes()
+    for size in SIZES:
+        also = [str(n) for n in chosen.scipy_images]
+        subprocess.run(
+            [sys.executable, __file__, "--images", str(size), "--scipy-images", *also], check=True
+        )
 
 
 if __name__ == "__main__":
