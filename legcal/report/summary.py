@@ -63,9 +63,9 @@ def _table(rows: list[ParameterRow]) -> Table:
         sigma = "" if row.sigma is None else f"{scale * row.sigma:.{digits}f}"
         table.add_row(
             row.name,
-            f"{nominal:.{digits}f}",
-            f"{value:.{digits}f}",
-            f"{value - nominal:+.{digits}f}",
+            f"{nominal:z.{digits}f}",
+            f"{value:z.{digits}f}",
+            f"{value - nominal:+z.{digits}f}",
             sigma,
             unit,
             "" if row.status == "estimated" else row.status,
@@ -100,7 +100,7 @@ def _steps_line(calibration: Calibration) -> str:
         return f"The four steps alone gave no result: {steps.failure}"
     left_out = f" They left out {len(steps.diagnostics)} axes or joints." * bool(steps.diagnostics)
     if calibration.platform is None:
-        return f"The four steps alone gave a result, which the fit ends.{left_out}"
+        return f"The four steps alone gave a result.{left_out}"
     mechanism, measurements = calibration.dataset.mechanism, calibration.dataset.measurements
     near, q = calibration.solution.T_Rb_Re, measurements.q[measurements.first_rows]
     staged = with_joints(geometries(mechanism), steps.parameters)
@@ -135,7 +135,12 @@ def _direction_lines(calibration: Calibration) -> list[str]:
         for weak in solution.weak
     ]
     lines = [f"Known worst (1 sigma): {'; '.join(worst)}."] if worst else []
-    return [*lines, *(f"Held at nominal: {held}." for held in solution.held)]
+    if solution.held:
+        lines.append(
+            "Held at nominal, since nothing determines it and the platform does not move with it: "
+            f"{'; '.join(solution.held)}."
+        )
+    return lines
 
 
 def _platform_lines(calibration: Calibration) -> list[str]:
@@ -147,9 +152,10 @@ def _platform_lines(calibration: Calibration) -> list[str]:
     if platform.workspace is not None:
         parts.append(f"over the workspace {_mean_and_most(platform.workspace)}")
     lines = [f"Predicted error of the platform (1 sigma): {'; '.join(parts)}."]
-    for found in platform.effects:
-        lines.append(f"{found.what} would move the platform by {_mean_and_most(found.error)}.")
-    return lines
+    return lines + [
+        f"{effect.what.capitalize()} would move the platform by {_mean_and_most(effect.error)}."
+        for effect in platform.effects
+    ]
 
 
 def _mean_and_most(error: PlatformError) -> str:

@@ -200,7 +200,11 @@ def check_closes(mechanism: Mechanism) -> None:
 
 
 def reload_and_check(path: Path) -> Mechanism:
-    """Load a mechanism that was just written and check that it closes at home."""
+    """Load a mechanism that was just written and check that it closes at home.
+
+    Loading closes the chain there; where the motors determine the pose they must lead back to it.
+    """
     mechanism = load_mechanism(path)
-    check_closes(mechanism)
+    if mechanism.is_determined:
+        check_closes(mechanism)
     return mechanism
