@@ -11,10 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import null_space
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array
-from legcal.mechanism.directions import SHOWN, sparse_basis, split_by_motion
+from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.directions import sparse_basis, split_by_motion
 from legcal.mechanism.sensitivity import pose_sensitivity
 from legcal.refinement.covariance import direction
 from legcal.refinement.normal import NormalEquations, inverse_on_range
@@ -43,7 +44,8 @@ class Held:
     directions : tuple of str
         The directions in words.
     names : tuple of str
-        The parameters that are part of one.
+        The parameters that a nominal model which is a hundredth of a leg wrong along them
+        would move by more than their standard deviations.
     """
 
     basis: Array
@@ -88,12 +90,11 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     if len(basis):
         raise NotIdentifiable(_refusal(names, sparse_basis(basis)[0], len(basis), unseen))
     rows = sparse_basis(harmless)
-    shown = np.abs(rows) > SHOWN * np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
     return Held(
         harmless,
         unit,
         tuple(str(direction(row, names, 0.0)) for row in rows),
-        tuple(names[i] for i in np.flatnonzero(shown.any(axis=0))),
+        tuple(names[i] for i in np.flatnonzero(_is_weak(scaled, harmless, length))),
     )
 
 
@@ -120,6 +121,25 @@ def named_units(problem: FitProblem, state: State) -> Array:
     focal = float(np.mean([camera.K[0, 0] for camera in state.cameras]))
     of = {"m": 1.0, "rad": 1.0 / length, "px": focal / length, "": 1.0 / length}
     return np.array([of[unit] for unit in problem.named_units])
+
+
+def _is_weak(scaled: Array, held: Array, length: float) -> BoolArray:
+    """Say which parameters move by more than their sigma where the nominal ones are a bit wrong.
+
+    Parameters
+    ----------
+    scaled : (n, n) array
+        Normal matrix of the named unknowns, each over its unit [1/m^2].
+    held : (w, n) array
+        What is held, orthonormal.
+    length : float
+        Mean leg length [m].
+    """
+    if len(held) == 0:
+        return np.zeros(len(scaled), dtype=np.bool_)
+    N = null_space(held)
+    sigma = np.sqrt(np.diagonal(N @ inverse_on_range(N.T @ scaled @ N) @ N.T))
+    return np.asarray(_HELD_SIGMA * length * np.linalg.norm(held, axis=0) > sigma)
 
 
 def mean_length(state: State) -> float:
