@@ -8,6 +8,7 @@ unknowns are turns of where it is now.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -65,6 +66,7 @@ def named_values(state: State, layout: Layout, legs: FittedLegs) -> Array:
     return np.concatenate([kinematic, radii, state.biases, _intrinsics(state, layout)])
 
 
+@lru_cache(maxsize=2)  # several ask for it at one state
 def named_jacobian(state: State, layout: Layout, legs: FittedLegs) -> Array:
     """Return the derivative (n_named, n_named) of the values of named unknowns by x.
 
@@ -84,6 +86,7 @@ def named_jacobian(state: State, layout: Layout, legs: FittedLegs) -> Array:
                     for sign in (1.0, -1.0)
                 )
                 J[: layout.n_kinematic, x] = ((ahead - behind) / (2.0 * _STEP))[free]
+    J.flags.writeable = False
     return J
 
 
