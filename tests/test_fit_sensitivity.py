@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hexapod_session import LENS, RADIUS, Session, disturbed_start, moved_outlines, simulate
+from machine_session import LENS as LENS_OF_MACHINES
+from machine_session import machine_session
 
 from legcal.geometry.types import Array
 from legcal.refinement import refine
@@ -98,6 +100,22 @@ def test_a_prior_of_a_camera_pulls_as_foretold(session: Session) -> None:
     mistaken = _fit(session, choices(1290.0 + 12.9 * PART))
     step = _steps(found)["a focal length 1 % longer"]
     assert np.linalg.norm(step) > 1e-8
+    np.testing.assert_allclose(
+        _difference(found, mistaken), step, atol=0.02 * float(np.abs(step).max())
+    )
+
+
+@pytest.mark.parametrize("name", ["3-rpr", "hexapod-rod", "tricept"])
+def test_legs_on_constraints_move_as_foretold(name: str) -> None:
+    session = machine_session(name)
+    wrong = with_intrinsics(LENS_OF_MACHINES, {"fx": 1290.0 + 0.0129, "fy": 1280.0 + 0.0128})
+    views = tuple(replace(view, camera=wrong) for view in session.measurements.views)
+    measurements = replace(session.measurements, views=views)
+    outlines = moved_outlines(session.outlines, wrong, np.zeros((len(session.outlines), 2)))
+    found = refine(session.legs, session.measurements, session.outlines, session.start)
+    mistaken = refine(session.legs, measurements, outlines, session.start)
+    step = _steps(found)["a focal length 1 % longer"]
+    assert np.linalg.norm(step) > 1e-6
     np.testing.assert_allclose(
         _difference(found, mistaken), step, atol=0.02 * float(np.abs(step).max())
     )

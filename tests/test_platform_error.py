@@ -60,32 +60,6 @@ def test_predicted_errors_are_those_of_written_models_in_pinocchio(
     assert predicted.displacement.min() > 1e-6
 
 
-def test_predicted_errors_are_those_of_many_drawn_machines(tmp_path: Path) -> None:
-    nominal = load_mechanism("hexapod")
-    parametrization = parametrization_of(nominal)
-    rng = np.random.default_rng(8)
-    drawn = random_configurations(nominal, 2, rng)
-    root = random_covariance(parametrization, rng, 30, 1e-4)
-    predicted = predict_platform_error(
-        geometries(nominal),
-        parametrization,
-        root @ root.T,
-        nominal.frame_legs,
-        [platform_in_base(nominal, T) for T in drawn.poses],
-    )
-    moved = [
-        _motions(
-            nominal,
-            written_with(nominal, parametrization, root @ rng.normal(size=30), tmp_path),
-            drawn.readings,
-        )
-        for _ in range(30)
-    ]
-    squares = np.mean(np.square(moved), axis=0)
-    np.testing.assert_allclose(predicted.displacement, np.sqrt(squares[:, 3:].sum(1)), rtol=0.25)
-    np.testing.assert_allclose(predicted.rotation, np.sqrt(squares[:, :3].sum(1)), rtol=0.25)
-
-
 def test_a_change_of_the_parameters_moves_the_platform_as_its_covariance_says() -> None:
     nominal = load_mechanism("3-rps")
     drawn = random_configurations(nominal, 4, 1)

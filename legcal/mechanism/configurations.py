@@ -100,14 +100,18 @@ def workspace(mechanism: Mechanism) -> Configurations:
     """Return the configurations that stand for the workspace, the same at every call.
 
     Errors over the workspace are those at these poses, whether they are predicted or found by
-    comparing two models.
+    comparing two models. The order of the legs does not matter.
 
     Raises
     ------
     DidNotConverge
         As :func:`random_configurations`.
     """
-    return random_configurations(mechanism, WORKSPACE_POSES, WORKSPACE_SEED)
+    names = sorted(mechanism.leg_names)
+    ordered = mechanism.with_leg_order(names)
+    drawn = random_configurations(ordered, WORKSPACE_POSES, WORKSPACE_SEED)
+    legs = [names.index(name) for name in mechanism.leg_names]
+    return drawn._replace(readings=drawn.readings[:, legs])
 
 
 def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Iterator[Array]:

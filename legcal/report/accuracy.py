@@ -181,6 +181,8 @@ def _random_poses(
     mechanism: Mechanism, reference: Mechanism
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
     """Return platform poses of both models at the same random readings inside the travel."""
+    names = sorted(mechanism.leg_names)
+    mechanism, reference = mechanism.with_leg_order(names), reference.with_leg_order(names)
     rng = np.random.default_rng(WORKSPACE_SEED)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
