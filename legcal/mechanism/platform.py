@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
@@ -31,7 +31,12 @@ def pose_differences(
     rotation : (n_poses,) array
         Delta E: the angle of the rotation between both orientations [rad].
     """
-    pairs = list(zip(poses, references, strict=True))
-    displacement = [np.linalg.norm(T.translation - T_r.translation) for T, T_r in pairs]
-    rotation = [(T_r.rotation.inv() * T.rotation).magnitude() for T, T_r in pairs]
-    return np.array(displacement), np.array(rotation)
+    T, T_reference = (
+        np.array([pose.as_matrix() for pose in several]).reshape(-1, 4, 4)
+        for several in (poses, references)
+    )
+    displacement = np.linalg.norm(T[:, :3, 3] - T_reference[:, :3, 3], axis=1)
+    if len(T) == 0:
+        return displacement, np.zeros(0)
+    between = np.swapaxes(T_reference[:, :3, :3], 1, 2) @ T[:, :3, :3]
+    return displacement, np.asarray(Rotation.from_matrix(between).magnitude())

@@ -17,6 +17,7 @@ from legcal.geometry.types import Array
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parametrization import Parametrization
 from legcal.mechanism.sensitivity import pose_sensitivity
+from legcal.refinement.state import components
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +111,7 @@ def platform_by_parameters(
     NotIdentifiable
         If the readings do not determine a pose.
     """
-    R = np.array([T.rotation.as_matrix() for T in T_Rb_Re]).reshape(-1, 3, 3)
-    t = np.array([T.translation for T in T_Rb_Re]).reshape(-1, 3)
-    return pose_sensitivity(legs, parametrization, frame_legs, R, t)
+    return pose_sensitivity(legs, parametrization, frame_legs, *components(T_Rb_Re))
 
 
 def expected_error(by_parameters: Array, covariance: Array) -> PlatformError:

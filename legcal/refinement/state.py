@@ -131,7 +131,7 @@ def motions(R: Array, t: Array) -> tuple[RigidTransform, ...]:
     if len(R) == 0:
         return ()
     together = RigidTransform.from_components(t, Rotation.from_matrix(R))
-    return tuple(together[i] for i in range(len(R)))
+    return tuple(together)
 
 
 def components(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
