@@ -85,6 +85,7 @@ def assemble_solution(
         rms_axes=float(np.sqrt(np.mean(linear.axes.r**2))) if linear.axes.r.size else None,
         noise=fit.noise,
         biases=_biases(problem, state),
+        shared_px=fit.shifts.sizes,
         sensitivities=sensitivities(problem, state, linear, normal, whitening, k),
         outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
         start=label,

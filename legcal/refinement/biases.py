@@ -21,7 +21,15 @@ from legcal.geometry.types import Array, IntArray
 from legcal.refinement.observed import ObservedOutlines
 from legcal.refinement.variances import Effects, estimate_variances
 
-N_KINDS = 6
+KINDS = (
+    "bias of many edges",
+    "tilt of many edges",
+    "bias of an edge in a view",
+    "tilt of an edge in a view",
+    "change of that bias over the image",
+    "change of that tilt over the image",
+)
+N_KINDS = len(KINDS)
 _LEAST_GAIN = 25.0  # of white residuals, one set in 20,000 gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
@@ -36,8 +44,7 @@ class SharedShifts:
         ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
         ``c1.leg1.rod.edge1.bias`` of an edge in a view, and ``.bias_x``, how it changes along x.
     kind : (b,) array of int
-        0 and 1 for bias and tilt of many edges, 2 and 3 of one edge in a view, 4 and 5 of how
-        these change with its place in the image.
+        What they are; it counts in ``KINDS``.
     sigma : (N_KINDS,) array
         Standard deviation of each kind [px].
     index : (n, c) array of int
@@ -56,6 +63,11 @@ class SharedShifts:
     def sigmas(self) -> Array:
         """Standard deviation of each shift [px], (b,)."""
         return np.asarray(self.sigma[self.kind])
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """Standard deviation of each kind [px], by its name; empty if there are no shifts."""
+        return dict(zip(KINDS, self.sigma.tolist(), strict=True)) if len(self) else {}
 
     def __len__(self) -> int:
         return len(self.names)

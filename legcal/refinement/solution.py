@@ -95,6 +95,9 @@ class Solution:
         The estimated errors of outlines; ``noise.bias_px`` is tau.
     biases : mapping
         Shifts of outlines that several share, by name [px]: those that the residuals show.
+    shared_px : mapping
+        Standard deviations of these shifts by what they are, one of
+        :data:`legcal.refinement.biases.KINDS` [px]; empty where residuals show none.
     sensitivities : tuple of Sensitivity
         What mistakes in cameras and radii would do.
     outlines : Outlines
@@ -129,6 +132,7 @@ class Solution:
     rms_axes: float | None
     noise: NoiseModel
     biases: Mapping[str, float]
+    shared_px: Mapping[str, float]
     sensitivities: tuple[Sensitivity, ...]
     outlines: Outlines
     start: str
