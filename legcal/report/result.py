@@ -55,6 +55,7 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
             "rms_px": solution.rms_px,
             "rms_axes": solution.rms_axes,
             "noise": asdict(solution.noise),
+            "shared_px": dict(solution.shared_px),
         },
         "start": solution.start,
         "platform": platform_document(calibration),

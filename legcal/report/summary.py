@@ -121,10 +121,12 @@ def _fit_line(calibration: Calibration) -> str:
         residuals.append(f"{solution.rms_px:.3f} px rms")
     if solution.rms_axes is not None:
         residuals.append(f"axes off by {solution.rms_axes:.3f} of their standard deviations, rms")
-    return (
+    fit = (
         f"The fit of everything started from the {solution.start} model: chi2 {solution.chi2:.1f} "
         f"for {', '.join([f'{solution.dof} degrees of freedom', *residuals])}."
     )
+    shared = [f"{what} {sigma:.3f} px" for what, sigma in solution.shared_px.items()]
+    return fit + (f" Errors that outlines share: {', '.join(shared)}." if shared else "")
 
 
 def _direction_lines(calibration: Calibration) -> list[str]:
