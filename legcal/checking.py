@@ -80,7 +80,8 @@ def check(
     dataset = _as_calibrated(dataset, earlier)
     known = _known(dataset, earlier)
     with worker_pool(workers) as run:
-        work = workpiece(dataset, run, None, _choices(dataset, earlier, known), use_cache=True)
+        choices = _choices(dataset, earlier, known)
+        work = workpiece(dataset, run, None, choices, use_cache=True, every_leg=False)
         found = observe_and_fit(work, np.arange(dataset.measurements.n_rows), progress)
     solution = in_file_order(found.solution, found.part.order, dataset)
     return _compare(dataset, earlier, solution, known, significance)

@@ -61,7 +61,7 @@ from legcal.observations.sets import choose_outlines, join_outlines, reject_unus
 from legcal.progress import Report
 from legcal.refinement.choices import Choices
 from legcal.refinement.legs import FittedLegs, fitted_legs
-from legcal.refinement.refine import refine_from_best
+from legcal.refinement.refine import refine, refine_from_best
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, platform_poses, start_from, with_joints
 from legcal.stages.nominal import Criteria
@@ -95,6 +95,8 @@ class Workpiece:
         What the four steps minimise; None to leave them out.
     choices : Choices
         Parameters that are fixed, freed or known.
+    every_leg : bool
+        Whether every leg must be seen that views say they show.
     """
 
     dataset: Dataset
@@ -107,6 +109,7 @@ class Workpiece:
     run: Run
     criteria: Criteria | None
     choices: Choices
+    every_leg: bool
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -204,6 +207,7 @@ def workpiece(
     choices: Choices,
     *,
     use_cache: bool,
+    every_leg: bool = True,
 ) -> Workpiece:
     """Put a dataset into the order of work, and see which images are still to be searched.
 
@@ -219,6 +223,8 @@ def workpiece(
         Parameters that are fixed, freed or known.
     use_cache : bool
         Use the outlines that an earlier run left, if they still fit.
+    every_leg : bool
+        Whether every leg must be seen that views say they show.
     """
     names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, names)
@@ -235,6 +241,7 @@ def workpiece(
         run=run,
         criteria=criteria,
         choices=choices,
+        every_leg=every_leg,
     )
 
 
@@ -280,18 +287,39 @@ def _fit(
     """
     seen = outlines_at(outlines, fitted)
     seen = reject_unused_legs(seen, part.measurements, part.mechanism.leg_names)
+    if part.every_leg:
+        _refuse_unseen_legs(part, seen)
     steps = _four_steps(part, seen, progress)
     progress("Fit of everything", 0, 1)
-    solution = refine_from_best(
-        part.fitted_legs,
-        part.measurements,
-        seen,
-        _starts(part, seen, scene, steps),
-        axes=part.axes,
-        choices=part.choices,
-    )
+    starts = _starts(part, seen, scene, steps)
+    everything = part.fitted_legs, part.measurements, seen
+    if len(starts) == 1:
+        solution = refine(*everything, starts[0], axes=part.axes, choices=part.choices)
+    else:
+        solution = refine_from_best(*everything, starts, axes=part.axes, choices=part.choices)
     progress("Fit of everything", 1, 1)
     return Found(outlines, fitted, part, steps, solution)
+
+
+def _refuse_unseen_legs(work: Workpiece, outlines: Outlines) -> None:
+    """Raise NotVisible if no image shows a leg that its view says it does."""
+    if work.axes is not None:
+        return
+    shown = set(outlines.leg[outlines.used].tolist())
+    views = [work.measurements.views[v] for v in np.unique(work.measurements.view).tolist()]
+    unseen = [
+        leg.name
+        for j, leg in enumerate(work.mechanism.legs)
+        if j not in shown
+        and leg.cylinders
+        and any(view.legs is None or leg.name in view.legs for view in views)
+    ]
+    if unseen:
+        raise NotVisible(
+            f"{work.dataset.folder}: the machine could not be calibrated: found no used outline of "
+            f"{', '.join(unseen)} in any image, needed some of every leg; add images that show it, "
+            "or name the legs of each view in dataset.yaml to leave it to the readings."
+        )
 
 
 def _fitted_scene(work: Workpiece, solution: Solution) -> Scene:

@@ -22,6 +22,8 @@ from legcal.observations.sets import choose_outlines
 from legcal.refinement.foretold import FittedModel, ForetoldOutlines, arrays
 from legcal.refinement.pose_by_outlines import poses_by_outlines
 
+_MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))  # of the norm of two unit Gaussians
+
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
@@ -32,8 +34,8 @@ class HeldOut:
     n_images, n_poses : int
         How many were kept aside.
     outlines, wrong : int
-        Outlines in them, and how many are so far from where they should be that the fit would
-        have rejected them; they are left out of what follows.
+        Outlines in them, and how many are far from where they should be, compared with the others
+        and with their noise; they are left out of what follows.
     rms_px, expected_px : float or None
         Root mean square of the offsets of the outlines [px], and what the noise of the fitted
         ones lets expect. None without outlines.
@@ -150,9 +152,11 @@ def compare_held_out(
     foretold = ForetoldOutlines(model, measurements, used)
     R, t = arrays(T_Rb_Re)
     offsets = foretold.offsets(R, t)
-    right = np.linalg.norm((whitening @ offsets[..., None])[..., 0], axis=1) < expected.rejection
+    norm = np.linalg.norm((whitening @ offsets[..., None])[..., 0], axis=1)
+    limit = expected.rejection * _usual(norm)
+    right = norm < limit
     view = measurements.view[used.row]
-    shown = poses_by_outlines(model, foretold, whitening, T_Rb_Re, expected.rejection)
+    shown = poses_by_outlines(model, foretold, whitening, T_Rb_Re, limit)
     known = np.flatnonzero(shown.known).tolist()
     displacement, rotation = pose_differences(
         [shown.T_Rb_Re[k] for k in known], [T_Rb_Re[k] for k in known]
@@ -173,6 +177,11 @@ def compare_held_out(
         expected_displacement=np.sqrt(variance[:, 3:].sum(axis=1)),
         expected_rotation=np.sqrt(variance[:, :3].sum(axis=1)),
     )
+
+
+def _usual(norm: Array) -> float:
+    """Return how far off outlines usually are, in sigmas of their noise, at least one."""
+    return max(float(np.median(norm)) / _MEDIAN, 1.0) if len(norm) else 1.0
 
 
 def _of_views(measurements: Measurements, view: IntArray, offsets: Array) -> dict[str, float]:
