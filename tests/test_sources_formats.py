@@ -14,8 +14,10 @@ from legcal.cli import main
 from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parametrization import geometries
+from legcal.refinement.start import with_joints
 from legcal.report.model_files import write_model
-from legcal.report.urdf import reload_and_check, write_calibrated_urdf, write_calibrated_yaml
+from legcal.report.urdf import reload_and_check, write_calibrated_yaml, write_urdf
 
 MACHINES = ("hexapod", "3-upu", "3-rpr", "tricept", "hexapod-strut")
 
@@ -99,7 +101,7 @@ def test_a_calibrated_model_of_any_format_is_complete(name: str, tmp_path: Path)
     platform[moved] += rng.uniform(-1e-3, 1e-3, (3, 3))
     offsets = known.offsets + rng.uniform(-1e-3, 1e-3, 6)
     calibrated = replace(known, base_joints=base, platform_joints=platform, offsets=offsets)
-    write_calibrated_urdf(nominal, calibrated, tmp_path / "calibrated.urdf")
+    write_urdf(nominal, with_joints(geometries(nominal), calibrated), tmp_path / "calibrated.urdf")
     write_calibrated_yaml(nominal, tmp_path / "calibrated.yaml", "calibrated.urdf")
     written = reload_and_check(tmp_path / "calibrated.yaml")
     assert written.leg_names == nominal.leg_names

@@ -14,13 +14,14 @@ from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.parametrization import geometries
+from legcal.refinement.start import with_joints
 from legcal.report.leg_origins import moved_origins
 from legcal.report.urdf import (
-    calibrated_legs,
     check_closes,
     reload_and_check,
-    write_calibrated_urdf,
     write_calibrated_yaml,
+    write_urdf,
 )
 from legcal.report.urdf_patch import Origin, patch_origins
 
@@ -35,7 +36,9 @@ def _distance(one: KinematicParameters, two: KinematicParameters) -> float:
 
 
 def _written(mechanism: Mechanism, parameters: KinematicParameters, folder: Path) -> Mechanism:
-    write_calibrated_urdf(mechanism, parameters, folder / "calibrated.urdf")
+    write_urdf(
+        mechanism, with_joints(geometries(mechanism), parameters), folder / "calibrated.urdf"
+    )
     write_calibrated_yaml(mechanism, folder / "calibrated.yaml", "calibrated.urdf")
     return reload_and_check(folder / "calibrated.yaml")
 
@@ -72,7 +75,7 @@ def test_only_the_intended_numbers_differ(tmp_path: Path) -> None:
     _written(nominal, wanted.parameters, tmp_path)
     before, after = SHIPPED_URDF.read_bytes(), (tmp_path / "calibrated.urdf").read_bytes()
     assert ORIGIN.sub(rb"\1\3", before) == ORIGIN.sub(rb"\1\3", after)
-    joints = set(moved_origins(nominal, calibrated_legs(nominal, wanted.parameters)))
+    joints = set(moved_origins(nominal, with_joints(geometries(nominal), wanted.parameters)))
     assert len(joints) == 18
     for old, new in zip(before.split(b"\n"), after.split(b"\n"), strict=True):
         name = re.search(rb'<joint name="([^"]*)"', old)
@@ -86,7 +89,7 @@ def test_only_the_intended_numbers_differ(tmp_path: Path) -> None:
 
 def test_nominal_parameters_leave_every_byte(tmp_path: Path) -> None:
     nominal = load_mechanism("hexapod")
-    write_calibrated_urdf(nominal, nominal.parameters, tmp_path / "same.urdf")
+    write_urdf(nominal, geometries(nominal), tmp_path / "same.urdf")
     assert (tmp_path / "same.urdf").read_bytes() == SHIPPED_URDF.read_bytes()
 
 
@@ -168,7 +171,7 @@ def test_a_platform_that_a_leg_carries_needs_a_link_of_its_own(tmp_path: Path) -
     urdf.write_text(urdf.read_text().replace("</robot>", extra.replace("CARRIER", carrier)))
     nominal = load_mechanism(path)
     with pytest.raises(OutOfClass, match="leg 'leg1' could not be written: found that joint"):
-        write_calibrated_urdf(nominal, nominal.parameters, tmp_path / "calibrated.urdf")
+        write_urdf(nominal, geometries(nominal), tmp_path / "calibrated.urdf")
     assert not (tmp_path / "calibrated.urdf").exists()
 
 
@@ -182,7 +185,7 @@ def test_a_closure_frame_that_carries_other_things_cannot_be_written(tmp_path: P
     urdf.write_text(urdf.read_text().replace("</robot>", extra))
     nominal = load_mechanism(path)
     with pytest.raises(OutOfClass, match="'leg3_seat' on a link that carries other things"):
-        write_calibrated_urdf(nominal, nominal.parameters, tmp_path / "calibrated.urdf")
+        write_urdf(nominal, geometries(nominal), tmp_path / "calibrated.urdf")
 
 
 @pytest.mark.parametrize(

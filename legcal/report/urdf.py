@@ -20,8 +20,6 @@ from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parameters import KinematicParameters
-from legcal.mechanism.parametrization import geometries
 from legcal.mechanism.sources.read import XML_SUFFIXES
 from legcal.report.leg_origins import moved_origins
 from legcal.report.model_files import mechanism_text
@@ -29,45 +27,6 @@ from legcal.report.urdf_patch import Origin, patch_origins, same_point
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
 CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
-
-
-def write_calibrated_urdf(
-    mechanism: Mechanism, parameters: KinematicParameters, destination: Path
-) -> None:
-    """Write the mechanism's URDF with calibrated joint centres, offsets and constant lengths.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The nominal mechanism, as loaded.
-    parameters : KinematicParameters
-        Joint centres in R_b and R_e, offsets and lengths [m], in the order of ``mechanism.legs``;
-        an offset that is NaN stays nominal. So do axes and twists.
-    destination : Path
-        The file to write.
-
-    Raises
-    ------
-    OutOfClass
-        As :func:`write_urdf`.
-    """
-    write_urdf(mechanism, calibrated_legs(mechanism, parameters), destination)
-
-
-def calibrated_legs(
-    mechanism: Mechanism, parameters: KinematicParameters
-) -> tuple[LegGeometry, ...]:
-    """Return the legs of a mechanism with calibrated joint centres, offsets and lengths."""
-    return tuple(
-        replace(leg, A=A, B=B, q0=leg.q0 if np.isnan(offset) else float(offset))
-        for leg, A, B, offset in zip(
-            geometries(mechanism),
-            parameters.base_joints,
-            parameters.platform_joints,
-            parameters.offsets,
-            strict=True,
-        )
-    )
 
 
 def write_urdf(mechanism: Mechanism, legs: Sequence[LegGeometry], destination: Path) -> None:
