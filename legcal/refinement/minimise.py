@@ -29,6 +29,9 @@ _LARGEST_TURN = 0.3  # [rad] in one step
 _MEDIANS = 5.0  # width of the loss while most measurements are beyond its final one
 _SLOW = 0.5  # of the cost: if the next step lowers it by less, this loss has done its work
 _NARROWING = 0.8  # of the width: smaller changes of the median do not change the loss
+_DONE = 0.01  # of the cost: where a step lowers it by less, the loss is narrowed in any case
+_HALF = 0.5  # of the width, then
+_PATIENCE = 30  # steps before a minimum may be near enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,7 @@ def minimise(
     whitening: Array,
     width: float,
     max_iterations: int = 100,
+    near_enough: float = 0.0,
 ) -> Minimum:
     """Minimise the robust cost from a state.
 
@@ -71,6 +75,9 @@ def minimise(
         Whitened distance at which the loss turns from quadratic to linear; infinite for none.
     max_iterations : int
         Steps to try.
+    near_enough : float
+        Fall of the cost for which no more than some steps are tried: where measurements that are
+        wrong altogether bend the cost, the last steps are many and lead to where these pull.
 
     Raises
     ------
@@ -98,7 +105,10 @@ def minimise(
                 narrower = wide
                 if expected < _SLOW * (cost - fall):
                     narrower = _width(linear, width, wide)
-                if narrower == wide and (at_rest or expected < _SMALLEST_FALL):
+                if narrower == wide and expected < _DONE * (cost - fall):
+                    narrower = max(width, _HALF * wide)
+                smallest = near_enough if iteration > _PATIENCE else 0.0
+                if narrower == wide and (at_rest or expected < max(smallest, _SMALLEST_FALL)):
                     return Minimum(state, linear, robust_cost(linear, k), iteration)
                 fall_before = promised if narrower == wide else np.inf
                 wide = narrower

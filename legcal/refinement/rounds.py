@@ -56,7 +56,8 @@ def first_minimum(problem: FitProblem, begin: State, settings: RefinementSetting
         If the solver does not come to rest.
     """
     whitening = NoiseModel().whitening(problem.outlines.covariance)
-    return minimise(problem, begin, whitening, settings.loss_width, settings.max_iterations)
+    width, n_steps = settings.loss_width, settings.max_iterations
+    return minimise(problem, begin, whitening, width, n_steps, _near_enough(problem))
 
 
 def fit_in_rounds(
@@ -90,9 +91,10 @@ def fit_in_rounds(
     possible = possible_shifts(problem.outlines, problem.legs.names)
     state, shifts = first, possible.of_sizes(np.zeros(N_KINDS))
 
-    def solved() -> Minimum:
+    def solved(near_enough: float = 0.0) -> Minimum:
         whitening = noise.whitening(claimed, accepted)
-        return minimise(problem, state, whitening, settings.loss_width, settings.max_iterations)
+        width, n_steps = settings.loss_width, settings.max_iterations
+        return minimise(problem, state, whitening, width, n_steps, near_enough)
 
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
         before = accepted
@@ -100,7 +102,7 @@ def fit_in_rounds(
         accepted = _accepted(problem, state, noise, settings)
         if np.array_equal(before, accepted):
             break
-        minimum = solved()
+        minimum = solved(_near_enough(problem))
         state, iterations = minimum.state, iterations + minimum.iterations
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before = _sizes(noise, shifts)
@@ -121,6 +123,11 @@ def fit_in_rounds(
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
     _refuse_disagreeing_axes(minimum.linear.axes.squared_norms, settings)
     return Fit(problem, minimum, noise, shifts, accepted, iterations)
+
+
+def _near_enough(problem: FitProblem) -> float:
+    """Return the fall of the cost, a hundredth a measurement, that rejecting needs not wait for."""
+    return 0.01 * (len(problem.outlines) + len(problem.axes))
 
 
 def _sizes(noise: NoiseModel, shifts: SharedShifts) -> Array:
