@@ -92,27 +92,27 @@ def minimise(
         k = width_to_k(wide)
         cost = robust_cost(linear, k)
         step, promised = normal_equations(problem, state, linear, k).step(damping)
-        trial = _tried(problem, state, step)
-        if trial is not None:
-            linear_there = linearize(problem, trial, whitening)
-            fall = cost - robust_cost(linear_there, k)
-            at_rest = promised < _SMALLEST_FALL + _ROUNDING * cost
-            if np.isfinite(fall) and (fall > 0.0 or at_rest):
-                state, linear = trial, linear_there
-                damping = _next(damping, fall / max(promised, 1e-300))
-                rate = promised / fall_before if np.isfinite(fall_before) else 1.0
-                expected = promised * min(rate, 1.0)
-                narrower = wide
-                if expected < _SLOW * (cost - fall):
-                    narrower = _width(linear, width, wide)
-                if narrower == wide and expected < _DONE * (cost - fall):
-                    narrower = max(width, _HALF * wide)
-                smallest = near_enough if iteration > _PATIENCE else 0.0
-                if narrower == wide and (at_rest or expected < max(smallest, _SMALLEST_FALL)):
-                    return Minimum(state, linear, robust_cost(linear, k), iteration)
-                fall_before = promised if narrower == wide else np.inf
-                wide = narrower
-                continue
+        at_rest = promised < _SMALLEST_FALL + _ROUNDING * cost
+        trial = _tried(problem, state, step, whitening)
+        if trial is not None and not at_rest and not robust_cost(trial[1], k) < cost:
+            trial = _followed(problem, *trial, whitening, k, damping)
+        fall = -np.inf if trial is None else cost - robust_cost(trial[1], k)
+        if trial is not None and np.isfinite(fall) and (fall > 0.0 or at_rest):
+            state, linear = trial
+            damping = _next(damping, fall / max(promised, 1e-300))
+            rate = promised / fall_before if np.isfinite(fall_before) else 1.0
+            expected = promised * min(rate, 1.0)
+            narrower = wide
+            if expected < _SLOW * (cost - fall):
+                narrower = _width(linear, width, wide)
+            if narrower == wide and expected < _DONE * (cost - fall):
+                narrower = max(width, _HALF * wide)
+            smallest = near_enough if iteration > _PATIENCE else 0.0
+            if narrower == wide and (at_rest or expected < max(smallest, _SMALLEST_FALL)):
+                return Minimum(state, linear, robust_cost(linear, k), iteration)
+            fall_before = promised if narrower == wide else np.inf
+            wide = narrower
+            continue
         damping *= 10.0
         fall_before = np.inf
         if damping > _MOST_DAMPING:
@@ -148,8 +148,10 @@ def _next(damping: float, gain: float) -> float:
     return damping if gain > 0.25 else 4.0 * damping
 
 
-def _tried(problem: FitProblem, state: State, step: Array) -> State | None:
-    """Return the state after a step, shortened where it turns too far; None if it leads nowhere."""
+def _tried(
+    problem: FitProblem, state: State, step: Array, whitening: Array
+) -> tuple[State, Linearization] | None:
+    """Return where a step leads, shortened where it turns too far; None if nowhere."""
     if not np.all(np.isfinite(step)):
         return None
     layout = problem.layout
@@ -161,6 +163,26 @@ def _tried(problem: FitProblem, state: State, step: Array) -> State | None:
         return None
     moved = replace(moved, legs=problem.tied(moved.legs))
     try:
-        return on_constraints(moved, problem.legs.frame_legs)
+        moved = on_constraints(moved, problem.legs.frame_legs)
     except DidNotConverge:
         return None
+    return moved, linearize(problem, moved, whitening)
+
+
+def _followed(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    whitening: Array,
+    k: float,
+    damping: float,
+) -> tuple[State, Linearization] | None:
+    """Return where one more step leads from a place where the cost is not lower.
+
+    Along a curved valley of the cost a straight step ends on its side, and the next one at its
+    bottom, far ahead.
+    """
+    if not np.isfinite(robust_cost(linear, k)):
+        return None
+    step, _ = normal_equations(problem, state, linear, k).step(damping)
+    return _tried(problem, state, step, whitening)
