@@ -148,9 +148,8 @@ def test_shifts_have_names_of_their_own(session: Session) -> None:
     observed = observed_in(session)
     possible = possible_shifts(observed, session.legs.names)
     assert len(set(possible.names)) == len(possible.names) == len(possible.kind)
-    assert {"all.bias", "c1.tilt", "leg1.rod.bias", "c2.leg1.rod.edge2.tilt_x"} <= set(
-        possible.names
-    )
+    assert {"all.bias", "c1.tilt", "leg1.rod.bias"} <= set(possible.names)
+    assert {"c1.leg5.rod.inward.bias", "c1.leg5.rod.sideways.tilt_x"} <= set(possible.names)
     assert len(possible.of_sizes(np.zeros(N_KINDS))) == 0
 
 
@@ -206,4 +205,4 @@ def test_residuals_of_known_shifts_give_their_sizes(session: Session) -> None:
         b = sigma[possible.kind] * rng.standard_normal(len(possible))
         z = K @ b + root @ rng.standard_normal(len(possible))
         found.append(estimated_shifts(possible, z, K).sigma ** 2)
-    assert np.sqrt(np.mean(found, axis=0)) == pytest.approx(sigma, rel=0.15, abs=0.02)
+    assert np.sqrt(np.mean(found, axis=0)) == pytest.approx(sigma, rel=0.15, abs=0.03)

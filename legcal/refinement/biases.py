@@ -5,9 +5,11 @@ stands elsewhere in the image; blur moves many edges. Such errors do not average
 So groups of outlines have unknown shifts, random with variances that restricted maximum
 likelihood finds in the residuals. Where these are white there are none.
 
-Shifts that move both edges of a leg inwards show in the residuals; those that move a leg
-sideways do not, since the fit follows, and they are what moves joints. Edges that err
-independently do both, and one variance serves both.
+Shifts that move both edges of a leg inwards show in the residuals, and depth and radius take
+them up. Those that move a leg sideways hardly show, since the fit follows, and they are what moves
+joints. What shows must therefore say how large both are. If edges erred independently, both
+variances would be equal; light from one side makes one edge of a leg brighter and the other
+darker, and sideways shifts count twice (:data:`SIDEWAYS`).
 """
 
 from __future__ import annotations
@@ -24,12 +26,13 @@ from legcal.refinement.variances import Effects, estimate_variances
 KINDS = (
     "bias of many edges",
     "tilt of many edges",
-    "bias of an edge in a view",
-    "tilt of an edge in a view",
+    "bias of a leg in a view",
+    "tilt of a leg in a view",
     "change of that bias over the image",
     "change of that tilt over the image",
 )
 N_KINDS = len(KINDS)
+SIDEWAYS = np.sqrt(2.0)  # standard deviation of sideways shifts, those inwards being one
 _LEAST_GAIN = 25.0  # of white residuals, one set in 20,000 gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
@@ -42,7 +45,8 @@ class SharedShifts:
     ----------
     names : tuple of str, length b
         ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
-        ``c1.leg1.rod.edge1.bias`` of an edge in a view, and ``.bias_x``, how it changes along x.
+        ``c1.leg1.rod.inward.bias`` of both edges of a part in a view, ``c1.leg1.rod.sideways.bias``
+        and, for how it changes along x of the image, ``c1.leg1.rod.sideways.bias_x``.
     kind : (b,) array of int
         What they are; it counts in ``KINDS``.
     sigma : (N_KINDS,) array
@@ -50,7 +54,7 @@ class SharedShifts:
     index : (n, c) array of int
         Which of them each outline has a part in.
     shift : (n, c, 2) array
-        How far one pixel of each moves both ends along the normal of the line [px].
+        How far one unit of each moves both ends along the normal of the line [px].
     """
 
     names: tuple[str, ...]
@@ -89,8 +93,8 @@ class SharedShifts:
 def possible_shifts(outlines: ObservedOutlines, leg_names: Sequence[str]) -> SharedShifts:
     """Return all shifts that outlines may share, with a standard deviation of one pixel.
 
-    Shifts of many edges are inward; those of one edge change along x and y of the image by
-    one unit a standard deviation of the places of all outlines in their groups.
+    Shifts of many edges are inward; those of one part in a view are inward and sideways and
+    change along x and y of the image, by one unit over the spread of places in all groups.
 
     Parameters
     ----------
@@ -99,19 +103,22 @@ def possible_shifts(outlines: ObservedOutlines, leg_names: Sequence[str]) -> Sha
     """
     o = outlines
     parts = [f"{leg_names[leg]}.{part}" for leg, part in o.parts]
-    edge = np.where(o.epsilon > 0.0, 1, 2)
-    found, group = np.unique(np.column_stack([o.view, o.radius, edge]), axis=0, return_inverse=True)
+    found, group = np.unique(np.column_stack([o.view, o.radius]), axis=0, return_inverse=True)
     group = group.ravel()
-    inward, one = o.epsilon, np.ones(len(o))
-    place = _places_in_groups(o.pixels.mean(axis=1), group)
-    edges = [f"{o.views[v]}.{parts[p]}.edge{e}" for v, p, e in found.tolist()]
+    inward, sideways = o.epsilon, np.full(len(o), SIDEWAYS)
+    x, y = _places_in_groups(o.pixels.mean(axis=1), group).T
+    together = [f"{o.views[v]}.{parts[p]}.inward" for v, p in found.tolist()]
+    aside = [f"{o.views[v]}.{parts[p]}.sideways" for v, p in found.tolist()]
     levels = [
         (("all",), np.zeros(len(o), dtype=np.intp), inward, "", 0),
         (o.views, o.view, inward, "", 0),
         (parts, o.radius, inward, "", 0),
-        (edges, group, one, "", 2),
-        (edges, group, place[:, 0], "_x", 4),
-        (edges, group, place[:, 1], "_y", 4),
+        (together, group, inward, "", 2),
+        (aside, group, sideways, "", 2),
+        (together, group, inward * x, "_x", 4),
+        (aside, group, sideways * x, "_x", 4),
+        (together, group, inward * y, "_y", 4),
+        (aside, group, sideways * y, "_y", 4),
     ]
     names: list[str] = []
     kind, index, shift = [], [], []
