@@ -5,19 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import qr
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
 from legcal.identify.elimination import compress
 from legcal.identify.session import Session
 from legcal.identify.steps import LARGEST_SIGMA
+from legcal.mechanism.directions import SHOWN, sparse_basis, split_by_motion
 from legcal.mechanism.parameter_words import describe_direction
 from legcal.mechanism.sensitivity import pose_sensitivity
 
 _ERROR = 1e-3  # [m], the largest component of a direction whose effect is told
 _HARMLESS = 1e-3  # of that: the platform does not move
-_SHOWN = 0.02  # of the largest component
 
 
 @dataclass(frozen=True)
@@ -128,14 +127,7 @@ class PlatformMotion:
 
     def split(self, basis: Array) -> tuple[Array, Array]:
         """Return a space (w, p) as that which moves the platform and that which does not."""
-        if self.by_metres is None or len(basis) == 0:
-            return basis, basis[:0]
-        moved = self.by_metres @ basis.T
-        moved[:, :3] *= self.session.mean_length
-        flat = moved.reshape(-1, len(basis)) / np.sqrt(len(moved))
-        _, singular, turn = np.linalg.svd(compress(flat))
-        harmless = singular < _HARMLESS
-        return turn[~harmless] @ basis, turn[harmless] @ basis
+        return split_by_motion(self.by_metres, basis, self.session.mean_length, _HARMLESS)
 
 
 def determined(session: Session, information: Array) -> int:
@@ -178,25 +170,12 @@ def weak_directions(
     )
 
 
-def sparse_basis(basis: Array) -> Array:
-    """Return a basis of the same space in which each direction has a parameter for itself."""
-    if len(basis) == 0:
-        return basis
-    _, upper, order = qr(basis, mode="economic", pivoting=True)
-    w = len(basis)
-    sparse = np.zeros_like(basis)
-    sparse[:, order] = np.linalg.solve(upper[:, :w], upper)
-    sparse[np.abs(sparse) < 1e-9] = 0.0
-    first = np.argmax(np.abs(sparse) > _SHOWN * np.abs(sparse).max(axis=1, keepdims=True), axis=1)
-    return np.asarray(sparse[np.argsort(first, kind="stable")])
-
-
 def _direction(
     session: Session, motion: PlatformMotion, row: Array, harmless: bool
 ) -> WeakDirection:
     """Return a direction with its largest component at 1 mm."""
     row = row * (_ERROR / row[np.argmax(np.abs(row))])
-    shown = np.flatnonzero(np.abs(row) > _SHOWN * _ERROR)
+    shown = np.flatnonzero(np.abs(row) > SHOWN * _ERROR)
     shown = shown[np.argsort(-np.abs(row[shown] / _ERROR).round(3), kind="stable")]
     names = tuple(session.parametrization.names[i] for i in shown)
     effect = motion.effect(row)

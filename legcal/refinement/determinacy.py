@@ -15,9 +15,9 @@ from scipy.linalg import null_space
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.directions import sparse_basis, split_by_motion
+from legcal.mechanism.directions import SHOWN, sparse_basis, split_by_motion
+from legcal.mechanism.parameter_words import describe_direction
 from legcal.mechanism.sensitivity import pose_sensitivity
-from legcal.refinement.covariance import direction
 from legcal.refinement.normal import NormalEquations, inverse_on_range
 from legcal.refinement.priors import named_jacobian
 from legcal.refinement.problem import FitProblem
@@ -88,12 +88,12 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         basis, _ = split_by_motion(motion, basis, length, _HARMLESS)
         _, harmless = split_by_motion(motion, poor, length, _HARMLESS)
     if len(basis):
-        raise NotIdentifiable(_refusal(names, sparse_basis(basis)[0], len(basis), unseen))
+        raise NotIdentifiable(_refusal(problem, sparse_basis(basis)[0], len(basis), unseen))
     rows = sparse_basis(harmless)
     return Held(
         harmless,
         unit,
-        tuple(str(direction(row, names, 0.0)) for row in rows),
+        tuple(_in_words(problem, row) for row in rows),
         tuple(names[i] for i in np.flatnonzero(_is_weak(scaled, harmless, length))),
     )
 
@@ -174,7 +174,15 @@ def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
     return motion * unit
 
 
-def _refusal(names: tuple[str, ...], row: Array, n_open: int, unseen: list[str]) -> str:
+def _in_words(problem: FitProblem, row: Array) -> str:
+    """Return a direction of the named unknowns in words, its largest parts first."""
+    size = np.abs(row)
+    order = np.argsort(-size, kind="stable")
+    shown = [problem.named[i] for i in order if size[i] > SHOWN * size[order[0]]]
+    return describe_direction(shown, problem.legs.names)
+
+
+def _refusal(problem: FitProblem, row: Array, n_open: int, unseen: list[str]) -> str:
     """Return why the fit cannot be trusted."""
     if unseen:
         return (
@@ -182,7 +190,7 @@ def _refusal(names: tuple[str, ...], row: Array, n_open: int, unseen: list[str])
             "needs readings or outlines; add images that show it."
         )
     return (
-        f"The fit is not determined: found {n_open} of {len(names)} directions of the parameters "
-        f"that the measurements leave open and that matter, such as {direction(row, names, 0.0)}, "
+        f"The fit is not determined: found {n_open} of {len(problem.named)} directions of the "
+        f"parameters that the measurements leave open and that matter, {_in_words(problem, row)}, "
         f"needed all to a tenth of a leg; {_REMEDY}, or state what is known with a prior."
     )

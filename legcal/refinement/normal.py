@@ -87,7 +87,7 @@ class NormalEquations:
         fall : float
         """
         V = _damped(self.V, damping)
-        V_inverse: Array = np.linalg.inv(V)
+        V_inverse = np.asarray(np.linalg.inv(V), dtype=np.float64)
         WV = _by_pose(self.W, V_inverse)
         U = _damped(self.U, damping)
         S = U - _coupled(WV, self.W)

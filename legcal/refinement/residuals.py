@@ -56,8 +56,8 @@ class Residual:
 def outline_of_leg(A: ca.SX, B: ca.SX, radius: ca.SX, epsilon: ca.SX) -> ca.SX:
     """Return the outline h of the cylinder about AB seen from the origin, eqs (1) and (3).
 
-    Its length is that of A x B squared, of no matter for a line. With n = A x B and D = B - A eq (3)
-    is h = epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2) up to that, without a division.
+    Its length is that of A x B squared, of no matter for a line. With n = A x B and D = B - A
+    eq (3) is h = epsilon r (D x n) - n sqrt(|n|^2 - |D|^2 r^2) up to that, without a division.
     """
     n, D = ca.cross(A, B), B - A
     depth = ca.sqrt(ca.dot(n, n) - radius**2 * ca.dot(D, D))
