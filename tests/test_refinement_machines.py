@@ -70,8 +70,8 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
     by = by_differences(problem, state, at, steps, kept_move)
     values, J = by[: len(problem.named)], by[len(problem.named) :]
     unit = np.linalg.norm(J, axis=0)
-    R = np.linalg.qr(J / unit, mode="r")
-    root = np.linalg.solve(R.T, (values / unit).T)
+    R = np.asarray(np.linalg.qr(J / unit, mode="r"))
+    root = np.linalg.solve(np.swapaxes(R, 0, 1), (values / unit).T)
     expected = root.T @ root
     return bound(problem, session.truth), expected
 
