@@ -27,10 +27,10 @@ from legcal.refinement import (
     FittedLegs,
     RefinementSettings,
     Solution,
-    Start,
     refine,
     refine_from_best,
 )
+from legcal.refinement.solution import joints_of
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_exact_outlines_give_the_truth(
     session: Session, joints: float, camera: float, degrees: float
 ) -> None:
     start = disturbed_start(session, joints=joints, camera=camera, angle=np.deg2rad(degrees))
-    assert np.abs(joint_errors(start.parameters)).min() > 0.9 * joints
+    assert np.abs(joint_errors(joints_of(start.legs))).min() > 0.9 * joints
     solution = refine(session.legs, session.measurements, session.outlines, start)
     assert np.abs(joint_errors(solution.parameters)).max() < 1e-9
     assert gauge_is_kept(solution.parameters)
@@ -216,17 +216,12 @@ def test_relabelling_legs_relabels_the_result(
     new_of_old = np.argsort(order)
     legs = FittedLegs(
         tuple(small.legs.names[i] for i in order),
+        tuple(small.legs.nominal[i] for i in order),
         small.legs.sign[order],
         tuple(int(new_of_old[i]) for i in FRAME_LEGS),
         {(int(new_of_old[i]), part): r for (i, part), r in small.legs.radii.items()},
     )
-    p = start.parameters
-    relabelled = Start(
-        KinematicParameters(p.base_joints[order], p.platform_joints[order], p.offsets[order]),
-        start.T_camera_Rb,
-        start.T_Rb_Re,
-        start.label,
-    )
+    relabelled = dataclasses.replace(start, legs=tuple(start.legs[i] for i in order))
     again = refine(
         legs,
         dataclasses.replace(measurements, q=measurements.q[:, order]),

@@ -121,7 +121,7 @@ def minimise(
         "The fit of everything did not converge: found a cost that still falls by "
         f"{promised:.2g} a step after {iteration} steps, needed a minimum; start nearer to the "
         "truth (joints to 5 mm, cameras to 2 cm and 2 deg) and check the camera poses, the "
-        "readings and that outlines or axes are those of the right legs."
+        "readings and that outlines or axes are those of the right legs and edges."
     )
 
 

@@ -104,6 +104,7 @@ def fit_in_rounds(
             break
         minimum = solved(_near_enough(problem))
         state, iterations = minimum.state, iterations + minimum.iterations
+    _refuse_disagreement(offsets_of(problem, state), accepted, settings)
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before = _sizes(noise, shifts)
         noise = _noise(problem, state, noise, accepted, settings)
