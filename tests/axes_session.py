@@ -6,11 +6,13 @@ from functools import cache
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.mechanism.leg_geometry import point_like_legs
 from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
 from legcal.observations.table_axes import axes_of_table, table_of_axes
 from legcal.refinement.legs import FittedLegs
+from legcal.refinement.solution import joints_of
 from legcal.refinement.start import Start, start_from
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import hexapod, perturb
@@ -27,6 +29,11 @@ class AxesSession:
     axes: LegAxes
     truth: Start
 
+    @property
+    def parameters(self) -> KinematicParameters:
+        """The true parameters [m]."""
+        return joints_of(self.truth.legs)
+
     def noisy(self, seed: int) -> tuple[Measurements, LegAxes]:
         """Return readings and axes with the errors that they claim."""
         rng, m = np.random.default_rng(seed), self.measurements
@@ -39,7 +46,7 @@ class AxesSession:
     def start(self, seed: int = 7, joints: float = 0.002) -> Start:
         """Return a start that is wrong by so much in every parameter [m]; cameras by 1 degree."""
         rng = np.random.default_rng(seed)
-        xi = to_vector(self.truth.parameters, self.legs.frame_legs)
+        xi = to_vector(self.parameters, self.legs.frame_legs)
         xi = xi + joints * rng.choice([-1.0, 1.0], len(xi))
         cameras = [
             view.T_base_camera.inv()
@@ -47,7 +54,7 @@ class AxesSession:
             if view.T_base_camera is not None
         ]
         return start_from(
-            from_vector(xi, self.legs.n_legs, self.legs.frame_legs),
+            point_like_legs(from_vector(xi, self.legs.n_legs, self.legs.frame_legs)),
             self.measurements,
             self.legs,
             cameras,
@@ -58,7 +65,7 @@ class AxesSession:
     def errors(self, parameters: KinematicParameters) -> Array:
         """Return the errors of the free parameters [m]."""
         frame_legs = self.legs.frame_legs
-        return to_vector(parameters, frame_legs) - to_vector(self.truth.parameters, frame_legs)
+        return to_vector(parameters, frame_legs) - to_vector(self.parameters, frame_legs)
 
 
 @cache
@@ -78,12 +85,13 @@ def axes_session(
     )
     # Rough camera poses, about 1 degree and 1 cm wrong.
     rough = simulate_session(machine, cameras, rng, noise=TableNoise(), n_poses=1).measurements
+    legs_true = point_like_legs(machine.parameters)
     return AxesSession(
-        FittedLegs(machine.leg_names, machine.sign, machine.frame_legs, {}),
+        FittedLegs(machine.leg_names, legs_true, machine.sign, machine.frame_legs, {}),
         replace(session.measurements, views=rough.views),
         session.axes,
         Start(
-            machine.parameters,
+            legs_true,
             tuple(camera.T_Rb_camera.inv() for camera in cameras),
             tuple(session.T_Rb_Re),
             "truth",

@@ -7,16 +7,16 @@ import pytest
 from axes_session import AxesSession, axes_session
 from hexapod_session import disturbed_start, joint_errors, simulate
 
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry.types import Array
-from legcal.observations.leg_axes import axes_from_outlines, choose_axes
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.observations.leg_axes import LegAxes, axes_from_outlines, choose_axes
+from legcal.observations.measurements import Measurements
 from legcal.observations.sets import no_outlines
-from legcal.refinement import Start, refine
-from legcal.refinement.inputs import evaluate, evaluate_jacobian, inputs_of
-from legcal.refinement.loss import efficiency, weights
+from legcal.refinement import Solution, build_fit, refine
+from legcal.refinement.bound import average_images, bound
+from legcal.refinement.linearize import linearize
 from legcal.refinement.observed_axes import observed_axes
-from legcal.refinement.repeated import average_images, bound, build_axes_fit, solve_again
-from legcal.refinement.residuals import axis_residual
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.solution import joints_of
 
 
 @pytest.fixture(scope="module")
@@ -24,22 +24,25 @@ def session() -> AxesSession:
     return axes_session()
 
 
-def _inputs(session: AxesSession, start: Start) -> Array:
-    problem = build_axes_fit(session.legs, session.measurements, session.axes).problem
-    state = start.state(np.zeros(0))
-    return inputs_of(problem, state, np.zeros((0, 2, 2)), 0.0)[3]
+def _fit(session: AxesSession, measurements: Measurements, axes: LegAxes) -> FitProblem:
+    return build_fit(session.legs, measurements, no_outlines(), axes=axes)
+
+
+def _found(session: AxesSession, measurements: Measurements, axes: LegAxes) -> Solution:
+    return refine(session.legs, measurements, no_outlines(), session.start(), axes=axes)
 
 
 def test_the_residual_is_where_the_predicted_line_passes_the_measured_one(
     session: AxesSession,
 ) -> None:
     start, axes, m = session.start(), session.axes, session.measurements
-    r = evaluate(axis_residual(), _inputs(session, start))
+    problem = _fit(session, m, axes)
+    r = linearize(problem, problem.begin(start), np.zeros((0, 2, 2))).axes.r
     whitening = observed_axes(axes, m, session.legs).whitening
     for i in range(0, len(axes), 7):
         j, T = axes.leg[i], start.T_camera_Rb[m.view[axes.row[i]]]
-        A = T.apply(start.parameters.base_joints[j])
-        B = start.T_Rb_Re[m.pose[axes.row[i]]].apply(start.parameters.platform_joints[j])
+        A = T.apply(start.legs[j].A)
+        B = start.T_Rb_Re[m.pose[axes.row[i]]].apply(start.legs[j].B)
         B = T.apply(B)
         # The line A + s (B - A) in the axes (e1, e2, u) with the origin M.
         frame = np.vstack([axes.basis[i], axes.u[i]])
@@ -54,27 +57,12 @@ def test_the_whitening_makes_the_claimed_covariance_one(session: AxesSession) ->
     assert not np.triu(T, 1).any()
 
 
-def test_the_derivative_of_the_residual_is_that_of_finite_differences(session: AxesSession) -> None:
-    inputs = _inputs(session, session.start())[:3]
-    _, J = evaluate_jacobian(axis_residual(), inputs)
-    step = 1e-4
-    for column in range(axis_residual().n_local):
-        local = np.zeros(axis_residual().n_local)
-        local[column] = step
-        ends = [
-            np.array([axis_residual().function(sign * local, row).full()[:, 0] for row in inputs])
-            for sign in (1.0, -1.0)
-        ]
-        expected = (ends[0] - ends[1]) / (2.0 * step)
-        assert np.allclose(J[:, :, column], expected, atol=1e-6 * np.abs(J).max())
-
-
 @pytest.mark.parametrize("coplanar", [False, True])
 @pytest.mark.parametrize("joints", [0.002, 0.005])
 def test_exact_axes_give_the_truth(joints: float, coplanar: bool) -> None:
     session = axes_session(coplanar=coplanar)
     start = session.start(joints=joints)
-    assert np.abs(session.errors(start.parameters)).min() > 0.9 * joints
+    assert np.abs(session.errors(joints_of(start.legs))).min() > 0.9 * joints
     found = refine(session.legs, session.measurements, no_outlines(), start, axes=session.axes)
     assert np.abs(session.errors(found.parameters)).max() < 1e-9
     assert found.rms_px is None
@@ -103,10 +91,8 @@ def test_axes_beside_outlines_add_to_what_is_known() -> None:
 @pytest.mark.parametrize("coplanar", [False, True])
 def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> None:
     session, n = axes_session(coplanar=coplanar), 40
-    start = session.start()
-    fit = build_axes_fit(session.legs, session.measurements, session.axes)
-    least = bound(fit, session.measurements, session.axes, session.truth).covariance
-    solutions = [solve_again(fit, *session.noisy(seed), start) for seed in range(n)]
+    least = bound(_fit(session, session.measurements, session.axes), session.truth)
+    solutions = [_found(session, *session.noisy(seed)) for seed in range(n)]
     errors = np.array([session.errors(found.parameters) for found in solutions])
     sigmas = np.array([found.sigma for found in solutions])
     claimed = [
@@ -126,36 +112,14 @@ def test_errors_reach_the_bound_and_agree_with_their_sigmas(coplanar: bool) -> N
     assert sigmas.mean() < 1.02 * np.sqrt(np.diag(least)).mean()
 
 
-def test_a_built_fit_gives_for_other_data_what_a_new_one_gives(session: AxesSession) -> None:
-    fit = build_axes_fit(session.legs, *session.noisy(0))
-    measurements, axes = session.noisy(1)
-    again = solve_again(fit, measurements, axes, session.start())
-    new = refine(session.legs, measurements, no_outlines(), session.start(), axes=axes)
-    assert np.array_equal(session.errors(again.parameters), session.errors(new.parameters))
-    assert np.array_equal(again.covariance, new.covariance)
-    assert again.chi2 == new.chi2
-
-
-def test_a_built_fit_refuses_data_of_another_structure(session: AxesSession) -> None:
-    fit = build_axes_fit(session.legs, session.measurements, session.axes)
-    fewer = choose_axes(session.axes, np.arange(len(session.axes) - 1))
-    with pytest.raises(UsageError, match="other images, legs or poses"):
-        solve_again(fit, session.measurements, fewer, session.start())
-    q = session.measurements.q.copy()
-    q[:, 1] = np.nan
-    with pytest.raises(UsageError, match="other images, legs or poses"):
-        bound(fit, replace(session.measurements, q=q), session.axes, session.truth)
-
-
 def test_the_mean_of_images_of_one_pose_holds_what_they_hold() -> None:
     session = axes_session(5, 3)
     m, axes = session.measurements, session.axes
     mean = average_images(axes, m)
     assert len(mean) == len(axes) / 3
     assert np.array_equal(np.unique(m.pose[mean.row]), np.arange(m.n_poses))
-    all_images = bound(build_axes_fit(session.legs, m, axes), m, axes, session.truth)
-    together = bound(build_axes_fit(session.legs, m, mean), m, mean, session.truth)
-    assert np.allclose(together.covariance, all_images.covariance, rtol=1e-6)
+    all_images, together = (bound(_fit(session, m, some), session.truth) for some in (axes, mean))
+    assert np.allclose(together, all_images, rtol=1e-6)
 
 
 def test_a_wrong_axis_hardly_bends_the_answer(session: AxesSession) -> None:
@@ -172,24 +136,12 @@ def test_a_wrong_axis_hardly_bends_the_answer(session: AxesSession) -> None:
     assert bent.chi2 > clean.chi2 + 1e4
 
 
-def test_the_efficiency_for_four_residuals_is_that_of_a_simulation() -> None:
-    k = 0.1
-    r = np.random.default_rng(0).normal(size=(200_000, 4))
-    s = np.sum(r**2, axis=1)
-    psi = r * weights(s, k)[:, None]
-    slope = np.mean(weights(s, k) - k * s * weights(s, k) ** 3 / 4.0)
-    assert efficiency(k, 4) == pytest.approx(slope**2 / np.mean(psi**2), rel=5e-3)
-    assert efficiency(0.0, 4) == pytest.approx(1.0, abs=1e-12)
-
-
 def test_a_covariance_that_is_not_one_is_refused(session: AxesSession) -> None:
     covariance = session.axes.covariance.copy()
     covariance[3] = 0.0
     leg = session.legs.names[session.axes.leg[3]]
     with pytest.raises(DatasetError, match=f"{leg} in row 1 could not be used: its covariance"):
-        build_axes_fit(
-            session.legs, session.measurements, replace(session.axes, covariance=covariance)
-        )
+        _fit(session, session.measurements, replace(session.axes, covariance=covariance))
 
 
 def test_axes_in_degrees_are_refused(session: AxesSession) -> None:
@@ -211,4 +163,4 @@ def test_fewer_equations_than_unknowns_are_refused_with_their_numbers(
 ) -> None:
     few = choose_axes(session.axes, np.arange(8))
     with pytest.raises(NotIdentifiable, match=r"24 images with 8 axes and 144 readings give 176"):
-        build_axes_fit(session.legs, session.measurements, few)
+        _fit(session, session.measurements, few)
