@@ -10,6 +10,7 @@ from legcal.mechanism.parameters import radius_name
 from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import named_covariance, worst_directions
 from legcal.refinement.determinacy import Held, named_units
+from legcal.refinement.focal_length import focal_lengths
 from legcal.refinement.linearize import Linearization, linearize, offsets_of
 from legcal.refinement.loss import width_to_k
 from legcal.refinement.minimise import robust_cost
@@ -90,7 +91,10 @@ def assemble_solution(
         outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
-        notes=_misfit_of_axes(chi2, dof) if len(problem.axes) else (),
+        notes=(
+            *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
+            *(str(f) for f in focal_lengths(problem, state, linear, whitening) if f.is_doubtful),
+        ),
     )
 
 

@@ -116,7 +116,7 @@ def _in_cameras(problem: FitProblem, state: State, mistake: _Mistake) -> _Change
         fixed = [name for name in steps if places.get(name, layout.size) >= layout.size]
         slopes = undistort_derivatives(camera, o.pixels[of_view], fixed)
         moved[of_view] = slopes @ np.array([steps[name] for name in fixed])
-    return _Change(mistake.what, _offsets_change(problem, state, moved), priors)
+    return _Change(mistake.what, offsets_change(problem, state, moved), priors)
 
 
 def _in_radii(problem: FitProblem, state: State) -> _Change:
@@ -132,7 +132,7 @@ def _in_radii(problem: FitProblem, state: State) -> _Change:
     return _Change("radii 1 % larger", offsets, priors)
 
 
-def _offsets_change(problem: FitProblem, state: State, moved: Array) -> Array:
+def offsets_change(problem: FitProblem, state: State, moved: Array) -> Array:
     """Return how offsets (n, 2) [px] change as measured ends (n, 2, 2) move [sensor plane]."""
     feet, _ = problem.measured_ends(state)
     fixed = replace(problem.layout, intrinsic_keys=())

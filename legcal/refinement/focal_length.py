@@ -1,0 +1,149 @@
+"""Whether the measurements agree with the focal lengths that cameras were given.
+
+Encoders carry the absolute scale, and a focal length that is wrong makes perspective wrong in a way
+that nothing else in the fit can imitate altogether. What is left in the residuals then has a slope
+by the focal length: Rao's score test, which needs no further fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry.types import Array, IntArray
+from legcal.refinement.influence import reduced_jacobian
+from legcal.refinement.linearize import Linearization
+from legcal.refinement.normal import NormalEquations, normal_equations
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.sensitivity import offsets_change
+from legcal.refinement.state import State, intrinsic_of
+from legcal.vision.intrinsics import shared_cameras, undistort_derivatives
+
+_SIGNIFICANT = 5.0  # standard deviations
+_KEYS = ("fx", "fy")
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """What the measurements say of the focal length of a camera that was taken as known.
+
+    Attributes
+    ----------
+    view : str
+        The view, the first one by name if several have the camera.
+    given : float
+        fx of the camera [px].
+    change : float
+        What would have to be added to fx and fy, as a part of them.
+    sigma : float
+        Standard deviation of that.
+    """
+
+    view: str
+    given: float
+    change: float
+    sigma: float
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the measurements disagree with what was given."""
+        return abs(self.change) > _SIGNIFICANT * self.sigma
+
+    def __str__(self) -> str:
+        found, sigma = self.given * (1.0 + self.change), self.given * self.sigma
+        away = abs(self.change) / self.sigma
+        return (
+            f"The focal length of {self.view} does not agree with the measurements: found fx = "
+            f"{found:.1f} +- {sigma:.1f} px, given {self.given:.1f} px, {away:.0f} standard "
+            f"deviations and {1e2 * self.change:+.2f} % apart; the stated uncertainty knows "
+            "nothing of it; calibrate the camera again, look for pictures that were scaled or "
+            f"focused anew, or let the fit find it (--free {self.view}.fx --free {self.view}.fy)."
+        )
+
+
+def focal_lengths(
+    problem: FitProblem, state: State, linear: Linearization, whitening: Array
+) -> tuple[FocalLength, ...]:
+    """Return what the measurements say of the focal lengths that the fit took as known.
+
+    Parameters
+    ----------
+    problem : FitProblem
+        With the shifts that outlines share, so that these are not taken for a focal length.
+    state : State
+        Where the fit ended.
+    linear : Linearization
+        There.
+    whitening : (n_outlines, 2, 2) array
+        What *linear* was taken with.
+
+    Returns
+    -------
+    tuple of FocalLength
+        One a camera; those are left out of which the measurements say nothing.
+    """
+    layout, o = problem.layout, problem.outlines
+    known = [
+        v
+        for v in np.unique(o.view).tolist()
+        if not any(
+            x < layout.size
+            for key, x in zip(layout.intrinsic_keys, layout.intrinsic[v].tolist(), strict=True)
+            if key in _KEYS
+        )
+    ]
+    owners = shared_cameras(o.views, state.cameras)
+    tested = sorted({owners[v] for v in known})
+    if not tested:
+        return ()
+    changes = []
+    for owner in tested:
+        views = np.array([v for v in known if owners[v] == owner], dtype=np.intp)
+        changes.append(_by_focal_length(problem, state, views))
+    columns = whitening @ np.stack(changes, axis=-1)
+    normal = normal_equations(problem, state, linear, 0.0)
+    score, information = _left_by_the_fit(problem, linear, normal, columns)
+    seen = np.diagonal(information) > 0.0
+    covariance = np.linalg.pinv(information, hermitian=True)
+    change, sigma = -covariance @ score, np.sqrt(np.diagonal(covariance))
+    return tuple(
+        FocalLength(
+            owner, intrinsic_of(state.cameras[owners.index(owner)], "fx"), float(d), float(s)
+        )
+        for owner, d, s, is_seen in zip(tested, change, sigma, seen, strict=True)
+        if is_seen
+    )
+
+
+def _by_focal_length(problem: FitProblem, state: State, views: IntArray) -> Array:
+    """Return the change of offsets (n, 2) [px] by a relative change of the views' focal length."""
+    o = problem.outlines
+    moved = np.zeros(o.feet.shape)
+    for v in views.tolist():
+        camera, of_view = state.cameras[v], o.view == v
+        slopes = undistort_derivatives(camera, o.pixels[of_view], _KEYS)
+        moved[of_view] = slopes @ np.array([intrinsic_of(camera, key) for key in _KEYS])
+    return offsets_change(problem, state, moved)
+
+
+def _left_by_the_fit(
+    problem: FitProblem, linear: Linearization, normal: NormalEquations, columns: Array
+) -> tuple[Array, Array]:
+    """Return what the fit leaves of v^T r (c,) and v^T v (c, c), v whitened columns (n, 2, c)."""
+    where, rows = problem.outline_places, linear.outlines
+    kept = np.einsum("nqk,nqc->kc", reduced_jacobian(where, rows, normal), columns, optimize=True)
+    J_pose = rows.J_pose
+    if normal.tangent is not None:
+        J_pose = J_pose @ normal.tangent.Z[where.pose]
+    by_pose = np.zeros((len(normal.V), J_pose.shape[-1], columns.shape[-1]))
+    np.add.at(by_pose, where.pose, np.swapaxes(J_pose, 1, 2) @ columns)
+    following = normal.V_inverse @ by_pose
+    covariance = normal.kept_covariance()
+    g_kept = normal.g_kept - np.einsum(
+        "akp,kpq,kq->a", normal.W, normal.V_inverse, normal.g_pose, optimize=True
+    )
+    score = np.einsum("nqc,nq->c", columns, rows.r) - kept.T @ covariance @ g_kept
+    score -= np.einsum("kpc,kp->c", following, normal.g_pose)
+    information = np.einsum("nqc,nqd->cd", columns, columns) - kept.T @ covariance @ kept
+    return score, information - np.einsum("kpc,kpd->cd", following, by_pose)
