@@ -17,7 +17,13 @@ from legcal.refinement.choices import NO_CHOICES, Choices
 from legcal.refinement.covariance import check_counts
 from legcal.refinement.layout import Layout, lay_out
 from legcal.refinement.legs import FittedLegs
-from legcal.refinement.observed import ObservedOutlines, Readings, observed_outlines, readings
+from legcal.refinement.observed import (
+    ObservedOutlines,
+    Readings,
+    observed_outlines,
+    readings,
+    seen_by,
+)
 from legcal.refinement.observed_axes import ObservedAxes, observed_axes
 from legcal.refinement.priors import Priors
 from legcal.refinement.problem import FirstValues, FitProblem
@@ -69,6 +75,11 @@ def build_fit(
     asked = (*choices.free, *choices.priors, *choices.values)
     legs = replace(legs, twists=any(name.endswith(".twist") for name in asked))
     observed = observed_outlines(outlines, measurements, legs)
+    cameras = _cameras(measurements, choices)
+    if any(
+        camera is not view.camera for camera, view in zip(cameras, measurements.views, strict=True)
+    ):
+        observed = seen_by(observed, cameras)
     lines = observed_axes(axes, measurements, legs)
     encoders = readings(measurements, legs)
     seen = np.zeros(len(measurements.views), dtype=np.bool_)
@@ -97,7 +108,7 @@ def build_fit(
     nominal = np.array([legs.radii[part] for part in observed.parts])
     first = FirstValues(
         np.array([choices.values.get(n, r) for n, r in zip(radii, nominal.tolist(), strict=True)]),
-        _cameras(measurements, choices),
+        cameras,
     )
     problem = FitProblem(
         legs,

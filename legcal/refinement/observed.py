@@ -1,6 +1,7 @@
 """What was measured, as arrays that the residuals take: outlines in the image, readings."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -142,6 +143,24 @@ def observed_outlines(
         np.zeros((len(index), 0), dtype=np.intp),
         np.zeros((len(index), 0, 2)),
     )
+
+
+def seen_by(outlines: ObservedOutlines, cameras: Sequence[Camera]) -> ObservedOutlines:
+    """Return the same outlines in the image, on the sensor planes of other cameras.
+
+    Parameters
+    ----------
+    outlines : ObservedOutlines
+    cameras : sequence of Camera
+        One a view.
+    """
+    feet, constants = outlines.feet.copy(), outlines.constants.copy()
+    for v in np.unique(outlines.view):
+        of_view = outlines.view == v
+        feet[of_view] = cameras[v].undistort(outlines.pixels[of_view])
+        lens = np.linalg.inv(cameras[v].pixels_per_unit(feet[of_view]))
+        constants[of_view, :8] = lens.reshape(-1, 8)
+    return replace(outlines, feet=feet, constants=constants)
 
 
 def feet_of_ends(camera: Camera, h: Array, ends: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -94,34 +95,59 @@ class FitProblem:
 
     def begin(self, start: Start) -> State:
         """Return the state at a start, with everything that is fixed at its value."""
-        legs, layout = self.legs, self.layout
-        values = legs.vector(legs.nominal)
-        at = {
-            i: self.choices.values.get(name, float(values[i]))
-            for i, name in enumerate(legs.parametrization.names)
-            if layout.kinematic[i] >= layout.size
-        }
         return State(
-            self.tied(with_values(start.legs, legs, at)),
+            self.tied(with_values(start.legs, self.legs, self._fixed())),
             self.first.radii,
-            np.zeros(len(layout.bias)),
+            np.zeros(len(self.layout.bias)),
             self.first.cameras,
             *components(start.T_camera_Rb),
             *components(start.T_Rb_Re),
         )
 
     def tied(self, geometry: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
-        """Return legs whose fixed twists are where they are fixed, whatever turned the axes.
+        """Return legs whose fixed angles are where they are fixed, whatever turned the axes.
 
-        Turning an axis away and back on another way leaves what is tied to it turned about it.
+        Turning an axis away and back on another way leaves what is tied to it turned about it, and
+        turning it by one of its angles changes the other a little.
         """
-        moved = list(geometry)
-        for j, (leg, nominal) in enumerate(zip(geometry, self.legs.nominal, strict=True)):
-            is_free = self.layout.place[j, -1] < self.layout.size
-            if nominal.twist is not None and leg.platform_joint == "" and not is_free:
-                fixed = self.choices.values.get(f"{self.legs.names[j]}.twist", nominal.twist)
-                moved[j] = replace(leg, twist=tied_twist(leg, nominal, fixed))
-        return tuple(moved)
+        moved = geometry
+        if self._half_fixed:
+            at = {i: value for i, value in self._fixed().items() if i in self._half_fixed}
+            moved = with_values(moved, self.legs, at)
+        return tuple(
+            replace(leg, twist=tied_twist(leg, nominal, self._fixed_twist(j, nominal.twist)))
+            if nominal.twist is not None and leg.platform_joint == "" and not self._is_free(j, -1)
+            else leg
+            for j, (leg, nominal) in enumerate(zip(moved, self.legs.nominal, strict=True))
+        )
+
+    def _is_free(self, leg: int, number: int) -> bool:
+        """Say whether one of the numbers of a leg is an unknown."""
+        return bool(self.layout.place[leg, number] < self.layout.size)
+
+    def _fixed_twist(self, leg: int, nominal: float) -> float:
+        return self.choices.values.get(f"{self.legs.names[leg]}.twist", nominal)
+
+    def _fixed(self) -> dict[int, float]:
+        """Return the values of the kinematic parameters that are no unknowns, by their number."""
+        legs, layout = self.legs, self.layout
+        values = legs.vector(legs.nominal)
+        return {
+            i: self.choices.values.get(name, float(values[i]))
+            for i, name in enumerate(legs.parametrization.names)
+            if layout.kinematic[i] >= layout.size
+        }
+
+    @cached_property
+    def _half_fixed(self) -> frozenset[int]:
+        """The angles of axes that are fixed where the other one is not."""
+        place, found = self.legs.parametrization.place, set[int]()
+        for j in range(self.legs.n_legs):
+            for pair in ((7, 8), (9, 10)):
+                fixed = [n for n in pair if place[j, n] >= 0 and not self._is_free(j, n)]
+                if len(fixed) == 1:
+                    found.add(int(place[j, fixed[0]]))
+        return frozenset(found)
 
     def measured_ends(self, state: State) -> tuple[Array, Array]:
         """Return the ends of outlines on the sensor plane, and how they move with intrinsics.
