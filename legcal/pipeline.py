@@ -21,7 +21,7 @@ from legcal.observations.canonical_order import inverse
 from legcal.observations.parts import outlines_at
 from legcal.observations.sets import reject_unused_legs
 from legcal.progress import Report, no_progress
-from legcal.refinement.choices import Choices
+from legcal.refinement.choices import Choices, Prior
 from legcal.refinement.file_order import in_file_order
 from legcal.refinement.foretold import FittedModel
 from legcal.refinement.held_out import Expected, HeldOut, compare_held_out
@@ -33,6 +33,8 @@ from legcal.report.result import write_result
 from legcal.stages.nominal import Criteria
 from legcal.workers import worker_pool
 from legcal.workpiece import Found, Workpiece, observe_and_fit, workpiece
+
+TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
 
 
 def calibrate(
@@ -127,10 +129,21 @@ def calibrate(
 
 
 def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
-    """Return what dataset and run choose of the parameters."""
+    """Return what dataset and run choose of the parameters.
+
+    Twists that nobody chooses anything of are looked for with a prior: no leg is built without an
+    error of its twist, and one that was left at nominal would spoil what is told of the others.
+    """
     views, axes_given = dataset.measurements.views, dataset.axes is not None
     known = known_parameters(dataset.mechanism, views, axes_given=axes_given)
-    return resolve([*dataset.wishes, *wishes], known)
+    choices = resolve([*dataset.wishes, *wishes], known)
+    twists = {
+        name: Prior(parameter.nominal, TWIST_SIGMA)
+        for name, parameter in known.by_name.items()
+        if name.endswith(".twist") and choices.holds(name, by_default=True)
+    }
+    twists = {name: prior for name, prior in twists.items() if name not in choices.fixed}
+    return replace(choices, priors={**twists, **choices.priors})
 
 
 def _compare_held_out(work: Workpiece, found: Found, split: Split) -> HeldOut:
