@@ -19,7 +19,7 @@ from legcal.geometry.types import Array
 from legcal.observations.outlines import Outlines
 from legcal.refinement.bias_scores import scores_of_shifts, with_shifts
 from legcal.refinement.biases import N_KINDS, estimated_shifts, possible_shifts
-from legcal.refinement.build import build_fit
+from legcal.refinement.build import build_fit, with_biases
 from legcal.refinement.linearize import linearize
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.observed import ObservedOutlines, observed_outlines
@@ -95,7 +95,7 @@ def test_scores_are_those_of_the_residuals_that_a_fit_leaves(session: Session) -
     state = problem.begin(disturbed_start(session, joints=1e-5, camera=1e-5, angle=1e-5))
     whitening = NoiseModel().whitening(problem.outlines.covariance)
     possible = possible_shifts(problem.outlines, session.legs.names)
-    z, K = scores_of_shifts(problem, state, whitening, possible)
+    z, K = scores_of_shifts(problem, state, whitening, possible, with_biases(problem, possible))
     linear = linearize(problem, state, whitening)
     # All at once: outlines, readings and priors, without elimination.
     layout, rows = problem.layout, list[tuple[Array, Array]]()
@@ -134,12 +134,14 @@ def test_scores_do_not_depend_on_the_shifts_that_are_fitted(session: Session) ->
     state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
     whitening = NoiseModel().whitening(problem.outlines.covariance)
     possible = possible_shifts(problem.outlines, session.legs.names)
-    bare = scores_of_shifts(problem, state, whitening, possible)
+    bare = scores_of_shifts(problem, state, whitening, possible, with_biases(problem, possible))
     some = possible.of_sizes(np.array([0.0, 0.1, 0.2, 0.0, 0.1, 0.0]))
     with_some, there = with_shifts(problem, state, some)
     there = replace(there, biases=0.1 * rng.standard_normal(len(some)))
     for one, other in zip(
-        bare, scores_of_shifts(with_some, there, whitening, possible), strict=True
+        bare,
+        scores_of_shifts(with_some, there, whitening, possible, with_biases(problem, possible)),
+        strict=True,
     ):
         np.testing.assert_allclose(other, one, atol=1e-7 * np.abs(one).max())
 
@@ -198,7 +200,7 @@ def test_residuals_of_known_shifts_give_their_sizes(session: Session) -> None:
     problem = build_fit(session.legs, session.measurements, session.outlines)
     state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
     whitening = NoiseModel().whitening(observed.covariance)
-    K = scores_of_shifts(problem, state, whitening, possible)[1]
+    K = scores_of_shifts(problem, state, whitening, possible, with_biases(problem, possible))[1]
     rng, value, vector = np.random.default_rng(0), *np.linalg.eigh(K)
     root = vector * np.sqrt(np.maximum(value, 0.0))
     for _ in range(40):

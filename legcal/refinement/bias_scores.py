@@ -20,15 +20,15 @@ def with_shifts(
     problem: FitProblem, state: State, shifts: SharedShifts
 ) -> tuple[FitProblem, State]:
     """Return problem and state with these shifts in place of others, known ones as they are."""
-    known = {
-        problem.named[i]: float(b) for i, b in zip(problem.layout.bias, state.biases, strict=True)
-    }
-    biases = np.array([known.get(name, 0.0) for name in shifts.names])
-    return with_biases(problem, shifts), replace(state, biases=biases)
+    return with_biases(problem, shifts), _with_values(problem, state, shifts)
 
 
 def scores_of_shifts(
-    problem: FitProblem, state: State, whitening: Array, possible: SharedShifts
+    problem: FitProblem,
+    state: State,
+    whitening: Array,
+    possible: SharedShifts,
+    asked: FitProblem,
 ) -> tuple[Array, Array]:
     """Return the scores of shifts where all of them are zero, and their covariance if they are.
 
@@ -37,11 +37,13 @@ def scores_of_shifts(
     problem : FitProblem
         With or without shifts.
     state : State
-        Near a minimum; Gauss-Newton's step from there is taken into account.
+        Of this problem, near a minimum; Gauss-Newton's step from there is taken into account.
     whitening : (n_outlines, 2, 2) array
         Of the outlines, zero for rejected ones [1/px].
     possible : SharedShifts
         The shifts that are asked for.
+    asked : FitProblem
+        The same problem with all of these, :func:`legcal.refinement.build.with_biases`.
 
     Returns
     -------
@@ -51,13 +53,13 @@ def scores_of_shifts(
     K : (b, b) array
         B^T M B [1/px^2].
     """
-    problem, state = with_shifts(problem, state, possible)
-    linear = linearize(problem, state, whitening)
-    normal = normal_equations(problem, state, linear, 0.0)
+    state = _with_values(problem, state, possible)
+    linear = linearize(asked, state, whitening)
+    normal = normal_equations(asked, state, linear, 0.0)
     S = normal.reduced()
     following = (normal.V_inverse @ normal.g_pose[..., None])[..., 0]
     g = normal.g_kept - np.einsum("akp,kp->a", normal.W, following)
-    bias = problem.layout.bias
+    bias = asked.layout.bias
     others = np.setdiff1d(np.arange(len(S)), bias)
     of_prior = 1.0 / possible.sigmas**2
     S_others, S_mixed = S[np.ix_(others, others)], S[np.ix_(others, bias)]
@@ -70,3 +72,10 @@ def scores_of_shifts(
     K = 0.5 * (K + K.T)
     left = g[bias] - of_prior * state.biases - S_mixed.T @ inverse @ g[others]
     return K @ state.biases - left, K
+
+
+def _with_values(problem: FitProblem, state: State, shifts: SharedShifts) -> State:
+    """Return a state of a problem with the values of these shifts, zero where it has none."""
+    names = (problem.named[i] for i in problem.layout.bias)
+    known = dict(zip(names, state.biases.tolist(), strict=True))
+    return replace(state, biases=np.array([known.get(name, 0.0) for name in shifts.names]))

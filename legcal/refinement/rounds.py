@@ -8,6 +8,7 @@ from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
 from legcal.refinement.bias_scores import scores_of_shifts, with_shifts
 from legcal.refinement.biases import N_KINDS, SharedShifts, estimated_shifts, possible_shifts
+from legcal.refinement.build import with_biases
 from legcal.refinement.influence import explained_share
 from legcal.refinement.linearize import linearize, offsets_of
 from legcal.refinement.loss import width_to_k
@@ -105,6 +106,7 @@ def fit_in_rounds(
         minimum = solved(_near_enough(problem))
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
+    asked = with_biases(problem, possible)
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before = _sizes(noise, shifts)
         noise = _noise(problem, state, noise, accepted, settings)
@@ -114,7 +116,8 @@ def fit_in_rounds(
         if not accepted.any():
             break
         whitening = noise.whitening(claimed, accepted)
-        shifts = estimated_shifts(possible, *scores_of_shifts(problem, state, whitening, possible))
+        scores = scores_of_shifts(problem, state, whitening, possible, asked)
+        shifts = estimated_shifts(possible, *scores)
         if len(shifts) or len(state.biases):
             problem, state = with_shifts(problem, state, shifts)
             minimum = solved()
