@@ -18,6 +18,7 @@ from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import NormalEquations, information
 from legcal.refinement.priors import named_values
 from legcal.refinement.problem import FitProblem
+from legcal.refinement.rejections import rejection_reasons
 from legcal.refinement.rounds import Fit
 from legcal.refinement.sensitivity import sensitivities
 from legcal.refinement.settings import RefinementSettings
@@ -88,7 +89,7 @@ def assemble_solution(
         biases=_biases(problem, state),
         shared_px=fit.shifts.sizes,
         sensitivities=sensitivities(problem, state, linear, normal, whitening, k),
-        outlines=_with_rejections(outlines, problem, fit.accepted, offsets),
+        outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
         notes=(
@@ -187,13 +188,13 @@ def _refuse_contradicted_priors(problem: FitProblem, state: State, covariance: A
 
 
 def _with_rejections(
-    outlines: Outlines, problem: FitProblem, accepted: BoolArray, offsets: Array
+    outlines: Outlines, problem: FitProblem, state: State, accepted: BoolArray, offsets: Array
 ) -> Outlines:
-    """Return the table with what the fit rejected, and by how much it disagrees."""
+    """Return the table with what the fit rejected, and why."""
     used, reason = outlines.used.copy(), list(outlines.reason)
-    worst = np.abs(offsets).max(axis=1, initial=0.0)
-    for i in np.flatnonzero(~accepted):
-        row = int(problem.outlines.index[i])
+    rejected = np.flatnonzero(~accepted)
+    words = rejection_reasons(problem, state, rejected, offsets)
+    for row, why in zip(problem.outlines.index[rejected].tolist(), words, strict=True):
         used[row] = False
-        reason[row] = f"disagrees with the fit by {worst[i]:.1f} px"
+        reason[row] = why
     return dataclasses.replace(outlines, used=used, reason=tuple(reason))
