@@ -29,6 +29,8 @@ from legcal.refinement.platform_error import (
 from legcal.refinement.solution import Sensitivity
 from legcal.refinement.start import platform_poses
 
+_REACHED = 1e-8  # [m]
+
 
 @dataclass(frozen=True, eq=False)
 class Effect:
@@ -136,7 +138,22 @@ def _workspace_poses(
     except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
         return None
     nearby = [platform_in_base(mechanism, T) for T in drawn.poses]
-    return poses_at_readings(mechanism, legs, drawn.readings, nearby)
+    poses = poses_at_readings(mechanism, legs, drawn.readings, nearby)
+    reached = [
+        T for T, q in zip(poses, drawn.readings, strict=True) if _is_reached(mechanism, legs, q, T)
+    ]
+    return reached or None
+
+
+def _is_reached(
+    mechanism: Mechanism, legs: Sequence[LegGeometry], q: Array, T_Rb_Re: RigidTransform
+) -> bool:
+    """Say whether legs have the lengths of readings (n_legs,) at a pose: some have them nowhere."""
+    return all(
+        abs(np.linalg.norm(T_Rb_Re.apply(leg.B) - leg.A) - sign * reading - leg.q0) < _REACHED
+        for leg, sign, reading in zip(legs, mechanism.sign, q, strict=True)
+        if leg.kind is LegKind.ACTUATED
+    )
 
 
 def poses_at_readings(
