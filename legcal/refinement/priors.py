@@ -21,7 +21,7 @@ from legcal.refinement.residuals import prior_residual
 from legcal.refinement.state import State, intrinsic_of
 
 _STEP = 1e-6  # [rad], of central differences
-_AXES = slice(7, 11)  # among the numbers of a leg
+_AXES, _ANGLES = slice(7, 11), slice(7, 12)  # among the numbers of a leg
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Priors:
         J = np.zeros((len(self), self.layout.n_kept))
         if len(self):
             by_x = np.eye(self.layout.n_named)
-            if np.any(self.position < self.layout.n_kinematic):
+            if np.isin(self.position, self.layout.place[:, _ANGLES]).any():
                 by_x = named_jacobian(state, self.layout, legs)
             J[:, : len(by_x)] = slope[:, 0] * by_x[self.position]
         return r[:, 0], J
