@@ -222,9 +222,10 @@ def _wrong(
     angle: float,
     rng: np.random.Generator,
 ) -> tuple[LegGeometry, ...]:
-    """Return legs every number of which is wrong by as much, up or down."""
+    """Return legs every number of which is wrong by as much, up or down; twists are right."""
     parametrization = fitted.parametrization
     size = np.where(np.array(parametrization.units) == "m", length, angle / np.sqrt(2.0))
+    size[[name.endswith(".twist") for name in parametrization.names]] = 0.0
     step = size * rng.choice([-1.0, 1.0], len(size))
     return moved_legs(legs, parametrization.place, step)
 

@@ -9,6 +9,7 @@ from machine_session import LENS as LENS_OF_MACHINES
 from machine_session import machine_session
 
 from legcal.geometry.types import Array
+from legcal.mechanism.leg_steps import moved_legs
 from legcal.refinement import refine
 from legcal.refinement.choices import NO_CHOICES, Choices, Prior
 from legcal.refinement.solution import Solution
@@ -38,7 +39,7 @@ def _fit(session: Session, choices: Choices = NO_CHOICES) -> Solution:
 
 
 def _steps(found: Solution) -> dict[str, Array]:
-    return {s.what: s.step for s in found.sensitivities}
+    return {s.what: s.steps[:, 0] for s in found.sensitivities}
 
 
 def _difference(found: Solution, mistaken: Solution) -> Array:
@@ -116,6 +117,25 @@ def test_legs_on_constraints_move_as_foretold(name: str) -> None:
     mistaken = refine(session.legs, measurements, outlines, session.start)
     step = _steps(found)["a focal length 1 % longer"]
     assert np.linalg.norm(step) > 1e-6
-    np.testing.assert_allclose(
-        _difference(found, mistaken), step, atol=0.02 * float(np.abs(step).max())
+    foretold = moved_legs(found.legs, found.parametrization.place, PART * step)
+    was, moved, expected = (
+        session.legs.vector(legs) for legs in (found.legs, mistaken.legs, foretold)
     )
+    np.testing.assert_allclose(moved, expected, atol=0.03 * float(np.abs(expected - was).max()))
+
+
+@pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])
+def test_a_mistaken_twist_moves_the_fit_as_foretold(model: str) -> None:
+    session = machine_session(model)
+    data = (session.legs, *session.noisy(0), session.start)
+    found = refine(*data)
+    told = next(s for s in found.sensitivities if "twist" in s.what)
+    name = next(n for n in found.parametrization.names if n.endswith(".twist"))
+    part = 0.1
+    twist = found.values[name] + part * np.radians(0.1)
+    mistaken = refine(*data, choices=Choices(fixed=frozenset({name}), values={name: twist}))
+    foretold = moved_legs(found.legs, found.parametrization.place, part * told.steps[:, 0])
+    was, moved, expected = (
+        session.legs.vector(legs) for legs in (found.legs, mistaken.legs, foretold)
+    )
+    np.testing.assert_allclose(moved, expected, atol=0.03 * float(np.abs(expected - was).max()))

@@ -72,7 +72,7 @@ def test_errors_in_what_counts_as_known_are_told_over_the_workspace() -> None:
     longer[-6:] = 1e-3  # all offsets: the platform is lifted
     q = random_configurations(nominal, 2, 0).readings
     accuracy = _accuracy(
-        nominal, nominal, q, np.zeros((30, 1)), Sensitivity("legs 1 mm longer", longer)
+        nominal, nominal, q, np.zeros((30, 1)), Sensitivity("legs 1 mm longer", longer[:, None])
     )
     (effect,) = accuracy.effects
     assert effect.what == "legs 1 mm longer"
@@ -88,7 +88,7 @@ def test_without_a_workspace_errors_are_told_at_the_readings(
     nominal = load_mechanism("hexapod")
     q = random_configurations(nominal, 2, 0).readings
     monkeypatch.setattr("legcal.mechanism.configurations.NEARER", np.zeros(0))
-    accuracy = _accuracy(nominal, nominal, q, np.eye(30), Sensitivity("anything", np.ones(30)))
+    accuracy = _accuracy(nominal, nominal, q, np.eye(30), Sensitivity("anything", np.ones((30, 1))))
     assert accuracy.workspace is None
     assert len(accuracy.effects[0].error.displacement) == 2
 

@@ -71,7 +71,7 @@ def test_a_change_of_the_parameters_moves_the_platform_as_its_covariance_says() 
         [platform_in_base(nominal, T) for T in drawn.poses],
     )
     change = np.random.default_rng(2).normal(size=len(parametrization))
-    moved, expected = moved_by(J, change), expected_error(J, np.outer(change, change))
+    moved, expected = moved_by(J, change[:, None]), expected_error(J, np.outer(change, change))
     np.testing.assert_allclose(moved.displacement, expected.displacement, rtol=1e-9)
     np.testing.assert_allclose(moved.rotation, expected.rotation, rtol=1e-9)
 

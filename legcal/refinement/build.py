@@ -72,8 +72,6 @@ def build_fit(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    asked = (*choices.free, *choices.priors, *choices.values)
-    legs = replace(legs, twists=any(name.endswith(".twist") for name in asked))
     observed = observed_outlines(outlines, measurements, legs)
     cameras = _cameras(measurements, choices)
     if any(

@@ -168,6 +168,17 @@ def tangent(state: State, layout: Layout, legs: FittedLegs) -> Tangent | None:
     return Tangent(Z, Q[:-1])
 
 
+def following(state: State, frame_legs: Sequence[int], leg: int, column: int) -> Array:
+    """Return how poses (n_poses, 6) follow one of the numbers of a leg, all else at rest."""
+    free = list(freedoms(frame_legs))
+    rows = _binding(state.legs, state.R_pose, state.t_pose)
+    inverse = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
+    by_number = np.where(rows.leg == leg, rows.by_local[:, :, column], 0.0)
+    motion = np.zeros((len(state.t_pose), 6))
+    motion[:, free] = -np.einsum("kfm,km->kf", inverse, by_number)
+    return motion
+
+
 def n_bonds(leg: LegGeometry) -> int:
     """Return how many equations of a leg hold without a reading."""
     return len(leg.demands) - (leg.kind is not LegKind.CONSTANT)

@@ -8,6 +8,7 @@ earlier, where a nominal model may well know it better.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,9 +94,44 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     return Held(
         harmless,
         unit,
-        tuple(_in_words(problem, row) for row in rows),
+        tuple(_in_words(names, row, problem.legs.names) for row in rows),
         tuple(names[i] for i in np.flatnonzero(_is_weak(scaled, harmless, length))),
     )
+
+
+def refuse_lost(problem: FitProblem, state: State, normal: NormalEquations, held: Held) -> None:
+    """Refuse a fit whose outlines, those that agree with it, leave more open than is held.
+
+    Parameters
+    ----------
+    problem : FitProblem
+        With or without biases.
+    state : State
+        Where the fit ended.
+    normal : NormalEquations
+        From :func:`legcal.refinement.normal.information` there.
+    held : Held
+        What :func:`open_directions` found before any outline was rejected.
+
+    Raises
+    ------
+    NotIdentifiable
+        With one of the directions.
+    """
+    S, biases = _of_values(problem, state, normal), problem.layout.bias
+    kept = np.setdiff1d(np.arange(len(S)), biases)
+    mixed = S[np.ix_(biases, kept)]
+    S = S[np.ix_(kept, kept)] - mixed.T @ np.linalg.inv(S[np.ix_(biases, biases)]) @ mixed
+    scaled = held.unit[:, None] * S * held.unit
+    N = null_space(held.basis) if len(held.basis) else np.eye(len(kept))
+    value, vector = np.linalg.eigh(N.T @ scaled @ N)
+    if value[0] * (_LARGEST_SIGMA * mean_length(state)) ** 2 < 1.0:
+        names = [problem.named[i] for i in kept]
+        raise NotIdentifiable(
+            "The fit is not determined: found that the outlines which agree with it leave "
+            f"{_in_words(names, N @ vector[:, 0], problem.legs.names)} open, needed what the "
+            "rejected ones showed; correct these, or add images."
+        )
 
 
 def held_at_nominal(problem: FitProblem, state: State, held: Held) -> tuple[FitProblem, State]:
@@ -174,12 +210,12 @@ def _motion(problem: FitProblem, state: State, unit: Array) -> Array | None:
     return motion * unit
 
 
-def _in_words(problem: FitProblem, row: Array) -> str:
-    """Return a direction of the named unknowns in words, its largest parts first."""
+def _in_words(names: Sequence[str], row: Array, leg_names: Sequence[str]) -> str:
+    """Return a direction of named unknowns in words, its largest parts first."""
     size = np.abs(row)
     order = np.argsort(-size, kind="stable")
-    shown = [problem.named[i] for i in order if size[i] > SHOWN * size[order[0]]]
-    return describe_direction(shown, problem.legs.names)
+    shown = [names[i] for i in order if size[i] > SHOWN * size[order[0]]]
+    return describe_direction(shown, leg_names)
 
 
 def _refusal(problem: FitProblem, row: Array, n_open: int, unseen: list[str]) -> str:
@@ -189,8 +225,9 @@ def _refusal(problem: FitProblem, row: Array, n_open: int, unseen: list[str]) ->
             f"The fit is not determined: no measurement depends on {', '.join(unseen)}; every leg "
             "needs readings or outlines; add images that show it."
         )
+    words = _in_words(problem.named, row, problem.legs.names)
     return (
         f"The fit is not determined: found {n_open} of {len(problem.named)} directions of the "
-        f"parameters that the measurements leave open and that matter, {_in_words(problem, row)}, "
+        f"parameters that the measurements leave open and that matter, {words}, "
         f"needed all to a tenth of a leg; {_REMEDY}, or state what is known with a prior."
     )

@@ -67,7 +67,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         covariance=solution.covariance[np.ix_(where, where)],
         sigma=solution.sigma[where],
         kinematic_covariance=solution.kinematic_covariance[np.ix_(steps, steps)],
-        sensitivities=tuple(replace(s, step=s.step[steps]) for s in solution.sensitivities),
+        sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=restore_outlines(solution.outlines, order),
     )
 
@@ -76,8 +76,7 @@ def _parametrization(
     solution: Solution, mechanism: Mechanism, legs: Sequence[LegGeometry]
 ) -> Parametrization:
     """Return the parameters of a solution in the order of the files."""
-    has_twists = any(name.endswith(".twist") for name in solution.parametrization.names)
-    return parametrize(mechanism.leg_names, legs, mechanism.frame_legs, twists=has_twists)
+    return parametrize(mechanism.leg_names, legs, mechanism.frame_legs, twists=True)
 
 
 def _places(names: tuple[str, ...], among: tuple[str, ...]) -> IntArray:

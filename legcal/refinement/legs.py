@@ -30,8 +30,6 @@ class FittedLegs:
         The legs whose joint centres define R_b and R_e: three in space, two in a plane.
     radii : dict
         Radius of the model [m] for each (leg index, part).
-    twists : bool
-        Whether twists are among the parameters.
     """
 
     names: tuple[str, ...]
@@ -39,7 +37,6 @@ class FittedLegs:
     sign: IntArray
     frame_legs: tuple[int, ...]
     radii: dict[tuple[int, str], float]
-    twists: bool = False
 
     @property
     def n_legs(self) -> int:
@@ -53,8 +50,8 @@ class FittedLegs:
 
     @cached_property
     def parametrization(self) -> Parametrization:
-        """The kinematic parameters."""
-        return parametrize(self.names, self.nominal, self.frame_legs, twists=self.twists)
+        """The kinematic parameters, twists among them."""
+        return parametrize(self.names, self.nominal, self.frame_legs, twists=True)
 
     def vector(self, legs: tuple[LegGeometry, ...]) -> Array:
         """Return the kinematic parameters of legs [m, rad]; axes count from the nominal ones."""

@@ -125,7 +125,7 @@ def platform_accuracy(
         PlatformError(*pose_differences(calibrated, nominal)),
         expected_error(here, covariance),
         None if everywhere is None else expected_error(everywhere, covariance),
-        tuple(Effect(s.what, moved_by(judged, s.step)) for s in sensitivities),
+        tuple(Effect(s.what, moved_by(judged, s.steps)) for s in sensitivities),
     )
 
 

@@ -128,17 +128,18 @@ def expected_error(by_parameters: Array, covariance: Array) -> PlatformError:
     return PlatformError(_root_of_sum(variance[:, 3:]), _root_of_sum(variance[:, :3]))
 
 
-def moved_by(by_parameters: Array, change: Array) -> PlatformError:
-    """Return how far a small change of the parameters moves the platform at poses.
+def moved_by(by_parameters: Array, changes: Array) -> PlatformError:
+    """Return how far small changes of the parameters move the platform at poses.
 
     Parameters
     ----------
     by_parameters : (n_poses, 6, p) array
         From :func:`platform_by_parameters`.
-    change : (p,) array
-        Of the parameters [m, rad].
+    changes : (p, c) array
+        Independent changes of the parameters [m, rad], of which the root of the sum of squares
+        is told.
     """
-    motion = (by_parameters @ change) ** 2
+    motion = np.sum((by_parameters @ changes) ** 2, axis=2)
     return PlatformError(_root_of_sum(motion[:, 3:]), _root_of_sum(motion[:, :3]))
 
 

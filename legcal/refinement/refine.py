@@ -10,8 +10,6 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
@@ -20,7 +18,7 @@ from legcal.refinement.assembly import assemble_solution, comparable_cost
 from legcal.refinement.build import build_fit
 from legcal.refinement.choices import NO_CHOICES, Choices
 from legcal.refinement.constraints import on_constraints
-from legcal.refinement.determinacy import Held, held_at_nominal, open_directions
+from legcal.refinement.determinacy import held_at_nominal, open_directions, refuse_lost
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.linearize import linearize
 from legcal.refinement.loss import width_to_k
@@ -28,7 +26,7 @@ from legcal.refinement.minimise import Minimum
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import information
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.rounds import Fit, first_minimum, fit_in_rounds
+from legcal.refinement.rounds import first_minimum, fit_in_rounds
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start
@@ -200,7 +198,8 @@ def _refined(
         _refuse_undetermined(free, state)
         raise
     _refuse_other_radii(problem, fit.state)
-    _refuse_lost(fit, held, k)
+    normal = information(fit.problem, fit.state, fit.minimum.linear, k)
+    refuse_lost(fit.problem, fit.state, normal, held)
     return assemble_solution(fit.problem, fit, held, outlines, candidate.label, settings)
 
 
@@ -208,19 +207,6 @@ def _refuse_undetermined(problem: FitProblem, state: State) -> None:
     """Raise NotIdentifiable if that is why there is no minimum to converge to."""
     linear = linearize(problem, state, NoiseModel().whitening(problem.outlines.covariance))
     open_directions(problem, state, information(problem, state, linear, 0.0))
-
-
-def _refuse_lost(fit: Fit, held: Held, k: float) -> None:
-    """Raise NotIdentifiable if what was rejected leaves a direction open that was not before."""
-    problem = dataclasses.replace(fit.problem, held=np.zeros((0, fit.problem.layout.n_kept)))
-    normal = information(problem, fit.state, fit.minimum.linear, k)
-    left = open_directions(problem, fit.state, normal)
-    if len(left.basis) > len(held.basis):
-        raise NotIdentifiable(
-            "The fit is not determined: found that the outlines which agree with it leave "
-            f"{', '.join(left.directions)} open, needed what the rejected ones showed; correct "
-            "these, or add images."
-        )
 
 
 def _refuse_other_radii(problem: FitProblem, state: State) -> None:

@@ -1,8 +1,8 @@
 """What the fit would have found if something that it took as known were mistaken.
 
 A mistake changes residuals: a longer focal length puts what is seen elsewhere on the sensor
-plane, a thicker leg has its outlines further apart, and a prior pulls elsewhere. The fit follows by
-one Gauss-Newton step.
+plane, a thicker leg has its outlines further apart, a prior pulls elsewhere, and another twist
+keeps the platform elsewhere. The fit follows by one Gauss-Newton step.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.refinement.constraints import following
 from legcal.refinement.influence import response
 from legcal.refinement.linearize import Linearization, offsets_of
 from legcal.refinement.loss import efficiency
@@ -24,6 +25,9 @@ from legcal.vision.intrinsics import undistort_derivatives
 
 _PART = 1e-3  # of a mistake that is tried: its effect is told to first order
 _OF_RADII = 0.01
+_OF_TWISTS = np.radians(0.1)
+_TWISTED = "twists that are held, each 0.1 deg off,"
+_TWIST = 11  # among the numbers of a leg
 
 
 @dataclass(frozen=True)
@@ -69,10 +73,10 @@ def sensitivities(
     whitening: Array,
     k: float,
 ) -> tuple[Sensitivity, ...]:
-    """Return what mistakes in cameras and radii would do to the kinematic parameters.
+    """Return what mistakes in cameras, radii and held twists would do to the parameters.
 
     What the fit looked for without a prior is not taken as known; a mistake in nothing else is
-    left out. So are all of them where axes were measured in place of outlines.
+    left out. So are those in cameras and radii where axes were measured in place of outlines.
 
     Parameters
     ----------
@@ -88,17 +92,45 @@ def sensitivities(
     k : float
         What *normal* was taken with.
     """
+    twisted = _of_twists(problem, state, linear, normal, k)
     changes = [*(_in_cameras(problem, state, m) for m in _OF_CAMERAS), _in_radii(problem, state)]
     changes = [c for c in changes if c.offsets.any() or c.priors.any()]
     if not changes:
-        return ()
+        return twisted
     offsets = efficiency(k, 2) * whitening @ np.stack([c.offsets for c in changes], axis=-1)
     pulls = np.column_stack([c.priors for c in changes]) / problem.priors.sigma[:, None]
     steps = response(problem.outline_places, linear.outlines, normal, offsets)
     steps += normal.kept_covariance() @ linear.prior_J.T @ pulls
     padded = np.vstack([steps, np.zeros(len(changes))])
     kinematic = padded[np.minimum(problem.layout.kinematic, problem.layout.n_kept)]
-    return tuple(Sensitivity(c.what, kinematic[:, i]) for i, c in enumerate(changes))
+    others = (Sensitivity(c.what, kinematic[:, i : i + 1]) for i, c in enumerate(changes))
+    return (*others, *twisted)
+
+
+def _of_twists(
+    problem: FitProblem, state: State, linear: Linearization, normal: NormalEquations, k: float
+) -> tuple[Sensitivity, ...]:
+    """Return what twists that the fit holds would do, each of them by itself, or nothing."""
+    layout = problem.layout
+    names = problem.legs.parametrization.names
+    place = problem.legs.parametrization.place[:, _TWIST]
+    held = [j for j, x in enumerate(place) if x >= 0 and layout.kinematic[x] >= layout.size]
+    if not held:
+        return ()
+    steps = np.zeros((len(names), len(held)))
+    for i, leg in enumerate(held):
+        motion = _OF_TWISTS * following(state, problem.legs.frame_legs, leg, _TWIST)
+        moved = np.zeros((layout.n_kept + 1, 1))
+        for where, rows, kept in (
+            (problem.outline_places, linear.outlines, efficiency(k, 2)),
+            (problem.reading_places, linear.readings, 1.0),
+            (problem.axis_places, linear.axes, efficiency(k, 4)),
+        ):
+            change = kept * rows.J_pose @ motion[where.pose][..., None]
+            moved[:-1] += response(where, rows, normal, change)
+        steps[:, i] = moved[np.minimum(layout.kinematic, layout.n_kept), 0]
+        steps[place[leg], i] = _OF_TWISTS
+    return (Sensitivity(_TWISTED, steps),)
 
 
 def _in_cameras(problem: FitProblem, state: State, mistake: _Mistake) -> _Change:

@@ -30,12 +30,13 @@ class Sensitivity:
     ----------
     what : str
         The mistake, in words.
-    step : (p,) array
-        Step of all kinematic parameters from the fitted legs [m, rad].
+    steps : (p, c) array
+        Steps of all kinematic parameters from the fitted legs [m, rad], one for each of c
+        independent parts of the mistake.
     """
 
     what: str
-    step: Array
+    steps: Array
 
 
 @dataclass(frozen=True, eq=False)
