@@ -181,7 +181,7 @@ def test_a_prior_that_contradicts_the_measurements_is_refused(session: MachineSe
 
 
 def test_two_priors_that_contradict_each_other_are_refused() -> None:
-    session = machine_session("3-upu", n_poses=4)
+    session = machine_session("3-upu")
     found = truth(session, "leg2.base.x"), truth(session, "leg3.base.y")
     choices = Choices(
         priors={
