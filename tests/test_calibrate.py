@@ -4,7 +4,6 @@ import csv
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import yaml
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset, load_mechanism
-from legcal.errors import DatasetError, NotIdentifiable, NotVisible, OutOfClass, UsageError
+from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.identify.check import check_identifiable
 
 
@@ -189,23 +188,6 @@ def test_outlines_without_photographs_are_enough(example_run: Run, tmp_path: Pat
     result = calibrate(folder)
     expected = example_run.calibration.solution.parameters
     assert np.abs(result.solution.parameters.base_joints - expected.base_joints).max() < 1e-12
-
-
-@pytest.mark.parametrize(
-    ("model", "found"),
-    [
-        ("3-upu", r"leg1 \(actuated, UPU\)"),
-        ("hexapod-rod", r"legs leg6 \(constant, SU\)"),
-        ("tricept", r"centre \(passive, UP\)"),
-    ],
-)
-def test_machines_that_are_not_calibrated_yet_are_refused_before_any_work(
-    model: str, found: str, tmp_path: Path
-) -> None:
-    dataset = replace(load_dataset(HEXAPOD), mechanism=load_mechanism(model))
-    with pytest.raises(OutOfClass, match=found):
-        calibrate(dataset, output=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 def test_too_few_images_are_refused_with_both_numbers(tmp_path: Path) -> None:
