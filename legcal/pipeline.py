@@ -74,8 +74,8 @@ def calibrate(
     fixed : sequence of str
         Names or patterns of parameters left at nominal, or ``NAME=VALUE``.
     free : sequence of str
-        Names or patterns of parameters to look for that are fixed otherwise (intrinsics,
-        twists), and of radii to look for without a prior.
+        Names or patterns of parameters to look for that are fixed otherwise (intrinsics), and of
+        radii and twists to look for without a prior.
     holdout : float, optional
         Keep this part of the images aside, and tell how well the fit of the others foretells them.
 

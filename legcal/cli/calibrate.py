@@ -63,7 +63,7 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Look for what is fixed otherwise (camera, twists), and for radii without a "
+            help="Look for what is fixed otherwise (camera), and for radii and twists without a "
             "prior.",
             rich_help_panel=_PARAMETERS,
         ),
