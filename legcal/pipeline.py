@@ -16,6 +16,7 @@ from legcal.calibration import Calibration, judge
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.dataset.holdout import Split, check_fraction, dataset_at, split_images
 from legcal.dataset.wishes import Wish, wishes_of_call
+from legcal.errors import UsageError
 from legcal.identify.check import check_identifiable
 from legcal.observations.canonical_order import inverse
 from legcal.observations.parts import outlines_at
@@ -106,6 +107,11 @@ def calibrate(
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     choices = _choices(dataset, wishes)
     rows = np.arange(dataset.measurements.n_rows)
+    if holdout is not None and dataset.axes is not None:
+        raise UsageError(
+            f"{dataset.folder}: no images could be kept aside: found a table of axes, needed images "
+            "or outlines, in which the fit is compared with what it did not see; leave out --holdout."
+        )
     split = Split(rows, rows[:0]) if holdout is None else split_images(dataset, holdout)
     fitted = dataset_at(dataset, split.fitted)
     left_open = check_identifiable(fitted, choices)

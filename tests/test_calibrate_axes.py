@@ -14,7 +14,7 @@ from rich.console import Console
 
 from legcal import calibrate, load_dataset, load_mechanism
 from legcal.calibration import Calibration
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.identify.analysis import identifiability_of_dataset
 from legcal.identify.recorded import recorded_session
 from legcal.mechanism.parameters import to_vector
@@ -174,3 +174,8 @@ def test_axes_of_another_machine_are_refused(dataset: Path) -> None:
     with pytest.raises(DidNotConverge, match=r"axes of the right legs|axes disagree with it"):
         calibrate(dataset, output=dataset.parent / "result")
     assert not (dataset.parent / "result").exists()
+
+
+def test_axes_are_not_kept_aside(dataset: Path) -> None:
+    with pytest.raises(UsageError, match="no images could be kept aside: found a table of axes"):
+        calibrate(dataset, holdout=0.2)
