@@ -109,8 +109,9 @@ def calibrate(
     rows = np.arange(dataset.measurements.n_rows)
     if holdout is not None and dataset.axes is not None:
         raise UsageError(
-            f"{dataset.folder}: no images could be kept aside: found a table of axes, needed images "
-            "or outlines, in which the fit is compared with what it did not see; leave out --holdout."
+            f"{dataset.folder}: no images could be kept aside: found a table of axes, needed "
+            "images or outlines, in which a fit is compared with what it did not see; leave out "
+            "--holdout."
         )
     split = Split(rows, rows[:0]) if holdout is None else split_images(dataset, holdout)
     fitted = dataset_at(dataset, split.fitted)
