@@ -10,6 +10,7 @@ import numpy as np
 
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.fitting import observe_and_fit
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import (
@@ -31,7 +32,7 @@ from legcal.refinement.solution import Solution
 from legcal.report.check_report import Check
 from legcal.report.earlier_result import EarlierResult, read_result
 from legcal.workers import worker_pool
-from legcal.workpiece import observe_and_fit, workpiece
+from legcal.workpiece import workpiece
 
 SIGNIFICANCE = 0.01
 _LARGEST_SIGNIFICANCE = 0.5

@@ -1,6 +1,6 @@
 """From photographs and readings to a calibrated mechanism: the whole method in one place.
 
-The images are searched and fitted in :mod:`legcal.workpiece`, in an order of rows, views and legs
+The images are searched and fitted in :mod:`legcal.fitting`, in an order of rows, views and legs
 that does not depend on the files.
 """
 
@@ -17,6 +17,7 @@ from legcal.dataset.folder import Dataset, load_dataset
 from legcal.dataset.holdout import Split, check_fraction, dataset_at, split_images
 from legcal.dataset.wishes import Wish, wishes_of_call
 from legcal.errors import UsageError
+from legcal.fitting import Found, observe_and_fit
 from legcal.identify.check import check_identifiable
 from legcal.observations.canonical_order import inverse
 from legcal.observations.parts import outlines_at
@@ -33,7 +34,7 @@ from legcal.report.destination import check_destination, output_path
 from legcal.report.result import write_result
 from legcal.stages.nominal import Criteria
 from legcal.workers import worker_pool
-from legcal.workpiece import Found, Workpiece, observe_and_fit, workpiece
+from legcal.workpiece import Workpiece, workpiece
 
 TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
 

@@ -23,6 +23,7 @@ LAYERS = (
     "repeatability",
     "report",
     "workpiece",
+    "fitting",
     "pipeline",
     "checking",
     "cli",
