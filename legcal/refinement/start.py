@@ -9,10 +9,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DatasetError
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import moved_legs
+from legcal.mechanism.leg_steps import turn_of
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.parametrization import tied_twist
 from legcal.mechanism.sensitivity import freedoms
 from legcal.observations.measurements import Measurements
 from legcal.refinement.constraints import pose_rows
@@ -22,7 +23,6 @@ from legcal.refinement.state import components, motions, turned
 _MAX_ITERATIONS = 60
 _STEP = 1e-12  # [m, rad]
 _LARGEST_TURN = 0.3  # [rad] in one step
-_TURNS = 4  # steps that put axes where they are wanted; each squares what is left
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +95,44 @@ def with_values(
     geometry: Sequence[LegGeometry], legs: FittedLegs, values: Mapping[int, float]
 ) -> tuple[LegGeometry, ...]:
     """Return legs some of whose parameters, by their number, have given values [m, rad]."""
-    moved = tuple(geometry)
-    where = list(values)
-    for _ in range(_TURNS if where else 0):
-        step = np.zeros(len(legs.parametrization))
-        step[where] = np.array(list(values.values())) - legs.vector(moved)[where]
-        moved = moved_legs(moved, legs.parametrization.place, step)
-    return moved
+    wanted = np.append(legs.vector(tuple(geometry)), 0.0)
+    wanted[list(values)] = list(values.values())
+    asked = np.isin(legs.parametrization.place, list(values))
+    return tuple(
+        _with_numbers(leg, nominal, wanted[place], is_asked) if is_asked.any() else leg
+        for leg, nominal, place, is_asked in zip(
+            geometry, legs.nominal, legs.parametrization.place, asked, strict=True
+        )
+    )
+
+
+def _with_numbers(
+    leg: LegGeometry, nominal: LegGeometry, numbers: Array, asked: BoolArray
+) -> LegGeometry:
+    """Return a leg some of whose numbers have given values; axes count from the nominal ones."""
+    moved = replace(
+        leg,
+        A=np.where(asked[:3], numbers[:3], leg.A),
+        B=np.where(asked[3:6], numbers[3:6], leg.B),
+        q0=float(numbers[6]) if asked[6] else leg.q0,
+        base_axis=_axis_at(leg.base_axis, nominal.base_axis, numbers[7:9], asked[7:9]),
+        platform_axis=_axis_at(
+            leg.platform_axis, nominal.platform_axis, numbers[9:11], asked[9:11]
+        ),
+    )
+    if leg.twist is None or not asked[9:].any():
+        return moved
+    return replace(moved, twist=tied_twist(moved, nominal, float(numbers[11])))
+
+
+def _axis_at(
+    axis: Array | None, nominal: Array | None, angles: Array, asked: BoolArray
+) -> Array | None:
+    """Return an axis at angles from the nominal one, as it was if none is asked for."""
+    if axis is None or nominal is None or not asked.any():
+        return axis
+    there = np.asarray(turn_of(nominal, angles).apply(nominal))
+    return there if there @ axis > 0.0 else -there
 
 
 def cameras_from_hints(
