@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.parameters import radius_name
 from legcal.observations.outlines import Outlines
+from legcal.refinement.contradictions import refuse_contradicted_priors
 from legcal.refinement.covariance import named_covariance, worst_directions
 from legcal.refinement.determinacy import Held, named_units
 from legcal.refinement.focal_length import focal_lengths
@@ -25,8 +25,7 @@ from legcal.refinement.settings import RefinementSettings
 from legcal.refinement.solution import Solution, Status
 from legcal.refinement.state import State
 
-_SIGNIFICANT = 5.0  # standard deviations of chi2, or between a prior and the measurements
-_INDEPENDENT = 1e-9  # of a prior's variance: what the measurements must take off it to be asked
+_SIGNIFICANT = 5.0  # standard deviations of chi2
 
 
 def assemble_solution(
@@ -51,7 +50,7 @@ def assemble_solution(
     whitening = fit.noise.whitening(problem.outlines.covariance, fit.accepted)
     normal = information(problem, state, linear, k)
     covariance = named_covariance(problem, state, normal)
-    _refuse_contradicted_priors(problem, state, covariance)
+    refuse_contradicted_priors(problem, state, normal)
     values, status = _values(problem, state), _status(problem, held)
     names = tuple(name for name in values if status[name] == "estimated")
     where = [problem.named.index(name) for name in names]
@@ -156,35 +155,6 @@ def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
         "degrees of freedom, so that the uncertainty of the result is about "
         f"{np.sqrt(chi2 / max(dof, 1)):.1f} times what is stated; correct them.",
     )
-
-
-def _refuse_contradicted_priors(problem: FitProblem, state: State, covariance: Array) -> None:
-    """Raise DidNotConverge if what somebody stated cannot be true beside the measurements.
-
-    An estimate with a prior has the covariance s; without it, it would differ from the mean by
-    sigma^2 / (sigma^2 - s) times what it does, with the variance sigma^4 / (sigma^2 - s).
-    """
-    values = named_values(state, problem.layout, problem.legs)
-    problems = []
-    for i, mean, sigma in zip(
-        problem.priors.position, problem.priors.mean, problem.priors.sigma, strict=True
-    ):
-        name = problem.named[i]
-        taken = sigma**2 - covariance[i, i]
-        if name not in problem.choices.priors or taken < _INDEPENDENT * sigma**2:
-            continue
-        apart = abs(values[i] - mean) / np.sqrt(taken)
-        if apart > _SIGNIFICANT:
-            alone = mean + (values[i] - mean) * sigma**2 / taken
-            unit = problem.named_units[i]
-            problems.append(
-                f"The prior of {name} contradicts the measurements: it says {mean:.6g} +- "
-                f"{sigma:.2g} {unit}, they say {alone:.6g} {unit}, {apart:.0f} standard "
-                f"deviations apart; at most {_SIGNIFICANT:g} are believed; correct the prior or "
-                "leave it out."
-            )
-    if problems:
-        raise DidNotConverge(problems)
 
 
 def _with_rejections(

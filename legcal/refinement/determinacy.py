@@ -72,7 +72,7 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         If an open direction moves the platform, or belongs to a camera or a radius.
     """
     names, unit, length = problem.named, named_units(problem, state), mean_length(state)
-    S = _of_values(problem, state, normal)
+    S = of_values(problem, state, normal)
     unseen = [name for name, row in zip(names, S, strict=True) if not np.any(row)]
     scaled = unit[:, None] * S * unit
     value, vector = np.linalg.eigh(0.5 * (scaled + scaled.T))
@@ -118,7 +118,7 @@ def refuse_lost(problem: FitProblem, state: State, normal: NormalEquations, held
     NotIdentifiable
         With one of the directions.
     """
-    S, biases = _of_values(problem, state, normal), problem.layout.bias
+    S, biases = of_values(problem, state, normal), problem.layout.bias
     kept = np.setdiff1d(np.arange(len(S)), biases)
     mixed = S[np.ix_(biases, kept)]
     S = S[np.ix_(kept, kept)] - mixed.T @ np.linalg.inv(S[np.ix_(biases, biases)]) @ mixed
@@ -184,7 +184,7 @@ def mean_length(state: State) -> float:
     return float(np.linalg.norm(ends - state.A, axis=-1).mean())
 
 
-def _of_values(problem: FitProblem, state: State, normal: NormalEquations) -> Array:
+def of_values(problem: FitProblem, state: State, normal: NormalEquations) -> Array:
     """Return the normal matrix of the values of named unknowns, all else unknown; biases too."""
     S, layout = normal.reduced(), problem.layout
     n = layout.n_named

@@ -18,12 +18,13 @@ from legcal.refinement.assembly import assemble_solution, comparable_cost
 from legcal.refinement.build import build_fit
 from legcal.refinement.choices import NO_CHOICES, Choices
 from legcal.refinement.constraints import on_constraints
+from legcal.refinement.contradictions import refuse_contradicted_priors
 from legcal.refinement.determinacy import held_at_nominal, open_directions, refuse_lost
 from legcal.refinement.legs import FittedLegs
-from legcal.refinement.linearize import linearize
+from legcal.refinement.linearize import linearize, offsets_of
 from legcal.refinement.loss import width_to_k
 from legcal.refinement.minimise import Minimum
-from legcal.refinement.noise import NoiseModel
+from legcal.refinement.noise import NoiseModel, noise_of_the_median
 from legcal.refinement.normal import information
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.rounds import first_minimum, fit_in_rounds
@@ -194,12 +195,13 @@ def _refined(
             there = first_minimum(problem, state, settings)
             state, iterations = there.state, iterations + there.iterations
         fit = fit_in_rounds(problem, state, iterations, settings)
-    except DidNotConverge:
+        normal = information(fit.problem, fit.state, fit.minimum.linear, k)
+        refuse_lost(fit.problem, fit.state, normal, held)
+    except (DidNotConverge, NotIdentifiable):
+        _refuse_contradicted(free, state)
         _refuse_undetermined(free, state)
         raise
     _refuse_other_radii(problem, fit.state)
-    normal = information(fit.problem, fit.state, fit.minimum.linear, k)
-    refuse_lost(fit.problem, fit.state, normal, held)
     return assemble_solution(fit.problem, fit, held, outlines, candidate.label, settings)
 
 
@@ -207,6 +209,16 @@ def _refuse_undetermined(problem: FitProblem, state: State) -> None:
     """Raise NotIdentifiable if that is why there is no minimum to converge to."""
     linear = linearize(problem, state, NoiseModel().whitening(problem.outlines.covariance))
     open_directions(problem, state, information(problem, state, linear, 0.0))
+
+
+def _refuse_contradicted(problem: FitProblem, state: State) -> None:
+    """Raise DidNotConverge if stated priors are why a fit fails."""
+    claimed = problem.outlines.covariance
+    noise = NoiseModel()
+    if len(claimed):
+        noise = noise_of_the_median(offsets_of(problem, state), claimed)
+    linear = linearize(problem, state, noise.whitening(claimed))
+    refuse_contradicted_priors(problem, state, information(problem, state, linear, 0.0))
 
 
 def _refuse_other_radii(problem: FitProblem, state: State) -> None:
