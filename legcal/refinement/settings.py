@@ -27,7 +27,7 @@ class RefinementSettings:
     largest_rms_px : float
         Root mean square of the offsets of accepted outlines beyond which a fit is refused [px].
     max_iterations : int
-        Limit for IPOPT in each solve.
+        Steps to try in each solve, at most.
     """
 
     radius_sigma: float = 0.02
