@@ -19,6 +19,7 @@ from legcal.mechanism.leg_steps import moved_legs
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 from legcal.report.axis_turns import nominal_axes, turns_between
+from legcal.report.earlier_result import read_result
 from legcal.simulation.simulate import simulate
 
 MODEL = "3-rpr"
@@ -233,6 +234,12 @@ def test_an_image_that_says_nothing_is_refused(result: Path, images: Path, tmp_p
         csv.writer(file).writerows([header, *rows])
     with pytest.raises(NotVisible, match="found no used outline in any image"):
         check(blank, result)
+
+
+def test_a_result_whose_platform_axes_turned_is_read_again(tmp_path: Path) -> None:
+    made = simulate("tricept", tmp_path / "set", settings(poses=8, views=2))
+    calibrate(made.folder, output=tmp_path / "result")
+    assert "centre.twist" in read_result(tmp_path / "result").names
 
 
 @pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,11 +15,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from legcal.errors import DatasetError, ModelError, OutOfClass
 from legcal.files.schema import Number, Version, describe, read_text, validate
 from legcal.geometry.types import Array
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 from legcal.refinement.noise import NoiseModel
-from legcal.report.axis_turns import calibrated_axis, nominal_axes, turns_between
+from legcal.report.axis_turns import Axes, calibrated_axis, nominal_axes, turns_between
 
 RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
 _SAME = 1e-9  # [m]: rounding of files
@@ -180,7 +181,8 @@ def _check_same_model(
 ) -> None:
     """Refuse a document whose parameters are not those of the model beside it."""
     legs, known = geometries(mechanism), parametrization_of(mechanism, twists=True)
-    numbers = dict(zip(known.names, vector_of(known, legs, legs).tolist(), strict=True))
+    nominal_legs = _with_nominal_axes(mechanism.leg_names, legs, document.nominal_axes, values)
+    numbers = dict(zip(known.names, vector_of(known, legs, nominal_legs).tolist(), strict=True))
     other = [
         name
         for name, number in numbers.items()
@@ -195,6 +197,28 @@ def _check_same_model(
     if other:
         found = f"other values of {', '.join(other[:3])}" + " and more" * (len(other) > 3)
         raise DatasetError(_refused(path, found, f"those of {MODEL_NAME} beside it"))
+
+
+def _with_nominal_axes(
+    names: Sequence[str],
+    legs: Sequence[LegGeometry],
+    axes: Mapping[str, Axes],
+    values: Mapping[str, float],
+) -> tuple[LegGeometry, ...]:
+    """Return legs with the axes and twists that the parameters of a document count from."""
+    base, platform = (
+        {name: np.array(axis) for name, axis in axes.get(side, {}).items()}
+        for side in ("base", "platform")
+    )
+    return tuple(
+        replace(
+            leg,
+            base_axis=base.get(name, leg.base_axis),
+            platform_axis=platform.get(name, leg.platform_axis),
+            twist=values.get(f"{name}.twist", leg.twist),
+        )
+        for name, leg in zip(names, legs, strict=True)
+    )
 
 
 def _is_axis(found: Array, axis: Sequence[float]) -> bool:
