@@ -22,6 +22,7 @@ from legcal.refinement.resolution import resolve
         ("leg1.offset=0.35±1e999", "found '1e999', needed a number"),
         ("leg1.offset=0.35±nan", "needed a value and its sigma"),
         ("leg1.offset=0.35±1e-12", "found the sigma 1e-12, needed at least 1e-09; fix"),
+        ("leg1.offset=0.35±1e300", "found the sigma 1e.300, needed at most 1e.06; free"),
         ("leg1.offset=350mm±0.1", "needed the unit of sigma too"),
         ("leg1.offset=350mm±1deg", "needed units of one kind"),
         ("leg1.offset=350±1furlong", "found the unknown unit 'furlong', needed one of mm, um"),

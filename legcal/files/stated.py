@@ -12,6 +12,7 @@ from legcal.files.quantity import ANGLE, LENGTH, PIXELS
 from legcal.files.schema import describe
 
 SMALLEST_SIGMA = 1e-9  # [m, rad, px]; what is known better is fixed
+LARGEST_SIGMA = 1e6  # [m, rad, px]; tells nothing of any parameter
 
 _DIMENSIONS = {"m": LENGTH, "rad": ANGLE, "px": PIXELS}
 _SIZES = {unit: size for units in _DIMENSIONS.values() for unit, size in units.items()}
@@ -128,6 +129,11 @@ def _prior(value: float, sigma: float, dimension: str = "") -> Stated:
         raise ValueError(
             f"found the sigma {sigma:g}, needed at least {SMALLEST_SIGMA:g}; fix the parameter at "
             "the value instead."
+        )
+    if sigma > LARGEST_SIGMA:
+        raise ValueError(
+            f"found the sigma {sigma:g}, needed at most {LARGEST_SIGMA:g}; free the parameter or "
+            "leave the prior out."
         )
     return Stated(value, sigma, dimension)
 
