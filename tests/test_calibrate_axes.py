@@ -171,7 +171,9 @@ def test_axes_with_sigmas_that_are_too_small_are_noted(dataset: Path) -> None:
 def test_axes_of_another_machine_are_refused(dataset: Path) -> None:
     names = {f"leg{j}": f"leg{j % 6 + 1}" for j in range(1, 7)}
     _change(dataset / "axes.csv", lambda rows: [row | {"leg": names[row["leg"]]} for row in rows])
-    with pytest.raises(DidNotConverge, match=r"axes are those of the right legs|axes disagree with it"):
+    with pytest.raises(
+        DidNotConverge, match=r"axes are those of the right legs|axes disagree with it"
+    ):
         calibrate(dataset, output=dataset.parent / "result")
     assert not (dataset.parent / "result").exists()
 
