@@ -69,8 +69,13 @@ def main() -> None:
     error = to_vector(solution.parameters, mechanism.frame_legs) - to_vector(
         truth, mechanism.frame_legs
     )
-    pull = error / solution.sigma[: len(error)]
-    print(f"normalised squared error of the parameters: {np.mean(pull**2):.2f}")
+    n = len(error)
+    pull = error / solution.sigma[:n]
+    together = error @ np.linalg.solve(solution.covariance[:n, :n], error) / n
+    print(
+        f"normalised squared error: {np.mean(pull**2):.2f} of single parameters, {together:.2f} of "
+        "all together"
+    )
 
 
 if __name__ == "__main__":

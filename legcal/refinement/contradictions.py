@@ -62,9 +62,9 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
             unit = problem.named_units[i]
             problems.append(
                 f"The prior of {problem.named[i]} contradicts the measurements: it says {mean:.6g} "
-                f"+- {sigma:.2g} {unit}, they say {mean + away:.6g} {unit}, {apart:.0f} standard "
-                f"deviations apart; at most {_SIGNIFICANT:g} are believed; correct the prior or "
-                "leave it out."
+                f"+- {sigma:.2g} {unit}, they say about {mean + away:.4g} {unit}, {apart:.0f} "
+                f"standard deviations apart; at most {_SIGNIFICANT:g} are believed; correct the "
+                "prior or leave it out."
             )
     if problems:
         raise DidNotConverge(problems)

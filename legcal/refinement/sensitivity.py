@@ -26,7 +26,7 @@ from legcal.vision.intrinsics import undistort_derivatives
 _PART = 1e-3  # of a mistake that is tried: its effect is told to first order
 _OF_RADII = 0.01
 _OF_TWISTS = np.radians(0.1)
-_TWISTED = "twists that are held, each 0.1 deg off,"
+_TWISTED = "twists that are fixed, each 0.1 deg off,"
 _TWIST = 11  # among the numbers of a leg
 
 
@@ -73,7 +73,7 @@ def sensitivities(
     whitening: Array,
     k: float,
 ) -> tuple[Sensitivity, ...]:
-    """Return what mistakes in cameras, radii and held twists would do to the parameters.
+    """Return what mistakes in cameras, radii and fixed twists would do to the parameters.
 
     What the fit looked for without a prior is not taken as known; a mistake in nothing else is
     left out. So are those in cameras and radii where axes were measured in place of outlines.
@@ -110,15 +110,15 @@ def sensitivities(
 def _of_twists(
     problem: FitProblem, state: State, linear: Linearization, normal: NormalEquations, k: float
 ) -> tuple[Sensitivity, ...]:
-    """Return what twists that the fit holds would do, each of them by itself, or nothing."""
+    """Return what fixed twists would do, each of them by itself, or nothing."""
     layout = problem.layout
     names = problem.legs.parametrization.names
     place = problem.legs.parametrization.place[:, _TWIST]
-    held = [j for j, x in enumerate(place) if x >= 0 and layout.kinematic[x] >= layout.size]
-    if not held:
+    fixed = [j for j, x in enumerate(place) if x >= 0 and layout.kinematic[x] >= layout.size]
+    if not fixed:
         return ()
-    steps = np.zeros((len(names), len(held)))
-    for i, leg in enumerate(held):
+    steps = np.zeros((len(names), len(fixed)))
+    for i, leg in enumerate(fixed):
         motion = _OF_TWISTS * following(state, problem.legs.frame_legs, leg, _TWIST)
         moved = np.zeros((layout.n_kept + 1, 1))
         for where, rows, kept in (

@@ -22,7 +22,8 @@ def readings(noise: Noise, errors: StartErrors, n_views: int, n_poses: int) -> t
         "the fit takes them for.",
         _start(errors),
         "The fit sees outlines, readings, the nominal model and the rough camera poses. It "
-        "estimates the noise and guards against wrong outlines as in any calibration.",
+        "estimates the noise and guards against wrong outlines as in any calibration. Twists of "
+        "legs without an S joint are known (`legcal calibrate` has a prior on them).",
     )
 
 
