@@ -91,7 +91,6 @@ def build_fit(
         np.array(is_free, dtype=np.bool_),
         np.array([not choices.holds(name) for name in radii], dtype=np.bool_),
         observed.parts,
-        0,
         intrinsic,
         keys,
         seen,

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from legcal.dataset.folder import Dataset
 from legcal.geometry.types import IntArray
-from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.leg_steps import footed
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import Parametrization, parametrize
+from legcal.mechanism.parametrization import parametrize
 from legcal.observations.canonical_order import (
     Order,
     inverse,
@@ -49,7 +46,8 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     known = known_parameters(mechanism, measurements.views).by_name
     ordered = [name for name in known if name in solution.values]
     names = tuple(name for name in ordered if name in solution.names)
-    parametrization = _parametrization(solution, mechanism, geometry)
+    names_of_legs, frame_legs = mechanism.leg_names, mechanism.frame_legs
+    parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     where = _places(names, solution.names)
     steps = _places(parametrization.names, solution.parametrization.names)
     return replace(
@@ -70,13 +68,6 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
         outlines=restore_outlines(solution.outlines, order),
     )
-
-
-def _parametrization(
-    solution: Solution, mechanism: Mechanism, legs: Sequence[LegGeometry]
-) -> Parametrization:
-    """Return the parameters of a solution in the order of the files."""
-    return parametrize(mechanism.leg_names, legs, mechanism.frame_legs, twists=True)
 
 
 def _places(names: tuple[str, ...], among: tuple[str, ...]) -> IntArray:

@@ -75,13 +75,12 @@ def lay_out(
     is_free: BoolArray,
     radius_is_free: BoolArray,
     parts: Sequence[tuple[int, str]],
-    n_biases: int,
     intrinsic: IntArray,
     intrinsic_keys: Sequence[str],
     camera_is_seen: BoolArray,
     n_poses: int,
 ) -> Layout:
-    """Return the layout of the unknowns.
+    """Return the layout of the unknowns, without shifts of outlines.
 
     Parameters
     ----------
@@ -93,8 +92,6 @@ def lay_out(
         Which radii are.
     parts : sequence of (int, str)
         Leg index and part of each radius.
-    n_biases : int
-        Number of shifts of outlines.
     intrinsic : (n_views, n_keys) array of int
         Number of the unknown intrinsic of each view, counted from zero; -1 for none.
     intrinsic_keys : sequence of str
@@ -105,7 +102,7 @@ def lay_out(
         Number of platform poses.
     """
     n_intrinsics = int(intrinsic.max(initial=-1)) + 1
-    counts = [is_free.sum(), radius_is_free.sum(), n_biases, n_intrinsics, 6 * camera_is_seen.sum()]
+    counts = [is_free.sum(), radius_is_free.sum(), n_intrinsics, 6 * camera_is_seen.sum()]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
     n_kept = int(first[-1])
     size = n_kept + 6 * n_poses
@@ -115,9 +112,9 @@ def lay_out(
         place=extended[place],
         kinematic=kinematic,
         radius=_numbered(radius_is_free, first[1], size),
-        bias=first[2] + np.arange(n_biases, dtype=np.intp),
-        intrinsic=np.where(intrinsic < 0, size, first[3] + intrinsic),
-        camera=_numbered(np.repeat(camera_is_seen[:, None], 6, axis=1), first[4], size),
+        bias=np.zeros(0, dtype=np.intp),
+        intrinsic=np.where(intrinsic < 0, size, first[2] + intrinsic),
+        camera=_numbered(np.repeat(camera_is_seen[:, None], 6, axis=1), first[3], size),
         n_poses=n_poses,
         n_kept=n_kept,
         parts=tuple(parts),

@@ -24,8 +24,6 @@ class Residual:
     name : str
     n_local, n_data, n_rows : int
         Sizes of what it depends on, of the data and of the residual.
-    function : casadi.Function
-        (local, data) -> residual.
     jacobian : casadi.Function
         (local, data) -> residual and its dense Jacobian by *local*.
     """
@@ -34,7 +32,6 @@ class Residual:
     n_local: int
     n_data: int
     n_rows: int
-    function: ca.Function
     jacobian: ca.Function
 
     def evaluate(self, local: Array, data: Array) -> tuple[Array, Array]:
@@ -144,7 +141,6 @@ def _residual(name: str, local: ca.SX, data: ca.SX, r: ca.SX) -> Residual:
         local.size1(),
         data.size1(),
         r.size1(),
-        ca.Function(name, [local, data], [r], options),
         ca.Function(f"{name}_jacobian", [local, data], [r, by_local], options),
     )
 
