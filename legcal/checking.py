@@ -24,11 +24,11 @@ from legcal.progress import Report, no_progress
 from legcal.refinement.changes import possible_changes
 from legcal.refinement.choices import Choices, Prior
 from legcal.refinement.file_order import in_file_order
-from legcal.refinement.foretold import arrays
 from legcal.refinement.held_out import PlatformPair
 from legcal.refinement.known_parameters import known_parameters
 from legcal.refinement.moved import difference, judge_movement, noise_dof
 from legcal.refinement.solution import Solution
+from legcal.refinement.state import components
 from legcal.report.check_report import Check
 from legcal.report.earlier_result import EarlierResult, read_result
 from legcal.workers import worker_pool
@@ -208,9 +208,8 @@ def _compare(
         mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
     )
     movement = judge_movement(found, dof, changes, significance)
-    J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *arrays(solution.T_Rb_Re))[
-        :, :, columns
-    ]
+    poses = components(solution.T_Rb_Re)
+    J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *poses)[:, :, columns]
     # Priors pull what was found to the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / known.plausible**2
     spread = worse * G @ covariance + G @ known.covariance @ G.T

@@ -25,8 +25,7 @@ from legcal.observations.sets import reject_unused_legs
 from legcal.progress import Report, no_progress
 from legcal.refinement.choices import Choices, Prior
 from legcal.refinement.file_order import in_file_order
-from legcal.refinement.foretold import FittedModel
-from legcal.refinement.held_out import Expected, HeldOut, compare_held_out
+from legcal.refinement.held_out import HeldOut, compare_held_out
 from legcal.refinement.known_parameters import known_parameters
 from legcal.refinement.resolution import resolve
 from legcal.refinement.settings import DEFAULT_SETTINGS
@@ -160,19 +159,7 @@ def _compare_held_out(work: Workpiece, found: Found, split: Split) -> HeldOut:
     rows = inverse(work.order.rows)[split.kept_aside[aside.order.rows]]
     outlines = outlines_at(found.outlines, rows)
     outlines = reject_unused_legs(outlines, aside.measurements, aside.mechanism.leg_names)
-    legs = work.fitted_legs
-    model = FittedModel(
-        solution.legs,
-        legs.frame_legs,
-        solution.T_camera_Rb,
-        solution.cameras,
-        legs.radii | solution.radii,
-    )
-    expected = Expected(
-        solution.parametrization,
-        solution.kinematic_covariance,
-        solution.noise.covariance(outlines.covariance),
-        DEFAULT_SETTINGS.rejection,
-    )
     poses = aside.poses_by(solution.legs)
-    return compare_held_out(model, aside.measurements, outlines, poses, expected)
+    return compare_held_out(
+        solution.posterior, aside.measurements, outlines, poses, DEFAULT_SETTINGS.rejection
+    )

@@ -11,11 +11,12 @@ from legcal.refinement.contradictions import refuse_contradicted_priors
 from legcal.refinement.covariance import named_covariance, worst_directions
 from legcal.refinement.determinacy import Held, named_units
 from legcal.refinement.focal_length import focal_lengths
+from legcal.refinement.foretold import Posterior
 from legcal.refinement.linearize import Linearization, linearize, offsets_of
 from legcal.refinement.loss import width_to_k
 from legcal.refinement.minimise import robust_cost
 from legcal.refinement.noise import NoiseModel
-from legcal.refinement.normal import NormalEquations, information
+from legcal.refinement.normal import information
 from legcal.refinement.priors import named_values
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.rejections import rejection_reasons
@@ -49,7 +50,8 @@ def assemble_solution(
     linear = fit.minimum.linear
     whitening = fit.noise.whitening(problem.outlines.covariance, fit.accepted)
     normal = information(problem, state, linear, k)
-    covariance = named_covariance(problem, state, normal)
+    kept = normal.kept_covariance()
+    covariance = named_covariance(problem, state, kept)
     refuse_contradicted_priors(problem, state, normal)
     values, status = _values(problem, state), _status(problem, held)
     names = tuple(name for name in values if status[name] == "estimated")
@@ -76,7 +78,7 @@ def assemble_solution(
         names=names,
         covariance=estimated,
         sigma=np.sqrt(np.diagonal(estimated)),
-        kinematic_covariance=_of_kinematic(problem, normal),
+        kinematic_covariance=_of_kinematic(problem, kept),
         weak=worst_directions(estimated, names, named_units(problem, state)[where]),
         held=held.directions,
         cost=comparable_cost(problem, state, settings),
@@ -91,6 +93,7 @@ def assemble_solution(
         outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
+        posterior=Posterior(problem, state, fit.shifts, fit.noise, kept),
         notes=(
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
             *(str(f) for f in focal_lengths(problem, state, linear, whitening) if f.is_doubtful),
@@ -126,13 +129,13 @@ def _status(problem: FitProblem, held: Held) -> dict[str, Status]:
     return status | dict.fromkeys(held.names, "weak")
 
 
-def _of_kinematic(problem: FitProblem, normal: NormalEquations) -> Array:
+def _of_kinematic(problem: FitProblem, covariance: Array) -> Array:
     """Return the covariance of steps of all kinematic parameters, fixed ones too."""
     position = problem.layout.kinematic
     free = position < problem.layout.size
     wide = np.zeros((len(position), len(position)))
     n = problem.layout.n_kinematic
-    wide[np.ix_(free, free)] = normal.kept_covariance()[:n, :n]
+    wide[np.ix_(free, free)] = covariance[:n, :n]
     return wide
 
 

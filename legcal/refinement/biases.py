@@ -90,7 +90,11 @@ class SharedShifts:
         )
 
 
-def possible_shifts(outlines: ObservedOutlines, leg_names: Sequence[str]) -> SharedShifts:
+def possible_shifts(
+    outlines: ObservedOutlines,
+    leg_names: Sequence[str],
+    fitted: ObservedOutlines | None = None,
+) -> SharedShifts:
     """Return all shifts that outlines may share, with a standard deviation of one pixel.
 
     Shifts of many edges are inward; those of one part in a view are inward and sideways and
@@ -100,13 +104,16 @@ def possible_shifts(outlines: ObservedOutlines, leg_names: Sequence[str]) -> Sha
     ----------
     outlines : ObservedOutlines
     leg_names : sequence of str
+    fitted : ObservedOutlines, optional
+        Those with the same parts whose places say what change over the image one unit is, if not
+        these themselves: shifts of other images then mean the same.
     """
     o = outlines
     parts = [f"{leg_names[leg]}.{part}" for leg, part in o.parts]
     found, group = np.unique(np.column_stack([o.view, o.radius]), axis=0, return_inverse=True)
     group = group.ravel()
     inward, sideways = o.epsilon, np.full(len(o), SIDEWAYS)
-    x, y = _places_in_groups(o.pixels.mean(axis=1), group).T
+    x, y = _places_in_groups(o, o if fitted is None else fitted).T
     together = [f"{o.views[v]}.{parts[p]}.inward" for v, p in found.tolist()]
     aside = [f"{o.views[v]}.{parts[p]}.sideways" for v, p in found.tolist()]
     levels = [
@@ -151,12 +158,19 @@ def estimated_shifts(possible: SharedShifts, z: Array, K: Array) -> SharedShifts
     return possible.of_sizes(np.sqrt(variances))
 
 
-def _places_in_groups(places: Array, group: IntArray) -> Array:
-    """Return places (n, 2) from the middle of their groups, over the spread of all of them."""
-    if len(places) == 0:
-        return places
-    counts = np.bincount(group)
-    middle = np.stack([np.bincount(group, weights=x) / counts for x in places.T], axis=1)
-    away = places - middle[group]
-    spread = float(np.sqrt(np.mean(away**2)))
-    return np.asarray(away / spread if spread > 0.0 else np.zeros_like(away))
+def _places_in_groups(outlines: ObservedOutlines, others: ObservedOutlines) -> Array:
+    """Return places (n, 2) from the middle of others of the group, over the spread of all these.
+
+    Where a group has no others, places count as their middle.
+    """
+    n_parts = len(outlines.parts)
+    group, of_others = (o.view * n_parts + o.radius for o in (outlines, others))
+    places = others.pixels.mean(axis=1)
+    counts = np.bincount(of_others, minlength=len(others.views) * n_parts)
+    sums = [np.bincount(of_others, weights=x, minlength=len(counts)) for x in places.T]
+    middle = np.stack(sums, axis=1) / np.maximum(counts, 1)[:, None]
+    squares = np.sum((places - middle[of_others]) ** 2)
+    spread = float(np.sqrt(squares / (2 * len(places)))) if len(places) else 0.0
+    away = outlines.pixels.mean(axis=1) - middle[group]
+    known = (counts[group] > 0) & (spread > 0.0)
+    return np.where(known[:, None], away, 0.0) / (spread or 1.0)

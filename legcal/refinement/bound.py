@@ -44,7 +44,7 @@ def bound(problem: FitProblem, truth: Start, radii: Array | None = None) -> Arra
     whitening = NoiseModel().whitening(problem.outlines.covariance)
     normal = information(problem, state, linearize(problem, state, whitening), 0.0)
     open_directions(problem, state, normal)
-    return named_covariance(problem, state, normal)
+    return named_covariance(problem, state, normal.kept_covariance())
 
 
 def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:

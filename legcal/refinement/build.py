@@ -125,6 +125,37 @@ def build_fit(
     return problem
 
 
+def with_measurements(
+    problem: FitProblem,
+    measurements: Measurements,
+    outlines: ObservedOutlines,
+    biases: SharedShifts,
+) -> FitProblem:
+    """Return a problem with the same unknowns but shifts, and other images without axes.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    measurements : Measurements
+        Of the same views.
+    outlines : ObservedOutlines
+        Their outlines; the parts of the problem come first in theirs, others have known radii.
+    biases : SharedShifts
+        The shifts that these outlines share.
+    """
+    layout = problem.layout.of_poses(measurements.n_poses)
+    of_others = np.full(len(outlines.parts) - len(layout.parts), layout.size, dtype=np.intp)
+    radius = np.concatenate([layout.radius, of_others])
+    other = replace(
+        problem,
+        layout=replace(layout, radius=radius, parts=outlines.parts),
+        outlines=outlines,
+        readings=readings(measurements, problem.legs),
+        axes=observed_axes(None, measurements, problem.legs),
+    )
+    return with_biases(other, biases)
+
+
 def with_biases(problem: FitProblem, biases: SharedShifts) -> FitProblem:
     """Return a problem in which outlines share unknown shifts, in place of those it had.
 

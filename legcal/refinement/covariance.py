@@ -10,7 +10,6 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.refinement.normal import NormalEquations
 from legcal.refinement.priors import named_jacobian
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.state import State
@@ -37,19 +36,19 @@ class WeakDirection:
         return " ".join(f"{value:+.2f} {name}" for name, value in self.parts)
 
 
-def named_covariance(problem: FitProblem, state: State, normal: NormalEquations) -> Array:
+def named_covariance(problem: FitProblem, state: State, covariance: Array) -> Array:
     """Return the covariance (n_named, n_named) of the values of the named unknowns.
 
     Parameters
     ----------
     problem : FitProblem
     state : State
-    normal : NormalEquations
-        From :func:`legcal.refinement.normal.information` at the state.
+    covariance : (n_kept, n_kept) array
+        Of all unknowns but poses, as :func:`legcal.refinement.normal.information` has them.
     """
     n = problem.layout.n_named
     by_x = named_jacobian(state, problem.layout, problem.legs)
-    return np.asarray(by_x @ normal.kept_covariance()[:n, :n] @ by_x.T)
+    return np.asarray(by_x @ covariance[:n, :n] @ by_x.T)
 
 
 def worst_directions(

@@ -1,110 +1,118 @@
-"""Where a fitted model puts the outlines of legs at given poses of the platform."""
+"""What a fit knows, put to images that it has not seen."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
-from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
-from legcal.refinement.observed import feet_of_ends
-from legcal.vision.camera import Camera
-from legcal.vision.cylinder import outlines_of_axis
+from legcal.refinement.biases import SharedShifts, possible_shifts
+from legcal.refinement.build import with_measurements
+from legcal.refinement.noise import NoiseModel
+from legcal.refinement.observed import observed_outlines, of_parts, seen_by
+from legcal.refinement.problem import FitProblem
+from legcal.refinement.state import State, components
 
 
 @dataclass(frozen=True, eq=False)
-class FittedModel:
-    """Everything but the poses of the platform.
+class Foretold:
+    """Images that a fit has not seen, with all that it knows of them.
 
     Attributes
     ----------
-    legs : tuple of LegGeometry
-        The legs in R_b and R_e.
-    frame_legs : tuple of int
-        The legs that define R_b and R_e.
-    T_camera_Rb : tuple of RigidTransform
-        Camera poses, one a view.
-    cameras : tuple of Camera
-        Their intrinsics.
-    radii : mapping
-        Radius [m] for each (leg index, part).
+    problem : FitProblem
+        Their outlines and readings; its unknowns are those of the fit, with the shifts that these
+        outlines share.
+    state : State
+        Where the fit ended, at the poses of these images.
+    covariance : (n_kept, n_kept) array
+        What the fit says of all unknowns but poses; shifts that it has not met have their prior.
     """
 
-    legs: tuple[LegGeometry, ...]
-    frame_legs: tuple[int, ...]
-    T_camera_Rb: tuple[RigidTransform, ...]
-    cameras: tuple[Camera, ...]
-    radii: Mapping[tuple[int, str], float]
+    problem: FitProblem
+    state: State
+    covariance: Array
 
 
-class ForetoldOutlines:
-    """Measured outlines, ready to be compared with those of a model.
-
-    Parameters
-    ----------
-    model : FittedModel
-        The model.
-    measurements : Measurements
-        The images.
-    outlines : Outlines
-        Their outlines; all are taken.
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Where a fit ended, with the covariance of everything that is no pose.
 
     Attributes
     ----------
-    pose : (n,) array of int
-        The pose of each outline.
+    problem : FitProblem
+        With the shifts that outlines share.
+    state : State
+    shifts : SharedShifts
+    noise : NoiseModel
+    covariance : (n_kept, n_kept) array
+        Of parameters, radii, shifts, intrinsics and cameras, all together.
     """
 
-    def __init__(self, model: FittedModel, measurements: Measurements, outlines: Outlines) -> None:
-        self.pose = measurements.pose[outlines.row]
-        leg, view = outlines.leg, measurements.view[outlines.row]
-        self._A = np.array([leg.A for leg in model.legs])[leg]
-        self._B = np.array([leg.B for leg in model.legs])[leg]
-        parts = zip(leg.tolist(), outlines.part, strict=True)
-        self._radius = np.array([model.radii[key] for key in parts]).reshape(-1)
-        self._edge = outlines.edge - 1
-        T = np.array([T.as_matrix() for T in model.T_camera_Rb]).reshape(-1, 4, 4)[view]
-        self._R, self._t = T[:, :3, :3], T[:, :3, 3]
-        self._feet = np.zeros((len(leg), 2, 2))
-        self._to_pixels = np.zeros((len(leg), 2, 2, 2))
-        for v in np.unique(view).tolist():
-            here = view == v
-            self._feet[here], self._to_pixels[here] = feet_of_ends(
-                model.cameras[v], outlines.h[here], outlines.ends[here]
-            )
+    problem: FitProblem
+    state: State
+    shifts: SharedShifts
+    noise: NoiseModel
+    covariance: Array
 
-    def offsets(self, R: Array, t: Array) -> Array:
-        """Return how far measured outlines are from the foretold ones at both ends, (n, 2) [px].
+    def of_images(
+        self,
+        measurements: Measurements,
+        outlines: Outlines,
+        T_Rb_Re: Sequence[RigidTransform],
+    ) -> Foretold:
+        """Return what the fit knows of other images of the same views.
 
         Parameters
         ----------
-        R, t : (n_poses, 3, 3) and (n_poses, 3) array
-            Rotation and position [m] of R_e in R_b.
+        measurements : Measurements
+            The images.
+        outlines : Outlines
+            Their outlines; the used ones enter.
+        T_Rb_Re : sequence of RigidTransform
+            Their poses.
 
         Raises
         ------
-        NotVisible
-            If a camera stands inside a leg.
+        DatasetError
+            If an outline cannot be used.
         """
-        B = (R[self.pose] @ self._B[..., None])[..., 0] + t[self.pose]
-        A_camera, B_camera = (
-            (self._R @ point[..., None])[..., 0] + self._t for point in (self._A, B)
+        legs, state = self.problem.legs, self.state
+        found = of_parts(observed_outlines(outlines, measurements, legs), self.problem.layout.parts)
+        found = seen_by(found, state.cameras)
+        possible = possible_shifts(found, legs.names, self.problem.outlines)
+        shifts = possible.of_sizes(self.shifts.sigma)
+        problem = with_measurements(self.problem, measurements, found, shifts)
+        known = {self.problem.named[i]: i for i in self.problem.layout.bias.tolist()}
+        values = dict(zip(known, state.biases.tolist(), strict=True))
+        others = [legs.radii[part] for part in found.parts[len(state.radii) :]]
+        R, t = components(T_Rb_Re)
+        return Foretold(
+            problem,
+            replace(
+                state,
+                radii=np.append(state.radii, others),
+                biases=np.array([values.get(name, 0.0) for name in shifts.names]),
+                R_pose=R,
+                t_pose=t,
+            ),
+            self._covariance_of(problem, shifts),
         )
-        u = B_camera - A_camera
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        both = outlines_of_axis(u, A_camera, self._radius)
-        h = both[np.arange(len(both)), self._edge]
-        value = np.einsum("nei,ni->ne", self._feet, h[:, :2]) + h[:, 2:]
-        normal = np.einsum("neij,nj->nei", self._to_pixels, h[:, :2])
-        return np.asarray(value / np.sqrt(np.sum(normal**2, axis=2)))
 
-
-def arrays(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
-    """Return rotation matrices (n, 3, 3) and translations (n, 3) [m] of motions."""
-    T = np.array([T.as_matrix() for T in motions]).reshape(-1, 4, 4)
-    return T[:, :3, :3].copy(), T[:, :3, 3].copy()
+    def _covariance_of(self, problem: FitProblem, shifts: SharedShifts) -> Array:
+        """Return the covariance of the unknowns of a problem with other shifts."""
+        old, new = self.problem, problem.layout
+        place = {name: i for i, name in enumerate(old.named)}
+        cameras = range(old.layout.n_named, old.layout.n_kept)
+        where = np.array([*(place.get(name, -1) for name in problem.named), *cameras], np.intp)
+        is_known = where >= 0
+        covariance = np.zeros((new.n_kept, new.n_kept))
+        covariance[new.bias, new.bias] = shifts.sigmas**2
+        kept = where[is_known]
+        covariance[np.ix_(is_known, is_known)] = self.covariance[np.ix_(kept, kept)]
+        return covariance

@@ -12,17 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.errors import NotIdentifiable, NotVisible
 from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.parametrization import Parametrization
 from legcal.mechanism.platform import pose_differences
-from legcal.mechanism.sensitivity import pose_sensitivity
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
-from legcal.observations.sets import choose_outlines
-from legcal.refinement.foretold import FittedModel, ForetoldOutlines, arrays
+from legcal.refinement.foretold import Posterior
+from legcal.refinement.influence import explained_share
+from legcal.refinement.linearize import Linearization, linearize
+from legcal.refinement.normal import NormalEquations, of_one_kind
 from legcal.refinement.pose_by_outlines import poses_by_outlines
 
 _MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))  # of the norm of two unit Gaussians
+_SINGULAR = 1e-18  # of the largest eigenvalue of what readings say of a pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,16 +39,16 @@ class HeldOut:
         Outlines in them, and how many are far from where they should be, compared with the others
         and with their noise; they are left out of what follows.
     rms_px, expected_px : float or None
-        Root mean square of the offsets of the outlines [px], and what the noise of the fitted
-        ones lets expect. None without outlines.
+        Root mean square of the offsets of the outlines, without the shifts that they share with
+        fitted ones [px], and what is expected. None without outlines.
     rms_px_of_view : dict
         The same for each view that has some, by its name.
     displacement, rotation : (n_known,) array
         Distance [m] and angle [rad] between the platform by the readings and by the outlines alone,
         for each pose that its outlines determine.
     expected_displacement, expected_rotation : (n_known,) array
-        One standard deviation of these, by the noise of the outlines and the covariance of the
-        parameters [m, rad].
+        One standard deviation of these, by the noise of outlines and readings and the covariance
+        of all that the fit knows [m, rad].
     """
 
     n_images: int
@@ -93,49 +95,30 @@ class PlatformPair:
     expected_rotation: float
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """What a fit says of its own errors.
-
-    Attributes
-    ----------
-    parametrization : Parametrization
-        The kinematic parameters.
-    parameters : (p, p) array
-        Their covariance.
-    outlines : (n, 2, 2) array
-        Covariance of the offsets of the outlines at both ends [px^2].
-    rejection : float
-        Whitened distance beyond which the fit rejects an outline.
-    """
-
-    parametrization: Parametrization
-    parameters: Array
-    outlines: Array
-    rejection: float
-
-
 def compare_held_out(
-    model: FittedModel,
+    posterior: Posterior,
     measurements: Measurements,
     outlines: Outlines,
     T_Rb_Re: Sequence[RigidTransform],
-    expected: Expected,
+    rejection: float,
 ) -> HeldOut:
     """Compare images that were kept aside with what a fit of others foretells.
 
+    Shifts that the outlines share with those of the fit are taken off. What is expected has the
+    noise of the outlines, that of the readings, and the covariance of all that the fit knows.
+
     Parameters
     ----------
-    model : FittedModel
+    posterior : Posterior
         The fit.
     measurements : Measurements
         The images that were kept aside.
     outlines : Outlines
         Their outlines; the used ones are compared.
     T_Rb_Re : sequence of RigidTransform
-        Their poses by the model and the readings.
-    expected : Expected
-        What the fit says of its errors; its ``outlines`` are those of the table that came in.
+        Their poses by the fit and the readings.
+    rejection : float
+        Whitened distance beyond which the fit rejects an outline.
 
     Returns
     -------
@@ -143,40 +126,75 @@ def compare_held_out(
 
     Raises
     ------
+    NotIdentifiable
+        If the readings do not determine the poses.
     NotVisible
         If a camera stands inside a leg.
     """
-    used = choose_outlines(outlines, outlines.used)
-    covariance = expected.outlines[outlines.used]
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    foretold = ForetoldOutlines(model, measurements, used)
-    R, t = arrays(T_Rb_Re)
-    offsets = foretold.offsets(R, t)
-    norm = np.linalg.norm((whitening @ offsets[..., None])[..., 0], axis=1)
-    limit = expected.rejection * _usual(norm)
+    foretold = posterior.of_images(measurements, outlines, T_Rb_Re)
+    problem, state = foretold.problem, foretold.state
+    noise = posterior.noise.covariance(problem.outlines.covariance)
+    L = np.linalg.cholesky(noise)
+    whitening = np.linalg.inv(L)
+    linear = linearize(problem, state, whitening)
+    _refuse_unseen(linear)
+    readings = of_one_kind(problem, state, linear, "readings")
+    _refuse_undetermined(readings)
+    places, of_fit = problem.outline_places, foretold.covariance
+    expected = np.eye(2) + explained_share(places, linear.outlines, readings, of_fit)
+    offsets = (L @ linear.outlines.r[..., None])[..., 0]
+    norm = _norms(linear.outlines.r, expected)
+    limit = rejection * _usual(norm)
     right = norm < limit
-    view = measurements.view[used.row]
-    shown = poses_by_outlines(model, foretold, whitening, T_Rb_Re, limit)
-    known = np.flatnonzero(shown.known).tolist()
+    pixels = np.einsum("nij,njk,nik->ni", L, expected, L)
+    shown = poses_by_outlines(foretold, whitening, limit)
+    known = shown.known.tolist()
     displacement, rotation = pose_differences(
         [shown.T_Rb_Re[k] for k in known], [T_Rb_Re[k] for k in known]
     )
-    J = pose_sensitivity(model.legs, expected.parametrization, model.frame_legs, R[known], t[known])
-    both = shown.covariance[known] + J @ expected.parameters @ J.swapaxes(1, 2)
-    variance = np.einsum("kii->ki", both)
+    variance = np.einsum("kii->ki", shown.covariance)
     return HeldOut(
         n_images=measurements.n_rows,
         n_poses=measurements.n_poses,
-        outlines=len(used),
+        outlines=len(problem.outlines),
         wrong=int(np.sum(~right)),
         rms_px=_rms(offsets[right]),
-        expected_px=_rms(np.sqrt(np.einsum("nii->ni", covariance[right]))),
-        rms_px_of_view=_of_views(measurements, view[right], offsets[right]),
+        expected_px=_rms(np.sqrt(pixels[right])),
+        rms_px_of_view=_of_views(measurements, problem.outlines.view[right], offsets[right]),
         displacement=displacement,
         rotation=rotation,
         expected_displacement=np.sqrt(variance[:, 3:].sum(axis=1)),
         expected_rotation=np.sqrt(variance[:, :3].sum(axis=1)),
     )
+
+
+def _refuse_undetermined(readings: NormalEquations) -> None:
+    """Raise NotIdentifiable where readings do not determine a pose."""
+    value = np.linalg.eigvalsh(readings.V)
+    bad = np.flatnonzero(value[:, 0] <= _SINGULAR * value[:, -1])
+    if len(bad):
+        raise NotIdentifiable(
+            "The images that were kept aside could not be compared with what the fit foretells: "
+            f"found readings that leave platform pose {bad[0] + 1} of them open, needed readings "
+            "that determine every pose; leave out --holdout."
+        )
+
+
+def _refuse_unseen(linear: Linearization) -> None:
+    """Raise NotVisible where a camera stands inside a leg."""
+    bad = int(np.sum(~np.isfinite(linear.outlines.r).all(axis=1)))
+    if bad:
+        raise NotVisible(
+            "The images that were kept aside could not be compared with what the fit foretells: "
+            f"found {bad} outlines of legs that a camera stands inside by their readings, needed "
+            "cameras outside the legs; check the readings."
+        )
+
+
+def _norms(r: Array, covariance: Array) -> Array:
+    """Return how many standard deviations residuals (n, 2) are off, (n,)."""
+    inverse = np.linalg.inv(covariance)
+    return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", r, inverse, r)))
 
 
 def _usual(norm: Array) -> float:

@@ -25,16 +25,30 @@ def reduced_jacobian(where: Places, rows: Rows, normal: NormalEquations) -> Arra
     return np.asarray(G - J_pose @ follow[pose])
 
 
-def explained_share(where: Places, rows: Rows, normal: NormalEquations) -> Array:
+def explained_share(
+    where: Places, rows: Rows, normal: NormalEquations, covariance: Array | None = None
+) -> Array:
     """Return the covariance (n, q, q) of the predicted whitened residuals of every measurement.
 
-    The residuals of a right fit have covariance one minus this.
+    The residuals of a right fit have covariance one minus this, those of what it has not seen one
+    plus this.
+
+    Parameters
+    ----------
+    where, rows
+        Of the measurements.
+    normal : NormalEquations
+        Of what tells their poses.
+    covariance : (n_kept, n_kept) array, optional
+        Of the kept unknowns, if it is not that of these equations.
     """
     G = reduced_jacobian(where, rows, normal)
+    if covariance is None:
+        covariance = normal.kept_covariance()
     J_pose = rows.J_pose
     if normal.tangent is not None:
         J_pose = J_pose @ normal.tangent.Z[where.pose]
-    share = (G @ normal.kept_covariance()) @ np.swapaxes(G, -1, -2)
+    share = (G @ covariance) @ np.swapaxes(G, -1, -2)
     through_pose = J_pose @ normal.V_inverse[where.pose]
     return np.asarray(share + through_pose @ np.swapaxes(J_pose, -1, -2))
 

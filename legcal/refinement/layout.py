@@ -7,7 +7,7 @@ order; it holds changes of a state [m, rad, px].
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,6 +68,23 @@ class Layout:
         """Number of unknowns that have a name and a prior: all but cameras and poses."""
         cameras = self.camera[self.camera < self.size]
         return int(cameras.min()) if cameras.size else self.n_kept
+
+    def of_poses(self, n_poses: int) -> Layout:
+        """Return the layout of the same unknowns with another number of platform poses."""
+        size = self.n_kept + 6 * n_poses
+
+        def marked(position: IntArray) -> IntArray:
+            return np.where(position < self.size, position, size)
+
+        return replace(
+            self,
+            place=marked(self.place),
+            kinematic=marked(self.kinematic),
+            radius=marked(self.radius),
+            intrinsic=marked(self.intrinsic),
+            camera=marked(self.camera),
+            n_poses=n_poses,
+        )
 
 
 def lay_out(

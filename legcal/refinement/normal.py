@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, null_space
@@ -153,6 +154,21 @@ def information(
         (problem.axis_places, linear.axes.scaled(np.sqrt(efficiency(k, 4)))),
     ]
     sums = summed(kinds, problem.layout.n_kept, problem.layout.n_poses)
+    return _constrained(problem, state, linear, sums)
+
+
+def of_one_kind(
+    problem: FitProblem, state: State, linear: Linearization, kind: Literal["outlines", "readings"]
+) -> NormalEquations:
+    """Return the normal equations of one kind of measurements and the priors, plain squares.
+
+    Their poses are those that this kind alone tells: V and W are without the other kinds.
+    """
+    of_kind = {
+        "outlines": (problem.outline_places, linear.outlines),
+        "readings": (problem.reading_places, linear.readings),
+    }
+    sums = summed([of_kind[kind]], problem.layout.n_kept, problem.layout.n_poses)
     return _constrained(problem, state, linear, sums)
 
 

@@ -145,6 +145,20 @@ def observed_outlines(
     )
 
 
+def of_parts(outlines: ObservedOutlines, parts: Sequence[tuple[int, str]]) -> ObservedOutlines:
+    """Return the same outlines with their radii counted in given parts, then in those of no other.
+
+    Parameters
+    ----------
+    outlines : ObservedOutlines
+    parts : sequence of (int, str)
+        Leg index and part of each radius.
+    """
+    together = tuple(dict.fromkeys((*parts, *outlines.parts)))
+    number = np.array([together.index(part) for part in outlines.parts], dtype=np.intp)
+    return replace(outlines, radius=number[outlines.radius], parts=together)
+
+
 def seen_by(outlines: ObservedOutlines, cameras: Sequence[Camera]) -> ObservedOutlines:
     """Return the same outlines in the image, on the sensor planes of other cameras.
 

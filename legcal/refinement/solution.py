@@ -16,6 +16,7 @@ from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.parametrization import Parametrization
 from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import WeakDirection
+from legcal.refinement.foretold import Posterior
 from legcal.refinement.noise import NoiseModel
 from legcal.vision.camera import Camera
 
@@ -107,6 +108,9 @@ class Solution:
         Label of the start that led here.
     iterations : int
         Steps of the solver, all rounds.
+    posterior : Posterior
+        What it says of images that it has not seen; always in the order of the measurements that
+        were fitted.
     notes : tuple of str
         What else a reader should know, one sentence each.
     """
@@ -138,6 +142,7 @@ class Solution:
     outlines: Outlines
     start: str
     iterations: int
+    posterior: Posterior
     notes: tuple[str, ...] = ()
 
     @property
