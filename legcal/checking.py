@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ from legcal.refinement.solution import Solution
 from legcal.refinement.state import components
 from legcal.report.check_report import Check
 from legcal.report.earlier_result import EarlierResult, read_result
+from legcal.vision.intrinsics import camera_numbers, intrinsic_names
 from legcal.workers import worker_pool
 from legcal.workpiece import workpiece
 
@@ -109,11 +110,28 @@ def check_significance(significance: float) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
 class _Known:
-    """The parameters that may have moved, where they were, and how far they may be now."""
+    """The parameters that may have moved, where they were, and how far they may be now.
 
-    def __init__(self, names: Sequence[str], old: Array, plausible: Array, covariance: Array):
-        self.names, self.old, self.plausible, self.covariance = names, old, plausible, covariance
+    Attributes
+    ----------
+    names : tuple of str
+    old : (n,) array
+        Their earlier values.
+    covariance : (n, n) array
+        That of these, room along what was held included.
+    plausible : (n,) array
+        Standard deviations that leave room for whatever moved [m, rad].
+    furthest : float
+        That along directions that are held [m].
+    """
+
+    names: tuple[str, ...]
+    old: Array
+    covariance: Array
+    plausible: Array
+    furthest: float
 
 
 def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
@@ -153,18 +171,17 @@ def _known(dataset: Dataset, earlier: EarlierResult) -> _Known:
     mechanism = dataset.mechanism
     legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
     values = vector_of(found, legs, legs)
-    compared = {*earlier.names, *earlier.weak}
-    chosen = [i for i, name in enumerate(found.names) if name in compared]
-    names = [found.names[i] for i in chosen]
+    chosen = [found.names.index(name) for name in earlier.names]
     length = float(np.mean([np.linalg.norm(vector) for vector in _leg_vectors(mechanism)]))
     plausible = np.array([_PLAUSIBLE * (length if found.units[i] == "m" else 1.0) for i in chosen])
-    covariance = np.zeros((len(names), len(names)))
-    weak = [i for i, name in enumerate(names) if name not in earlier.names]
-    covariance[weak, weak] = plausible[weak] ** 2
-    place = [earlier.names.index(name) for name in names if name in earlier.names]
-    at = [i for i, name in enumerate(names) if name in earlier.names]
-    covariance[np.ix_(at, at)] = earlier.covariance[np.ix_(place, place)]
-    return _Known(names, values[chosen], plausible, covariance)
+    furthest = _PLAUSIBLE * length
+    covariance = _with_held(earlier.covariance, earlier.held, furthest)
+    return _Known(earlier.names, values[chosen], covariance, plausible, furthest)
+
+
+def _with_held(covariance: Array, held: Array, furthest: float) -> Array:
+    """Return a covariance with room along what was held, of which nothing is known."""
+    return np.asarray(covariance + furthest**2 * held.T @ held)
 
 
 def _leg_vectors(mechanism: Mechanism) -> Array:
@@ -178,13 +195,19 @@ def _choices(dataset: Dataset, earlier: EarlierResult, known: _Known) -> Choices
         name: Prior(float(mean), float(sigma))
         for name, mean, sigma in zip(known.names, known.old, known.plausible, strict=True)
     }
-    cameras = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
-    for name, parameter in cameras.items():
-        for other, (nominal, value, sigma) in earlier.intrinsics.items():
-            same = name.rsplit(".", 1)[1] == other.rsplit(".", 1)[1]
-            if parameter.kind == "intrinsic" and same and parameter.nominal == nominal:
-                priors[name] = Prior(value, sigma)
-    return Choices(fixed=frozenset(earlier.fixed), priors=priors)
+    for view in dataset.measurements.views:
+        for owner, numbers in earlier.cameras.items():
+            if numbers != camera_numbers(view.camera):
+                continue
+            for key in intrinsic_names(view.camera):
+                if f"{owner}.{key}" in earlier.intrinsics:
+                    priors[f"{view.name}.{key}"] = Prior(*earlier.intrinsics[f"{owner}.{key}"])
+    owned = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
+    return Choices(
+        fixed=frozenset(earlier.fixed),
+        priors={name: prior for name, prior in priors.items() if name in owned},
+        least_shared_px=earlier.shared_px,
+    )
 
 
 def _compare(
@@ -195,15 +218,18 @@ def _compare(
     significance: float,
 ) -> Check:
     """Return what the fit of the new images says against the earlier result."""
-    where = [solution.names.index(name) for name in known.names]
+    mechanism, parametrization = dataset.mechanism, solution.parametrization
+    columns = [parametrization.names.index(name) for name in known.names]
     values = np.array([solution.values[name] for name in known.names])
-    covariance = solution.covariance[np.ix_(where, where)]
+    covariance = _with_held(
+        solution.value_covariance[np.ix_(columns, columns)],
+        solution.held_basis[:, columns],
+        known.furthest,
+    )
     worse = _earlier_noise(solution, earlier)
     found = difference(values, covariance, known.plausible, known.old, known.covariance, worse)
     dof = noise_dof(solution.dof, covariance, known.plausible) if worse == 1.0 else earlier.dof
-    mechanism = dataset.mechanism
-    legs, parametrization = geometries(mechanism), solution.parametrization
-    columns = [parametrization.names.index(name) for name in known.names]
+    legs = geometries(mechanism)
     changes = possible_changes(
         mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
     )

@@ -18,8 +18,7 @@ from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
 from legcal.mechanism.leg_steps import moved_legs
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
-from legcal.report.axis_turns import nominal_axes, turns_between
-from legcal.report.earlier_result import read_result
+from legcal.report.axis_turns import turns_between
 from legcal.simulation.simulate import simulate
 
 MODEL = "3-rpr"
@@ -142,6 +141,22 @@ def _other_covariance(folder: Path, document: dict[str, Any]) -> None:
     document["covariance"][0][1] *= -1.0
 
 
+def _other_kinematic_covariance(folder: Path, document: dict[str, Any]) -> None:
+    document["kinematic"]["covariance"][0][1] += 1.0
+
+
+def _other_kinematic_names(folder: Path, document: dict[str, Any]) -> None:
+    document["kinematic"]["names"][0] = "leg9.base.x"
+
+
+def _short_held_direction(folder: Path, document: dict[str, Any]) -> None:
+    document["kinematic"]["held"].append([1.0])
+
+
+def _unknown_shared_error(folder: Path, document: dict[str, Any]) -> None:
+    document["residuals"]["shared_px"]["bias of nothing"] = 0.1
+
+
 def _negative_sigma(folder: Path, document: dict[str, Any]) -> None:
     document["parameters"][0]["sigma"] = -1e-5
 
@@ -171,6 +186,10 @@ def _no_model(folder: Path, document: dict[str, Any]) -> None:
         (_later_version, "legcal_result could not be read: found 2"),
         (_short_covariance, r"found \d+ rows of \d+ numbers"),
         (_other_covariance, "needed a covariance of the"),
+        (_other_kinematic_covariance, "found another matrix in 'kinematic'"),
+        (_other_kinematic_names, r"found those of \d+ others"),
+        (_short_held_direction, "found rows of other lengths"),
+        (_unknown_shared_error, "found the shared errors 'bias of nothing', needed bias of many"),
         (_negative_sigma, "sigma could not be read"),
         (_missing_parameter, "found other values of leg"),
         (_other_value, "found other values of leg"),
@@ -236,23 +255,16 @@ def test_an_image_that_says_nothing_is_refused(result: Path, images: Path, tmp_p
         check(blank, result)
 
 
-def test_a_result_whose_platform_axes_turned_is_read_again(tmp_path: Path) -> None:
-    made = simulate("tricept", tmp_path / "set", settings(poses=8, views=2))
-    calibrate(made.folder, output=tmp_path / "result")
-    assert "centre.twist" in read_result(tmp_path / "result").names
-
-
 @pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])
 def test_covariances_of_turned_axes_are_taken_along(model: str) -> None:
     mechanism = load_mechanism(model)
-    nominal, found = geometries(mechanism), parametrization_of(mechanism)
+    nominal, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
     rng = np.random.default_rng(4)
     is_angle = np.array(found.units) == "rad"
     far = np.where(is_angle, rng.uniform(-0.1, 0.1, len(found)), 0.0)
     calibrated = moved_legs(nominal, found.place, far)
     start, here = (vector_of(found, calibrated, legs) for legs in (nominal, calibrated))
-    values = dict(zip(found.names, start.tolist(), strict=True))
-    turns = turns_between(nominal_axes(mechanism.leg_names, nominal), values, found.names)
+    turns = turns_between(found, calibrated, nominal)
     for i in np.flatnonzero(is_angle):
         step = np.zeros(len(found))
         step[i] = 1e-6

@@ -79,6 +79,8 @@ def assemble_solution(
         covariance=estimated,
         sigma=np.sqrt(np.diagonal(estimated)),
         kinematic_covariance=_of_kinematic(problem, kept),
+        value_covariance=_of_kinematic(problem, covariance),
+        held_basis=_held_values(problem, held),
         weak=worst_directions(estimated, names, named_units(problem, state)[where]),
         held=held.directions,
         cost=comparable_cost(problem, state, settings),
@@ -130,12 +132,20 @@ def _status(problem: FitProblem, held: Held) -> dict[str, Status]:
 
 
 def _of_kinematic(problem: FitProblem, covariance: Array) -> Array:
-    """Return the covariance of steps of all kinematic parameters, fixed ones too."""
+    """Return of the covariance of unknowns that of all kinematic parameters, fixed ones too."""
     position = problem.layout.kinematic
     free = position < problem.layout.size
     wide = np.zeros((len(position), len(position)))
     n = problem.layout.n_kinematic
     wide[np.ix_(free, free)] = covariance[:n, :n]
+    return wide
+
+
+def _held_values(problem: FitProblem, held: Held) -> Array:
+    """Return how the values of all kinematic parameters change along what is held (w, p)."""
+    position, n = problem.layout.kinematic, problem.layout.n_kinematic
+    wide = np.zeros((len(held.basis), len(position)))
+    wide[:, position < problem.layout.size] = (held.basis * held.unit)[:, :n]
     return wide
 
 

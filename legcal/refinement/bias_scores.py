@@ -69,7 +69,9 @@ def scores_of_shifts(
     else:
         inverse = inverse_on_range(S_others)
     K = S[np.ix_(bias, bias)] - np.diag(of_prior) - S_mixed.T @ inverse @ S_mixed
-    K = 0.5 * (K + K.T)
+    # A difference of what nearly cancels where images determine little: rounded below zero.
+    value, vector = np.linalg.eigh(0.5 * (K + K.T))
+    K = (vector * np.maximum(value, 0.0)) @ vector.T
     left = g[bias] - of_prior * state.biases - S_mixed.T @ inverse @ g[others]
     return K @ state.biases - left, K
 

@@ -144,7 +144,9 @@ def possible_shifts(
     )
 
 
-def estimated_shifts(possible: SharedShifts, z: Array, K: Array) -> SharedShifts:
+def estimated_shifts(
+    possible: SharedShifts, z: Array, K: Array, least: Array | float = 0.0
+) -> SharedShifts:
     """Return the shifts that the residuals show: none at all where they are white.
 
     Parameters
@@ -153,9 +155,11 @@ def estimated_shifts(possible: SharedShifts, z: Array, K: Array) -> SharedShifts
     z, K : (b,) and (b, b) array
         Scores of all of them and their covariance, as :class:`legcal.refinement.variances.Effects`
         has them [1/px, 1/px^2].
+    least : (N_KINDS,) array
+        Standard deviations that are known from elsewhere, where the residuals show less [px].
     """
     variances, _ = estimate_variances(Effects(z, K, possible.kind), _LEAST_GAIN)
-    return possible.of_sizes(np.sqrt(variances))
+    return possible.of_sizes(np.maximum(np.sqrt(variances), least))
 
 
 def _places_in_groups(outlines: ObservedOutlines, others: ObservedOutlines) -> Array:

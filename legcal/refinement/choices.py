@@ -35,6 +35,9 @@ class Choices:
         the nominal axis.
     notes : tuple of str
         What gave way to what.
+    least_shared_px : mapping
+        Standard deviations that errors which outlines share have at least, by what they are
+        (:data:`legcal.refinement.biases.KINDS`) [px].
     """
 
     fixed: frozenset[str] = frozenset()
@@ -42,6 +45,7 @@ class Choices:
     priors: Mapping[str, Prior] = field(default_factory=dict)
     values: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    least_shared_px: Mapping[str, float] = field(default_factory=dict)
 
     def holds(self, name: str, *, by_default: bool = False) -> bool:
         """Say whether a parameter is held; ``by_default``: whether it is without a choice."""
@@ -56,6 +60,7 @@ class Choices:
             "fixed_at": dict(sorted(self.values.items())),
             "free": sorted(self.free),
             "priors": {name: [p.mean, p.sigma] for name, p in sorted(self.priors.items())},
+            "least_shared_px": dict(sorted(self.least_shared_px.items())),
         }
         return {key: value for key, value in found.items() if value}
 

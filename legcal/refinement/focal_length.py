@@ -21,6 +21,7 @@ from legcal.refinement.state import State, intrinsic_of
 from legcal.vision.intrinsics import shared_cameras, undistort_derivatives
 
 _SIGNIFICANT = 5.0  # standard deviations
+_ROUNDED = 1e-9  # relative: what is left of a difference of equals
 _KEYS = ("fx", "fy")
 
 
@@ -104,15 +105,18 @@ def focal_lengths(
     columns = whitening @ np.stack(changes, axis=-1)
     normal = normal_equations(problem, state, linear, 0.0)
     score, information = _left_by_the_fit(problem, linear, normal, columns)
-    seen = np.diagonal(information) > 0.0
-    covariance = np.linalg.pinv(information, hermitian=True)
-    change, sigma = -covariance @ score, np.sqrt(np.diagonal(covariance))
+    whole = np.sum(columns**2, axis=(0, 1))
+    seen = np.flatnonzero(np.diagonal(information) > _ROUNDED * whole)
+    covariance = np.linalg.pinv(information[np.ix_(seen, seen)], rcond=_ROUNDED, hermitian=True)
+    change, sigma = -covariance @ score[seen], np.sqrt(np.diagonal(covariance))
     return tuple(
         FocalLength(
-            owner, intrinsic_of(state.cameras[owners.index(owner)], "fx"), float(d), float(s)
+            tested[i],
+            intrinsic_of(state.cameras[owners.index(tested[i])], "fx"),
+            float(d),
+            float(s),
         )
-        for owner, d, s, is_seen in zip(tested, change, sigma, seen, strict=True)
-        if is_seen
+        for i, d, s in zip(seen.tolist(), change, sigma, strict=True)
     )
 
 

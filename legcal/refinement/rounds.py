@@ -7,7 +7,13 @@ import numpy as np
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array, BoolArray
 from legcal.refinement.bias_scores import scores_of_shifts, with_shifts
-from legcal.refinement.biases import N_KINDS, SharedShifts, estimated_shifts, possible_shifts
+from legcal.refinement.biases import (
+    KINDS,
+    N_KINDS,
+    SharedShifts,
+    estimated_shifts,
+    possible_shifts,
+)
 from legcal.refinement.build import with_biases
 from legcal.refinement.influence import explained_share
 from legcal.refinement.linearize import linearize, offsets_of
@@ -90,6 +96,7 @@ def fit_in_rounds(
     claimed, noise = problem.outlines.covariance, NoiseModel()
     accepted = np.ones(len(claimed), dtype=np.bool_)
     possible = possible_shifts(problem.outlines, problem.legs.names)
+    least = np.array([problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS])
     state, shifts = first, possible.of_sizes(np.zeros(N_KINDS))
 
     def solved(near_enough: float = 0.0) -> Minimum:
@@ -117,7 +124,7 @@ def fit_in_rounds(
             break
         whitening = noise.whitening(claimed, accepted)
         scores = scores_of_shifts(problem, state, whitening, possible, asked)
-        shifts = estimated_shifts(possible, *scores)
+        shifts = estimated_shifts(possible, *scores, least)
         if len(shifts) or len(state.biases):
             problem, state = with_shifts(problem, state, shifts)
             minimum = solved()

@@ -77,6 +77,11 @@ class Solution:
         :func:`legcal.mechanism.leg_steps.moved_legs` and
         :func:`legcal.mechanism.sensitivity.pose_sensitivity` have them (axes turn about the
         vectors of where they are); zero where they are fixed, and along what is held.
+    value_covariance : (p, p) array
+        The same of the values of all kinematic parameters, axes as angles from the nominal axis.
+    held_basis : (w, p) array
+        How these values change along each direction that is held, by a metre: angles count at the
+        mean length of the legs. As a set of metres, orthonormal but for what is not kinematic.
     weak : tuple of WeakDirection
         The directions of the estimated parameters known worst, worst first.
     held : tuple of str
@@ -128,6 +133,8 @@ class Solution:
     covariance: Array
     sigma: Array
     kinematic_covariance: Array
+    value_covariance: Array
+    held_basis: Array
     weak: tuple[WeakDirection, ...]
     held: tuple[str, ...]
     cost: float

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import turn_of
+from legcal.mechanism.leg_steps import moved_legs, turn_of
+from legcal.mechanism.parametrization import Parametrization, vector_of
 
-_STEP = 1e-6  # [rad]
+_STEP = 1e-6  # [m or rad]
 
 Axes = Mapping[str, Sequence[float]]  # by leg name, in R_b or R_e
 
@@ -38,29 +38,32 @@ def nominal_axes(
 
 
 def turns_between(
-    nominal: Mapping[str, Axes], values: Mapping[str, float], names: Sequence[str]
+    parametrization: Parametrization,
+    calibrated: Sequence[LegGeometry],
+    nominal: Sequence[LegGeometry],
 ) -> Array:
-    """Return the derivative (n, n) of parameters with calibrated axes by those with nominal ones.
+    """Return the derivative (p, p) of parameters with calibrated axes by those with nominal ones.
+
+    Twists, which are tied to axes, depend on these and on the turns of the axes.
 
     Parameters
     ----------
-    nominal : mapping
-        What :func:`nominal_axes` gave.
-    values : mapping
-        All parameters by name, axes as turns of the nominal ones.
-    names : sequence of str
+    parametrization : Parametrization
         The parameters of rows and columns.
+    calibrated, nominal : sequence of LegGeometry
+        The legs at which the derivative is taken, and those whose axes counted as zero before.
     """
-    place = {name: i for i, name in enumerate(names)}
-    turns = np.eye(len(names))
-    for side, axes in nominal.items():
-        for leg, axis in axes.items():
-            both = [f"{leg}.{side}_axis.{k}" for k in (1, 2)]
-            kept = [k for k in range(2) if both[k] in place]
-            at = [place[both[k]] for k in kept]
-            w = np.array([values.get(name, 0.0) for name in both])
-            turns[np.ix_(at, at)] = _turns_of(np.array(axis), w)[np.ix_(kept, kept)]
-    return turns
+    by_step = []
+    for start in (calibrated, nominal):
+        columns = []
+        for step in _STEP * np.eye(len(parametrization)):
+            ahead, behind = (
+                vector_of(parametrization, moved_legs(calibrated, parametrization.place, by), start)
+                for by in (step, -step)
+            )
+            columns.append((ahead - behind) / (2.0 * _STEP))
+        by_step.append(np.column_stack(columns))
+    return np.asarray(np.linalg.solve(by_step[1].T, by_step[0].T).T)
 
 
 def calibrated_axis(
@@ -69,15 +72,3 @@ def calibrated_axis(
     """Return the axis (3,) that a result has, from the nominal one and its turns."""
     w = np.array([values.get(f"{leg}.{side}_axis.{k}", 0.0) for k in (1, 2)])
     return np.asarray(turn_of(np.array(nominal), w).apply(nominal))
-
-
-def _turns_of(nominal: Array, w: Array) -> Array:
-    """Return the derivative (2, 2) of turns of the calibrated axis by those of the nominal one."""
-    axis = turn_of(nominal, w).apply(nominal)
-    columns = []
-    for k in range(2):
-        ends = [
-            turn_of(nominal, w + step * np.eye(2)[k]).apply(nominal) for step in (-_STEP, _STEP)
-        ]
-        columns.append(normal_basis(axis) @ np.cross(axis, (ends[1] - ends[0]) / (2.0 * _STEP)))
-    return np.column_stack(columns)

@@ -81,7 +81,7 @@ class Check:
             "p_value": movement.p_value,
             "statistic": movement.statistic,
             "dof": movement.dof,
-            "of": len(self.earlier.names) + len(self.earlier.weak),
+            "of": len(self.earlier.names),
             "noise_dof": movement.noise_dof,
             "verdict": self.sentence,
             "explanations": [_explanation(e) for e in movement.explanations],
@@ -111,7 +111,7 @@ def check_summary(check: Check) -> RenderableType:
     lines = [f"Note: {note}" for note in check.notes]
     lines.append(
         f"{images} image{'s' * (images != 1)} compared with {check.earlier.folder}: {movement.dof} "
-        f"of {len(check.earlier.names) + len(check.earlier.weak)} directions of the parameters, "
+        f"of {len(check.earlier.names)} directions of the parameters, "
         f"statistic {movement.statistic:.1f}."
     )
     lines += _explanation_lines(movement)

@@ -19,6 +19,7 @@ from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
+from legcal.refinement.biases import KINDS
 from legcal.refinement.noise import NoiseModel
 from legcal.report.axis_turns import Axes, calibrated_axis, nominal_axes, turns_between
 
@@ -50,12 +51,22 @@ class _Noise(BaseModel):
     tilt_px: Annotated[Number, Field(ge=0.0)]
 
 
+class _Kinematic(BaseModel):
+    """What is known of all kinematic parameters."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    names: list[str]
+    covariance: list[list[Number]]
+    held: list[list[Number]]
+
+
 class _Residuals(BaseModel):
     """What was left of the observations."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
     dof: int
     noise: _Noise
+    shared_px: dict[str, Annotated[Number, Field(ge=0.0)]]
 
 
 class _Document(BaseModel):
@@ -68,6 +79,8 @@ class _Document(BaseModel):
     parameters: Annotated[list[_Row], Field(min_length=1)]
     nominal_axes: dict[str, dict[str, _Axis]]
     covariance: list[list[Number]]
+    kinematic: _Kinematic
+    cameras: dict[str, dict[str, Number | str]]
     residuals: _Residuals
 
 
@@ -82,17 +95,23 @@ class EarlierResult:
     mechanism : Mechanism
         The calibrated model.
     names : tuple of str
-        The estimated kinematic parameters.
+        The kinematic parameters that were looked for: estimated ones, and those of which the
+        calibration says nothing along some direction.
     covariance : (n, n) array
-        Their covariance; axes count from the calibrated ones [m, rad].
+        Their covariance, zero along what was held; axes count from the calibrated ones [m, rad].
+    held : (w, n) array
+        How they change along the directions that were held, by a metre.
     fixed : tuple of str
         Kinematic parameters that were fixed.
-    weak : tuple of str
-        Kinematic parameters of which the calibration says nothing.
     intrinsics : mapping
-        (nominal value, value, sigma) of intrinsics that were looked for, by name.
+        (value, sigma) of intrinsics that were looked for, by name.
+    cameras : mapping
+        What :func:`legcal.vision.intrinsics.camera_numbers` says of the cameras as they came, by
+        the view that intrinsics are named after.
     noise : NoiseModel
         The noise of its outlines.
+    shared_px : mapping
+        Standard deviations of the errors that its outlines share, by what they are [px].
     dof : int
         Degrees of freedom that it is known from.
     """
@@ -101,10 +120,12 @@ class EarlierResult:
     mechanism: Mechanism
     names: tuple[str, ...]
     covariance: Array
+    held: Array
     fixed: tuple[str, ...]
-    weak: tuple[str, ...]
-    intrinsics: Mapping[str, tuple[float, float, float]]
+    intrinsics: Mapping[str, tuple[float, float]]
+    cameras: Mapping[str, Mapping[str, float | str]]
     noise: NoiseModel
+    shared_px: Mapping[str, float]
     dof: int
 
 
@@ -154,34 +175,76 @@ def _assembled(path: Path, document: _Document, mechanism: Mechanism) -> Earlier
     estimated = [row for row in rows if row.status == "estimated"]
     covariance = _covariance(path, estimated, document.covariance)
     values = {row.name: row.value for row in rows}
-    _check_same_model(path, document, values, mechanism)
-    known = set(parametrization_of(mechanism, twists=True).names)
-    kinematic = [i for i, row in enumerate(estimated) if row.name in known]
-    names = tuple(estimated[i].name for i in kinematic)
-    turns = turns_between(document.nominal_axes, values, names)
+    legs, known = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    nominal_legs = _with_nominal_axes(mechanism.leg_names, legs, document.nominal_axes, values)
+    _check_same_model(path, document, values, mechanism, nominal_legs)
+    wide, held = _kinematic(path, estimated, covariance, document.kinematic, known.names)
+    turns = turns_between(known, legs, nominal_legs)
+    fixed = tuple(r.name for r in rows if r.status == "fixed" and r.name in known.names)
+    kept = [i for i, name in enumerate(known.names) if name not in fixed]
+    _check_shared(path, document.residuals.shared_px)
     return EarlierResult(
         folder=path.parent,
         mechanism=mechanism,
-        names=names,
-        covariance=turns @ covariance[np.ix_(kinematic, kinematic)] @ turns.T,
-        fixed=tuple(r.name for r in rows if r.status == "fixed" and r.name in known),
-        weak=tuple(r.name for r in rows if r.status == "weak" and r.name in known),
+        names=tuple(known.names[i] for i in kept),
+        covariance=(turns @ wide @ turns.T)[np.ix_(kept, kept)],
+        held=(held @ turns.T)[:, kept],
+        fixed=fixed,
         intrinsics={
-            row.name: (row.nominal, row.value, row.sigma)
+            row.name: (row.value, row.sigma)
             for row in estimated
-            if row.name not in known and ".radius." not in row.name and row.sigma is not None
+            if row.name not in known.names and ".radius." not in row.name and row.sigma is not None
         },
+        cameras=document.cameras,
         noise=NoiseModel(**document.residuals.noise.model_dump()),
+        shared_px=document.residuals.shared_px,
         dof=document.residuals.dof,
     )
 
 
+def _kinematic(
+    path: Path,
+    estimated: Sequence[_Row],
+    covariance: Array,
+    found: _Kinematic,
+    known: Sequence[str],
+) -> tuple[Array, Array]:
+    """Return covariance (p, p) and held directions (w, p) of all kinematic parameters."""
+    n = len(known)
+    needed = f"a covariance and held directions of the {n} kinematic parameters"
+    rows = (*found.covariance, *found.held)
+    if sorted(found.names) != sorted(known) or len(found.covariance) != n:
+        raise DatasetError(_refused(path, f"those of {len(found.names)} others", needed))
+    if any(len(row) != n for row in rows):
+        raise DatasetError(_refused(path, "rows of other lengths", needed))
+    order = [found.names.index(name) for name in known]
+    wide = np.array(found.covariance)[np.ix_(order, order)]
+    held = np.array(found.held).reshape(-1, n)[:, order]
+    both = [i for i, row in enumerate(estimated) if row.name in known]
+    at = [known.index(estimated[i].name) for i in both]
+    sigma = np.sqrt(np.diagonal(covariance))[both]
+    apart = (wide[np.ix_(at, at)] - covariance[np.ix_(both, both)]) / np.outer(sigma, sigma)
+    if np.abs(apart).max(initial=0.0) > _SYMMETRIC or np.abs(wide - wide.T).max() > _SAME:
+        raise DatasetError(_refused(path, "another matrix in 'kinematic'", needed))
+    return wide, held
+
+
+def _check_shared(path: Path, shared_px: Mapping[str, float]) -> None:
+    """Refuse sizes of shared errors that are none."""
+    others = [name for name in shared_px if name not in KINDS]
+    if others:
+        raise DatasetError(_refused(path, f"the shared errors '{others[0]}'", ", ".join(KINDS)))
+
+
 def _check_same_model(
-    path: Path, document: _Document, values: Mapping[str, float], mechanism: Mechanism
+    path: Path,
+    document: _Document,
+    values: Mapping[str, float],
+    mechanism: Mechanism,
+    nominal_legs: Sequence[LegGeometry],
 ) -> None:
     """Refuse a document whose parameters are not those of the model beside it."""
     legs, known = geometries(mechanism), parametrization_of(mechanism, twists=True)
-    nominal_legs = _with_nominal_axes(mechanism.leg_names, legs, document.nominal_axes, values)
     numbers = dict(zip(known.names, vector_of(known, legs, nominal_legs).tolist(), strict=True))
     other = [
         name

@@ -27,6 +27,7 @@ from legcal.report.held_out_report import held_out_document
 from legcal.report.parameter_rows import parameter_rows
 from legcal.report.platform_document import platform_document
 from legcal.report.urdf import reload_and_check, write_calibrated_yaml, write_urdf
+from legcal.vision.intrinsics import camera_numbers, shared_cameras
 
 _RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m, rad]
 _FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what calibrated legs demand
@@ -45,9 +46,15 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
         "nominal_axes": nominal_axes(mechanism.leg_names, geometries(mechanism)),
         "parameters": [asdict(row) for row in parameter_rows(calibration)],
         "covariance": solution.covariance.tolist(),
+        "kinematic": {
+            "names": list(solution.parametrization.names),
+            "covariance": solution.value_covariance.tolist(),
+            "held": solution.held_basis.tolist(),
+        },
         "weakest": _weakest(calibration),
         "held": list(solution.held),
         "views": _views(calibration),
+        "cameras": _cameras(calibration),
         "stages": {"staged": _steps(calibration)},
         "residuals": {
             "chi2": solution.chi2,
@@ -169,6 +176,13 @@ def _views(calibration: Calibration) -> dict[str, Any]:
         }
         for v in np.unique(measurements.view[shown]).tolist()
     }
+
+
+def _cameras(calibration: Calibration) -> dict[str, Any]:
+    """Return the numbers that cameras came with, by the view whose name their intrinsics have."""
+    views = calibration.dataset.measurements.views
+    owners = set(shared_cameras([view.name for view in views], [view.camera for view in views]))
+    return {view.name: camera_numbers(view.camera) for view in views if view.name in owners}
 
 
 def _steps(calibration: Calibration) -> dict[str, Any]:

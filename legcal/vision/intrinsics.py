@@ -116,6 +116,14 @@ def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str
     return tuple(owner[key] for key in keys)
 
 
+def camera_numbers(camera: Camera) -> dict[str, float | str]:
+    """Return all that tells one camera from another: size, model and numbers, by their names."""
+    numbers = zip(intrinsic_names(camera), intrinsic_values(camera).tolist(), strict=True)
+    skew = float(camera.K[0, 1])
+    size = {"width": camera.width, "height": camera.height, "model": camera.model}
+    return size | {"skew": skew} | dict(numbers)
+
+
 def _identity(camera: Camera) -> tuple[object, ...]:
     """Return what two equal cameras have in common."""
     numbers = (*camera.K.ravel().tolist(), *_padded(camera).tolist())
