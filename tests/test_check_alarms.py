@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from machine_session import machine_session
 from simulated import settings
 
 from legcal import calibrate, check
@@ -13,6 +14,7 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
 from legcal.observations.measurements import Measurements
 from legcal.observations.sets import choose_outlines
+from legcal.refinement.refine import refine
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.simulate import simulate
 
@@ -106,6 +108,41 @@ def test_images_of_one_leg_tell_little_and_raise_no_alarm(planar: Path, tmp_path
     found = check(images, planar)
     assert not found.movement.moved
     assert found.movement.dof <= 4
+
+
+def test_intrinsics_are_taken_over_for_the_whole_camera_only(tmp_path: Path) -> None:
+    images = _with_errors(_simulated("3-rpr", tmp_path / "set", 8, 2), np.random.default_rng(10))
+    fx = float(images.measurements.views[0].camera.K[0, 0])
+    found = calibrate(images, output=tmp_path / "result", priors={"c1.fx": (fx, 1.0)})
+    assert "c1.fx" in found.solution.names
+    new = _simulated("3-rpr", tmp_path / "new", 4, 1)
+    assert "c1.fx" in check(new, tmp_path / "result").solution.names
+    view = new.measurements.views[0]
+    larger = replace(view, camera=replace(view.camera, height=view.camera.height + 1))
+    other = replace(new, measurements=replace(new.measurements, views=(larger,)))
+    assert "c1.fx" not in check(other, tmp_path / "result").solution.values
+
+
+@pytest.mark.parametrize("model", ["3-upu", "hexapod"])
+def test_what_is_known_of_parameters_is_told_apart_from_what_is_held(model: str) -> None:
+    session = machine_session(model)
+    found = refine(session.legs, *session.noisy(3), session.start)
+    names = found.parametrization.names
+    both = [name for name in found.names if name in names]
+    here, there = ([all_.index(n) for n in both] for all_ in (names, found.names))
+    np.testing.assert_allclose(
+        found.value_covariance[np.ix_(here, here)], found.covariance[np.ix_(there, there)]
+    )
+    assert len(found.held_basis) == len(found.held)
+    assert bool(len(found.held)) == (model == "3-upu")
+    # In metres, nothing is estimated along what is held.
+    length = np.mean([np.linalg.norm(found.T_Rb_Re[0].apply(leg.B) - leg.A) for leg in found.legs])
+    metre = np.where(np.array(found.parametrization.units) == "m", 1.0, 1.0 / length)
+    held = found.held_basis / metre
+    np.testing.assert_allclose(held @ held.T, np.eye(len(held)), atol=0.1)
+    scaled = found.value_covariance / np.outer(metre, metre)
+    along = np.diagonal(held @ scaled @ held.T)
+    assert np.all(along < 0.01 * np.linalg.eigvalsh(scaled)[-1])
 
 
 @pytest.mark.slow
