@@ -97,6 +97,7 @@ def assemble_solution(
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.shifts, fit.noise, kept),
         notes=(
+            *fit.notes,
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
             *(str(f) for f in focal_lengths(problem, state, linear, whitening) if f.is_doubtful),
         ),

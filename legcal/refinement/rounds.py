@@ -23,6 +23,7 @@ from legcal.refinement.noise import NoiseModel, estimate_noise, noise_of_the_med
 from legcal.refinement.normal import information
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.settings import RefinementSettings
+from legcal.refinement.settling import NO_CHANGES, Changes, sizes, unsettled
 from legcal.refinement.state import State
 
 
@@ -39,6 +40,8 @@ class Fit:
     shifts : SharedShifts
     accepted : (n_outlines,) array of bool
     iterations : int
+    notes : tuple of str
+        What the last round still changed, if that was more than it should.
     """
 
     problem: FitProblem
@@ -47,6 +50,7 @@ class Fit:
     shifts: SharedShifts
     accepted: BoolArray
     iterations: int
+    notes: tuple[str, ...]
 
     @property
     def state(self) -> State:
@@ -91,7 +95,8 @@ def fit_in_rounds(
     Raises
     ------
     DidNotConverge
-        If a solve fails, or most outlines or axes disagree with what was found.
+        If a solve fails, most outlines or axes disagree with what was found, or the rounds do not
+        settle.
     """
     claimed, noise = problem.outlines.covariance, NoiseModel()
     accepted = np.ones(len(claimed), dtype=np.bool_)
@@ -113,9 +118,9 @@ def fit_in_rounds(
         minimum = solved(_near_enough(problem))
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
-    asked = with_biases(problem, possible)
+    asked, changes = with_biases(problem, possible), NO_CHANGES
     for _ in range(settings.noise_rounds if len(claimed) else 1):
-        errors_before = _sizes(noise, shifts)
+        errors_before, accepted_before = sizes(noise, shifts), accepted
         noise = _noise(problem, state, noise, accepted, settings)
         accepted = _accepted(problem, state, noise, settings)
         minimum = solved()
@@ -129,21 +134,20 @@ def fit_in_rounds(
             problem, state = with_shifts(problem, state, shifts)
             minimum = solved()
             state, iterations = minimum.state, iterations + minimum.iterations
-        if np.allclose(_sizes(noise, shifts), errors_before, rtol=settings.settled, atol=1e-3):
+        errors = sizes(noise, shifts)
+        n_changed = int(np.sum(accepted != accepted_before))
+        changes = Changes(errors_before, errors, n_changed, int(accepted.sum()))
+        if changes.are_settled(settings):
             break
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
     _refuse_disagreeing_axes(minimum.linear.axes.squared_norms, settings)
-    return Fit(problem, minimum, noise, shifts, accepted, iterations)
+    notes = unsettled(changes, claimed, settings)
+    return Fit(problem, minimum, noise, shifts, accepted, iterations, notes)
 
 
 def _near_enough(problem: FitProblem) -> float:
     """Return the fall of the cost, a hundredth a measurement, that rejecting needs not wait for."""
     return 0.01 * (len(problem.outlines) + len(problem.axes))
-
-
-def _sizes(noise: NoiseModel, shifts: SharedShifts) -> Array:
-    """Return all standard deviations of errors in one vector."""
-    return np.array([noise.scale, noise.bias_px, noise.tilt_px, *shifts.sigma])
 
 
 def _noise(

@@ -34,7 +34,7 @@ class RefinementSettings:
     loss_width: float = 3.0
     rejection: float = 4.5
     rejection_rounds: int = 6
-    noise_rounds: int = 6
+    noise_rounds: int = 10
     settled: float = 0.02
     axis_disagreement: float = 20.0
     largest_rms_px: float = 3.0

@@ -1,0 +1,66 @@
+"""Fits whose rounds end before they settle: refused, or told."""
+
+import numpy as np
+import pytest
+from hexapod_session import (
+    PINHOLE,
+    Session,
+    disturbed_start,
+    moved_outlines,
+    noisy_outlines,
+    noisy_readings,
+    simulate,
+)
+
+from legcal.errors import DidNotConverge
+from legcal.refinement.biases import possible_shifts
+from legcal.refinement.observed import observed_outlines
+from legcal.refinement.refine import refine
+from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
+from legcal.refinement.settling import NO_CHANGES, Changes, unsettled
+from legcal.refinement.solution import Solution
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return simulate(10, legs_seen=5, sigma_px=0.05)
+
+
+def _fit(session: Session, level: float, n_rounds: int) -> Solution:
+    """Return a fit to outlines whose errors are shared by parts in views, in some rounds."""
+    rng = np.random.default_rng(3)
+    observed = observed_outlines(session.outlines, session.measurements, session.legs)
+    possible = possible_shifts(observed, session.legs.names)
+    sigma = np.array([0.0, 0.0, level, level, 0.5 * level, 0.5 * level])
+    values = sigma[possible.kind] * rng.standard_normal(len(possible))
+    shift = np.einsum("nc,nce->ne", values[possible.index], possible.shift)
+    outlines = moved_outlines(noisy_outlines(session, rng), PINHOLE, shift)
+    measurements, start = noisy_readings(session, rng), disturbed_start(session)
+    settings = RefinementSettings(noise_rounds=n_rounds)
+    return refine(session.legs, measurements, outlines, start, settings)
+
+
+def test_a_fit_that_still_changes_a_lot_is_refused(session: Session) -> None:
+    with pytest.raises(DidNotConverge, match=r"could not settle.*needed hardly any change"):
+        _fit(session, 0.2, 1)
+
+
+def test_a_fit_that_still_changes_a_little_says_so(session: Session) -> None:
+    (note,) = _fit(session, 0.2, 4).notes or ("",)
+    assert "not quite settled" in note
+    assert " px to 0." in note
+
+
+@pytest.mark.parametrize("level", [0.0, 0.03, 0.2])
+def test_a_fit_that_has_the_usual_rounds_settles(session: Session, level: float) -> None:
+    assert _fit(session, level, DEFAULT_SETTINGS.noise_rounds).notes == ()
+
+
+def test_outlines_that_come_and_go_are_not_settled() -> None:
+    sizes, claimed = np.array([1.0, 0.0, 0.0]), np.broadcast_to(0.01 * np.eye(2), (100, 2, 2))
+    assert unsettled(Changes(sizes, sizes, 1, 100), claimed, DEFAULT_SETTINGS) == ()
+    assert unsettled(NO_CHANGES, claimed, DEFAULT_SETTINGS) == ()
+    (note,) = unsettled(Changes(sizes, sizes, 4, 100), claimed, DEFAULT_SETTINGS)
+    assert "rejected 4 outlines anew, with 100 accepted" in note
+    with pytest.raises(DidNotConverge, match="rejected 6 outlines anew"):
+        unsettled(Changes(sizes, sizes, 6, 100), claimed, DEFAULT_SETTINGS)
