@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
+from legcal.refinement import pose_by_outlines
 from legcal.refinement.biases import N_KINDS, possible_shifts
 from legcal.refinement.build import build_fit
 from legcal.refinement.foretold import Posterior
@@ -104,6 +105,16 @@ def test_poses_by_outlines_do_not_depend_on_where_they_are_looked_for(name: str)
         apart = near.T_Rb_Re[k].inv() * far.T_Rb_Re[k]
         sigma = np.sqrt(np.trace(covariance[3:, 3:]))
         assert np.linalg.norm(apart.translation) < 2e-2 * sigma
+
+
+def test_poses_that_still_move_are_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = _truth("6-spu-coplanar")
+    away = RigidTransform.from_translation([4e-3, -3e-3, 0.0])
+    poses = [away * T for T in truth.poses]
+    assert len(_shown(truth, truth.outlines, poses).known) >= 7
+    monkeypatch.setattr(pose_by_outlines, "_ROBUST_STEPS", 0)
+    monkeypatch.setattr(pose_by_outlines, "_MOST_STEPS", 1)
+    assert len(_shown(truth, truth.outlines, poses).known) == 0
 
 
 def _shown(truth: Truth, outlines: Outlines, poses: Sequence[RigidTransform]) -> ShownPoses:
