@@ -25,6 +25,7 @@ from legcal.refinement.sensitivity import sensitivities
 from legcal.refinement.settings import RefinementSettings
 from legcal.refinement.solution import Solution, Status
 from legcal.refinement.state import State
+from legcal.refinement.suspicions import rejected_notes, scale_notes
 
 _SIGNIFICANT = 5.0  # standard deviations of chi2
 
@@ -98,6 +99,8 @@ def assemble_solution(
         posterior=Posterior(problem, state, fit.shifts, fit.noise, kept),
         notes=(
             *fit.notes,
+            *rejected_notes(problem, fit.accepted),
+            *scale_notes(problem, state, settings),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
             *(str(f) for f in focal_lengths(problem, state, linear, whitening) if f.is_doubtful),
         ),

@@ -78,12 +78,61 @@ def build_fit(
         camera is not view.camera for camera, view in zip(cameras, measurements.views, strict=True)
     ):
         observed = seen_by(observed, cameras)
-    lines = observed_axes(axes, measurements, legs)
-    encoders = readings(measurements, legs)
-    seen = np.zeros(len(measurements.views), dtype=np.bool_)
+    problem = _with_unknowns(
+        legs,
+        choices,
+        observed,
+        readings(measurements, legs),
+        observed_axes(axes, measurements, legs),
+        cameras,
+        shared_cameras(observed.views, [view.camera for view in measurements.views]),
+        measurements.n_poses,
+        settings,
+    )
+    check_counts(problem, measurements.n_rows)
+    return problem
+
+
+def with_choices(problem: FitProblem, choices: Choices, settings: RefinementSettings) -> FitProblem:
+    """Return a problem with the same measurements and cameras, and other unknowns.
+
+    Parameters
+    ----------
+    problem : FitProblem
+        Without anything held, and without shifts.
+    choices : Choices
+    settings : RefinementSettings
+    """
+    cameras = problem.first.cameras
+    return _with_unknowns(
+        problem.legs,
+        choices,
+        problem.outlines,
+        problem.readings,
+        problem.axes,
+        cameras,
+        shared_cameras(problem.outlines.views, cameras),
+        problem.layout.n_poses,
+        settings,
+    )
+
+
+def _with_unknowns(
+    legs: FittedLegs,
+    choices: Choices,
+    observed: ObservedOutlines,
+    encoders: Readings,
+    lines: ObservedAxes,
+    cameras: tuple[Camera, ...],
+    owners: tuple[str, ...],
+    n_poses: int,
+    settings: RefinementSettings,
+) -> FitProblem:
+    """Return the problem of measurements, with the unknowns and the priors of choices."""
+    seen = np.zeros(len(cameras), dtype=np.bool_)
     seen[observed.view] = seen[lines.view] = True
     radii = [radius_name(legs.names[leg], part) for leg, part in observed.parts]
-    intrinsic, keys, intrinsics = _intrinsics(measurements, choices)
+    intrinsic, keys, intrinsics = _intrinsics(observed.views, cameras, owners, choices)
     names = legs.parametrization.names
     is_free = [not choices.holds(name, by_default=name.endswith(".twist")) for name in names]
     layout = lay_out(
@@ -94,7 +143,7 @@ def build_fit(
         intrinsic,
         keys,
         seen,
-        measurements.n_poses,
+        n_poses,
     )
     units = legs.parametrization.units
     named = [
@@ -107,7 +156,7 @@ def build_fit(
         np.array([choices.values.get(n, r) for n, r in zip(radii, nominal.tolist(), strict=True)]),
         cameras,
     )
-    problem = FitProblem(
+    return FitProblem(
         legs,
         choices,
         layout,
@@ -121,8 +170,6 @@ def build_fit(
         tuple(unit for _, unit in named),
         np.zeros((0, layout.n_kept)),
     )
-    check_counts(problem, measurements.n_rows)
-    return problem
 
 
 def with_measurements(
@@ -244,18 +291,16 @@ def _places(
 
 
 def _intrinsics(
-    measurements: Measurements, choices: Choices
+    views: Sequence[str], cameras: Sequence[Camera], owners: Sequence[str], choices: Choices
 ) -> tuple[IntArray, tuple[str, ...], tuple[str, ...]]:
     """Return the unknown intrinsic of each view (n_views, n_keys), what they are, their names."""
-    views = measurements.views
-    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
     asked = {*choices.free, *choices.priors}
     names = [
-        f"{view.name}.{key}"
-        for view in views
-        if view.name in owners
-        for key in intrinsic_names(view.camera)
-        if f"{view.name}.{key}" in asked
+        f"{view}.{key}"
+        for view, camera in zip(views, cameras, strict=True)
+        if view in owners
+        for key in intrinsic_names(camera)
+        if f"{view}.{key}" in asked
     ]
     keys = tuple(dict.fromkeys(name.rsplit(".", 1)[1] for name in names))
     number = {name: i for i, name in enumerate(names)}

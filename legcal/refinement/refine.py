@@ -20,6 +20,7 @@ from legcal.refinement.choices import NO_CHOICES, Choices
 from legcal.refinement.constraints import on_constraints
 from legcal.refinement.contradictions import refuse_contradicted_priors
 from legcal.refinement.determinacy import held_at_nominal, open_directions, refuse_lost
+from legcal.refinement.fixed_values import refuse_contradicted_values
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.linearize import linearize, offsets_of
 from legcal.refinement.loss import width_to_k
@@ -32,6 +33,7 @@ from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start
 from legcal.refinement.state import State
+from legcal.refinement.suspicions import blaming_what_was_stated, rejected_notes
 
 _LARGEST_RADIUS_CHANGE = 0.5
 _EQUAL_COSTS = 1e-6  # relative: the same minimum
@@ -135,7 +137,7 @@ def refine_from_best(
             found = _refined(problem, outlines, candidate, settings)
         except (DidNotConverge, NotIdentifiable) as failure:
             failures.append(failure)
-            notes.append(f"The start {candidate.label} was given up. {failure}")
+            notes.append(f"The start {candidate.start.label} was given up. {failure}")
             continue
         return dataclasses.replace(found, notes=(*found.notes, *notes))
     if failures and all(isinstance(failure, NotIdentifiable) for failure in failures):
@@ -150,7 +152,7 @@ def refine_from_best(
 class _Candidate:
     """A first minimum."""
 
-    label: str
+    start: Start
     minimum: Minimum
     cost: float
 
@@ -160,11 +162,12 @@ def _candidate(problem: FitProblem, start: Start, settings: RefinementSettings) 
     begin = problem.begin(start)
     try:
         found = first_minimum(*_held_at_start(problem, begin), settings)
-    except DidNotConverge:
+    except DidNotConverge as failure:
+        refuse_contradicted_values(problem, start, begin, settings, with_priors=True)
         _refuse_undetermined(problem, begin)
-        raise
+        raise blaming_what_was_stated(problem, failure) from None
     cost = comparable_cost(problem, found.state, settings)
-    return _Candidate(start.label, found, cost)
+    return _Candidate(start, found, cost)
 
 
 def _held_at_start(problem: FitProblem, begin: State) -> tuple[FitProblem, State]:
@@ -186,6 +189,7 @@ def _refined(
 ) -> Solution:
     """Work out a first minimum with a problem that is already built."""
     first = candidate.minimum
+    refuse_contradicted_values(problem, candidate.start, first.state, settings)
     k = width_to_k(settings.loss_width)
     held = open_directions(problem, first.state, information(problem, first.state, first.linear, k))
     free, state, iterations = problem, first.state, first.iterations
@@ -197,12 +201,16 @@ def _refined(
         fit = fit_in_rounds(problem, state, iterations, settings)
         normal = information(fit.problem, fit.state, fit.minimum.linear, k)
         refuse_lost(fit.problem, fit.state, normal, held)
-    except (DidNotConverge, NotIdentifiable):
+    except (DidNotConverge, NotIdentifiable) as failure:
         _refuse_contradicted(free, state)
         _refuse_undetermined(free, state)
+        if isinstance(failure, DidNotConverge):
+            raise blaming_what_was_stated(free, failure) from None
         raise
+    if rejected_notes(fit.problem, fit.accepted):
+        refuse_contradicted_values(free, candidate.start, state, settings, with_priors=True)
     _refuse_other_radii(problem, fit.state)
-    return assemble_solution(fit.problem, fit, held, outlines, candidate.label, settings)
+    return assemble_solution(fit.problem, fit, held, outlines, candidate.start.label, settings)
 
 
 def _refuse_undetermined(problem: FitProblem, state: State) -> None:
