@@ -81,7 +81,7 @@ def _ratios(session: Session, level: float) -> Array:
                 strict=True,
             )
         ]
-    return np.sqrt(np.mean(np.square(ratios), axis=0))
+    return np.asarray(np.sqrt(np.mean(np.square(ratios), axis=0)))
 
 
 @pytest.mark.parametrize("level", [0.0, 0.05, 0.15])
