@@ -31,6 +31,9 @@ _SLOW = 0.5  # of the cost: if the next step lowers it by less, this loss has do
 _NARROWING = 0.8  # of the width: smaller changes of the median do not change the loss
 _DONE = 0.01  # of the cost: where a step lowers it by less, the loss is narrowed in any case
 _HALF = 0.5  # of the width, then
+_POSE_STEPS = 3
+_SAFER = 3.0  # times a damping that failed is tried after one that did not
+_FORGOTTEN = 0.3  # of a damping that failed, every step
 _PATIENCE = 30  # steps before a minimum may be near enough
 
 
@@ -59,7 +62,7 @@ def minimise(
     state: State,
     whitening: Array,
     width: float,
-    max_iterations: int = 100,
+    max_iterations: int = 200,
     near_enough: float = 0.0,
 ) -> Minimum:
     """Minimise the robust cost from a state.
@@ -76,8 +79,9 @@ def minimise(
     max_iterations : int
         Steps to try.
     near_enough : float
-        Fall of the cost for which no more than some steps are tried: where measurements that are
-        wrong altogether bend the cost, the last steps are many and lead to where these pull.
+        Fall of the cost, as a part of it, for which no more than some steps are tried: where
+        measurements that are wrong altogether bend the cost, the last steps are many and lead to
+        where these pull.
 
     Raises
     ------
@@ -87,7 +91,7 @@ def minimise(
     state = on_constraints(state, problem.legs.frame_legs)
     linear = linearize(problem, state, whitening)
     wide = _width(linear, width, np.inf)
-    damping, fall_before = _FIRST_DAMPING, np.inf
+    damping, failed, fall_before = _FIRST_DAMPING, 0.0, np.inf
     for iteration in range(1, max_iterations + 1):
         k = width_to_k(wide)
         cost = robust_cost(linear, k)
@@ -95,11 +99,12 @@ def minimise(
         at_rest = promised < _SMALLEST_FALL + _ROUNDING * cost
         trial = _tried(problem, state, step, whitening)
         if trial is not None and not at_rest and not robust_cost(trial[1], k) < cost:
-            trial = _followed(problem, *trial, whitening, k, damping)
+            trial = _followed(problem, *trial, whitening, k, cost)
         fall = -np.inf if trial is None else cost - robust_cost(trial[1], k)
         if trial is not None and np.isfinite(fall) and (fall > 0.0 or at_rest):
             state, linear = trial
-            damping = _next(damping, fall / max(promised, 1e-300))
+            damping = max(_next(damping, fall / max(promised, 1e-300)), _SAFER * failed)
+            failed *= _FORGOTTEN
             rate = promised / fall_before if np.isfinite(fall_before) else 1.0
             expected = promised * min(rate, 1.0)
             narrower = wide
@@ -107,13 +112,13 @@ def minimise(
                 narrower = _width(linear, width, wide)
             if narrower == wide and expected < _DONE * (cost - fall):
                 narrower = max(width, _HALF * wide)
-            smallest = near_enough if iteration > _PATIENCE else 0.0
+            smallest = near_enough * (cost - fall) if iteration > _PATIENCE else 0.0
             if narrower == wide and (at_rest or expected < max(smallest, _SMALLEST_FALL)):
                 return Minimum(state, linear, robust_cost(linear, k), iteration)
             fall_before = promised if narrower == wide else np.inf
             wide = narrower
             continue
-        damping *= 10.0
+        failed, damping = damping, 10.0 * damping
         fall_before = np.inf
         if damping > _MOST_DAMPING:
             break
@@ -175,14 +180,19 @@ def _followed(
     linear: Linearization,
     whitening: Array,
     k: float,
-    damping: float,
+    cost: float,
 ) -> tuple[State, Linearization] | None:
-    """Return where one more step leads from a place where the cost is not lower.
+    """Return where poses come to rest after a step that has not lowered the cost.
 
-    Along a curved valley of the cost a straight step ends on its side, and the next one at its
-    bottom, far ahead.
+    Readings are exact beside outlines, and curved: a long straight step leaves them, and the poses
+    bring them back where the rest of the step was right.
     """
-    if not np.isfinite(robust_cost(linear, k)):
-        return None
-    step, _ = normal_equations(problem, state, linear, k).step(damping)
-    return _tried(problem, state, step, whitening)
+    there: tuple[State, Linearization] | None = (state, linear)
+    for _ in range(_POSE_STEPS):
+        if there is None or not np.isfinite(robust_cost(there[1], k)):
+            return None
+        step = normal_equations(problem, *there, k).pose_step()
+        there = _tried(problem, there[0], step, whitening)
+        if there is not None and robust_cost(there[1], k) < cost:
+            return there
+    return there

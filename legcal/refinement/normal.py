@@ -104,6 +104,13 @@ class NormalEquations:
         pose = y if self.tangent is None else _carried(self.tangent, kept, y)
         return np.concatenate([kept, pose.ravel()]), 0.5 * (extra - linear)
 
+    def pose_step(self) -> Array:
+        """Return the step (size,) of the poses alone, all else at rest."""
+        y = -(self.V_inverse @ self.g_pose[..., None])[..., 0]
+        kept = np.zeros(len(self.U))
+        pose = y if self.tangent is None else _carried(self.tangent, kept, y)
+        return np.concatenate([kept, pose.ravel()])
+
     def _solved(self, S: Array, right: Array) -> Array:
         """Return S^-1 right in the complement of what is held."""
         if len(self.held):

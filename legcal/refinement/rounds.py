@@ -26,6 +26,8 @@ from legcal.refinement.settings import RefinementSettings
 from legcal.refinement.settling import NO_CHANGES, Changes, sizes, unsettled
 from legcal.refinement.state import State
 
+_NEAR_ENOUGH = 0.005  # of the cost a step: rejecting need not wait for the rest
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -68,7 +70,7 @@ def first_minimum(problem: FitProblem, begin: State, settings: RefinementSetting
     """
     whitening = NoiseModel().whitening(problem.outlines.covariance)
     width, n_steps = settings.loss_width, settings.max_iterations
-    return minimise(problem, begin, whitening, width, n_steps, _near_enough(problem))
+    return minimise(problem, begin, whitening, width, n_steps, _NEAR_ENOUGH)
 
 
 def fit_in_rounds(
@@ -115,7 +117,7 @@ def fit_in_rounds(
         accepted = _accepted(problem, state, noise, settings)
         if np.array_equal(before, accepted):
             break
-        minimum = solved(_near_enough(problem))
+        minimum = solved(_NEAR_ENOUGH)
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
     asked, changes = with_biases(problem, possible), NO_CHANGES
@@ -143,11 +145,6 @@ def fit_in_rounds(
     _refuse_disagreeing_axes(minimum.linear.axes.squared_norms, settings)
     notes = unsettled(changes, claimed, settings)
     return Fit(problem, minimum, noise, shifts, accepted, iterations, notes)
-
-
-def _near_enough(problem: FitProblem) -> float:
-    """Return the fall of the cost, a hundredth a measurement, that rejecting needs not wait for."""
-    return 0.01 * (len(problem.outlines) + len(problem.axes))
 
 
 def _noise(

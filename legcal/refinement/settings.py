@@ -38,7 +38,7 @@ class RefinementSettings:
     settled: float = 0.02
     axis_disagreement: float = 20.0
     largest_rms_px: float = 3.0
-    max_iterations: int = 100
+    max_iterations: int = 200
 
 
 DEFAULT_SETTINGS = RefinementSettings()
