@@ -201,6 +201,7 @@ def _refined(
         fit = fit_in_rounds(problem, state, iterations, settings)
         normal = information(fit.problem, fit.state, fit.minimum.linear, k)
         refuse_lost(fit.problem, fit.state, normal, held)
+        _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
         _refuse_contradicted(free, state)
         _refuse_undetermined(free, state)
@@ -209,7 +210,6 @@ def _refined(
         raise
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(free, candidate.start, state, settings, with_priors=True)
-    _refuse_other_radii(problem, fit.state)
     return assemble_solution(fit.problem, fit, held, outlines, candidate.start.label, settings)
 
 
