@@ -15,6 +15,7 @@ from legcal.observations.canonical_order import Order, inverse
 from legcal.refinement.held_out import HeldOut
 from legcal.refinement.known_parameters import known_parameters
 from legcal.refinement.platform_accuracy import PlatformAccuracy, platform_accuracy
+from legcal.refinement.sensitivity import FOCAL_PART
 from legcal.refinement.solution import Solution
 
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
@@ -121,12 +122,15 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
     if platform is None:
         verdict = _verdict_on_parameters(dataset, solution)
     else:
-        verdict = _verdict_on_platform(platform)
+        verdict = _verdict_on_platform(platform, solution.focal_doubt)
     return Calibration(dataset, solution, steps, platform, verdict, tuple(notes))
 
 
-def _verdict_on_platform(platform: PlatformAccuracy) -> Verdict:
-    """Compare the change of the platform with its uncertainty, in displacement."""
+def _verdict_on_platform(platform: PlatformAccuracy, focal_doubt: float) -> Verdict:
+    """Compare the change of the platform with its uncertainty, in displacement.
+
+    A focal length that the measurements contradict counts with what it does to the platform.
+    """
     change, sigma = platform.change, platform.sigma
     found = (
         f"the platform moves by {1e3 * change.mean_displacement:.3f} mm / "
@@ -134,7 +138,13 @@ def _verdict_on_platform(platform: PlatformAccuracy) -> Verdict:
         f"{1e3 * sigma.mean_displacement:.3f} mm / {np.degrees(sigma.mean_rotation):.4f} deg "
         "(1 sigma)"
     )
-    return _verdict(change.mean_displacement, sigma.mean_displacement, found)
+    of_focal = [e.error.mean_displacement for e in platform.effects if "focal" in e.what]
+    doubt = focal_doubt / FOCAL_PART * max(of_focal, default=0.0)
+    if doubt > 0.0:
+        found += f"; a focal length that the measurements contradict may add {1e3 * doubt:.3f} mm"
+    return _verdict(
+        change.mean_displacement, float(np.hypot(sigma.mean_displacement, doubt)), found
+    )
 
 
 def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:

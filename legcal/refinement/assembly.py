@@ -66,6 +66,8 @@ def assemble_solution(
     units |= dict(
         zip(problem.legs.parametrization.names, problem.legs.parametrization.units, strict=True)
     )
+    focal = focal_lengths(problem, state, linear, whitening)
+    doubtful = [f for f in focal if f.is_doubtful]
     return Solution(
         legs=state.legs,
         T_camera_Rb=state.T_camera_Rb,
@@ -97,12 +99,13 @@ def assemble_solution(
         start=label,
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.shifts, fit.noise, kept),
+        focal_doubt=max((abs(f.change) for f in doubtful), default=0.0),
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
             *scale_notes(problem, state, settings),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
-            *(str(f) for f in focal_lengths(problem, state, linear, whitening) if f.is_doubtful),
+            *(str(f) for f in doubtful),
         ),
     )
 

@@ -25,6 +25,7 @@ from legcal.vision.intrinsics import undistort_derivatives
 
 _PART = 1e-3  # of a mistake that is tried: its effect is told to first order
 _OF_RADII = 0.01
+FOCAL_PART = 0.01  # of the focal length, in the mistake that is told
 _OF_TWISTS = np.radians(0.1)
 _TWISTED = "twists that are fixed, each 0.1 deg off,"
 _TWIST = 11  # among the numbers of a leg
@@ -40,7 +41,7 @@ class _Mistake:
 
 
 _OF_CAMERAS = (
-    _Mistake("a focal length 1 % longer", {"fx": 0.01, "fy": 0.01}, {}),
+    _Mistake("a focal length 1 % longer", {"fx": FOCAL_PART, "fy": FOCAL_PART}, {}),
     _Mistake("a principal point 0.1 px further right", {}, {"cx": 0.1}),
     _Mistake("a principal point 0.1 px further down", {}, {"cy": 0.1}),
 )

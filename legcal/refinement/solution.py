@@ -118,6 +118,8 @@ class Solution:
         were fitted.
     notes : tuple of str
         What else a reader should know, one sentence each.
+    focal_doubt : float
+        By what part of itself a focal length is wrong, if measurements contradict one; 0 otherwise.
     """
 
     legs: tuple[LegGeometry, ...]
@@ -151,6 +153,7 @@ class Solution:
     iterations: int
     posterior: Posterior
     notes: tuple[str, ...] = ()
+    focal_doubt: float = 0.0
 
     @property
     def parameters(self) -> KinematicParameters:
