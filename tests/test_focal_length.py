@@ -61,7 +61,9 @@ def doubts(solution: Solution) -> list[str]:
 @pytest.mark.parametrize("camera", [PINHOLE, LENS])
 @pytest.mark.parametrize("factor", [0.99, 1.01])
 def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: float) -> None:
-    (note,) = doubts(fitted(simulate(12, camera=camera), 0, factor))
+    solution = fitted(simulate(12, camera=camera), 0, factor)
+    (note,) = doubts(solution)
+    assert solution.focal_doubt == pytest.approx(0.01, abs=0.004)
     found = float(note.partition("found fx = ")[2].partition(" +-")[0])
     assert found == pytest.approx(1290.0, abs=5.0)
     assert note.startswith("The focal length of c1 does not agree with the measurements")
@@ -71,7 +73,9 @@ def test_a_focal_length_wrong_by_one_percent_is_noticed(camera: Camera, factor: 
 def test_a_right_focal_length_is_left_alone() -> None:
     session = simulate(8)
     for seed in range(6):
-        assert doubts(fitted(session, seed, 1.0)) == []
+        solution = fitted(session, seed, 1.0)
+        assert doubts(solution) == []
+        assert solution.focal_doubt == 0.0
 
 
 def test_nothing_is_said_where_the_measurements_cannot_tell() -> None:
