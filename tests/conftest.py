@@ -1,5 +1,6 @@
 """What several test files share."""
 
+import one_thread  # noqa: F401
 import pytest
 from hexapod_example import Run, copy_of_the_example
 
