@@ -18,6 +18,7 @@ from legcal.mechanism.parameters import KinematicParameters, to_vector
 from legcal.mechanism.platform import pose_differences
 from legcal.observations.leg_axes import axes_from_outlines
 from legcal.refinement.start import platform_poses
+from legcal.stages.nominal import nominal_mechanism
 from legcal.stages.run import run_steps
 
 ROOT = Path(__file__).parents[1]
@@ -49,8 +50,9 @@ def main() -> None:
     solution = calibration.solution
     radii = {cylinder.link: cylinder.radius for leg in mechanism.legs for cylinder in leg.cylinders}
     axes = axes_from_outlines(solution.outlines, dataset.measurements, radii)
+    nominal = nominal_mechanism(mechanism)
     steps = {
-        criteria: run_steps(mechanism, axes, dataset.measurements, criteria=criteria).parameters
+        criteria: run_steps(nominal, axes, dataset.measurements, criteria=criteria).parameters
         for criteria in ("literal", "default")
     }
     rows = {

@@ -25,6 +25,7 @@ from legcal.simulation.table_noise import TableNoise
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import run_steps
 from legcal.studies.eq20 import platform_errors
+from legcal.studies.estimators import nominal_of
 from legcal.studies.session import simulate_session
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
@@ -66,7 +67,7 @@ def _print_times() -> None:
         seconds = []
         for _ in range(n_runs):
             begin = perf_counter()
-            run_steps(nominal, session.axes, session.measurements)
+            run_steps(nominal_of(nominal), session.axes, session.measurements)
             seconds.append(perf_counter() - begin)
         median = float(np.median(seconds))
         memory = getrusage(RUSAGE_SELF).ru_maxrss / 1024.0  # Linux counts kB
@@ -102,7 +103,9 @@ def _errors(
     found = {"nominal": _platform_error(machine, nominal.parameters)}
     for criteria in CRITERIA:
         try:
-            result = run_steps(nominal, session.axes, session.measurements, criteria=criteria)
+            result = run_steps(
+                nominal_of(nominal), session.axes, session.measurements, criteria=criteria
+            )
             found[criteria] = _platform_error(machine, result.parameters)
         except LegcalError:
             continue

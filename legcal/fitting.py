@@ -47,6 +47,7 @@ from legcal.progress import Report
 from legcal.refinement.refine import refine, refine_from_best
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, start_from, with_joints
+from legcal.stages.nominal import nominal_mechanism
 from legcal.stages.run import run_steps
 from legcal.workpiece import Workpiece
 
@@ -183,7 +184,8 @@ def _four_steps(work: Workpiece, outlines: Outlines, progress: Report) -> Steps:
         axes = work.axes
         if axes is None:
             axes = axes_from_outlines(outlines, work.measurements, radii)
-        found = run_steps(work.mechanism, axes, work.measurements, criteria=work.criteria)
+        nominal = nominal_mechanism(work.mechanism)
+        found = run_steps(nominal, axes, work.measurements, criteria=work.criteria)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
     finally:

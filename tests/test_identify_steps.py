@@ -21,6 +21,7 @@ from legcal.stages.joints_in_camera import locate_joints_in_cameras
 from legcal.stages.least_squares import LeastSquares, structure_jacobian
 from legcal.stages.leg_directions import directions_through_joints
 from legcal.stages.solution import Solution
+from legcal.studies.estimators import nominal_of
 
 VIEWS = [
     ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5)),
@@ -63,14 +64,14 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
 ) -> None:
     session = exact_session(legs=views, n_poses=8, share_poses=shared)
     machine, axes, m = session.machine, session.axes, session.measurements
-    joints = locate_joints_in_cameras(machine, axes, m)
+    joints = locate_joints_in_cameras(nominal_of(machine), axes, m)
     cameras = register_views(machine.parameters.base_joints, joints)
     base = JointsInBase(machine.parameters.base_joints, cameras, cast(Solution, None))
-    directions = directions_through_joints(machine, axes, m, joints, base)
+    directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
     q0 = machine.parameters.offsets
-    step2 = joints_in_base.build_rigid(machine, joints, cameras)
-    step3 = offsets.build_constant_distances(machine, directions, q0, m.sigma_q)
-    step4 = platform_joints.build_rigid(machine, directions, q0, m.sigma_q)
+    step2 = joints_in_base.build_rigid(nominal_of(machine), joints, cameras)
+    step3 = offsets.build_constant_distances(nominal_of(machine), directions, q0, m.sigma_q)
+    step4 = platform_joints.build_rigid(nominal_of(machine), directions, q0, m.sigma_q)
     built = [
         3 * int(joints.located.sum()),
         rank_of_first(step2, 12),
@@ -94,18 +95,20 @@ def test_printed_ranks_are_those_of_the_problems_that_the_steps_solve(coplanar: 
     views = VIEWS[0]
     session = exact_session(legs=views, n_poses=8, coplanar=coplanar)
     machine, axes, m = session.machine, session.axes, session.measurements
-    joints = locate_joints_in_cameras(machine, axes, m, criteria="literal")
+    joints = locate_joints_in_cameras(nominal_of(machine), axes, m, criteria="literal")
     base = JointsInBase(
         machine.parameters.base_joints,
         register_views(machine.parameters.base_joints, joints),
         cast(Solution, None),
     )
-    directions = directions_through_joints(machine, axes, m, joints, base)
+    directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
     built = [
-        rank_of_first(joints_in_base.build_scalar_products(machine, joints), 12),
-        rank_of_first(offsets.build_consecutive(machine, directions), 6),
+        rank_of_first(joints_in_base.build_scalar_products(nominal_of(machine), joints), 12),
+        rank_of_first(offsets.build_consecutive(nominal_of(machine), directions), 6),
         rank_of_first(
-            platform_joints.build_mean_distances(machine, directions, machine.parameters.offsets),
+            platform_joints.build_mean_distances(
+                nominal_of(machine), directions, machine.parameters.offsets
+            ),
             12,
         ),
     ]

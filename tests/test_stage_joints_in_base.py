@@ -13,14 +13,15 @@ from legcal.simulation.machine import Machine, hexapod
 from legcal.stages.joints_in_base import JointsInBase, build_scalar_products, locate_joints_in_base
 from legcal.stages.joints_in_camera import locate_joints_in_cameras
 from legcal.stages.nominal import Criteria
+from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession
 
 
 def _locate(
     session: SimulatedSession, nominal: Machine, criteria: Criteria = "default"
 ) -> JointsInBase:
-    joints = locate_joints_in_cameras(nominal, session.axes, session.measurements)
-    return locate_joints_in_base(nominal, joints, criteria=criteria)
+    joints = locate_joints_in_cameras(nominal_of(nominal), session.axes, session.measurements)
+    return locate_joints_in_base(nominal_of(nominal), joints, criteria=criteria)
 
 
 def _with_base(machine: Machine, A_Rb: Array) -> Machine:
@@ -47,8 +48,10 @@ def test_rigid_parts_give_joints_and_cameras_exactly_from_five_millimetres(copla
 
 def test_eq09_has_21_products_of_6_pairs_for_four_legs_seen() -> None:
     session = exact_session()
-    joints = locate_joints_in_cameras(session.machine, session.axes, session.measurements)
-    problem = build_scalar_products(session.machine, joints)
+    joints = locate_joints_in_cameras(
+        nominal_of(session.machine), session.axes, session.measurements
+    )
+    problem = build_scalar_products(nominal_of(session.machine), joints)
     assert problem.n_residuals == 3 * 21
     assert len(problem.start) == 12
 
@@ -93,8 +96,10 @@ def test_three_pairs_are_refused_although_together_they_might_be_enough() -> Non
 
 def test_joints_that_were_never_seen_together_are_refused() -> None:
     session = exact_session()
-    joints = locate_joints_in_cameras(session.machine, session.axes, session.measurements)
+    joints = locate_joints_in_cameras(
+        nominal_of(session.machine), session.axes, session.measurements
+    )
     alone = np.zeros_like(joints.located)
     alone[0, 0] = True
     with pytest.raises(NotIdentifiable, match=r"by view: 1, 0, 0"):
-        locate_joints_in_base(session.machine, replace(joints, located=alone))
+        locate_joints_in_base(nominal_of(session.machine), replace(joints, located=alone))

@@ -14,11 +14,14 @@ from legcal.simulation.observe import OutlineNoise
 from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.stages.leg_directions import select_axes
 from legcal.stages.nominal import Criteria
+from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession
 
 
 def _locate(session: SimulatedSession, axes: LegAxes, criteria: Criteria) -> JointsInCamera:
-    return locate_joints_in_cameras(session.machine, axes, session.measurements, criteria=criteria)
+    return locate_joints_in_cameras(
+        nominal_of(session.machine), axes, session.measurements, criteria=criteria
+    )
 
 
 def _true(session: SimulatedSession) -> Array:

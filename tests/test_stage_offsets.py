@@ -19,17 +19,20 @@ from legcal.stages.leg_directions import (
 )
 from legcal.stages.nominal import Criteria
 from legcal.stages.offsets import build_consecutive, identify_offsets, leg_ends
+from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession
 
 
 def _directions(session: SimulatedSession, nominal: Machine, criteria: Criteria) -> LegDirections:
     joints = locate_joints_in_cameras(
-        nominal, session.axes, session.measurements, criteria=criteria
+        nominal_of(nominal), session.axes, session.measurements, criteria=criteria
     )
     if criteria == "literal":
-        return observed_directions(nominal, session.axes, session.measurements, joints)
-    base = locate_joints_in_base(nominal, joints)
-    return directions_through_joints(nominal, session.axes, session.measurements, joints, base)
+        return observed_directions(nominal_of(nominal), session.axes, session.measurements, joints)
+    base = locate_joints_in_base(nominal_of(nominal), joints)
+    return directions_through_joints(
+        nominal_of(nominal), session.axes, session.measurements, joints, base
+    )
 
 
 def _some(directions: LegDirections, keep: BoolArray) -> LegDirections:
@@ -42,7 +45,7 @@ def test_eq14_gives_exact_offsets_from_five_millimetres_away(criteria: Criteria)
     session = exact_session()
     nominal = five_millimetres_away(session.machine)
     directions = _directions(session, nominal, criteria)
-    offsets = identify_offsets(nominal, directions, 2e-6, criteria=criteria)
+    offsets = identify_offsets(nominal_of(nominal), directions, 2e-6, criteria=criteria)
     assert np.abs(offsets.q0 - session.machine.parameters.offsets).max() < 1e-9
 
 
@@ -60,7 +63,7 @@ def test_eq13_leg_ends_have_the_distances_of_the_platform_joints() -> None:
 def test_eq14_compares_consecutive_positions_of_a_view_only() -> None:
     session = exact_session(n_poses=6)
     directions = _directions(session, session.machine, "literal")
-    problem = build_consecutive(session.machine, directions)
+    problem = build_consecutive(nominal_of(session.machine), directions)
     assert problem.n_residuals == 3 * (6 - 1) * 6
 
 
@@ -69,13 +72,15 @@ def test_a_motor_that_counts_backwards_gives_the_same_offsets() -> None:
     sign = np.array([1, -1, 1, -1, -1, 1])
     backwards = replace(session.measurements, q=session.measurements.q * sign)
     machine = replace(session.machine, sign=sign)
-    forth = identify_offsets(nominal, _directions(session, nominal, "default"), 2e-6).q0
+    forth = identify_offsets(nominal_of(nominal), _directions(session, nominal, "default"), 2e-6).q0
     directions = _directions(
         replace(session, measurements=backwards, machine=machine),
         replace(nominal, sign=sign),
         "default",
     )
-    assert np.allclose(identify_offsets(nominal, directions, 2e-6).q0, forth, atol=1e-12)
+    assert np.allclose(
+        identify_offsets(nominal_of(nominal), directions, 2e-6).q0, forth, atol=1e-12
+    )
 
 
 def test_passing_through_the_joint_improves_the_tilt_of_a_leg() -> None:
@@ -104,11 +109,11 @@ def test_legs_that_are_always_alone_are_refused_by_name() -> None:
     with_leg6 = np.isin(directions.group, directions.group[directions.leg == 5])
     alone = _some(directions, ~with_leg6 | (directions.leg == 5))
     with pytest.raises(NotIdentifiable, match="fixes that of leg5, leg6"):
-        identify_offsets(session.machine, alone, 2e-6)
+        identify_offsets(nominal_of(session.machine), alone, 2e-6)
 
 
 def test_no_two_legs_at_once_is_refused() -> None:
     session = exact_session()
     directions = _directions(session, session.machine, "default")
     with pytest.raises(NotIdentifiable, match="no image shows two legs"):
-        identify_offsets(session.machine, _some(directions, directions.leg == 0), 2e-6)
+        identify_offsets(nominal_of(session.machine), _some(directions, directions.leg == 0), 2e-6)

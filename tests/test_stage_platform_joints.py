@@ -17,15 +17,16 @@ from legcal.stages.leg_directions import LegDirections, directions_through_joint
 from legcal.stages.offsets import Offsets, identify_offsets
 from legcal.stages.platform_joints import locate_platform_joints
 from legcal.stages.run import run_steps
+from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession, simulate_session
 
 
 def _until_offsets(session: SimulatedSession, nominal: Machine) -> tuple[LegDirections, Offsets]:
     axes, measurements = session.axes, session.measurements
-    joints = locate_joints_in_cameras(nominal, axes, measurements)
-    base = locate_joints_in_base(nominal, joints)
-    directions = directions_through_joints(nominal, axes, measurements, joints, base)
-    return directions, identify_offsets(nominal, directions, measurements.sigma_q)
+    joints = locate_joints_in_cameras(nominal_of(nominal), axes, measurements)
+    base = locate_joints_in_base(nominal_of(nominal), joints)
+    directions = directions_through_joints(nominal_of(nominal), axes, measurements, joints, base)
+    return directions, identify_offsets(nominal_of(nominal), directions, measurements.sigma_q)
 
 
 @pytest.mark.parametrize("coplanar", [False, True])
@@ -33,7 +34,7 @@ def test_rigid_poses_give_exact_joints_from_five_millimetres(coplanar: bool) -> 
     session = exact_session(coplanar=coplanar)
     nominal = five_millimetres_away(session.machine)
     directions, offsets = _until_offsets(session, nominal)
-    platform = locate_platform_joints(nominal, directions, offsets, 2e-6)
+    platform = locate_platform_joints(nominal_of(nominal), directions, offsets, 2e-6)
     true = session.machine.parameters
     assert np.abs(platform.B_Re - true.platform_joints).max() < 1e-9
     assert np.abs(platform.q0 - true.offsets).max() < 1e-9
@@ -43,7 +44,7 @@ def test_offsets_heal_when_step_3_left_them_wrong() -> None:
     session = exact_session()
     directions, offsets = _until_offsets(session, session.machine)
     wrong = replace(offsets, q0=offsets.q0 + 0.002)
-    platform = locate_platform_joints(session.machine, directions, wrong, 2e-6)
+    platform = locate_platform_joints(nominal_of(session.machine), directions, wrong, 2e-6)
     assert np.abs(platform.q0 - session.machine.parameters.offsets).max() < 1e-9
 
 
@@ -52,10 +53,12 @@ def test_eq16_never_moves_z_from_a_coplanar_nominal_model() -> None:
     true = session.machine.parameters.platform_joints
     nominal = hexapod()
     directions, offsets = _until_offsets(session, nominal)
-    literal = locate_platform_joints(nominal, directions, offsets, 2e-6, criteria="literal")
+    literal = locate_platform_joints(
+        nominal_of(nominal), directions, offsets, 2e-6, criteria="literal"
+    )
     assert np.abs(literal.B_Re[:, 2]).max() < 1e-9
     assert np.abs(literal.B_Re - true).max() > 5e-4
-    default = locate_platform_joints(nominal, directions, offsets, 2e-6)
+    default = locate_platform_joints(nominal_of(nominal), directions, offsets, 2e-6)
     assert np.abs(default.B_Re - true).max() < 1e-9
 
 
@@ -68,9 +71,11 @@ def test_eq16_accepts_a_mirror_image_that_the_rigid_criterion_corrects() -> None
         parameters=KinematicParameters(true.base_joints, mirrored, true.offsets),
     )
     directions, offsets = _until_offsets(session, nominal)
-    literal = locate_platform_joints(nominal, directions, offsets, 2e-6, criteria="literal")
+    literal = locate_platform_joints(
+        nominal_of(nominal), directions, offsets, 2e-6, criteria="literal"
+    )
     assert np.abs(literal.B_Re - mirrored).max() < 1e-6
-    default = locate_platform_joints(nominal, directions, offsets, 2e-6)
+    default = locate_platform_joints(nominal_of(nominal), directions, offsets, 2e-6)
     assert np.abs(default.B_Re - true.platform_joints).max() < 1e-9
 
 
@@ -83,7 +88,7 @@ def test_poses_that_show_two_legs_or_one_take_part() -> None:
     counts = np.bincount(some.axes.row)
     assert set(counts.tolist()) >= {2, 4}
     nominal = five_millimetres_away(session.machine)
-    result = run_steps(nominal, some.axes, some.measurements)
+    result = run_steps(nominal_of(nominal), some.axes, some.measurements)
     true = session.machine.parameters
     assert np.abs(result.parameters.platform_joints - true.platform_joints).max() < 1e-9
 
@@ -100,7 +105,7 @@ def test_a_passive_leg_is_located_by_its_direction_alone_as_in_eq19() -> None:
     q = session.measurements.q.copy()
     q[:, 1] = np.nan
     nominal = five_millimetres_away(machine)
-    result = run_steps(nominal, session.axes, replace(session.measurements, q=q))
+    result = run_steps(nominal_of(nominal), session.axes, replace(session.measurements, q=q))
     assert np.abs(result.parameters.platform_joints - true.platform_joints).max() < 1e-9
     assert np.isnan(result.parameters.offsets).tolist() == [False, True] + 4 * [False]
 
@@ -116,7 +121,9 @@ def test_a_constant_length_leg_gets_its_length_as_offset() -> None:
         machine, cameras_around(machine, rng), rng, noise=OutlineNoise(), noisy=False, n_poses=6
     )
     assert np.abs(session.measurements.q[:, 5]).max() < 1e-12
-    result = run_steps(five_millimetres_away(machine), session.axes, session.measurements)
+    result = run_steps(
+        nominal_of(five_millimetres_away(machine)), session.axes, session.measurements
+    )
     assert result.parameters.offsets[5] == pytest.approx(0.4137, abs=1e-9)
 
 
@@ -126,7 +133,7 @@ def test_no_two_legs_at_once_is_refused() -> None:
     names = ("group", "view", "leg", "A", "u", "basis", "covariance", "reading")
     alone = LegDirections(**{n: getattr(directions, n)[directions.leg == 0] for n in names})
     with pytest.raises(NotIdentifiable, match="no pose shows two legs at once"):
-        locate_platform_joints(session.machine, alone, offsets, 2e-6)
+        locate_platform_joints(nominal_of(session.machine), alone, offsets, 2e-6)
 
 
 def test_a_joint_that_is_seen_in_pairs_only_is_refused_by_name() -> None:
@@ -137,4 +144,4 @@ def test_a_joint_that_is_seen_in_pairs_only_is_refused_by_name() -> None:
     names = ("group", "view", "leg", "A", "u", "basis", "covariance", "reading")
     some = LegDirections(**{n: getattr(directions, n)[keep] for n in names})
     with pytest.raises(NotIdentifiable, match="leg6"):
-        locate_platform_joints(session.machine, some, offsets, 2e-6)
+        locate_platform_joints(nominal_of(session.machine), some, offsets, 2e-6)

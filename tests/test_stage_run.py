@@ -19,13 +19,14 @@ from legcal.simulation.table_noise import TableNoise
 from legcal.stages.nominal import Criteria
 from legcal.stages.run import StagedResult, run_steps
 from legcal.studies.eq20 import platform_errors
+from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession
 
 
 def _run(
     session: SimulatedSession, nominal: Machine, criteria: Criteria = "default"
 ) -> StagedResult:
-    return run_steps(nominal, session.axes, session.measurements, criteria=criteria)
+    return run_steps(nominal_of(nominal), session.axes, session.measurements, criteria=criteria)
 
 
 @pytest.mark.parametrize("coplanar", [False, True])
@@ -182,7 +183,7 @@ def test_wrong_outlines_are_named_and_hardly_matter() -> None:
     h, ends = shifted_outlines(camera, session.outlines.h, session.outlines.ends, offsets)
     wrong = replace(session.outlines, h=h, ends=ends)
     axes = axes_from_outlines(wrong, session.measurements, session.machine.radius_of_part())
-    result = run_steps(nominal, axes, session.measurements)
+    result = run_steps(nominal_of(nominal), axes, session.measurements)
     assert len(result.diagnostics) == 9
     assert "Leg leg1 in image 1 was left out of steps 3 and 4" in result.diagnostics[0]
     clean = errors(_run(session, nominal).parameters, session.machine).max()

@@ -1,36 +1,101 @@
-"""What the four steps ask of a mechanism."""
+"""What the four steps know of a mechanism: its legs as drawn, in R_b and R_e."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
+from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry, point_like_legs
+from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.parametrization import geometries
 
 Criteria = Literal["default", "literal"]
 
 
-class NominalMechanism(Protocol):
-    """A mechanism with point-like joints, as in :class:`legcal.mechanism.model.Mechanism`."""
+@dataclass(frozen=True, eq=False)
+class NominalMechanism:
+    """The nominal legs of a mechanism: where the steps start, and which unknowns they have.
 
-    @property
-    def leg_names(self) -> Sequence[str]:
-        """Names of the legs, for messages."""
+    Attributes
+    ----------
+    leg_names : tuple of str
+        Names of the legs, for messages.
+    legs : tuple of LegGeometry
+        Joint centres, axes and lengths; what belongs to the base in R_b, what belongs to the
+        platform in R_e.
+    sign : (n_legs,) array
+        Sign of q in the leg length: L = sign q + q0.
+    frame_legs : tuple of int
+        The legs whose joint centres define R_b and R_e: three in space, two in a plane.
+    """
+
+    leg_names: tuple[str, ...]
+    legs: tuple[LegGeometry, ...]
+    sign: NDArray[Any]
+    frame_legs: tuple[int, ...]
 
     @property
     def n_legs(self) -> int:
         """Number of legs."""
+        return len(self.legs)
 
     @property
-    def sign(self) -> NDArray[Any]:
-        """Sign of q in the leg length, (n_legs,): L = sign q + q0."""
+    def spatial(self) -> bool:
+        """Whether the platform moves in space and not in a plane."""
+        return len(self.frame_legs) == 3
 
-    @property
-    def frame_legs(self) -> tuple[int, ...]:
-        """The legs whose joint centres define R_b and R_e."""
-
-    @property
+    @cached_property
     def parameters(self) -> KinematicParameters:
-        """Nominal parameters: the start of steps 2, 3 and 4."""
+        """Nominal joint centres and offsets [m]; constant legs have their length, passive NaN."""
+        passive = np.array([leg.kind is LegKind.PASSIVE for leg in self.legs])
+        return KinematicParameters(
+            np.array([leg.A for leg in self.legs]),
+            np.array([leg.B for leg in self.legs]),
+            np.where(passive, np.nan, [leg.q0 for leg in self.legs]),
+        )
+
+    @cached_property
+    def constant(self) -> BoolArray:
+        """Which legs have a constant length and no reading, (n_legs,)."""
+        return np.array([leg.kind is LegKind.CONSTANT for leg in self.legs], dtype=np.bool_)
+
+    @cached_property
+    def revolute(self) -> BoolArray:
+        """Which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
+        return np.array(
+            [leg.base_joint == "R" and leg.base_axis is not None for leg in self.legs],
+            dtype=np.bool_,
+        )
+
+    @cached_property
+    def base_axes(self) -> Array:
+        """Nominal revolute axes in R_b, (n_legs, 3); NaN where :attr:`revolute` is not."""
+        axes = np.full((self.n_legs, 3), np.nan)
+        for j in np.flatnonzero(self.revolute):
+            axes[j] = self.legs[j].base_axis
+        return axes
+
+
+def nominal_mechanism(mechanism: Mechanism) -> NominalMechanism:
+    """Return a mechanism as the steps take it."""
+    return NominalMechanism(
+        mechanism.leg_names, geometries(mechanism), mechanism.sign, mechanism.frame_legs
+    )
+
+
+def point_like_mechanism(
+    leg_names: Sequence[str],
+    parameters: KinematicParameters,
+    sign: NDArray[Any],
+    frame_legs: tuple[int, ...],
+) -> NominalMechanism:
+    """Return a mechanism with point-like joints; legs without an offset are passive."""
+    return NominalMechanism(tuple(leg_names), point_like_legs(parameters), sign, frame_legs)

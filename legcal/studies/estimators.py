@@ -18,6 +18,7 @@ from legcal.refinement.refine import refine
 from legcal.refinement.start import Start, cameras_from_hints, start_from
 from legcal.simulation.forward import follow_from_home
 from legcal.simulation.machine import Machine
+from legcal.stages.nominal import NominalMechanism, point_like_mechanism
 from legcal.stages.run import run_steps
 from legcal.studies.session import SimulatedSession
 
@@ -27,12 +28,13 @@ Estimator = Callable[[SimulatedSession, Machine], KinematicParameters]
 
 def literal_steps(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
     """Return what the four steps with the criteria as printed find."""
-    return run_steps(nominal, session.axes, session.measurements, criteria="literal").parameters
+    steps = run_steps(nominal_of(nominal), session.axes, session.measurements, criteria="literal")
+    return steps.parameters
 
 
 def default_steps(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
     """Return what the four steps with legcal's criteria find."""
-    return run_steps(nominal, session.axes, session.measurements).parameters
+    return run_steps(nominal_of(nominal), session.axes, session.measurements).parameters
 
 
 def one_fit(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
@@ -88,6 +90,13 @@ ESTIMATORS: dict[str, Estimator] = {
     "default": default_steps,
     "fit": one_fit,
 }
+
+
+def nominal_of(machine: Machine) -> NominalMechanism:
+    """Return a simulated machine as the steps take a mechanism."""
+    return point_like_mechanism(
+        machine.leg_names, machine.parameters, machine.sign, machine.frame_legs
+    )
 
 
 def _legs(machine: Machine) -> FittedLegs:
