@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.dataset.entry import DatasetEntry, ViewEntry
 from legcal.dataset.given_axes import AXES_NAME, read_given_axes, rows_without_axes
@@ -18,10 +19,12 @@ from legcal.geometry.types import Image
 from legcal.mechanism.files import DATASET_YAML, shipped_folders, shipped_names
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
+from legcal.observations.corners import Corners
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
 from legcal.observations.table import read_observations
+from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
 from legcal.vision.image_file import image_problem, read_image
@@ -55,6 +58,12 @@ class Dataset:
         then not searched, and there are no observations.
     wishes : tuple of Wish
         What the block ``parameters`` asks of parameters by name.
+    board : Board or None
+        The calibration board that is fixed to the base.
+    T_base_board : RigidTransform or None
+        Its pose in the base link, where it is known.
+    corners : Corners or None
+        The rows of ``corners.csv`` if there is one. Images are then not searched for the board.
     """
 
     folder: Path
@@ -67,6 +76,9 @@ class Dataset:
     notes: tuple[str, ...] = ()
     axes: LegAxes | None = None
     wishes: tuple[Wish, ...] = ()
+    board: Board | None = None
+    T_base_board: RigidTransform | None = None
+    corners: Corners | None = None
 
     def image_path(self, row: int) -> Path | None:
         """Return the image file of a row; None where only outlines are given."""
