@@ -1,9 +1,9 @@
 """The schema of ``dataset.yaml``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, field_validator
 
 from legcal.dataset.wishes import Wish, read_wish
 from legcal.files.motion import MotionEntry
@@ -18,6 +18,7 @@ class ViewEntry(FileSchema):
 
     camera: str
     T_base_camera: MotionEntry | None = None
+    hand_held: Annotated[bool, Strict()] = False
     legs: Annotated[list[str], Field(min_length=1)] | None = None
 
     @field_validator("legs")
@@ -70,6 +71,7 @@ class DatasetEntry(FileSchema):
     encoder_sigma: Annotated[Number, Field(gt=0.0)]
     views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
     parameters: ParametersEntry = Field(default_factory=ParametersEntry)
+    board: dict[str, Any] | None = None  # read by its kind
 
     @field_validator("encoder_sigma")
     @classmethod

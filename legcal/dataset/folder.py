@@ -2,148 +2,32 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
+from legcal.dataset.board_entry import read_board
+from legcal.dataset.dataset import OBSERVATIONS_NAME, Dataset, row_problems
 from legcal.dataset.entry import DatasetEntry, ViewEntry
-from legcal.dataset.given_axes import AXES_NAME, read_given_axes, rows_without_axes
+from legcal.dataset.given_axes import AXES_NAME, read_given_axes
+from legcal.dataset.given_corners import CORNERS_NAME, read_given_corners
+from legcal.dataset.hand_held import expand_hand_held, hand_held_problems
 from legcal.dataset.measurement_table import read_measurements
-from legcal.dataset.wishes import Wish
 from legcal.errors import DatasetError
 from legcal.files.inside import path_problem
 from legcal.files.schema import closest, describe, parse_yaml, read_text, validate
-from legcal.geometry.types import Image
 from legcal.mechanism.files import DATASET_YAML, shipped_folders, shipped_names
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.observations.corners import Corners
-from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
 from legcal.observations.table import read_observations
-from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import read_camera
-from legcal.vision.image_file import image_problem, read_image
 
-OBSERVATIONS_NAME = "observations.csv"
 CACHE_NAME = ".legcal-cache.json"
 
-
-@dataclass(frozen=True, eq=False)
-class Dataset:
-    """Everything that a calibration starts from.
-
-    Attributes
-    ----------
-    folder : Path
-        The dataset folder.
-    yaml_path, table_path : Path
-        ``dataset.yaml`` and the table of measurements.
-    camera_paths : tuple of Path
-        The camera file of each view.
-    mechanism : Mechanism
-        The nominal model.
-    measurements : Measurements
-        The rows of the table, in its order.
-    observations : Outlines or None
-        The rows of ``observations.csv`` if there is one: given, cached or edited.
-    notes : tuple of str
-        What is odd but allowed.
-    axes : LegAxes or None
-        The rows of ``axes.csv`` if there is one, of the legs that the views use. Images are
-        then not searched, and there are no observations.
-    wishes : tuple of Wish
-        What the block ``parameters`` asks of parameters by name.
-    board : Board or None
-        The calibration board that is fixed to the base.
-    T_base_board : RigidTransform or None
-        Its pose in the base link, where it is known.
-    corners : Corners or None
-        The rows of ``corners.csv`` if there is one. Images are then not searched for the board.
-    """
-
-    folder: Path
-    yaml_path: Path
-    table_path: Path
-    camera_paths: tuple[Path, ...]
-    mechanism: Mechanism
-    measurements: Measurements
-    observations: Outlines | None
-    notes: tuple[str, ...] = ()
-    axes: LegAxes | None = None
-    wishes: tuple[Wish, ...] = ()
-    board: Board | None = None
-    T_base_board: RigidTransform | None = None
-    corners: Corners | None = None
-
-    def image_path(self, row: int) -> Path | None:
-        """Return the image file of a row; None where only outlines are given."""
-        image = self.measurements.image[row]
-        return self.folder / image if image else None
-
-    def read_image(self, row: int) -> Image:
-        """Return the image of a row as (height, width) grey levels 0 to 255, float32.
-
-        Raises
-        ------
-        DatasetError
-            If the row has no image, or its file cannot be used.
-        """
-        return self.image_reader([row])(0)
-
-    def image_reader(self, rows: Sequence[int]) -> "ImageReader":
-        """Return what reads the images of these rows, in this order, in any process."""
-        return ImageReader(
-            tuple(self.image_path(row) for row in rows),
-            tuple(self._camera(row) for row in rows),
-            tuple(self._where(row) for row in rows),
-        )
-
-    def image_problem(self, row: int) -> str | None:
-        """Return what keeps the image of a row from being used, or None; nothing is decoded."""
-        path = self.image_path(row)
-        return image_problem(path, self._camera(row), self._where(row)) if path else None
-
-    def _camera(self, row: int) -> Camera:
-        """Return the camera that took the image of a row."""
-        return self.measurements.views[int(self.measurements.view[row])].camera
-
-    def _where(self, row: int) -> str:
-        """Return the place of a row for a message."""
-        return f"{self.table_path}, row {row + 1}"
-
-
-@dataclass(frozen=True, eq=False)
-class ImageReader:
-    """Reads images by their number.
-
-    Attributes
-    ----------
-    paths : tuple of Path or None
-        The files; None where a row has no image.
-    cameras : tuple of Camera
-        The camera of each image.
-    places : tuple of str
-        Where each image is named, for messages.
-    """
-
-    paths: tuple[Path | None, ...]
-    cameras: tuple[Camera, ...]
-    places: tuple[str, ...]
-
-    def __call__(self, k: int) -> Image:
-        """Return image k as (height, width) grey levels 0 to 255, float32."""
-        path = self.paths[k]
-        if path is None:
-            raise DatasetError(
-                f"{self.places[k]}: its image could not be read: found an empty cell, needed an "
-                f"image; name one or give its outlines in {OBSERVATIONS_NAME}."
-            )
-        return read_image(path, self.cameras[k], self.places[k])
+__all__ = ["CACHE_NAME", "OBSERVATIONS_NAME", "Dataset", "load_dataset"]
 
 
 def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
@@ -172,7 +56,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     yaml_path = _dataset_file(Path(folder))
     folder = yaml_path.parent
     entry = _read_entry(yaml_path)
-    problems: list[str] = []
+    board, T_base_board = read_board(entry.board, yaml_path)
+    problems = hand_held_problems(yaml_path, entry.views, has_board=board is not None)
     if found := path_problem(folder, entry.measurements):
         problems.append(
             f"{yaml_path}: measurements could not be used: found {found} ({entry.measurements}), "
@@ -189,31 +74,42 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         for (name, view), path in zip(entry.views.items(), camera_paths, strict=True)
     )
     table_path = folder / entry.measurements
-    measurements, notes = read_measurements(
-        table_path, folder, views, mechanism.legs, entry.encoder_sigma
-    )
-    if os.path.exists(folder / AXES_NAME) and os.path.exists(folder / OBSERVATIONS_NAME):
-        raise DatasetError(
-            f"{folder}: the observations could not be read: found {AXES_NAME} and "
-            f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
-        )
+    rows, notes = read_measurements(table_path, folder, views, mechanism.legs, entry.encoder_sigma)
+    measurements, origin, problems = expand_hand_held(yaml_path, rows, entry.views)
+    if problems:
+        raise DatasetError(problems)
+    _refuse_two_tables(folder)
     axes, left_out = read_given_axes(folder / AXES_NAME, mechanism.leg_names, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
         table_path=table_path,
-        camera_paths=camera_paths,
+        camera_paths=tuple(camera_paths[v] for v in origin),
         mechanism=mechanism,
         measurements=measurements,
         observations=_read_outlines(folder, mechanism, measurements),
-        notes=(*notes, *left_out, *_unused_views(yaml_path, measurements)),
+        notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         wishes=entry.parameters.wishes(yaml_path),
+        board=board,
+        T_base_board=T_base_board,
+        corners=read_given_corners(folder / CORNERS_NAME, board, measurements),
     )
-    problems = _row_problems(dataset) if check_images else []
+    held = [view.hand_held for view in entry.views.values()]
+    of_hand = [row for row, v in enumerate(rows.view.tolist()) if held[v]]
+    problems = row_problems(dataset, of_hand) if check_images else []
     if problems:
         raise DatasetError(problems)
     return dataset
+
+
+def _refuse_two_tables(folder: Path) -> None:
+    """Refuse a dataset with axes and outlines."""
+    if os.path.exists(folder / AXES_NAME) and os.path.exists(folder / OBSERVATIONS_NAME):
+        raise DatasetError(
+            f"{folder}: the observations could not be read: found {AXES_NAME} and "
+            f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
+        )
 
 
 def _dataset_file(given: Path) -> Path:
@@ -308,24 +204,3 @@ def _unused_views(path: Path, measurements: Measurements) -> list[str]:
         for v, view in enumerate(measurements.views)
         if not np.any(measurements.view == v)
     ]
-
-
-def _row_problems(dataset: Dataset) -> list[str]:
-    """Return the rows that neither an image nor outlines nor axes make usable."""
-    if dataset.axes is not None:
-        return rows_without_axes(dataset.table_path, dataset.measurements, dataset.axes)
-    outlines = dataset.observations
-    given = set() if outlines is None else set(outlines.row.tolist())
-    problems = []
-    for row in range(dataset.measurements.n_rows):
-        path = dataset.image_path(row)
-        if path is None and row not in given:
-            problems.append(
-                f"{dataset.table_path}, row {row + 1}, column image: the row could not be used: "
-                f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
-                "them; name an image or remove the row."
-            )
-        elif path is not None and (os.path.exists(path) or row not in given):
-            found = dataset.image_problem(row)
-            problems += [found] if found else []
-    return problems

@@ -15,7 +15,7 @@ from legcal.dataset.folder import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.observations.canonical_order import canonical_order
-from legcal.observations.parts import axes_at, measurements_at, outlines_at
+from legcal.observations.parts import axes_at, corners_at, measurements_at, outlines_at
 
 _SEED = 20020721
 
@@ -94,12 +94,13 @@ def split_images(dataset: Dataset, fraction: float) -> Split:
 
 def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
     """Return a dataset with some of its images only."""
-    observations, axes = dataset.observations, dataset.axes
+    observations, axes, corners = dataset.observations, dataset.axes, dataset.corners
     return replace(
         dataset,
         measurements=measurements_at(dataset.measurements, rows),
         observations=None if observations is None else outlines_at(observations, rows),
         axes=None if axes is None else axes_at(axes, rows),
+        corners=None if corners is None else corners_at(corners, rows),
     )
 
 

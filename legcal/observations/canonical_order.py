@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.geometry.types import IntArray
+from legcal.observations.corners import Corners, sort_corners
 from legcal.observations.leg_axes import LegAxes, choose_axes
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
@@ -130,6 +131,24 @@ def reorder_axes(axes: LegAxes, order: Order) -> LegAxes:
     """
     row, leg = inverse(order.rows)[axes.row], inverse(order.legs)[axes.leg]
     return choose_axes(replace(axes, row=row, leg=leg), np.lexsort([leg, row]))
+
+
+def reorder_corners(corners: Corners, order: Order) -> Corners:
+    """Return corners of reordered measurements, sorted by row and number.
+
+    Parameters
+    ----------
+    corners : Corners
+        Corners of the measurements in their original order.
+    order : Order
+        The order given to :func:`reorder_measurements`.
+    """
+    return sort_corners(replace(corners, row=inverse(order.rows)[corners.row]))
+
+
+def restore_corners(corners: Corners, order: Order) -> Corners:
+    """Return corners of reordered measurements as those of the original ones, sorted."""
+    return sort_corners(replace(corners, row=order.rows[corners.row]))
 
 
 def restore_outlines(outlines: Outlines, order: Order) -> Outlines:

@@ -76,3 +76,8 @@ def join_corners(tables: Sequence[Corners]) -> Corners:
         tuple(reason for t in tables for reason in t.reason),
         tuple(source for t in tables for source in t.source),
     )
+
+
+def sort_corners(corners: Corners) -> Corners:
+    """Return the corners sorted by image row and number."""
+    return choose_corners(corners, np.lexsort([corners.corner, corners.row]))

@@ -1,4 +1,4 @@
-"""Some of the images of a session, with the outlines and axes that belong to them."""
+"""Some of the images of a session, with the outlines, axes and corners that belong to them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from legcal.geometry.types import IntArray
+from legcal.observations.corners import Corners, choose_corners
 from legcal.observations.leg_axes import LegAxes, choose_axes
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
@@ -47,6 +48,13 @@ def axes_at(axes: LegAxes, rows: IntArray) -> LegAxes:
     """Return the axes of some rows as those of :func:`measurements_at` them."""
     place = _places(rows, axes.row)
     chosen = choose_axes(axes, np.flatnonzero(place >= 0))
+    return replace(chosen, row=place[place >= 0])
+
+
+def corners_at(corners: Corners, rows: IntArray) -> Corners:
+    """Return the corners of some rows as those of :func:`measurements_at` them."""
+    place = _places(rows, corners.row)
+    chosen = choose_corners(corners, place >= 0)
     return replace(chosen, row=place[place >= 0])
 
 

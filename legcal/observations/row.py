@@ -68,6 +68,21 @@ def place_in_measurements(
     thing: str,
 ) -> tuple[tuple[int, int], list[str]]:
     """Return image row and leg that a table's row names, -1 where unknown, and what is unknown."""
+    row, unknown = row_in_measurements(where, cells, places, thing)
+    leg = list(leg_names).index(cells["leg"]) if cells["leg"] in leg_names else -1
+    if leg < 0:
+        unknown.append(
+            f"{where}, column leg: the {thing} could not be used: found the unknown leg "
+            f"{describe(cells['leg'])}, needed a leg of the mechanism; "
+            f"{closest(cells['leg'], leg_names)}"
+        )
+    return (row, leg), unknown
+
+
+def row_in_measurements(
+    where: str, cells: Mapping[str, str], places: Mapping[tuple[str, str], int], thing: str
+) -> tuple[int, list[str]]:
+    """Return the image row that a table's row names, -1 if unknown, and what is unknown."""
     start = f"the {thing} could not be used: found"
     unknown = []
     view, image = cells["view"], cells["image"]
@@ -82,13 +97,7 @@ def place_in_measurements(
             f"{where}, column image: {start} {describe(image)}, needed an image of view {view} in "
             f"the measurements; {closest(image, [i for v, i in places if v == view])}"
         )
-    leg = list(leg_names).index(cells["leg"]) if cells["leg"] in leg_names else -1
-    if leg < 0:
-        unknown.append(
-            f"{where}, column leg: {start} the unknown leg {describe(cells['leg'])}, needed a leg "
-            f"of the mechanism; {closest(cells['leg'], leg_names)}"
-        )
-    return (places.get((view, image), -1), leg), unknown
+    return places.get((view, image), -1), unknown
 
 
 def parse_row(

@@ -1,0 +1,184 @@
+"""The table ``corners.csv``: corners of the calibration board, written and read back.
+
+One row a corner: view and image, named as in ``observations.csv``; the number of the corner on the
+board; where it is seen and the standard deviation of that [px]; verdict, reason and source.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from legcal.errors import DatasetError
+from legcal.files.atomic import write_atomically
+from legcal.files.csv_file import read_named_rows
+from legcal.files.schema import describe
+from legcal.observations.corners import Corners
+from legcal.observations.measurements import Measurements
+from legcal.observations.row import SOURCES, VERDICTS, number_in, row_in_measurements
+from legcal.observations.table import row_names, rows_by_name
+from legcal.vision.board import Board
+
+NUMBERS = ("u", "v", "sigma")
+COLUMNS = ("view", "image", "corner", *NUMBERS, "verdict", "reason", "source")
+SIGMA_RANGE = (1e-6, 100.0)  # [px]: no corner is known better, and worse says nothing
+_START = "the corner could not be used: found"
+
+
+def write_corners(path: Path, corners: Corners, measurements: Measurements) -> None:
+    """Write corners so that reading gives the same numbers, and the file complete or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        ``corners.csv``.
+    corners : Corners
+        What to write.
+    measurements : Measurements
+        The rows they belong to, in the order of the file.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    write_atomically(path, format_corners(corners, measurements).encode())
+
+
+def format_corners(corners: Corners, measurements: Measurements) -> str:
+    """Return the text of ``corners.csv``; arguments as in :func:`write_corners`."""
+    names = row_names(measurements)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for i, row in enumerate(corners.row.tolist()):
+        numbers = [*corners.px[i].tolist(), float(corners.sigma_px[i])]
+        writer.writerow(
+            [
+                measurements.views[measurements.view[row]].name,
+                names[row],
+                int(corners.corner[i]),
+                *("" if math.isnan(x) else repr(x) for x in numbers),
+                VERDICTS[0 if corners.used[i] else 1],
+                corners.reason[i],
+                corners.source[i],
+            ]
+        )
+    return text.getvalue()
+
+
+def read_corners(path: Path, board: Board, measurements: Measurements) -> Corners:
+    """Read ``corners.csv``.
+
+    An edited row wins over the detected one of the same image and corner.
+
+    Parameters
+    ----------
+    path : Path
+        The table.
+    board : Board
+        The board, for the numbers of its corners.
+    measurements : Measurements
+        The rows that corners belong to, in the order of the file.
+
+    Returns
+    -------
+    Corners
+        In the order of the file.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong, naming row and column.
+    """
+    problems: list[str] = []
+    rows = read_named_rows(path, "table of corners", COLUMNS, "correct the header", problems)
+    if not problems and not rows:
+        problems.append(
+            f"{path}: the corners could not be used: found no row, needed the corners of the board "
+            "in the images; add them, or delete the file to have images searched."
+        )
+    places = rows_by_name(measurements)
+    sizes = [(camera.width, camera.height) for camera in (v.camera for v in measurements.views)]
+    found: dict[tuple[int, int, str], tuple[str, Mapping[str, str]]] = {}
+    for where, cells in rows:
+        row, wrong = row_in_measurements(where, cells, places, "corner")
+        size = sizes[measurements.view[row]] if row >= 0 else (math.inf, math.inf)
+        wrong += _problems(where, cells, board, size)
+        problems += wrong
+        if wrong:
+            continue
+        key = row, int(cells["corner"]), cells["source"]
+        earlier, _ = found.setdefault(key, (where, cells))
+        if earlier != where:
+            problems.append(
+                f"{where}: {_START} the same image and corner in "
+                f"{earlier.rsplit(', ', 1)[-1]}, needed it once; remove one of them."
+            )
+    if problems:
+        raise DatasetError(problems)
+    return _corners(
+        {
+            key: cells
+            for key, (_, cells) in found.items()
+            if key[2] == SOURCES[1] or (*key[:2], SOURCES[1]) not in found
+        }
+    )
+
+
+def _corners(found: Mapping[tuple[int, int, str], Mapping[str, str]]) -> Corners:
+    """Return checked rows, by image row, corner and source, as arrays."""
+    keys, cells = list(found), list(found.values())
+    numbers = np.array([[number_in(c[name]) for name in NUMBERS] for c in cells])
+    return Corners(
+        row=np.array([row for row, _, _ in keys], dtype=np.intp),
+        corner=np.array([corner for _, corner, _ in keys], dtype=np.intp),
+        px=numbers[:, :2],
+        sigma_px=numbers[:, 2],
+        used=np.array([c["verdict"] == VERDICTS[0] for c in cells], dtype=np.bool_),
+        reason=tuple(c["reason"] for c in cells),
+        source=tuple(c["source"] for c in cells),
+    )
+
+
+def _problems(
+    where: str, cells: Mapping[str, str], board: Board, size: Sequence[float]
+) -> list[str]:
+    """Return what is wrong with the cells of a row besides its place; ``size`` of the image."""
+    problems = [
+        f"{where}, column {name}: {_START} {describe(cells[name])}, needed "
+        f"{' or '.join(allowed)}; correct it."
+        for name, allowed in (("verdict", VERDICTS), ("source", SOURCES))
+        if cells[name] not in allowed
+    ]
+    number = cells["corner"]
+    if not (number.isascii() and number.isdecimal()) or int(number) >= board.n_corners:
+        problems.append(
+            f"{where}, column corner: {_START} {describe(number)}, needed a corner of the board, "
+            f"0 to {board.n_corners - 1}; correct it, or the board in the dataset file."
+        )
+    used = cells["verdict"] == VERDICTS[0]
+    values = {name: number_in(cells[name]) for name in NUMBERS}
+    problems += [
+        f"{where}, column {name}: {_START} "
+        f"{describe(cells[name]) if cells[name] else 'an empty cell'}, needed a finite number; "
+        "correct it or set the verdict to rejected with an empty cell."
+        for name, x in values.items()
+        if not math.isfinite(x) and (used or cells[name])
+    ]
+    problems += [
+        f"{where}, column {name}: {_START} {values[name]:g} px, needed -0.5 to {length - 0.5:g} px,"
+        " inside the image; correct it."
+        for name, length in zip(NUMBERS[:2], size, strict=True)
+        if math.isfinite(values[name]) and not -0.5 <= values[name] <= length - 0.5
+    ]
+    least, most = SIGMA_RANGE
+    if math.isfinite(values["sigma"]) and not least <= values["sigma"] <= most:
+        problems.append(
+            f"{where}, column sigma: {_START} {values['sigma']:g}, needed a standard deviation "
+            f"from {least:g} to {most:g} px; correct it."
+        )
+    return problems
