@@ -15,9 +15,11 @@ from legcal.identify.ranks import Analysis
 from legcal.identify.session import Session
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
-from legcal.stages import joints_in_base, offsets, platform_joints
-from legcal.stages.joints_in_base import JointsInBase, register_views
-from legcal.stages.joints_in_camera import locate_joints_in_cameras
+from legcal.simulation.machine import Machine
+from legcal.stages import offsets, platform_joints, rigid_parts, scalar_products
+from legcal.stages.joints_in_base import JointsInBase
+from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
+from legcal.stages.laid_together import register_views
 from legcal.stages.least_squares import LeastSquares, structure_jacobian
 from legcal.stages.leg_directions import directions_through_joints
 from legcal.stages.solution import Solution
@@ -57,6 +59,13 @@ def shared_poses(session: Session) -> Session:
     return replace(session, R=session.R[:n], t=session.t[:n], pose=pose)
 
 
+def base_as_drawn(machine: Machine, joints: JointsInCamera) -> JointsInBase:
+    """Return the base of a machine of point-like joints as step 2 would, without solving."""
+    A_Rb, no_axes = machine.parameters.base_joints, np.full((machine.n_legs, 3), np.nan)
+    cameras = register_views(A_Rb, no_axes, joints)
+    return JointsInBase(A_Rb, cameras, cast(Solution, None), no_axes)
+
+
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("views", VIEWS)
 def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
@@ -65,11 +74,10 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
     session = exact_session(legs=views, n_poses=8, share_poses=shared)
     machine, axes, m = session.machine, session.axes, session.measurements
     joints = locate_joints_in_cameras(nominal_of(machine), axes, m)
-    cameras = register_views(machine.parameters.base_joints, joints)
-    base = JointsInBase(machine.parameters.base_joints, cameras, cast(Solution, None))
+    base = base_as_drawn(machine, joints)
     directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
     q0 = machine.parameters.offsets
-    step2 = joints_in_base.build_rigid(nominal_of(machine), joints, cameras)
+    step2 = rigid_parts.build_rigid(nominal_of(machine), joints, base.T_Rb_camera)
     step3 = offsets.build_constant_distances(nominal_of(machine), directions, q0, m.sigma_q)
     step4 = platform_joints.build_rigid(nominal_of(machine), directions, q0, m.sigma_q)
     built = [
@@ -96,14 +104,10 @@ def test_printed_ranks_are_those_of_the_problems_that_the_steps_solve(coplanar: 
     session = exact_session(legs=views, n_poses=8, coplanar=coplanar)
     machine, axes, m = session.machine, session.axes, session.measurements
     joints = locate_joints_in_cameras(nominal_of(machine), axes, m, criteria="literal")
-    base = JointsInBase(
-        machine.parameters.base_joints,
-        register_views(machine.parameters.base_joints, joints),
-        cast(Solution, None),
-    )
+    base = base_as_drawn(machine, joints)
     directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
     built = [
-        rank_of_first(joints_in_base.build_scalar_products(nominal_of(machine), joints), 12),
+        rank_of_first(scalar_products.build_scalar_products(nominal_of(machine), joints), 12),
         rank_of_first(offsets.build_consecutive(nominal_of(machine), directions), 6),
         rank_of_first(
             platform_joints.build_mean_distances(

@@ -10,9 +10,10 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.simulation.machine import Machine, hexapod
-from legcal.stages.joints_in_base import JointsInBase, build_scalar_products, locate_joints_in_base
+from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.stages.joints_in_camera import locate_joints_in_cameras
 from legcal.stages.nominal import Criteria
+from legcal.stages.scalar_products import build_scalar_products
 from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession
 

@@ -49,7 +49,7 @@ def test_weights_make_a_centre_far_better_and_its_covariance_true() -> None:
             error = joints.A_camera[v, j] - true[v, j]
             default.append(error @ error)
             literal.append(np.sum((plain.A_camera[v, j] - true[v, j]) ** 2))
-            normalised.append(error @ np.linalg.solve(joints.covariance[v, j], error))
+            normalised.append(error @ np.linalg.solve(joints.covariance[v, j, :3, :3], error))
     assert np.mean(default) < 0.25 * np.mean(literal)
     assert 2.0 < np.mean(normalised) < 5.0  # 3 by rights; outlier weights cost a little
 

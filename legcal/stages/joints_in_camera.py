@@ -1,12 +1,14 @@
-"""Section 3.2: the base joint centres in the camera frames, eq (6).
+"""Section 3.2: base joint centres and revolute axes in the camera frames, eqs (6) and (7).
 
-All axes of one leg in the images of one view meet in its base joint centre A. The centre is
-the point nearest to them: linear least squares, in closed form.
+All axes of one leg in the images of one view meet in its base joint centre A, and are normal
+to the revolute axis v of that joint. In a planar mechanism the axes of a view are one normal.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,18 +16,18 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
+from legcal.stages.base_unknowns import nominal_axes
+from legcal.stages.bundles import Bundles
+from legcal.stages.camera_starts import camera_starts, signs_seen
+from legcal.stages.doubts import too_few_directions, too_tilted, too_uncertain
+from legcal.stages.meeting_axes import flipped, plain_axes, weighted_joints
+from legcal.stages.meeting_points import nearest_points, plain_information, weighted_points
 from legcal.stages.nominal import Criteria, NominalMechanism
-
-_REWEIGHTINGS = 10
-_OUTLIER = 3.0  # an axis that misses A by this many times the median has half its weight
-_NO_NOISE = 1e-3  # standard deviations: smaller misses are rounding
-_SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
-_LARGEST_SIGMA = 0.1  # of the distance to the camera
 
 
 @dataclass(frozen=True, eq=False)
 class JointsInCamera:
-    """Base joint centres in the frame of each view.
+    """Base joint centres and revolute axes in the frame of each view.
 
     Attributes
     ----------
@@ -33,14 +35,23 @@ class JointsInCamera:
         Centres in the camera frame [m]; zero where not located.
     located : (n_views, n_legs) array of bool
         Which centres were located.
-    covariance : (n_views, n_legs, 3, 3) array
-        Covariance of the centres [m^2]; zero where not located.
+    v_camera : (n_views, n_legs, 3) array
+        Unit revolute axes in the camera frame, the common normal in a planar mechanism; zero
+        where not located. They point as :func:`oriented` says.
+    axis_located : (n_views, n_legs) array of bool
+        Which axes were located.
+    covariance : (n_views, n_legs, 5, 5) array
+        Covariance of the centres [m^2] and of two turns of the axes about their
+        :func:`legcal.geometry.lines.normal_basis` [rad^2]; zero where not located. Of a planar
+        mechanism, that of each leg and the common normal.
     diagnostics : tuple of str
         Which legs were left out of which views, and why.
     """
 
     A_camera: Array
     located: BoolArray
+    v_camera: Array
+    axis_located: BoolArray
     covariance: Array
     diagnostics: tuple[str, ...]
 
@@ -52,18 +63,18 @@ def locate_joints_in_cameras(
     *,
     criteria: Criteria = "default",
 ) -> JointsInCamera:
-    """Locate each base joint centre in each camera frame, eq (6).
+    """Locate base joint centres and revolute axes in each camera frame, eqs (6) and (7).
 
     Parameters
     ----------
     mechanism : NominalMechanism
-        Names and number of the legs.
+        Names and joints of the legs; its base says to which side axes point.
     axes : LegAxes
         Leg axes in the camera frames.
     measurements : Measurements
         The view of each image.
     criteria : {"default", "literal"}
-        ``literal`` solves (6) as printed, every equation with the same weight.
+        ``literal`` solves (6) and then (7) as printed, every equation with the same weight.
 
     Returns
     -------
@@ -76,156 +87,130 @@ def locate_joints_in_cameras(
 
     Notes
     -----
-    The default weights the distance of A from each axis by the covariance of the axis there:
-    an outline pair says very exactly in which plane through the camera centre A lies, and
-    little about its depth. The covariance at A depends on A, so the weights are computed
-    again a few times, and axes that miss the others by far are given less.
+    The default weights the distance of A from each axis, and the angle of the axis to v, by the
+    covariance of the axis: see :mod:`legcal.stages.meeting_points` and
+    :mod:`legcal.stages.meeting_axes`. Axes that miss the others by far are given less.
     """
-    n_views, n_legs = len(measurements.views), mechanism.n_legs
-    A_camera = np.zeros((n_views, n_legs, 3))
-    covariance = np.zeros((n_views, n_legs, 3, 3))
-    located = np.zeros((n_views, n_legs), dtype=np.bool_)
-    key = measurements.view[axes.row] * n_legs + axes.leg
-    views, legs = np.divmod(np.unique(key), n_legs)
-    bundles = _Bundles.of(key)
-    information = plain_information(axes, bundles)
-    counts = bundles.counts.tolist()
-    reasons = [_too_few_directions(*told) for told in zip(information[0], counts, strict=True)]
-    clear = np.array([not reason for reason in reasons], dtype=np.bool_)
-    A, C = nearest_points((information[0][clear], information[1][clear]))
-    if criteria == "default" and clear.any():
-        A, C = weighted_points(axes, bundles.some(clear), A)
-        for k, i in enumerate(np.flatnonzero(clear)):
-            reasons[i] = _too_uncertain(A[k], C[k])
-    found = np.array([not reason for reason in reasons], dtype=np.bool_)
-    v, j = views[found], legs[found]
-    A_camera[v, j], covariance[v, j], located[v, j] = A[found[clear]], C[found[clear]], True
-    diagnostics = [
-        f"The base joint of leg {mechanism.leg_names[int(j)]} in view "
-        f"{measurements.views[int(v)].name} was left out: {reason}."
-        for v, j, reason in zip(views, legs, reasons, strict=True)
-        if reason
+    key = measurements.view[axes.row] * mechanism.n_legs + axes.leg
+    views, legs = np.divmod(np.unique(key), mechanism.n_legs)
+    bundles = Bundles.of(key)
+    spread = plain_information(axes, bundles)[0]
+    reasons = [
+        too_few_directions(*told) for told in zip(spread, bundles.counts.tolist(), strict=True)
     ]
-    _check_every_leg(mechanism, located, diagnostics)
-    return JointsInCamera(A_camera, located, covariance, tuple(diagnostics))
+    clear = np.flatnonzero([not reason for reason in reasons])
+    bundles = bundles.some(np.isin(np.arange(len(reasons)), clear))
+    A, v, C = _estimate(mechanism, axes, bundles, views[clear], legs[clear], criteria)
+    has_axis = np.any(v != 0.0, axis=1)
+    doubts = [""] * len(clear)
+    if criteria == "default":
+        for k, i in enumerate(clear):
+            reasons[i] = too_uncertain(A[k], C[k, :3, :3])
+            if has_axis[k] and not reasons[i]:
+                doubts[k] = too_tilted(C[k, 3:, 3:])
+    good = np.array([not reasons[i] for i in clear], dtype=np.bool_)
+    good_axis = good & has_axis & np.array([not doubt for doubt in doubts], dtype=np.bool_)
+    at = (views[clear], legs[clear])
+    shape = (len(measurements.views), mechanism.n_legs)
+    diagnostics = (
+        *_left_out("base joint", mechanism, measurements, (views, legs), reasons),
+        *_left_out("revolute axis", mechanism, measurements, at, doubts),
+    )
+    found = JointsInCamera(
+        _laid_out(shape, at, np.where(good[:, None], A, 0.0)),
+        _laid_out(shape, at, good),
+        _laid_out(shape, at, np.where(good_axis[:, None], v, 0.0)),
+        _laid_out(shape, at, good_axis),
+        _laid_out(shape, at, np.where(good[:, None, None], C, 0.0)),
+        diagnostics,
+    )
+    _check_every_leg(mechanism, found.located, diagnostics)
+    return oriented(mechanism, found)
 
 
-@dataclass(frozen=True, eq=False)
-class _Bundles:
-    """Axes in bundles, each of one leg in one view, whose axes meet in one point.
+def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCamera:
+    """Return joints with their axes pointing to the side of the nominal axes.
 
-    ``rows`` (k,) are the axes, bundle by bundle, and ``counts`` how many each bundle has.
+    An axis in a camera is a line: (7) gives it up to its sign, while products of vectors need one.
+    The nominal base is laid on the joints of each view, and each axis takes the sign with which it
+    points to the side of its nominal axis. Where the joints lie on one line, the base is
+    turned about it until the axes agree best, as lines. Where two turns agree alike, as for
+    axes normal to the line between two joints, the sign remains a matter of choice, and so does
+    that of an axis whose joint is alone in its view.
     """
-
-    rows: IntArray
-    counts: IntArray
-
-    @classmethod
-    def of(cls, key: IntArray) -> _Bundles:
-        """Return the bundles of axes with equal keys, by key."""
-        return cls(np.argsort(key, kind="stable"), np.unique(key, return_counts=True)[1])
-
-    @property
-    def bundle(self) -> IntArray:
-        """The bundle of each of ``rows``, (k,)."""
-        return np.repeat(np.arange(len(self.counts)), self.counts)
-
-    def some(self, wanted: BoolArray) -> _Bundles:
-        """Return some of the bundles."""
-        return _Bundles(self.rows[wanted[self.bundle]], self.counts[wanted])
-
-    def total(self, values: Array) -> Array:
-        """Return the sum over each bundle of values of ``rows``."""
-        return np.asarray(np.add.reduceat(values, np.cumsum(self.counts) - self.counts))
-
-    def median(self, values: Array) -> Array:
-        """Return the median over each bundle of values (k,) of ``rows``."""
-        ordered = values[np.lexsort((values, self.bundle))]
-        first = np.cumsum(self.counts) - self.counts
-        low, high = first + (self.counts - 1) // 2, first + self.counts // 2
-        return np.asarray(0.5 * (ordered[low] + ordered[high]))
+    nominal, A_Rb = nominal_axes(mechanism), mechanism.parameters.base_joints
+    signs = np.ones(joints.located.shape)
+    for v, (located, with_axis) in enumerate(zip(joints.located, joints.axis_located, strict=True)):
+        seen = joints.v_camera[v, with_axis]
+        starts = camera_starts(A_Rb[located], nominal[with_axis], joints.A_camera[v, located], seen)
+        if starts:
+            signs[v, with_axis] = signs_seen(nominal[with_axis], seen, starts[0].T_Rb_camera)
+    return with_signs(joints, signs)
 
 
-def plain_information(axes: LegAxes, bundles: _Bundles) -> tuple[Array, Array]:
-    """Return the normal equations of (6), (n, 3, 3) and (n, 3): sums of I - u u' and of its M."""
-    u, M = axes.u[bundles.rows], axes.M[bundles.rows]
-    normal = np.eye(3) - u[:, :, None] * u[:, None, :]
-    return bundles.total(normal), bundles.total(np.einsum("kij,kj->ki", normal, M))
+def with_signs(joints: JointsInCamera, signs: Array) -> JointsInCamera:
+    """Return joints with the axes turned round whose sign (n_views, n_legs) is -1."""
+    turned = (signs < 0.0)[..., None]
+    return replace(
+        joints,
+        v_camera=np.where(turned, -joints.v_camera, joints.v_camera),
+        covariance=np.where(turned[..., None], flipped(joints.covariance), joints.covariance),
+    )
 
 
-def nearest_points(information: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return the least-squares points A (n, 3) and the inverses of their normal matrices."""
-    inverse = np.asarray(np.linalg.inv(information[0]))
-    return np.asarray((inverse @ information[1][..., None])[..., 0]), inverse
+def _estimate(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    bundles: Bundles,
+    views: IntArray,
+    legs: IntArray,
+    criteria: Criteria,
+) -> tuple[Array, Array, Array]:
+    """Return A (n, 3), v (n, 3), zero where there is none, and covariances (n, 5, 5) of bundles."""
+    A, C_A = nearest_points(plain_information(axes, bundles))
+    v, C = np.zeros((len(A), 3)), np.zeros((len(A), 5, 5))
+    C[:, :3, :3] = C_A
+    revolute = mechanism.revolute[legs] | (not mechanism.spatial)
+    if criteria == "default" and not revolute.all():
+        some = bundles.some(~revolute)
+        A[~revolute], C[~revolute, :3, :3] = weighted_points(axes, some, A[~revolute])
+    if revolute.any():
+        some, pool = bundles.some(revolute), np.arange(int(revolute.sum()))
+        if not mechanism.spatial:
+            pool = np.unique(views[revolute], return_inverse=True)[1].ravel()
+        v[revolute], C[revolute, 3:, 3:] = plain_axes(axes, some, pool)
+        if criteria == "default":
+            A[revolute], v[revolute], C[revolute] = weighted_joints(
+                axes, some, pool, A[revolute], v[revolute]
+            )
+    return A, v, C
 
 
-def weighted_points(axes: LegAxes, bundles: _Bundles, A: Array) -> tuple[Array, Array]:
-    """Return the points nearest to axes in units of their covariances, and their covariances."""
-    E, M = axes.basis[bundles.rows], axes.M[bundles.rows]
-    across, bundle = np.swapaxes(E, -1, -2), bundles.bundle
-    C = np.zeros((len(A), 3, 3))
-    for _ in range(_REWEIGHTINGS):
-        residual, spread = miss(axes, bundles.rows, A[bundle])
-        weight = np.linalg.inv(spread)
-        chi = np.sqrt(np.einsum("ki,kij,kj->k", residual, weight, residual))
-        limit = np.maximum(_OUTLIER * bundles.median(chi), _NO_NOISE)[bundle]
-        weight = weight / (1.0 + (chi / limit) ** 2)[:, None, None]
-        normal = across @ weight @ E
-        right = (normal @ M[..., None])[..., 0]
-        A, C = nearest_points((bundles.total(normal), bundles.total(right)))
-    return A, C
+def _laid_out(shape: tuple[int, int], at: tuple[IntArray, IntArray], values: Any) -> Any:
+    """Return values of bundles by view and leg, zero where there is no bundle."""
+    found = np.zeros((*shape, *values.shape[1:]), dtype=values.dtype)
+    found[at] = values
+    return found
 
 
-def miss(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Array]:
-    """Return by how much axes miss points, in e1 and e2, and the covariance of that.
-
-    Parameters
-    ----------
-    axes : LegAxes
-        Axes.
-    here : (k,) array of int
-        Which of them.
-    A : (3,) or (k, 3) array
-        Points in the same frame [m].
-
-    Returns
-    -------
-    (k, 2) array [m], (k, 2, 2) array [m^2]
-        The axis at the height s of the point is M + s u + e (beta + s alpha).
-    """
-    arm = A - axes.M[here]
-    residual = np.einsum("kia,ka->ki", axes.basis[here], arm)
-    s = np.sum(arm * axes.u[here], axis=-1)
-    C, s = axes.covariance[here], s[:, None, None]
-    mixed = C[:, :2, 2:]
-    spread = s**2 * C[:, :2, :2] + s * (mixed + np.swapaxes(mixed, 1, 2)) + C[:, 2:, 2:]
-    return residual, spread
-
-
-def _too_few_directions(information: Array, n_images: int) -> str:
-    """Return why (6) has no single solution, or an empty string."""
-    smallest = float(np.linalg.eigvalsh(information)[0])
-    if smallest > _SAME_DIRECTION * n_images:
-        return ""
-    if n_images == 1:
-        return "it was found in one image, and at least two different directions are needed"
-    return f"its direction is the same in all {n_images} images, and two are needed"
-
-
-def _too_uncertain(A: Array, covariance: Array) -> str:
-    """Return why a centre says nothing, or an empty string."""
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-    distance = float(np.linalg.norm(A))
-    if sigma <= _LARGEST_SIGMA * distance:
-        return ""
-    return (
-        f"its directions differ too little to say where they meet (sigma {1e3 * sigma:.0f} mm "
-        f"at {1e3 * distance:.0f} mm from the camera)"
+def _left_out(
+    what: str,
+    mechanism: NominalMechanism,
+    measurements: Measurements,
+    at: tuple[IntArray, IntArray],
+    reasons: Sequence[str],
+) -> tuple[str, ...]:
+    """Return a sentence for each bundle that gives nothing, by view and leg."""
+    return tuple(
+        f"The {what} of leg {mechanism.leg_names[int(j)]} in view "
+        f"{measurements.views[int(v)].name} was left out: {reason}."
+        for v, j, reason in zip(*at, reasons, strict=True)
+        if reason
     )
 
 
 def _check_every_leg(
-    mechanism: NominalMechanism, located: BoolArray, diagnostics: list[str]
+    mechanism: NominalMechanism, located: BoolArray, diagnostics: Sequence[str]
 ) -> None:
     """Refuse when a leg was located in no view."""
     missing = [mechanism.leg_names[int(j)] for j in np.flatnonzero(~located.any(axis=0))]
@@ -236,5 +221,5 @@ def _check_every_leg(
                 "leg in two different directions, needed one; add images in which it is visible."
                 for name in missing
             ]
-            + diagnostics
+            + list(diagnostics)
         )

@@ -16,7 +16,8 @@ from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.observations.leg_axes import LegAxes, join_axes
 from legcal.observations.measurements import Measurements
 from legcal.stages.joints_in_base import JointsInBase
-from legcal.stages.joints_in_camera import JointsInCamera, miss
+from legcal.stages.joints_in_camera import JointsInCamera
+from legcal.stages.meeting_points import miss
 from legcal.stages.nominal import NominalMechanism
 
 _FAR = 8.0  # an axis that misses its joint by so many deviations or medians is a wrong one
@@ -79,7 +80,7 @@ def find_misses(
             A[view == v] = T.inv().apply(base.A_Rb[axes.leg[view == v]])
     residual, spread = miss(axes, np.arange(len(axes)), A)
     E = axes.basis
-    spread = spread + E @ joints.covariance[view, axes.leg] @ np.swapaxes(E, 1, 2)
+    spread = spread + E @ joints.covariance[view, axes.leg, :3, :3] @ np.swapaxes(E, 1, 2)
     chi = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(spread), residual))
     return np.asarray(chi > _FAR * max(1.0, float(np.median(chi))))
 
