@@ -92,6 +92,8 @@ def machine_session(
     *,
     length: float = 0.003,
     angle: float = float(np.deg2rad(1.0)),
+    camera_shift: float = 0.003,
+    camera_turn: float = float(np.deg2rad(1.0)),
     n_views: int = 3,
     n_poses: int = 6,
     camera: Camera = LENS,
@@ -105,7 +107,9 @@ def machine_session(
         The model.
     length, angle : float
         How wrong every coordinate, offset and constant length [m] and every axis [rad] of the
-        nominal legs is; the cameras are wrong by as much.
+        nominal legs is.
+    camera_shift, camera_turn : float
+        How far each camera is from where it is said to be [m], [rad].
     n_views, n_poses : int
         Number of cameras, and of poses that each of them sees alone.
     camera : Camera
@@ -130,7 +134,7 @@ def machine_session(
     truth = Start(legs, T_camera_Rb, motions(R, t), "truth")
     away = _wrong(fitted, legs, length, angle, rng)
     home = (platform_in_base(mechanism, mechanism.home),) * len(t)
-    rough = tuple(_shaken(T, length, angle, rng) for T in T_camera_Rb)
+    rough = tuple(_shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)
     wrong = replace(fitted, nominal=away)
     return MachineSession(
         wrong,

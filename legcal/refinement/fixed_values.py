@@ -39,7 +39,7 @@ _WIDE = 0.05  # of the mean leg length, angles at it: the prior of what was fixe
 _WIDE_RADIUS = 0.2  # of the radius
 _KNOWN = 1e-3  # of the information of that prior: what the measurements must have to be asked
 _TOLD = 0.5  # of the variance of that prior: what measurements leave where they tell the value
-_HELD = 1e-6  # [m] how well directions are known that are held
+_HELD = 0.01  # of the mean leg length: how well a nominal model knows what is held
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _doubts(
     """
     problem, state = fit.problem, fit.state
     normal = information(problem, state, fit.minimum.linear, width_to_k(settings.loss_width))
-    S = of_values(problem, state, normal) + _held_information(problem, held)
+    S = of_values(problem, state, normal) + _held_information(problem, held, mean_length(state))
     where = np.array([problem.named.index(name) for name in stated], dtype=np.intp)
     found = named_values(state, problem.layout, problem.legs)[where]
     M, P = _without_others(S, where), np.array([1.0 / one.wide.sigma**2 for one in stated.values()])
@@ -205,11 +205,15 @@ def _doubts(
     return doubts
 
 
-def _held_information(problem: FitProblem, held: Held) -> Array:
-    """Return the normal matrix of named unknowns that knows what is held."""
+def _held_information(problem: FitProblem, held: Held, length: float) -> Array:
+    """Return the normal matrix of named unknowns that knows what is held as nominal models do.
+
+    Where the fit holds a direction at nominal that what was stated would tell, as the size of a
+    3-UPU that only translates is told by its radii, the measurements do not speak against it.
+    """
     n = len(problem.named)
-    rows = np.zeros((len(held.basis), n))
-    rows[:, np.setdiff1d(np.arange(n), problem.layout.bias)] = held.basis / (_HELD * held.unit)
+    rows, known = np.zeros((len(held.basis), n)), _HELD * length * held.unit
+    rows[:, np.setdiff1d(np.arange(n), problem.layout.bias)] = held.basis / known
     return rows.T @ rows
 
 
