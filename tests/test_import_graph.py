@@ -68,7 +68,16 @@ def _unit(module: str) -> str:
 
 
 def test_every_part_of_the_package_has_its_place() -> None:
-    outside = {"legcal", "__main__", "errors", "progress", "signals", "version", "workers"}
+    outside = {
+        "legcal",
+        "__main__",
+        "errors",
+        "processors",
+        "progress",
+        "signals",
+        "version",
+        "workers",
+    }
     assert {_unit(module) for module in _modules()} == outside | set(LAYERS) | SIMULATED
 
 

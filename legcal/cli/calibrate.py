@@ -10,8 +10,8 @@ import typer
 
 from legcal.cli.options import JsonOption
 from legcal.cli.output import print_json, print_table
-from legcal.cli.processors import processors
 from legcal.errors import UsageError
+from legcal.processors import processors
 
 MOST_WORKERS = 4  # processes that search images; each takes about 150 MB
 

@@ -10,7 +10,7 @@ import typer
 from legcal.cli.calibrate import MOST_WORKERS
 from legcal.cli.options import JsonOption
 from legcal.cli.output import print_json, print_table
-from legcal.cli.processors import processors
+from legcal.processors import processors
 
 
 def noise(

@@ -6,7 +6,7 @@ import legcal.cli.simulate_options as opt
 from legcal.cli.calibrate import MOST_WORKERS
 from legcal.cli.options import JsonOption, ModelArgument
 from legcal.cli.output import print_json, print_table
-from legcal.cli.processors import processors
+from legcal.processors import processors
 
 
 def simulate(

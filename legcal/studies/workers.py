@@ -17,6 +17,7 @@ from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from legcal.errors import LegcalError, OutOfResources
+from legcal.processors import processors
 from legcal.studies.study import Study
 
 _LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
@@ -59,7 +60,7 @@ def lines_of_runs(
     OutOfResources
         If a process is ended from outside.
     """
-    workers = min(workers, max(len(runs), 1), _PROCESSES * (os.cpu_count() or 1))
+    workers = min(workers, max(len(runs), 1), _PROCESSES * processors())
     chunks = _chunks(runs, workers)
     if workers == 1:
         for chunk in chunks:
