@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from legcal.checking import check
     from legcal.dataset.folder import load_dataset
     from legcal.identify.analysis import identifiability
+    from legcal.location.document import load_location, write_location
+    from legcal.location.locate import locate
+    from legcal.location.location import Location
+    from legcal.location.tool_poses import ToolPoses
     from legcal.mechanism.configurations import random_configurations
     from legcal.mechanism.kinematics import Follower, forward_kinematics, inverse_kinematics
     from legcal.mechanism.load import load_mechanism
@@ -46,10 +50,12 @@ __all__ = [
     "Appearance",
     "Follower",
     "LegcalError",
+    "Location",
     "ParameterErrors",
     "SimulationSettings",
     "Spread",
     "TableNoise",
+    "ToolPoses",
     "__version__",
     "calibrate",
     "check",
@@ -58,20 +64,25 @@ __all__ = [
     "identifiability",
     "inverse_kinematics",
     "load_dataset",
+    "load_location",
     "load_mechanism",
+    "locate",
     "measure_noise",
     "random_configurations",
     "simulate",
     "singularity",
+    "write_location",
 ]
 
 _HOME = {
     "Appearance": "legcal.simulation.rendering.appearance",
     "Follower": "legcal.mechanism.kinematics",
+    "Location": "legcal.location.location",
     "ParameterErrors": "legcal.simulation.parameter_errors",
     "SimulationSettings": "legcal.simulation.settings",
     "Spread": "legcal.simulation.parameter_errors",
     "TableNoise": "legcal.simulation.table_noise",
+    "ToolPoses": "legcal.location.tool_poses",
     "calibrate": "legcal.pipeline",
     "check": "legcal.checking",
     "evaluate": "legcal.report.accuracy",
@@ -79,11 +90,14 @@ _HOME = {
     "identifiability": "legcal.identify.analysis",
     "inverse_kinematics": "legcal.mechanism.kinematics",
     "load_dataset": "legcal.dataset.folder",
+    "load_location": "legcal.location.document",
     "load_mechanism": "legcal.mechanism.load",
+    "locate": "legcal.location.locate",
     "measure_noise": "legcal.repeatability.noise",
     "random_configurations": "legcal.mechanism.configurations",
     "simulate": "legcal.simulation.simulate",
     "singularity": "legcal.mechanism.singularity",
+    "write_location": "legcal.location.document",
 }
 
 

@@ -22,6 +22,7 @@ LAYERS = (
     "calibration",
     "repeatability",
     "report",
+    "location",
     "workpiece",
     "fitting",
     "pipeline",

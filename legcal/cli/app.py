@@ -18,6 +18,7 @@ from legcal.cli.calibrate import calibrate
 from legcal.cli.evaluate import evaluate
 from legcal.cli.identify import identify
 from legcal.cli.inspect import inspect
+from legcal.cli.locate import locate
 from legcal.cli.new import new
 from legcal.cli.noise import noise
 from legcal.cli.output import print_failure
@@ -58,7 +59,7 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-for command in (inspect, identify, calibrate, evaluate, new, noise, simulate):
+for command in (inspect, identify, calibrate, evaluate, locate, new, noise, simulate):
     app.command()(command)
 app.add_typer(study, name="study")
 
