@@ -7,6 +7,7 @@ planar mechanism and the normal of its plane: nothing depends on them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -15,6 +16,7 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.parameters import free_coordinates
 from legcal.stages.nominal import NominalMechanism
+from legcal.stages.solution import Solution
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +89,14 @@ class BaseUnknowns:
             axes[j] = np.array(_axis_of_turns()(turns[j], self.frames[j])).ravel()
         return axes
 
-    def turns_basis(self, x: Array) -> Array:
-        """Return how v follows its turns, (n_legs, 2, 3); zero for legs without a revolute axis."""
-        turns = np.where(self.axes >= 0, x[self.axes], 0.0)
-        basis = np.zeros((len(self.axes), 2, 3))
+    def axis_covariance(self, solution: Solution) -> Array:
+        """Return the covariance of v in R_b, (n_legs, 3, 3) [rad^2]; zero for legs without one."""
+        turns = np.where(self.axes >= 0, solution.x[self.axes], 0.0)
+        of_turns, found = solution.covariance(), np.zeros((len(self.axes), 3, 3))
         for j in np.flatnonzero(self.axes[:, 0] >= 0):
-            basis[j] = np.array(_slope_of_turns()(turns[j], self.frames[j])).T
-        return basis
+            slope = np.array(_slope_of_turns()(turns[j], self.frames[j]))
+            found[j] = slope @ of_turns[np.ix_(self.axes[j], self.axes[j])] @ slope.T
+        return found
 
 
 def nominal_axes(mechanism: NominalMechanism) -> Array:
@@ -126,12 +129,14 @@ def turned_axis(turns: ca.SX, frame: ca.SX) -> ca.SX:
     return v + 2.0 / (1.0 + ca.dot(w, w)) * (across + ca.cross(w, across))
 
 
+@cache
 def _axis_of_turns() -> ca.Function:
     """Return (turns, frame) -> v, for numbers."""
     turns, frame = ca.SX.sym("turns", 2), ca.SX.sym("frame", 3, 3)
     return ca.Function("axis", [turns, frame], [turned_axis(turns, frame)])
 
 
+@cache
 def _slope_of_turns() -> ca.Function:
     """Return (turns, frame) -> derivative of v by the turns, (3, 2), for numbers."""
     turns, frame = ca.SX.sym("turns", 2), ca.SX.sym("frame", 3, 3)

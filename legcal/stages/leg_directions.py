@@ -15,9 +15,10 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.observations.leg_axes import LegAxes, join_axes
 from legcal.observations.measurements import Measurements
+from legcal.stages.conditioned_axes import condition_on_joint, known_normals
 from legcal.stages.joints_in_base import JointsInBase
 from legcal.stages.joints_in_camera import JointsInCamera
-from legcal.stages.meeting_points import miss
+from legcal.stages.meeting_points import derivative_of_miss, miss_of_joint
 from legcal.stages.nominal import NominalMechanism
 
 _FAR = 8.0  # an axis that misses its joint by so many deviations or medians is a wrong one
@@ -44,7 +45,8 @@ class LegDirections:
     covariance : (n, 2, 2) array
         Covariance of u along e1 and e2 [rad^2].
     reading : (n,) array
-        sign * q [m]: the leg length less its offset; NaN for passive legs.
+        sign * q [m]: the leg length less its offset; zero for legs of constant length, NaN for
+        passive ones.
     """
 
     group: IntArray
@@ -70,19 +72,28 @@ def find_misses(
 ) -> BoolArray:
     """Return which axes miss their base joint by far, (n,): wrong outlines, as a rule.
 
+    An axis misses A, or the plane normal to v of a revolute joint.
+
     The limit is a multiple of what the covariances promise, or of the median where they promise
     too much.
     """
     view = measurements.view[axes.row]
     A = joints.A_camera[view, axes.leg]
-    for v, T in enumerate(base.T_Rb_camera):
+    known = joints.located[view, axes.leg]
+    for i, T in enumerate(base.T_Rb_camera):
         if T is not None:
-            A[view == v] = T.inv().apply(base.A_Rb[axes.leg[view == v]])
-    residual, spread = miss(axes, np.arange(len(axes)), A)
-    E = axes.basis
-    spread = spread + E @ joints.covariance[view, axes.leg, :3, :3] @ np.swapaxes(E, 1, 2)
+            A[view == i] = T.inv().apply(base.A_Rb[axes.leg[view == i]])
+            known |= view == i
+    here, v = np.arange(len(axes)), joints.v_camera[view, axes.leg]
+    residual, spread = miss_of_joint(axes, here, A, v)
+    with_axis = joints.axis_located[view, axes.leg]
+    slope = np.zeros((len(axes), 3, 5))
+    slope[:, :2, :3] = axes.basis
+    slope[with_axis] = derivative_of_miss(axes, here[with_axis], v[with_axis])
+    spread = spread + slope @ joints.covariance[view, axes.leg] @ np.swapaxes(slope, 1, 2)
+    spread[~with_axis, 2, 2] = 1.0  # of nothing: the residual is zero
     chi = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(spread), residual))
-    return np.asarray(chi > _FAR * max(1.0, float(np.median(chi))))
+    return np.asarray(known & (chi > _FAR * max(1.0, float(np.median(chi[known])))))
 
 
 def observed_directions(
@@ -114,7 +125,7 @@ def observed_directions(
         u=u,
         basis=normal_basis(u),
         covariance=axes.covariance[first, :2, :2],
-        reading=mechanism.sign[j] * measurements.q[axes.row[first], j],
+        reading=_readings(mechanism, measurements, axes.row[first], j),
     )
 
 
@@ -125,7 +136,7 @@ def directions_through_joints(
     joints: JointsInCamera,
     base: JointsInBase,
 ) -> LegDirections:
-    """Return u of the legs given that each axis passes through its base joint A.
+    """Return u of the legs given that each axis belongs to its base joint.
 
     Parameters
     ----------
@@ -149,7 +160,8 @@ def directions_through_joints(
     One image says little about the tilt of a leg towards the camera, and (13) multiplies
     that error by the leg's length. But A is known from many images, and the middle of the
     leg from this one: an axis through both has a much better direction. This is what
-    conditioning the covariance of the axis on "it passes through A" does.
+    conditioning the covariance of the axis on "it passes through A" does, and on "it is normal
+    to v" for a leg with a revolute joint.
     """
     view = measurements.view[axes.row]
     known = np.array([T is not None for T in base.T_Rb_camera])
@@ -168,7 +180,8 @@ def directions_through_joints(
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     frame = np.where(known[view], 0, 1 + view)
     A = np.where(known[view][:, None], base.A_Rb[axes.leg], joints.A_camera[view, axes.leg])
-    u, basis, covariance = condition_on_point(axes, A)
+    normals = known_normals(mechanism, joints, base, view, axes.leg)
+    u, basis, covariance = condition_on_joint(axes, A, *normals)
     return LegDirections(
         group=frame * measurements.n_poses + pose,
         view=view,
@@ -177,25 +190,16 @@ def directions_through_joints(
         u=u,
         basis=basis,
         covariance=covariance,
-        reading=mechanism.sign[axes.leg] * measurements.q[axes.row, axes.leg],
+        reading=_readings(mechanism, measurements, axes.row, axes.leg),
     )
 
 
-def condition_on_point(axes: LegAxes, A: Array) -> tuple[Array, Array, Array]:
-    """Return u, basis and covariance (n, 2, 2) of axes that are known to pass through points A."""
-    residual, spread = miss(axes, np.arange(len(axes)), A)
-    s = np.sum((A - axes.M) * axes.u, axis=-1)
-    C = axes.covariance
-    cross = C[:, :2, 2:] + s[:, None, None] * C[:, :2, :2]  # cov(alpha, beta + s alpha)
-    gain = cross @ np.linalg.inv(spread)
-    alpha = (gain @ residual[..., None])[..., 0]
-    covariance = C[:, :2, :2] - gain @ np.swapaxes(cross, 1, 2)
-    u = axes.u + np.einsum("nia,ni->na", axes.basis, alpha)
-    u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=-1, keepdims=True)
-    e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
-    symmetric = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
-    return u, np.stack([e1, np.cross(u, e1)], axis=1), symmetric
+def _readings(
+    mechanism: NominalMechanism, measurements: Measurements, row: IntArray, leg: IntArray
+) -> Array:
+    """Return sign * q of legs in images [m]; a leg of constant length reads zero, as in (14)."""
+    q = np.where(mechanism.constant[leg], 0.0, measurements.q[row, leg])
+    return np.asarray(mechanism.sign[leg] * q)
 
 
 def select_axes(axes: LegAxes, keep: BoolArray) -> LegAxes:

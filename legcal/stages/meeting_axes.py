@@ -12,7 +12,12 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, IntArray
 from legcal.observations.leg_axes import LegAxes
 from legcal.stages.bundles import Bundles
-from legcal.stages.meeting_points import REWEIGHTINGS, miss_of_joint, robust_weights
+from legcal.stages.meeting_points import (
+    REWEIGHTINGS,
+    derivative_of_miss,
+    miss_of_joint,
+    robust_weights,
+)
 
 
 def plain_axes(axes: LegAxes, bundles: Bundles, pool: IntArray) -> tuple[Array, Array]:
@@ -75,7 +80,7 @@ def weighted_joints(
     for _ in range(REWEIGHTINGS):
         residual, spread = miss_of_joint(axes, rows, A[bundle], v[bundle])
         weight = robust_weights(bundles, residual, spread)
-        J = _derivative(axes, rows, v[bundle])
+        J = derivative_of_miss(axes, rows, v[bundle])
         back = np.swapaxes(J, 1, 2) @ weight
         step, C = _pooled(
             bundles.total(back @ J), bundles.total((back @ residual[..., None])[..., 0]), pool
@@ -98,16 +103,6 @@ def flipped(covariance: Array) -> Array:
     """
     sign = np.array([1.0, 1.0, 1.0, 1.0, -1.0])
     return np.asarray(covariance * np.outer(sign, sign))
-
-
-def _derivative(axes: LegAxes, rows: IntArray, v: Array) -> Array:
-    """Return the derivative (k, 3, 5) of the residuals by A and the turns of v."""
-    N, u = normal_basis(v), axes.u[rows]
-    J = np.zeros((len(rows), 3, 5))
-    J[:, :2, :3] = axes.basis[rows]
-    J[:, 2, 3] = np.sum(N[:, 1] * u, axis=1)
-    J[:, 2, 4] = -np.sum(N[:, 0] * u, axis=1)
-    return J
 
 
 def _pooled(F: Array, b: Array, pool: IntArray) -> tuple[Array, Array]:

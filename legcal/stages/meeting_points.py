@@ -1,4 +1,4 @@
-"""Where axes meet, eq (6): the point nearest to the axes of a bundle.
+"""Where axes meet, eq (6), and by how much they miss a joint: the point nearest to a bundle.
 
 An outline pair says very exactly in which plane through the camera centre a joint lies, and little
 about its depth, so that the miss of an axis is weighted by its covariance.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, IntArray
 from legcal.observations.leg_axes import LegAxes
 from legcal.stages.bundles import Bundles
@@ -121,3 +122,13 @@ def miss_of_joint(axes: LegAxes, here: IntArray, A: Array, v: Array) -> tuple[Ar
     T[:, :2, 2:] = np.eye(2)
     T[:, 2, :2] = np.einsum("kia,ka->ki", E, v)
     return residual, np.asarray(T @ axes.covariance[here] @ np.swapaxes(T, 1, 2))
+
+
+def derivative_of_miss(axes: LegAxes, here: IntArray, v: Array) -> Array:
+    """Return the derivative (k, 3, 5) of :func:`miss_of_joint` by A and turns of v (k, 3)."""
+    N, u = normal_basis(v), axes.u[here]
+    J = np.zeros((len(here), 3, 5))
+    J[:, :2, :3] = axes.basis[here]
+    J[:, 2, 3] = np.sum(N[:, 1] * u, axis=1)
+    J[:, 2, 4] = -np.sum(N[:, 0] * u, axis=1)
+    return J

@@ -68,6 +68,11 @@ class NominalMechanism:
         return np.array([leg.kind is LegKind.CONSTANT for leg in self.legs], dtype=np.bool_)
 
     @cached_property
+    def on_platform(self) -> BoolArray:
+        """Which legs are fixed to the platform, (n_legs,)."""
+        return np.array([leg.platform_joint == "" for leg in self.legs], dtype=np.bool_)
+
+    @cached_property
     def revolute(self) -> BoolArray:
         """Which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
         return np.array(

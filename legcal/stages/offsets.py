@@ -6,22 +6,22 @@ rigid platform: it is the same in all poses for the right offsets only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
 from legcal.stages.least_squares import LeastSquares, Term
 from legcal.stages.leg_directions import LegDirections
+from legcal.stages.loose_offsets import check_any, check_identifiable
 from legcal.stages.nominal import Criteria, NominalMechanism
 from legcal.stages.residuals import change_of_distance, constant_distance
 from legcal.stages.solution import Solution
 from legcal.stages.solve import solve_least_squares
 
 _REWEIGHTINGS = 2
+_APART = 1e-3  # mean leg lengths: nearer platform joints count as one
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,16 +77,17 @@ def identify_offsets(
     default compares every distance with one unknown d_jg a pair of legs, the same in all poses
     and views, and weights it by its covariance.
     """
+    pairs = pairs_apart(mechanism, directions)
     if criteria == "literal":
         problem = build_consecutive(mechanism, directions)
         solution = solve_least_squares(problem)
-        _check_identifiable(mechanism, solution)
+        check_identifiable(mechanism, directions, pairs, solution)
         return Offsets(_all_offsets(mechanism, solution.x), solution)
     q0 = mechanism.parameters.offsets
     for _ in range(_REWEIGHTINGS):
         problem = build_constant_distances(mechanism, directions, q0, sigma_q)
         solution = solve_least_squares(problem)
-        _check_identifiable(mechanism, solution)
+        check_identifiable(mechanism, directions, pairs, solution, mean_length(directions, q0))
         q0 = _all_offsets(mechanism, solution.x)
     return Offsets(q0, solution)
 
@@ -94,7 +95,7 @@ def identify_offsets(
 def build_consecutive(mechanism: NominalMechanism, directions: LegDirections) -> LeastSquares:
     """Build the criterion C_2 of (14): distances equal those of the next position of the view."""
     nominal = mechanism.parameters.offsets
-    pairs = pairs_of_legs(directions, nominal)
+    pairs = pairs_apart(mechanism, directions)
     last: dict[tuple[int, ...], int] = {}
     found = []
     for k, (a, b) in enumerate(pairs):
@@ -102,7 +103,7 @@ def build_consecutive(mechanism: NominalMechanism, directions: LegDirections) ->
         if key in last:
             found.append((last[key], k))
         last[key] = k
-    _check_any(found)
+    check_any(found)
     before, after = np.array(found, dtype=np.intp).T
     term = Term(
         change_of_distance(),
@@ -133,7 +134,7 @@ def build_constant_distances(
     LeastSquares
         Residuals in standard deviations of the distances.
     """
-    pairs = pairs_of_legs(directions, q0)
+    pairs = pairs_apart(mechanism, directions)
     ends = leg_ends(directions, q0)
     covariance = leg_end_covariance(directions, q0, sigma_q)
     legs = directions.leg[pairs]
@@ -188,8 +189,35 @@ def pairs_of_legs(directions: LegDirections, q0: Array) -> IntArray:
         for group in directions.groups()
         for pair in combinations(group[finite[group]].tolist(), 2)
     ]
-    _check_any(pairs)
+    check_any(pairs)
     return np.array(pairs, dtype=np.intp)
+
+
+def pairs_apart(mechanism: NominalMechanism, directions: LegDirections) -> IntArray:
+    """Return the pairs of :func:`pairs_of_legs` whose distance says something of their offsets.
+
+    Two legs that meet in one platform joint are at distance zero whatever their offsets are; a leg
+    that is fixed to the platform ends on it whatever its offset is.
+
+    Raises
+    ------
+    NotIdentifiable
+        If there is no such pair.
+    """
+    q0, B = mechanism.parameters.offsets, mechanism.parameters.platform_joints
+    pairs = pairs_of_legs(directions, q0)
+    legs = directions.leg[pairs]
+    gap = np.linalg.norm(B[legs[:, 0]] - B[legs[:, 1]], axis=1)
+    apart = gap > _APART * mean_length(directions, q0)
+    chosen: IntArray = pairs[apart & ~mechanism.on_platform[legs].any(axis=1)]
+    check_any(chosen.tolist())
+    return chosen
+
+
+def mean_length(directions: LegDirections, q0: Array) -> float:
+    """Return the mean length of the legs that have one [m]."""
+    length = directions.reading + q0[directions.leg]
+    return float(np.mean(length[np.isfinite(length)]))
 
 
 def observed_legs(directions: LegDirections, pairs: IntArray) -> Array:
@@ -216,25 +244,3 @@ def _all_offsets(mechanism: NominalMechanism, x: Array) -> Array:
     with_offset = np.isfinite(q0)
     q0[with_offset] = x[: int(with_offset.sum())]
     return q0
-
-
-def _check_any(found: Sequence[object]) -> None:
-    """Refuse an empty criterion."""
-    if not found:
-        raise NotIdentifiable(
-            "The offsets could not be identified: no image shows two legs whose base joints are "
-            "located; needed images that show several legs at once; add such images."
-        )
-
-
-def _check_identifiable(mechanism: NominalMechanism, solution: Solution) -> None:
-    """Refuse when an offset can change without any distance noticing."""
-    with_offset = np.flatnonzero(np.isfinite(mechanism.parameters.offsets))
-    loose = with_offset[solution.unseen(len(with_offset))]
-    if len(loose):
-        names = ", ".join(mechanism.leg_names[int(j)] for j in loose)
-        raise NotIdentifiable(
-            f"The offsets could not be identified: no distance between leg ends fixes that of "
-            f"{names}; needed each leg in images of at least three different poses together "
-            "with other legs; add images that show several legs at once."
-        )
