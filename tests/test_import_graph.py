@@ -129,8 +129,9 @@ def test_the_simulation_does_not_reach_the_method() -> None:
 
 def test_the_simulation_takes_only_cameras_and_tables_from_what_observes() -> None:
     cameras = {f"vision.{name}" for name in ("camera", "camera_file", "camera_writer")}
-    tables = {"measurements", "outlines", "table", "axes_file"}
-    allowed = cameras | {f"observations.{name}" for name in tables}
+    boards = {f"vision.board{name}" for name in ("", "_dictionaries", "_objects")}
+    tables = {"measurements", "outlines", "table", "axes_file", "corners", "corners_file"}
+    allowed = cameras | boards | {f"observations.{name}" for name in tables}
     modules = [module for module in _modules() if _unit(module) == "simulation"]
     taken = {
         (module, other)

@@ -124,6 +124,30 @@ CameraOption = Annotated[
         show_default="1024 x 768 px, slight distortion",
     ),
 ]
+BoardOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KIND|FILE",
+        help="A calibration board on the base: chessboard, charuco or aprilgrid, of a size that "
+        "fits the machine, or a YAML with the block board of a dataset.",
+        rich_help_panel=_CAMERAS,
+        show_default="none",
+    ),
+]
+BoardPoseOption = Annotated[
+    bool,
+    typer.Option(
+        "--board-pose", help="Tell where the board is in the base link.", rich_help_panel=_CAMERAS
+    ),
+]
+HandHeldOption = Annotated[
+    bool,
+    typer.Option(
+        "--hand-held",
+        help="Take every image from a place of its own, with the board in it.",
+        rich_help_panel=_CAMERAS,
+    ),
+]
 HintsOption = Annotated[
     bool,
     typer.Option(
@@ -136,7 +160,7 @@ PixelNoiseOption = Annotated[
     str | None,
     typer.Option(
         metavar="SIGMA",
-        help="Of each edge point of an outline.",
+        help="Of each edge point of an outline, and each corner of a board.",
         rich_help_panel=_NOISE,
         show_default="0.1px",
     ),

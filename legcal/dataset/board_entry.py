@@ -178,12 +178,17 @@ _KINDS: Mapping[str, type[ChessboardEntry | CharucoEntry | AprilgridEntry]] = {
 def read_board(
     found: Mapping[str, Any] | None, path: Path
 ) -> tuple[Board | None, RigidTransform | None]:
+    """Return what :func:`described_board` does, and None twice where a file has no such block."""
+    return (None, None) if found is None else described_board(found, path)
+
+
+def described_board(found: Mapping[str, Any], path: Path) -> tuple[Board, RigidTransform | None]:
     """Return the board that a block describes, and its pose in the base link where it is given.
 
     Parameters
     ----------
-    found : mapping or None
-        The block as the file has it; None if there is none.
+    found : mapping
+        The block as the file has it.
     path : Path
         The file, for messages.
 
@@ -192,8 +197,6 @@ def read_board(
     DatasetError
         With one sentence for each value that does not fit.
     """
-    if found is None:
-        return None, None
     kind = found.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
         what = "no such key" if "kind" not in found else describe(kind)

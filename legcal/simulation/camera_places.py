@@ -20,6 +20,7 @@ from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 from legcal.progress import Report, no_progress
 from legcal.simulation.cameras import look_at
+from legcal.simulation.placed_board import PlacedBoard
 from legcal.simulation.posed_machine import PosedMachine
 from legcal.simulation.rendering.footprint import surrounding_points
 from legcal.simulation.rendering.solid_in_view import in_view
@@ -33,8 +34,10 @@ _TRIED = 5  # poses at which directions are judged
 _SAMPLES = 32  # points of a leg in that
 _ROLL = 0.08  # [rad] by which cameras are not upright
 _FURTHER = 0.08  # of the least distance, by which cameras stand further away
+_HAND_ROLL, _HAND_FURTHER = 0.3, 0.25  # the same for cameras that are held in the hand
 _MARGIN = 0.03  # of the image that stays free at each side
 _CENTRINGS = 3  # steps that bring the machine into the middle of the image
+_MOSTLY = 0.75  # of the poses in which a camera must see the board
 _BEHIND = 0.3  # machine sizes that lie between the camera and the machine, at least
 
 
@@ -65,13 +68,41 @@ def places_around(
     tuple of RigidTransform
         T_base_camera.
     """
+    return scored_places(mechanism, machines, cameras, rng, progress)[0]
+
+
+def scored_places(
+    mechanism: Mechanism,
+    machines: Sequence[PosedMachine],
+    cameras: Sequence[Camera],
+    rng: np.random.Generator,
+    progress: Report = no_progress,
+    board: PlacedBoard | None = None,
+) -> tuple[tuple[RigidTransform, ...], float]:
+    """Return where cameras stand, and how much they see.
+
+    Parameters
+    ----------
+    mechanism, machines, cameras, rng, progress
+        As for :func:`places_around`.
+    board : PlacedBoard, optional
+        A calibration board that every camera must see; the machines have it beside them.
+
+    Returns
+    -------
+    places : tuple of RigidTransform
+        T_base_camera.
+    score : float
+        The least mean length of the legs in the images of a view [px]; zero if a camera does not
+        see the board.
+    """
     reached = _reached(machines)
     tried = [machines[i] for i in np.unique(np.linspace(0, len(machines) - 1, _TRIED).astype(int))]
-    up = _up(mechanism)
+    up = upward(mechanism)
     sector = 2.0 * np.pi / len(cameras)
     first = rng.uniform(0.0, 2.0 * np.pi)
     lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
-    found = []
+    found, least = [], np.inf
     for v, camera in enumerate(cameras):
         progress("Cameras", v, len(cameras))
         roll, further = rng.uniform(-_ROLL, _ROLL), 1.0 + _FURTHER * rng.random()
@@ -82,13 +113,51 @@ def places_around(
             for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
             for lift in lifts
         ]
-        scores = [_score(mechanism, tried, camera, T) for T in candidates]
+        scores = [_score(mechanism, tried, camera, T, board) for T in candidates]
         found.append(candidates[int(np.argmax(scores))])
+        least = min(least, max(scores))
     progress("Cameras", len(cameras), len(cameras))
-    return tuple(found)
+    return tuple(found), least
 
 
-def _up(mechanism: Mechanism) -> Array:
+def place_somewhere(
+    mechanism: Mechanism,
+    machine: PosedMachine,
+    camera: Camera,
+    rng: np.random.Generator,
+    board: PlacedBoard,
+) -> tuple[RigidTransform, float]:
+    """Return a place by chance of a camera that is held in the hand, and how much it sees.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The true machine.
+    machine : PosedMachine
+        The machine in the pose that it is to see, with the board.
+    camera : Camera
+        The camera.
+    rng : numpy.random.Generator
+        Source of the place.
+    board : PlacedBoard
+        The board.
+
+    Returns
+    -------
+    T_base_camera : RigidTransform
+        The place.
+    score : float
+        The mean length of the legs in the image [px], zero if it does not show the board.
+    """
+    up = upward(mechanism)
+    lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
+    toward = _direction(up, rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lifts[0], lifts[-1]))
+    roll, further = rng.uniform(-_HAND_ROLL, _HAND_ROLL), 1.0 + _HAND_FURTHER * rng.random()
+    T = _place(toward, up, roll, further, _reached([machine]), camera)
+    return T, _score(mechanism, [machine], camera, T, board)
+
+
+def upward(mechanism: Mechanism) -> Array:
     """Return the direction from base to platform at home, or the normal of the plane of motion."""
     if mechanism.base_normal is not None:
         return mechanism.base_normal
@@ -141,12 +210,25 @@ def _place(
 
 
 def _score(
-    mechanism: Mechanism, machines: Sequence[PosedMachine], camera: Camera, T: RigidTransform
+    mechanism: Mechanism,
+    machines: Sequence[PosedMachine],
+    camera: Camera,
+    T: RigidTransform,
+    board: PlacedBoard | None,
 ) -> float:
-    """Return the mean length in the image [px] of all legs, those hidden counted as nothing."""
+    """Return the mean length in the image [px] of all legs, those hidden counted as nothing.
+
+    It counts by the share of the poses in which the board is seen, which must be most of them.
+    """
+    share = 1.0
+    if board is not None:
+        shown = [board.is_enough(board.seen(machine, camera, T)) for machine in machines]
+        share = float(np.mean(shown))
+        if share < _MOSTLY:
+            return 0.0
     views = [
         view
         for machine in machines
         for view in legs_in_image(mechanism.legs, machine, camera, T, samples=_SAMPLES)
     ]
-    return float(np.mean([view.length_px if view.is_seen else 0.0 for view in views]))
+    return share * float(np.mean([view.length_px if view.is_seen else 0.0 for view in views]))

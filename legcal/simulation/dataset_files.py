@@ -81,7 +81,15 @@ def measurements_of(
     )
 
 
-def write_session(folder: Path, mechanism: Mechanism, model: str, m: Measurements) -> None:
+def write_session(
+    folder: Path,
+    mechanism: Mechanism,
+    model: str,
+    m: Measurements,
+    *,
+    groups: Sequence[str] = (),
+    board: Mapping[str, Any] | None = None,
+) -> None:
     """Write ``dataset.yaml``, ``measurements.csv`` and the camera files.
 
     Parameters
@@ -94,26 +102,36 @@ def write_session(folder: Path, mechanism: Mechanism, model: str, m: Measurement
         The path of its YAML in the dataset.
     m : Measurements
         The rows.
+    groups : sequence of str
+        The view of the file that each view belongs to where cameras are in the hand.
+    board : mapping, optional
+        The block of the calibration board.
     """
     cameras = _write_cameras(folder, m.views)
     views: dict[str, Any] = {}
-    for view, camera in zip(m.views, cameras, strict=True):
+    for v, (view, camera) in enumerate(zip(m.views, cameras, strict=True)):
         entry: dict[str, Any] = {"camera": camera}
+        if groups:
+            entry["hand_held"] = True
         if view.T_base_camera is not None:
             entry["T_base_camera"] = _rounded(view.T_base_camera)
         if view.legs is not None:
             entry["legs"] = list(view.legs)
-        views[view.name] = entry
-    document = {
+        views[groups[v] if groups else view.name] = entry
+    document: dict[str, Any] = {
         "legcal_dataset": 1,
         "mechanism": model,
         "measurements": "measurements.csv",
         "encoder_sigma": m.sigma_q,
         "views": views,
     }
+    if board is not None:
+        document["board"] = dict(board)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     (folder / "dataset.yaml").write_text(text, encoding="utf-8")
-    (folder / "measurements.csv").write_text(_measurements_text(mechanism, m), encoding="utf-8")
+    (folder / "measurements.csv").write_text(
+        _measurements_text(mechanism, m, groups), encoding="utf-8"
+    )
 
 
 def write_truth(
@@ -124,8 +142,9 @@ def write_truth(
     poses: Configurations,
     labels: Sequence[str],
     files: Sequence[str],
+    board: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``truth.json``: settings, radii, cameras and poses as they really were.
+    """Write ``truth.json``: settings, radii, cameras, poses and board as they really were.
 
     Parameters
     ----------
@@ -139,6 +158,8 @@ def write_truth(
         Cameras and poses.
     files : sequence of str
         The other files of the dataset.
+    board : mapping, optional
+        The block of the calibration board, with its true pose.
     """
     sliders = [
         (j, str(leg.prismatic))
@@ -164,6 +185,7 @@ def write_truth(
             }
             for label, T, readings in zip(labels, poses.poses, poses.readings, strict=True)
         },
+        **({} if board is None else {"board": dict(board)}),
         "files": list(files),
     }
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -182,7 +204,7 @@ def _write_cameras(folder: Path, views: Sequence[View]) -> list[str]:
     return names
 
 
-def _measurements_text(mechanism: Mechanism, m: Measurements) -> str:
+def _measurements_text(mechanism: Mechanism, m: Measurements, groups: Sequence[str]) -> str:
     """Return the text of ``measurements.csv``."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
@@ -190,7 +212,8 @@ def _measurements_text(mechanism: Mechanism, m: Measurements) -> str:
     joints = [str(mechanism.legs[j].prismatic) for j in motors]
     writer.writerow(["view", "image", "pose", *joints])
     for row in range(m.n_rows):
-        view, label = m.views[m.view[row]].name, m.pose_labels[m.pose[row]]
+        v, label = m.view[row], m.pose_labels[m.pose[row]]
+        view = groups[v] if groups else m.views[v].name
         writer.writerow([view, m.image[row], label, *map(repr, m.q[row, motors].tolist())])
     return text.getvalue()
 

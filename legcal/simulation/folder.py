@@ -15,6 +15,7 @@ from pathlib import Path
 
 from legcal.dataset.folder import CACHE_NAME, OBSERVATIONS_NAME
 from legcal.dataset.given_axes import AXES_NAME
+from legcal.dataset.given_corners import CORNERS_NAME
 from legcal.errors import UsageError
 from legcal.files.inside import path_problem
 from legcal.report.destination import (
@@ -29,7 +30,8 @@ from legcal.report.files import result_folder
 TRUTH = "truth"
 TRUTH_NAME = f"{TRUTH}/truth.json"
 _FOLDERS = ("images", "models", "urdf", TRUTH)
-_FILES = ("dataset.yaml", "measurements.csv", OBSERVATIONS_NAME, AXES_NAME, "camera_info*.yaml")
+_TABLES = ("measurements.csv", OBSERVATIONS_NAME, AXES_NAME, CORNERS_NAME)
+_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml")
 SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from legcal.mechanism.configurations import Configurations
 from legcal.mechanism.model import Mechanism
 from legcal.progress import Report
-from legcal.simulation.camera_places import places_around
 from legcal.simulation.cameras import mild_lens
 from legcal.simulation.cameras_file import read_cameras, read_lens
 from legcal.simulation.commanded_poses import commanded_poses
@@ -19,8 +19,11 @@ from legcal.simulation.dataset_files import pose_labels
 from legcal.simulation.dressing import dressed
 from legcal.simulation.images import Images, Viewpoint, take_images
 from legcal.simulation.motion import given_poses
+from legcal.simulation.placed_board import PlacedBoard
 from legcal.simulation.posed_machine import PosedMachine, pose_machine
 from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.viewing import look_at_machine, numbered
+from legcal.vision.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,11 @@ class ImagedMachine:
         The images that the dataset has rows for.
     left_out : int
         Images that show no leg, which a dataset of axes or outlines has no row for.
+    board : PlacedBoard or None
+        The calibration board on the base.
+    groups : tuple of str
+        The view of ``dataset.yaml`` that each camera belongs to where cameras are in the hand;
+        empty where they stand.
     """
 
     truth: Mechanism
@@ -48,6 +56,8 @@ class ImagedMachine:
     views: tuple[Viewpoint, ...]
     images: Images
     left_out: int
+    board: PlacedBoard | None = None
+    groups: tuple[str, ...] = ()
 
 
 def image_machine(
@@ -75,9 +85,8 @@ def image_machine(
     UsageError, DatasetError, DidNotConverge, NotVisible
         As :func:`legcal.simulation.simulate.simulate` does.
     """
-    camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
-    given = None if isinstance(settings.views, int) else read_cameras(settings.views, camera)
-    n_views = settings.views if isinstance(settings.views, int) else len(given or ())
+    cameras, places = _cameras(settings)
+    n_views = len(cameras)
     shared = settings.shared_poses or isinstance(settings.poses, Path)
     if isinstance(settings.poses, Path):
         poses = given_poses(truth, settings.poses)
@@ -90,17 +99,38 @@ def image_machine(
     # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
     shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
     machines = pose_machine(truth, dressed(shown), poses)
-    if given is None:
-        places = places_around(truth, machines, [camera] * n_views, chance["cameras"], progress)
-        views = tuple(Viewpoint(f"c{v + 1}", camera, T) for v, T in enumerate(places))
-    else:
-        views = tuple(Viewpoint(name, *place) for name, place in given.items())
+    viewing = look_at_machine(
+        truth, machines, settings, cameras, places,
+        shared=shared, chance=chance, progress=progress,
+    )  # fmt: skip
+    views = viewing.views
+    in_hand = len(viewing.groups) > 0
     images = take_images(
-        truth.legs, machines, views, settings.images, shared_poses=shared, progress=progress
-    )
+        truth.legs, viewing.machines, views, settings.images,
+        shared_poses=shared and not in_hand, progress=progress,
+    )  # fmt: skip
+    images = replace(images, pose=images.pose % len(machines))
     rows = list(range(len(images)))
     if settings.level is not Level.PHOTOGRAPHS:
         rows = [row for row in rows if images.seen(row)]
     kept, left_out = images.chosen(rows), len(images) - len(rows)
+    if in_hand:
+        kept, views, groups = numbered(kept, views, viewing.groups)
+        viewing = replace(viewing, groups=groups)
     labels = pose_labels(len(poses.poses))
-    return ImagedMachine(truth, poses, labels, machines, views, kept, left_out)
+    machines = viewing.machines[: len(machines)]
+    return ImagedMachine(
+        truth, poses, labels, machines, views, kept, left_out, viewing.board, viewing.groups
+    )
+
+
+def _cameras(
+    settings: SimulationSettings,
+) -> tuple[dict[str, Camera], dict[str, RigidTransform]]:
+    """Return the camera of each view, and where each stands if that is given."""
+    camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
+    if isinstance(settings.views, int):
+        return {f"c{v + 1}": camera for v in range(settings.views)}, {}
+    given = read_cameras(settings.views, camera)
+    cameras = {name: lens for name, (lens, _) in given.items()}
+    return cameras, {name: T for name, (_, T) in given.items()}

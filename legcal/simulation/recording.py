@@ -9,9 +9,12 @@ import numpy as np
 
 from legcal.dataset.folder import OBSERVATIONS_NAME
 from legcal.dataset.given_axes import AXES_NAME
+from legcal.dataset.given_corners import CORNERS_NAME
 from legcal.observations.axes_file import write_axis_table
+from legcal.observations.corners_file import write_corners
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.table import write_observations
+from legcal.simulation.corner_tables import corners_of_images
 from legcal.simulation.dataset_files import image_names, measurements_of
 from legcal.simulation.folder import TRUTH
 from legcal.simulation.hints import rough_pose
@@ -45,7 +48,7 @@ def recorded(
         T = rough_pose(view.T_base_camera, chance["hints"])
         shown = tuple(legs[j] for j in images.seen_in_view(v, least))
         hint = shown if 0 < len(shown) < len(legs) else None
-        hints = (T, hint) if settings.hints else (None, None)
+        hints = (T, hint) if settings.hints and not imaged.groups else (None, None)
         views.append(View(view.name, view.camera, *hints))
     q, size = imaged.poses.readings, settings.readings.size
     if settings.readings.distribution is Distribution.UNIFORM:
@@ -65,7 +68,7 @@ def write_tables(
     settings: SimulationSettings,
     chance: Mapping[str, np.random.Generator],
 ) -> None:
-    """Write the tables that the level asks for, and the exact outlines beside the truth.
+    """Write the tables that the level asks for, and exact outlines and corners beside the truth.
 
     Parameters
     ----------
@@ -76,10 +79,19 @@ def write_tables(
     m : Measurements
         The rows.
     chance : mapping of str to numpy.random.Generator
-        Source of ``observations``.
+        Sources of ``observations`` and ``corners``.
     """
     images, machines, views = imaged.images, imaged.machines, imaged.views
     legs = imaged.truth.leg_names
+    if imaged.board is not None:
+        placed, sigma_px = imaged.board, settings.sigma_px
+        exact_corners = corners_of_images(images, machines, views, placed, 0.0, None)
+        write_corners(folder / TRUTH / CORNERS_NAME, exact_corners, m)
+        if settings.level is not Level.PHOTOGRAPHS:
+            corners = corners_of_images(
+                images, machines, views, placed, sigma_px, chance["corners"]
+            )
+            write_corners(folder / CORNERS_NAME, corners, m)
     exact = outlines_of_images(images, machines, views, 0.0, None)
     write_observations(folder / TRUTH / "outlines.csv", exact, m, legs)
     if settings.level is Level.OUTLINES:

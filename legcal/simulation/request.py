@@ -12,6 +12,7 @@ from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
 from legcal.files.schema import closest, describe
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.appearance_file import read_appearance
+from legcal.simulation.board_choice import KINDS
 from legcal.simulation.motion import Sampling
 from legcal.simulation.parameter_errors import (
     LARGEST,
@@ -62,7 +63,7 @@ class Request:
         Keep joints in the plane that they are nominally in.
     poses : str
         A number or the path of a CSV.
-    sampling, shared_poses, images, views, cameras, camera, hints
+    sampling, shared_poses, images, views, cameras, camera, board, board_pose, hand_held, hints
         As in :class:`legcal.simulation.settings.SimulationSettings`; at most one of ``views`` and
         the file ``cameras``.
     pixel_noise, table_noise, encoder_noise : str
@@ -84,6 +85,9 @@ class Request:
     views: int | None = None
     cameras: Path | None = None
     camera: Path | None = None
+    board: str | None = None
+    board_pose: bool = False
+    hand_held: bool = False
     hints: bool = True
     pixel_noise: str | None = None
     table_noise: str | None = None
@@ -123,6 +127,9 @@ def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
         images=request.images,
         views=request.cameras or (3 if request.views is None else request.views),
         camera=request.camera,
+        board=_board(request.board),
+        board_pose=request.board_pose,
+        hand_held=request.hand_held,
         hints=request.hints,
         sigma_px=parse_quantity(noise, PIXELS, "--pixel-noise"),
         table=TableNoise.in_radians() if request.table_noise == "radians" else TableNoise(),
@@ -155,6 +162,17 @@ def _refuse_contradictions(request: Request, poses: int | Path, nominal: Mechani
             "The poses could not be drawn: found --sampling for a machine whose motors do not "
             "determine its pose, needed none, it takes a random walk; leave out --sampling."
         )
+    if request.hand_held and request.cameras is not None:
+        problems.append(
+            "The cameras could not be placed: found both --hand-held and --cameras, needed one of "
+            "them; leave out one of the two."
+        )
+    for option, given in (("--hand-held", request.hand_held), ("--board-pose", request.board_pose)):
+        if given and request.board is None:
+            problems.append(
+                f"{option} could not be used: found no --board, needed a board on the base; add "
+                "--board charuco."
+            )
     if problems:
         raise UsageError(problems)
 
@@ -165,10 +183,24 @@ def _refuse_other_levels(request: Request) -> None:
         f"{option} could not be used: found --level {request.level}, needed --level {level}, the "
         "only one that it has an effect on; leave it out or give that level."
         for name, (option, level) in _OF_LEVEL.items()
-        if getattr(request, name) is not None and request.level != level
+        if getattr(request, name) is not None
+        and request.level != level
+        and not (name == "pixel_noise" and request.level == "axes" and request.board is not None)
     ]
     if problems:
         raise UsageError(problems)
+
+
+def _board(choice: str | None) -> str | Path | None:
+    """Return a kind of board, or the path of a file."""
+    if choice is None or choice in KINDS:
+        return choice
+    if not Path(choice).exists():
+        raise UsageError(
+            f"--board could not be used: found {describe(choice)}, neither a kind of board nor a "
+            f"file, needed {', '.join(KINDS)} or the path of a YAML file; {closest(choice, KINDS)}"
+        )
+    return Path(choice)
 
 
 def _appearance(request: Request) -> Appearance:

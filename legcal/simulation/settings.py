@@ -17,6 +17,7 @@ from legcal.simulation.motion import Sampling
 from legcal.simulation.parameter_errors import KINDS, LARGEST, Distribution, ParameterErrors, Spread
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.table_noise import TableNoise
+from legcal.vision.board import Board
 
 _MILLIMETRES = Spread(2e-3)  # of the size by which the paper disturbs its machine
 _TENTH_DEGREE = Spread(float(np.deg2rad(0.1)))
@@ -74,6 +75,13 @@ class SimulationSettings:
         Errors of encoder readings [m].
     appearance : Appearance
         How photographs look.
+    board : Board, str, Path or None
+        A calibration board on the base: ``chessboard``, ``charuco`` or ``aprilgrid`` of a size that
+        fits the machine, a YAML file with the block ``board`` of a dataset, or a Board.
+    board_pose : bool
+        Say in the dataset where the board is in the base link.
+    hand_held : bool
+        Every image is taken from a place of its own, with the board in it.
     seed : int
         What all chance comes from.
 
@@ -96,6 +104,9 @@ class SimulationSettings:
     table: TableNoise = field(default_factory=TableNoise)
     readings: Spread = DEFAULT_READINGS
     appearance: Appearance = field(default_factory=Appearance)
+    board: Board | str | Path | None = None
+    board_pose: bool = False
+    hand_held: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -112,6 +123,7 @@ class SimulationSettings:
                 whole = whole_number(what, getattr(self, name), least, most)
                 object.__setattr__(self, name, whole)
         self._check_sizes()
+        self._check_board()
         n_views, n_poses = (1 if isinstance(x, Path) else x for x in (self.views, self.poses))
         self.check_images(n_views, n_poses)
 
@@ -154,6 +166,34 @@ class SimulationSettings:
             for name, (value, least, most) in sizes.items()
             if not least <= value <= most
         ]
+        if problems:
+            raise UsageError(problems)
+
+    def _check_board(self) -> None:
+        """Refuse settings of a board that contradict others."""
+        start = "The dataset could not be simulated: found"
+        problems = []
+        if self.board is not None and not isinstance(self.board, Board | str | Path):
+            problems.append(f"{start} {self.board!r} as board, needed a Board; correct it.")
+        if self.board is None:
+            problems += [
+                f"{start} {what} without a board, needed one on the base; choose a board."
+                for what, wanted in (
+                    ("a camera in the hand", self.hand_held),
+                    ("the pose of a board", self.board_pose),
+                )
+                if wanted
+            ]
+        if self.hand_held and not isinstance(self.views, int):
+            problems.append(
+                f"{start} a camera in the hand and a file of cameras, needed a number of views; "
+                "leave out one of the two."
+            )
+        if self.hand_held and self.images > 1:
+            problems.append(
+                f"{start} {self.images} images of each pose from a camera in the hand, needed 1, "
+                "each image has a place of its own; take more poses."
+            )
         if problems:
             raise UsageError(problems)
 

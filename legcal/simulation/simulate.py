@@ -27,11 +27,13 @@ from legcal.simulation.folder import (
 )
 from legcal.simulation.imaged_machine import image_machine
 from legcal.simulation.photographs import take_photographs
+from legcal.simulation.placed_board import without_pose
 from legcal.simulation.recording import recorded, write_tables
 from legcal.simulation.settings import Level, SimulationSettings, whole_number
 from legcal.simulation.truth import write_true_model
 
-_STREAMS = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs")
+_STREAMS = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
+            "corners")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +128,10 @@ def simulate(
         truth = write_true_model(nominal, settings.errors, chance["errors"], folder / TRUTH)
         imaged = image_machine(truth, nominal, settings, chance, progress)
         m = recorded(imaged, settings, chance)
-        write_session(folder, nominal, yaml_path.relative_to(folder).as_posix(), m)
+        board = None if imaged.board is None else imaged.board.document()
+        told = board if settings.board_pose else without_pose(board)
+        model_name = yaml_path.relative_to(folder).as_posix()
+        write_session(folder, nominal, model_name, m, groups=imaged.groups, board=told)
         write_tables(folder, imaged, m, settings, chance)
         if settings.level is Level.PHOTOGRAPHS:
             take_photographs(
@@ -136,7 +141,7 @@ def simulate(
         files = [*files_in(folder), TRUTH_NAME]
         write_truth(
             folder / TRUTH_NAME, settings, truth, imaged.views, imaged.poses,
-            imaged.labels, files,
+            imaged.labels, files, board,
         )  # fmt: skip
     readings = imaged.poses.readings[np.unique(imaged.images.pose)]
     return SimulatedDataset(

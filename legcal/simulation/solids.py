@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -13,6 +14,23 @@ from legcal.mechanism.leg import Leg
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.shapes import Cylinder, Shape
 from legcal.simulation.visuals import Visual, visuals
+
+
+class Sheet(Protocol):
+    """What is printed on a face of a box.
+
+    Attributes
+    ----------
+    face : int
+        The face: -x, -y, -z, x, y, z.
+    """
+
+    @property
+    def face(self) -> int:
+        """The face."""
+
+    def reflectance(self, x: Array, y: Array) -> Array:
+        """Return factors (n,) of the albedo at points x, y of the z faces, in the box [m]."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +53,8 @@ class Material:
         Standard deviation of a mottled pattern on it, as a part of the albedo.
     tint : tuple of float
         Factors of red, green, blue; used in pictures in colour only.
+    sheet : Sheet or None
+        What is printed on one of its faces, if it is a box.
     """
 
     albedo: float = 0.5
@@ -43,6 +63,7 @@ class Material:
     limb: float = 0.3
     texture: float = 0.0
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    sheet: Sheet | None = None
 
 
 TUBE = Material(albedo=0.70, specular=0.25, shininess=40.0, limb=0.35)

@@ -121,7 +121,7 @@ def legs_in_image(
     from_axis = np.linalg.norm(np.cross(u_camera, A_camera), axis=-1)
     radius = np.where(from_axis[:, None] > _END_ON * radius, radius, 0.0)
     offsets = contact_offsets(u_camera[:, None], axis, radius)
-    pixels, inside = _pixels(camera, axis[:, :, None] + offsets)
+    pixels, inside = pixels_in_image(camera, axis[:, :, None] + offsets)
     tested = inside & (radius > 0.0)[..., None]
     beside = axis[:, :, None] + (1.0 + _ASIDE) * offsets
     margin = np.broadcast_to(_IN_FRONT * radius[..., None], tested.shape)
@@ -200,8 +200,8 @@ def _name_of(
     return name if abs(main_cylinders(cylinders)[name].radius - R) <= _ALIKE * R else ""
 
 
-def _pixels(camera: Camera, points: Array) -> tuple[Array, BoolArray]:
-    """Return the pixels of points in the camera frame, and which are inside the image."""
+def pixels_in_image(camera: Camera, points: Array) -> tuple[Array, BoolArray]:
+    """Return the pixels of points (..., 3) in the camera frame, and which are in the image."""
     depth = points[..., 2]
     before = depth > 1e-6
     xy = points[..., :2] / np.where(before, depth, 1.0)[..., None]
