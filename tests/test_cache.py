@@ -189,6 +189,10 @@ def change_camera(folder: Folder) -> None:
     folder.camera["camera_matrix"]["data"][2] += 0.01
 
 
+def change_gamma(folder: Folder) -> None:
+    folder.entry["views"]["c1"]["gamma"] = 2.2
+
+
 def change_pose(folder: Folder) -> None:
     folder.entry["views"]["c1"]["T_base_camera"]["xyz"][0] += 0.01
 
@@ -203,7 +207,15 @@ def change_sigma(folder: Folder) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [change_image, change_reading, change_camera, change_pose, change_legs, change_sigma],
+    [
+        change_image,
+        change_reading,
+        change_camera,
+        change_gamma,
+        change_pose,
+        change_legs,
+        change_sigma,
+    ],
 )
 def test_every_change_of_the_dataset_changes_the_fingerprint(
     folder: Folder, change: Callable[[Folder], None]

@@ -55,37 +55,37 @@ def test_slopes_are_the_derivatives_of_the_basis() -> None:
 )
 def test_shift_of_an_outline_is_found_whatever_its_contrast(amplitude: list[float]) -> None:
     d, grey = blocks(0.15, 0.6, amplitude, noise=0.5)
-    inside = np.ones(d.shape, dtype=np.bool_)
+    weight = np.ones(d.shape, dtype=np.float32)
     moved = np.zeros(len(d))
     for _ in range(5):
         at = d - moved[:, None].astype(np.float32)
-        fit = fit_blocks(at, grey, inside, column(HALF_WIDTH, len(d)), 0.6)
+        fit = fit_blocks(at, grey, weight, column(HALF_WIDTH, len(d)), 0.6)
         moved += fit.shift
     assert np.median(moved) == pytest.approx(0.15, abs=0.01)
 
 
 def test_claimed_variance_is_the_scatter_of_the_blocks() -> None:
     d, grey = blocks(0.0, 0.6, [20.0, 0.0, 120.0, 60.0, 0.0], noise=3.0)
-    inside = np.ones(d.shape, dtype=np.bool_)
-    fit = fit_blocks(d, grey, inside, column(HALF_WIDTH, len(d)), 0.6)
+    weight = np.ones(d.shape, dtype=np.float32)
+    fit = fit_blocks(d, grey, weight, column(HALF_WIDTH, len(d)), 0.6)
     assert np.std(fit.shift) == pytest.approx(np.sqrt(np.median(fit.variance)), rel=0.2)
     assert np.sqrt(np.median(fit.noise)) == pytest.approx(3.0, rel=0.05)
 
 
 def test_flat_blocks_say_nothing() -> None:
     d, grey = blocks(0.0, 0.6, [50.0, 0.0, 0.0, 0.0, 0.0], noise=2.0)
-    inside = np.ones(d.shape, dtype=np.bool_)
-    fit = fit_blocks(d, grey, inside, column(HALF_WIDTH, len(d)), 0.6)
+    weight = np.ones(d.shape, dtype=np.float32)
+    fit = fit_blocks(d, grey, weight, column(HALF_WIDTH, len(d)), 0.6)
     assert np.median(fit.variance) > 0.2
-    hidden = fit_blocks(d, grey, ~inside, column(HALF_WIDTH, len(d)), 0.6)
+    hidden = fit_blocks(d, grey, 0.0 * weight, column(HALF_WIDTH, len(d)), 0.6)
     assert np.all(np.isinf(hidden.variance))
 
 
 @pytest.mark.parametrize("blur", [0.4, 0.7, 1.2])
 def test_blur_is_estimated_from_the_picture(blur: float) -> None:
     d, grey = blocks(0.1, blur, [20.0, 0.0, 120.0, 60.0, 0.0], noise=1.0, n=60)
-    inside = np.ones(d.shape, dtype=np.bool_)
-    estimate = estimate_blur(d, grey, inside, column(HALF_WIDTH, len(d)), np.ones(len(d)))
+    weight = np.ones(d.shape, dtype=np.float32)
+    estimate = estimate_blur(d, grey, weight, column(HALF_WIDTH, len(d)), np.ones(len(d)))
     assert estimate == pytest.approx(blur, rel=0.1)
 
 

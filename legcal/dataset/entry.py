@@ -11,12 +11,14 @@ from legcal.files.schema import FileSchema, Name, Number, Version
 from legcal.files.stated import Stated, read_prior
 
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
+GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
 
 
 class ViewEntry(FileSchema):
     """One camera position."""
 
     camera: str
+    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] = 1.0
     T_base_camera: MotionEntry | None = None
     hand_held: Annotated[bool, Strict()] = False
     legs: Annotated[list[str], Field(min_length=1)] | None = None

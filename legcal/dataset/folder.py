@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -180,7 +181,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
     """Return a view of the measurements."""
     return View(
         name=name,
-        camera=camera,
+        camera=camera if entry.gamma == 1.0 else replace(camera, gamma=entry.gamma),
         T_base_camera=entry.T_base_camera.motion() if entry.T_base_camera else None,
         legs=tuple(entry.legs) if entry.legs else None,
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.detection.limb import N_BASIS, Samples, basis
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array
 
 BLURS = (0.3, 2.7, 7)  # first trials, least to greatest [px]
 BLUR_BLOCKS = 40
@@ -53,25 +53,24 @@ class BlockFit:
 
 
 def fit_blocks(
-    d: Samples, grey: Samples, inside: BoolArray, half_width: Samples, blur: Samples | float
+    d: Samples, grey: Samples, weight: Samples, half_width: Samples, blur: Samples | float
 ) -> BlockFit:
     """Fit the limb model to blocks, by one Gauss-Newton step from the current line.
 
     Parameters
     ----------
     d, grey : (n, m) array of float32
-        Distances inside the current line [px] and grey levels.
-    inside : (n, m) array of bool
-        Samples to use.
+        Distances inside the current line [px] and grey levels, proportional to light.
+    weight : (n, m) array of float32
+        Inverse noise of the samples in some unit; zero for those that are not to be used.
     half_width : (n, 1) array of float32
         Half-width of the cylinder [px].
     blur : float or (n, 1) array of float32
         Standard deviation of the blur [px].
     """
     values, slopes = basis(d, half_width, blur)
-    weight = inside.astype(np.float32)
-    n_samples = weight.sum(axis=1).astype(np.float64)
-    level = np.einsum("nm,nm->n", grey, weight) / np.maximum(weight.sum(axis=1), 1)
+    n_samples = np.count_nonzero(weight, axis=1).astype(np.float64)
+    level = np.einsum("nm,nm->n", grey, weight) / np.maximum(weight.sum(axis=1), 1e-3)
     y = (grey - level[:, None]) * weight
     X = values * weight[:, None, :]
     Xt = X.swapaxes(1, 2)
@@ -121,25 +120,25 @@ def _regularised_inverse(normal: Array, right: Array, y: Samples, n_samples: Arr
 
 
 def estimate_blur(
-    d: Samples, grey: Samples, inside: BoolArray, half_width: Samples, merit: Array
+    d: Samples, grey: Samples, weight: Samples, half_width: Samples, merit: Array
 ) -> float:
     """Return the blur [px] that explains the best blocks of an image best.
 
     Parameters
     ----------
-    d, grey, inside, half_width
+    d, grey, weight, half_width
         As for :func:`fit_blocks`.
     merit : (n,) array
         How much each block tells, such as its contrast.
     """
     best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
-    d, grey, inside, half_width = d[best], grey[best], inside[best], half_width[best]
+    d, grey, weight, half_width = d[best], grey[best], weight[best], half_width[best]
     blurs = np.geomspace(*BLURS)
-    rough = blurs[int(np.argmin(_misfits(d, grey, inside, half_width, blurs)))]
+    rough = blurs[int(np.argmin(_misfits(d, grey, weight, half_width, blurs)))]
     near = np.abs(d) <= depth_for_blur(float(rough))
     ratio = np.sqrt(blurs[1] / blurs[0])
     fine = rough * ratio ** np.arange(-2.0, 3.0)
-    misfit = _misfits(d, grey, inside & near, half_width, fine)
+    misfit = _misfits(d, grey, weight * near, half_width, fine)
     i = int(np.clip(np.argmin(misfit), 1, len(fine) - 2))
     left, middle, right = misfit[i - 1 : i + 2]
     bend = left - 2.0 * middle + right
@@ -153,13 +152,13 @@ def depth_for_blur(blur: float) -> float:
 
 
 def _misfits(
-    d: Samples, grey: Samples, inside: BoolArray, half_width: Samples, blurs: Array
+    d: Samples, grey: Samples, weight: Samples, half_width: Samples, blurs: Array
 ) -> Array:
     """Return, for each of some blurs, the mean logarithm of the noise of the fitted blocks."""
     n = len(blurs)
     blur = np.repeat(blurs, len(d)).astype(np.float32)[:, None]
-    d, grey, inside, half_width = (np.concatenate([x] * n) for x in (d, grey, inside, half_width))
+    d, grey, weight, half_width = (np.concatenate([x] * n) for x in (d, grey, weight, half_width))
     for _ in range(BLUR_ROUNDS):
-        fit = fit_blocks(d, grey, inside, half_width, blur)
+        fit = fit_blocks(d, grey, weight, half_width, blur)
         d = d - fit.shift[:, None].astype(np.float32)
     return np.asarray(np.log(fit.noise + 1e-3).reshape(n, -1).mean(axis=1))

@@ -15,6 +15,7 @@ from legcal.detection.fit import depth_for_blur, estimate_blur, fit_blocks
 from legcal.detection.limb import Samples
 from legcal.detection.picture import Grey
 from legcal.detection.profiles import read_profiles
+from legcal.detection.response import to_light
 from legcal.detection.straight import StraightFit, fit_straight
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.camera import Camera
@@ -145,8 +146,8 @@ class _Blocks:
     """The blocks of all edges of an image, and how far their lines have moved."""
 
     d: Samples  # (n, m) from the lines at which they were read
-    grey: Samples  # (n, m)
-    inside: BoolArray  # (n, m)
+    grey: Samples  # (n, m) proportional to light
+    weight: Samples  # (n, m)
     gain: Array  # (n,)
     bounds: IntArray  # (n_edges + 1,) first block of each edge
     position: Array  # (n,) as fractions of the bands
@@ -182,10 +183,12 @@ class _Blocks:
             profiles.append(read.take(free))
         counts = [len(p.t) for p in profiles]
         half_width = np.repeat([edge.half_width for edge in edges], counts)
+        inside = np.concatenate([p.inside for p in profiles])
+        light, weight = to_light(np.concatenate([p.grey for p in profiles]), inside, camera.gamma)
         return cls(
             np.concatenate([p.d for p in profiles]),
-            np.concatenate([p.grey for p in profiles]),
-            np.concatenate([p.inside for p in profiles]),
+            light,
+            weight,
             np.concatenate([p.gain for p in profiles]),
             np.cumsum([0, *counts]),
             np.concatenate(
@@ -198,10 +201,10 @@ class _Blocks:
             [None] * len(edges),
         )
 
-    def samples(self, blocks: slice | BoolArray) -> tuple[Samples, Samples, BoolArray, Samples]:
-        """Return distances from the current lines, grey levels, use, half-widths."""
+    def samples(self, blocks: slice | BoolArray) -> tuple[Samples, Samples, Samples, Samples]:
+        """Return distances from the current lines, grey levels, weights, half-widths."""
         d = self.d[blocks] - self.moved[blocks, None].astype(np.float32)
-        return d, self.grey[blocks], self.inside[blocks], self.half_width[blocks]
+        return d, self.grey[blocks], self.weight[blocks], self.half_width[blocks]
 
     def contrasts(self) -> list[Array]:
         """Return the contrasts of the blocks of each edge, without sign."""

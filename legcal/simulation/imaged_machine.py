@@ -104,6 +104,8 @@ def image_machine(
         shared=shared, chance=chance, progress=progress,
     )  # fmt: skip
     views = viewing.views
+    if settings.level is Level.PHOTOGRAPHS:
+        views = _encoding(views, settings.appearance.gamma)
     in_hand = len(viewing.groups) > 0
     images = take_images(
         truth.legs, viewing.machines, views, settings.images,
@@ -134,3 +136,9 @@ def _cameras(
     given = read_cameras(settings.views, camera)
     cameras = {name: lens for name, (lens, _) in given.items()}
     return cameras, {name: T for name, (_, T) in given.items()}
+
+
+def _encoding(views: tuple[Viewpoint, ...], gamma: float) -> tuple[Viewpoint, ...]:
+    """Return views whose cameras encode light in their grey levels, as their makers say."""
+    cameras = {id(view.camera): replace(view.camera, gamma=gamma) for view in views}
+    return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)

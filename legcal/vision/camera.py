@@ -34,6 +34,9 @@ class Camera:
     model : {"plumb_bob", "rational_polynomial", "equidistant"}
         Meaning of the coefficients: OpenCV's usual model with 5 or 8 of them, or its
         fisheye model with 4.
+    gamma : float
+        Grey levels are light to the power 1 / gamma; 1 for a camera whose levels are proportional
+        to light.
     """
 
     K: Array
@@ -41,6 +44,7 @@ class Camera:
     height: int
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     model: DistortionModel = "plumb_bob"
+    gamma: float = 1.0
 
     @property
     def has_distortion(self) -> bool:

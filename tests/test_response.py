@@ -1,0 +1,85 @@
+"""Cameras that encode light: their outlines lie where the light has its edge."""
+
+import numpy as np
+import pytest
+from dataset_folder import Folder, folder
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from legcal.dataset.folder import load_dataset
+from legcal.detection.fit import fit_blocks
+from legcal.detection.limb import Samples, basis
+from legcal.detection.response import to_light
+from legcal.errors import DatasetError
+
+__all__ = ["folder"]
+BLUR, HALF_WIDTH, WHITE = 0.6, 14.0, 255.0
+
+
+def found(gamma_of_camera: float, gamma_told: float, dark: float, bright: float) -> float:
+    """Return where an outline is found that lies 0.15 px inside the line [px]."""
+    rng = np.random.default_rng(1)
+    d = rng.uniform(-3.5, 3.5, (150, 120)).astype(np.float32)
+    width: Samples = np.full((len(d), 1), HALF_WIDTH, dtype=np.float32)
+    step = basis(d - np.float32(0.15), width, BLUR)[0][:, 2]
+    light = dark + (bright - dark) * step
+    grey = WHITE * light ** (1.0 / gamma_of_camera) + 0.5 * rng.standard_normal(d.shape)
+    levels, weight = to_light(grey.astype(np.float32), np.ones(d.shape, np.bool_), gamma_told)
+    moved = np.zeros(len(d))
+    for _ in range(5):
+        at = d - moved[:, None].astype(np.float32)
+        moved += fit_blocks(at, levels, weight, width, BLUR).shift
+    return float(np.median(moved))
+
+
+@pytest.mark.parametrize(("dark", "bright"), [(0.02, 0.7), (0.7, 0.02), (0.1, 0.2)])
+@pytest.mark.parametrize("gamma", [1.0, 1.8, 2.2])
+def test_outline_is_where_the_light_has_its_edge(gamma: float, dark: float, bright: float) -> None:
+    assert found(gamma, gamma, dark, bright) == pytest.approx(0.15, abs=0.01)
+
+
+def test_grey_levels_taken_for_light_put_outlines_on_the_dark_side() -> None:
+    assert found(2.2, 1.0, 0.02, 0.7) < 0.15 - 0.1
+    assert found(2.2, 1.0, 0.7, 0.02) > 0.15 + 0.1
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    gamma=st.floats(0.5, 3.0),
+    level=st.floats(20.0, 230.0),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_weights_make_the_noise_of_light_that_of_grey_levels(
+    gamma: float, level: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    grey = np.concatenate([np.full(4000, level), np.full(4000, 0.5 * level + 15.0)])
+    noisy = (grey + 0.3 * rng.standard_normal(grey.shape)).astype(np.float32)[None]
+    inside = np.ones(noisy.shape, dtype=np.bool_)
+    light, weight = to_light(noisy, inside, gamma)
+    for half in (np.s_[:4000], np.s_[4000:]):
+        scatter = np.std(light[0, half]) * np.mean(weight[0, half])
+        assert scatter == pytest.approx(0.3, rel=0.1)
+    assert not np.any(to_light(noisy, ~inside, gamma)[1])
+
+
+def test_light_of_a_linear_camera_is_its_grey_levels() -> None:
+    grey = np.array([[3.0, 250.0]], dtype=np.float32)
+    light, weight = to_light(grey, np.array([[True, False]]), 1.0)
+    np.testing.assert_array_equal(light, grey)
+    np.testing.assert_array_equal(weight, [[1.0, 0.0]])
+
+
+def test_dataset_tells_the_gamma_of_a_camera(folder: Folder) -> None:
+    folder.entry["views"]["c1"]["gamma"] = 2.2
+    views = {view.name: view for view in load_dataset(folder.write()).measurements.views}
+    assert views["c1"].camera.gamma == 2.2
+    assert all(view.camera.gamma == 1.0 for name, view in views.items() if name != "c1")
+
+
+@pytest.mark.parametrize("gamma", [0.0, -2.2, 22.0, "sRGB"])
+def test_gamma_that_no_camera_has_is_refused(folder: Folder, gamma: object) -> None:
+    folder.entry["views"]["c1"]["gamma"] = gamma
+    with pytest.raises(DatasetError, match=r"views\.c1\.gamma") as refused:
+        load_dataset(folder.write())
+    assert len(refused.value.problems) == 1
