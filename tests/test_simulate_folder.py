@@ -209,17 +209,17 @@ def test_what_can_be_done_next_is_said(images: int, tmp_path: Path) -> None:
 
 
 def test_photographs_tell_the_gamma_of_their_camera(tmp_path: Path) -> None:
-    for gamma in (1.0, 1.8):
-        out = tmp_path / f"{gamma}"
-        chosen = settings(
-            level="photographs", poses=1, views=2, camera=small_camera(tmp_path),
-            appearance=legcal.Appearance(gamma=gamma, clutter=0, samples=13),
-        )  # fmt: skip
-        views = legcal.load_dataset(simulate("hexapod", out, chosen).folder).measurements.views
-        assert [view.camera.gamma for view in views] == [gamma, gamma]
-    few = settings(level="outlines", poses=1, views=1)
-    dataset = legcal.load_dataset(simulate("hexapod", tmp_path / "outlines", few).folder)
-    assert dataset.measurements.views[0].camera.gamma == 1.0
+    look = legcal.Appearance(gamma=1.8, clutter=0, samples=13)
+    few = {"poses": 1, "views": 1, "camera": small_camera(tmp_path)}
+    told = {
+        level: legcal.load_dataset(simulate("hexapod", tmp_path / level, chosen).folder)
+        for level, chosen in (
+            ("photographs", settings(level="photographs", appearance=look, **few)),
+            ("outlines", settings(level="outlines", **few)),
+        )
+    }
+    gammas = {level: d.measurements.views[0].camera.gamma for level, d in told.items()}
+    assert gammas == {"photographs": 1.8, "outlines": 1.0}
 
 
 def test_the_python_of_the_description_of_simulated_datasets_runs(
