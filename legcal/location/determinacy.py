@@ -10,8 +10,6 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.location.convention import covariance_with, hold_tool, is_resolved_by_the_tool
 from legcal.location.fit import Fit, finished, frame_design, system
-from legcal.location.model_errors import motions_by_parameters
-from legcal.location.noise import Noise
 from legcal.location.open_directions import (
     BLOCKS,
     OpenPart,
@@ -23,7 +21,7 @@ from legcal.location.open_directions import (
     open_parts,
     variety,
 )
-from legcal.location.pose_pairs import Frames, PosePairs
+from legcal.location.pose_pairs import N_FRAME, Frames, PosePairs, jacobian
 from legcal.location.problem import Problem
 from legcal.mechanism.configurations import random_configurations
 
@@ -83,12 +81,12 @@ def determine(problem: Problem, found: Fit, tool_position: Array, name: str) -> 
     parts: list[OpenPart] = []
     words = ""
     if basis.shape[1]:
-        workspace = _workspace(problem, found)
+        workspace = _workspace(problem)
         _check_machine(problem, found, basis, workspace, name)
         found = hold(problem, found, tool_position)
         basis = _open_at(problem, found, basis.shape[1], found.frames)
         parts = open_parts(basis, found.frames)
-        words = _held_words(parts, workspace[0], tool_position)
+        words = _held_words(parts, workspace, tool_position)
     scale = pairs.scale
     unit = covariance_with(found.information, basis, oriented=oriented)
     covariance = unit * np.outer(scale, scale)
@@ -122,11 +120,11 @@ def _open_at(problem: Problem, found: Fit, k: int, frames: Frames) -> Array:
     return basis
 
 
-def _workspace(problem: Problem, found: Fit) -> tuple[PosePairs, Array]:
-    """Return poses all over the workspace, and the design that they would make."""
+def _workspace(problem: Problem) -> PosePairs:
+    """Return poses all over the workspace, as if each had been measured."""
     drawn = random_configurations(problem.mechanism, WORKSPACE, SEED)
     matrices = np.array([T.as_matrix() for T in drawn.poses])
-    pairs = PosePairs(
+    return PosePairs(
         R=matrices[:, :3, :3],
         t=matrices[:, :3, 3],
         M=np.tile(np.eye(3), (WORKSPACE, 1, 1)),
@@ -134,40 +132,38 @@ def _workspace(problem: Problem, found: Fit) -> tuple[PosePairs, Array]:
         oriented=np.full(WORKSPACE, problem.is_oriented),
         length=problem.pairs.length,
     )
-    noise = found.noise
-    sigma = np.sqrt((noise.sigma**2).mean(axis=0) * WORKSPACE / len(problem.pairs))
-    same = Noise(np.tile(sigma, (WORKSPACE, 1)), noise.factor, (True, True))
-    result = problem.result
-    motions = None
-    if result is not None:
-        motions = motions_by_parameters(
-            problem.mechanism, drawn.poses, result.names, result.covariance
-        )
-    return pairs, frame_design(system(pairs, found.frames, same, motions)[1])
 
 
 def _check_machine(
-    problem: Problem, found: Fit, basis: Array, workspace: tuple[PosePairs, Array], name: str
+    problem: Problem, found: Fit, basis: Array, workspace: PosePairs, name: str
 ) -> None:
     """Refuse what other poses would tell, and what holding the tool does not close."""
     pairs = problem.pairs
-    beyond = beyond_the_machine(basis, workspace[1], oriented=problem.is_oriented)
+    units = np.repeat([1.0 / pairs.length, 1.0], 3)[:, None]
+    seen = (jacobian(found.frames, workspace) * units * pairs.scale).reshape(-1, N_FRAME)
+    beyond = beyond_the_machine(basis, seen, oriented=problem.is_oriented)
+    here = variety(pairs.R, pairs.t, pairs.length)
+    there = variety(workspace.R, workspace.t, pairs.length)
+    start = f"{name}: base and tool could not be located, because"
     if beyond.shape[1]:
-        here = variety(pairs.R, pairs.t, pairs.length)
-        there = variety(workspace[0].R, workspace[0].t, pairs.length)
         raise NotIdentifiable(
-            f"{name}: base and tool could not be located, because "
-            f"{joined(open_parts(beyond, found.frames))} cannot be told from the poses: found "
-            f"{len(pairs)} poses that {here.words}, {needed_words(here, there)}."
+            f"{start} {joined(open_parts(beyond, found.frames))} cannot be told from the poses: "
+            f"found {len(pairs)} poses that {here.words}"
+            f"{needed_words(here, there, _scatter(problem, found))}."
         )
     if not is_resolved_by_the_tool(basis):
         raise NotIdentifiable(
-            f"{name}: base and tool could not be located, because no pose of this machine tells "
-            f"{joined(open_parts(basis, found.frames))}: found a platform whose poses "
-            f"{variety(workspace[0].R, workspace[0].t, pairs.length).words}, needed a part that "
-            "holding the tool in the platform closes; measure orientations too, or "
-            "another point of the base."
+            f"{start} no pose of this machine tells {joined(open_parts(basis, found.frames))}: "
+            f"found a platform whose poses {there.words}, needed a part that holding the tool in "
+            "the platform closes; measure orientations too, or the base itself."
         )
+
+
+def _scatter(problem: Problem, found: Fit) -> str:
+    """Return the standard deviations of a measured component."""
+    sigma = found.noise.factor * np.sqrt((found.noise.sigma**2).mean(axis=0))
+    turn = f" and {np.degrees(sigma[1]):.2g} deg" if problem.is_oriented else ""
+    return f"{1e3 * sigma[0]:.2g} mm{turn}"
 
 
 def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Array) -> str:

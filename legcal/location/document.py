@@ -120,7 +120,8 @@ def location_document(location: Location) -> dict[str, Any]:
     """Return a location as its file has it."""
     sigma = [[float(s) for s in part] for part in location.sigma.reshape(4, 3)]
     base, tool = (
-        motion_to_xyz_quat(T) | {"sigma_xyz": sigma[i], "sigma_rotation": sigma[i + 1]}
+        dict[str, Any](motion_to_xyz_quat(T))
+        | {"sigma_xyz": sigma[i], "sigma_rotation": sigma[i + 1]}
         for i, T in ((0, location.T_world_base), (2, location.T_platform_tool))
     )
     if not location.has_tool_orientation:
@@ -215,7 +216,11 @@ def write_location(location: Location, path: Path) -> None:
     """
     check_place(path)
     text = yaml.safe_dump(
-        location_document(location), sort_keys=False, allow_unicode=True, width=120
+        location_document(location),
+        sort_keys=False,
+        default_flow_style=None,
+        allow_unicode=True,
+        width=120,
     )
     try:
         write_atomically(path, text.encode())

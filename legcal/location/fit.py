@@ -23,6 +23,8 @@ REML_STEPS = 300
 SINGULAR = 1e-9  # of the largest singular value: what is below is open
 _SMALL = 1e-12  # [m / length, rad]
 _SAME_FACTOR = 1e-7
+_HALVINGS = 12
+_ROUNDING = 1e-9  # of a sum of squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +120,19 @@ def fit(
 def _most_likely(
     pairs: PosePairs, frames: Frames, noise: Noise, motions: PlatformMotions | None
 ) -> Frames:
-    """Return the frames after Gauss-Newton, variances held."""
+    """Return the frames after Gauss-Newton, variances held; steps that do not help are halved."""
+    y, A = system(pairs, frames, noise, motions)
     for _ in range(STEPS):
-        y, A = system(pairs, frames, noise, motions)
-        step = _least_squares(A, y)[:N_FRAME]
-        frames = frames.moved(step * pairs.scale)
+        found = _least_squares(A, y)
+        step, left = found[:N_FRAME], y - A[:, N_FRAME:] @ found[N_FRAME:]
+        for _ in range(_HALVINGS):
+            tried = frames.moved(step * pairs.scale)
+            y_tried, A_tried = system(pairs, tried, noise, motions)
+            left_tried = y_tried - A_tried[:, N_FRAME:] @ found[N_FRAME:]
+            if left_tried @ left_tried <= (1.0 + _ROUNDING) * (left @ left) + _ROUNDING:
+                break
+            step = 0.5 * step
+        frames, y, A = tried, y_tried, A_tried
         if np.abs(step).max() < _SMALL + 1e-8 * _typical(A):
             return frames
     raise DidNotConverge(

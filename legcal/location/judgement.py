@@ -18,6 +18,7 @@ from legcal.location.problem import Problem
 
 DOUBTFUL = 1e-3  # probability of residuals as large as these
 TOO_GOOD = 1e-4  # probability of residuals as small as these
+_NONE = 1e-12  # [m, rad]: held
 _KINDS = ("positions", "orientations")
 
 
@@ -92,7 +93,7 @@ def _judged(found: Fit) -> tuple[float | None, str, str]:
     else:
         total, dof = float(squares[kinds[0]]), float(found.kind_dof[kinds[0]])
     p_value = float(stats.chi2.sf(total, dof))
-    large, small = [], []
+    large, small = list[str](), list[str]()
     for k in kinds:
         ratio = float(np.sqrt(squares[k] / found.kind_dof[k]))
         words = f"{_KINDS[k]} scatter {ratio:.2g} times as much as was stated of them"
@@ -175,8 +176,13 @@ def _sentence(
     sigma = np.sqrt(np.maximum(np.diagonal(determined.covariance), 0.0)).reshape(4, 3)
     size = np.linalg.norm(sigma, axis=1)
     base = f"{1e3 * size[0]:.2g} mm and {np.degrees(size[1]):.2g} deg"
-    tool = f"{1e3 * size[2]:.2g} mm"
-    tool += f" and {np.degrees(size[3]):.2g} deg" if problem.is_oriented else " (its position only)"
+    known = [
+        f"{1e3 * size[2]:.2g} mm" * bool(size[2] > _NONE),
+        f"{np.degrees(size[3]):.2g} deg" * bool(problem.is_oriented and size[3] > _NONE),
+    ]
+    tool = " and ".join(words for words in known if words)
+    tool = f", the tool in the platform to {tool}" if tool else ""
+    tool += "" if problem.is_oriented else " (its position only)"
     rows = f"{used} of {len(problem.poses)} poses" if left_out else f"{used} poses"
     out = ""
     if left_out:
@@ -188,13 +194,13 @@ def _sentence(
     if too_large:
         return (
             f"Doubtful: {too_large}, so that the standard deviations are too small; errors of the "
-            f"model or of the readings may be the reason, or {rows} that do not belong together."
-            + out
+            "model or of the readings may be the reason, or readings and poses that do not belong "
+            "together." + out
         )
     start = "Base and tool are located" + " in part" * bool(determined.held)
     return (
-        f"{start} from {rows}: the base in the world to {base}, the tool in the platform to {tool} "
-        f"(1 sigma).{' ' * bool(determined.words)}{determined.words}{out}"
+        f"{start} from {rows}: the base in the world to {base}{tool} (1 sigma)."
+        f"{' ' * bool(determined.words)}{determined.words}{out}"
     )
 
 

@@ -18,7 +18,7 @@ from legcal.location.judgement import judge
 from legcal.location.location import Location
 from legcal.location.mistakes import likely_mistake
 from legcal.location.noise import SMALLEST
-from legcal.location.pose_pairs import Frames, residuals
+from legcal.location.pose_pairs import Frames
 from legcal.location.poses_table import LARGEST_ANGLE, read_tool_poses
 from legcal.location.problem import Problem, build_problem
 from legcal.location.search import Candidates, search
@@ -93,6 +93,7 @@ def locate(
         encoder_sigma=encoder_sigma,
     )
     candidates = search(problem.pairs, problem.fewest)
+    _check_plausible(problem, candidates, name)
     agreement = find_agreement(
         problem.pairs, candidates.frames.at(0), problem.noise, problem.fewest
     )
@@ -144,41 +145,54 @@ def _check_numbers(
         )
 
 
+def _check_plausible(problem: Problem, candidates: Candidates, name: str) -> None:
+    """Refuse poses that no frames explain, with the mistake that would explain them.
+
+    The rows that agree best are looked at: most are right, or all are wrong in one way.
+    """
+    pairs = problem.pairs
+    spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
+    left = float(np.sqrt(candidates.cost[0]))  # in lengths of the machine, and [rad]
+    part = left / min(1.0, spread / pairs.length + 1e-12)
+    if part <= SUSPICIOUS:
+        return
+    _refuse_mistakes(problem, candidates, name)
+    if part > HOPELESS:
+        size = f"{1e3 * left * pairs.length:.3g} mm"
+        turn = f" or {np.degrees(left):.3g} deg" * problem.is_oriented
+        raise DatasetError(
+            f"{name}: base and tool could not be located: found poses about {size}{turn} from "
+            "where the readings put them, whatever the frames, needed poses measured at these "
+            "readings; check that rows belong together, the columns of the readings, and the model."
+        )
+
+
+def _refuse_mistakes(problem: Problem, candidates: Candidates, name: str) -> None:
+    """Refuse poses that a common mistake explains."""
+    mistake = likely_mistake(problem.pairs, float(candidates.cost[0]), problem.fewest)
+    if mistake is not None:
+        raise DatasetError(
+            f"{name}: base and tool could not be located: found poses that look like {mistake[0]}, "
+            "needed positions in metres and quaternions x, y, z, w of the tool in right-handed "
+            f"axes of the world; {mistake[1]}."
+        )
+
+
 def _check_agreement(
     problem: Problem, candidates: Candidates, agreement: Agreement, name: str
 ) -> None:
-    """Refuse poses that no frames explain, with the mistake that would explain them."""
-    pairs = problem.pairs
-    n, n_out = len(pairs), int(np.sum(~agreement.agrees))
-    r = residuals(agreement.frames, pairs)[agreement.agrees]
-    spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
-    away = float(np.sqrt((r[:, :3] ** 2).sum(axis=1).mean()))
-    turned = float(np.sqrt((r[:, 3:] ** 2).sum(axis=1).mean()))
-    too_many = n_out > max(1, n // MOST_LEFT_OUT)
-    if not too_many and away <= SUSPICIOUS * spread and turned <= SUSPICIOUS:
+    """Refuse poses of which too many disagree."""
+    n, n_out = len(problem.pairs), int(np.sum(~agreement.agrees))
+    most = max(1, n // MOST_LEFT_OUT)
+    if n_out <= most:
         return
-    mistake = likely_mistake(pairs, float(candidates.cost[0]), problem.fewest)
-    size = f"{1e3 * away:.3g} mm" + f" and {np.degrees(turned):.3g} deg" * problem.is_oriented
-    start = f"{name}: base and tool could not be located: found"
-    if mistake is not None:
-        raise DatasetError(
-            f"{start} poses that look like {mistake[0]}, needed positions in metres and "
-            "quaternions x, y, z, w of the tool in right-handed axes of the world; "
-            f"{mistake[1]}."
-        )
-    if away > HOPELESS * spread or turned > HOPELESS:
-        raise DatasetError(
-            f"{start} poses {size} (rms) from where the readings put them, whatever the frames, "
-            "needed poses measured at these readings; check that rows belong together, the columns "
-            "of the readings, and the model."
-        )
-    if too_many:
-        rows = ", ".join(str(i) for i in problem.poses.numbers[~agreement.agrees])
-        raise DatasetError(
-            f"{start} {n_out} of {n} rows that disagree with the others ({rows}), needed at most "
-            f"{max(1, n // MOST_LEFT_OUT)}; check that readings and poses of these rows belong "
-            "together."
-        )
+    _refuse_mistakes(problem, candidates, name)
+    rows = ", ".join(str(i) for i in problem.poses.numbers[~agreement.agrees])
+    raise DatasetError(
+        f"{name}: base and tool could not be located: found {n_out} of {n} rows that disagree with "
+        f"the others ({rows}), needed at most {most}; check that readings and poses of these rows "
+        "belong together."
+    )
 
 
 def _check_scatter(problem: Problem, found: Fit, name: str) -> None:
@@ -205,20 +219,28 @@ def _check_unique(
         start = candidates.frames.at(i)
         if candidates.cost[i] > _ALIKE * candidates.cost[0] + _ROUNDING:
             break
+        if not determined.held and _are_one(best.frames, start, problem.pairs.length):
+            continue
         try:
             other = fit(problem.pairs, start, noise, problem.by_model)
             other = hold(problem, other, at)
         except (DidNotConverge, np.linalg.LinAlgError):
             continue
-        shift, turn = _apart(best.frames, other.frames)
-        is_other = shift > _APART * problem.pairs.length or turn > _APART
+        is_other = not _are_one(best.frames, other.frames, problem.pairs.length)
         if is_other and other.chi2 < best.chi2 + _SAME_FIT:
+            shift, turn = _apart(best.frames, other.frames)
             raise NotIdentifiable(
                 f"{name}: base and tool could not be located: found two answers, "
                 f"{1e3 * shift:.3g} mm and {np.degrees(turn):.3g} deg apart, that explain the "
                 f"{len(problem.pairs)} poses equally well, needed one; add poses from all over "
                 "the workspace."
             )
+
+
+def _are_one(one: Frames, other: Frames, length: float) -> bool:
+    """Say whether the frames of two answers are the same but for noise."""
+    shift, turn = _apart(one, other)
+    return shift <= _APART * length and turn <= _APART
 
 
 def _apart(one: Frames, other: Frames) -> tuple[float, float]:

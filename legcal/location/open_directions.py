@@ -7,24 +7,25 @@ its workspace would (it only translates, or moves in a plane), it belongs to the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.location.fit import SINGULAR
 from legcal.location.pose_pairs import Frames
 
 OPEN = 0.1  # [rad], and of the length of the machine
-_CLEARLY = 3.0  # times better known, before other poses are asked for
+HARDLY = 2e-3  # of the best seen direction: what no pose of a machine shows better is its own
 _PART = 0.03  # of a unit direction: what is less is not named
 _SAME_AXIS = 0.02  # of the largest rotations: what is less is about the same axis
 
 BLOCKS = (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12))  # base, its turn, tool, its turn
 
 
-def open_directions(design: Array, *, oriented: bool, limit: float = OPEN) -> Array:
+def open_directions(design: Array, *, oriented: bool) -> Array:
     """Return an orthonormal basis (12, k) of the directions that a design leaves open.
 
     Parameters
@@ -34,35 +35,37 @@ def open_directions(design: Array, *, oriented: bool, limit: float = OPEN) -> Ar
     oriented : bool
         Whether orientations of the tool were measured at all; without, that of the tool in the
         platform is not looked for.
-    limit : float
-        The standard deviation from which a direction is open.
     """
-    n = 12 if oriented else 9
-    _, s, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
-    s = np.concatenate([s, np.zeros(n - len(s))])
-    is_open = (s < SINGULAR * s[0]) | (s * limit < 1.0)
-    basis = np.zeros((12, int(is_open.sum())))
-    basis[:n] = Vt[is_open].T
-    return basis
+    return _unseen(design, oriented, lambda s: (s < SINGULAR * s[0]) | (s * OPEN < 1.0))
 
 
-def beyond_the_machine(basis: Array, design: Array, *, oriented: bool) -> Array:
+def beyond_the_machine(basis: Array, jacobian: Array, *, oriented: bool) -> Array:
     """Return those open directions (12, k) of some poses that the machine's workspace would tell.
 
     Parameters
     ----------
     basis : (12, k) array
         What the measured poses leave open.
-    design : (m, 12) array
-        Whitened derivatives at poses all over the workspace.
+    jacobian : (m, 12) array
+        Derivatives of poses all over the workspace by a step, both in units of the machine's
+        length and radians: geometry alone, whatever the noise.
     oriented : bool
         As for :func:`open_directions`.
     """
-    own = open_directions(design, oriented=oriented, limit=OPEN / _CLEARLY)
-    if own.shape[1] >= basis.shape[1]:
-        return np.zeros((12, 0))
+    own = _unseen(jacobian, oriented, lambda s: s < HARDLY * s[0])
     U, s, _ = np.linalg.svd(basis - own @ (own.T @ basis), full_matrices=False)
     return np.asarray(U[:, s > 0.5])
+
+
+def _unseen(design: Array, oriented: bool, is_open: Callable[[Array], BoolArray]) -> Array:
+    """Return the right singular vectors (12, k) whose singular values are too small."""
+    n = 12 if oriented else 9
+    _, s, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
+    s = np.concatenate([s, np.zeros(n - len(s))])
+    chosen = is_open(s)
+    basis = np.zeros((12, int(chosen.sum())))
+    basis[:n] = Vt[chosen].T
+    return basis
 
 
 @dataclass(frozen=True)
@@ -176,15 +179,18 @@ def variety(R: Array, t: Array, length: float) -> Variety:
     return Variety(axes, n_shifts)
 
 
-def needed_words(found: Variety, possible: Variety) -> str:
-    """Return what poses need that the machine could have, and what to do."""
+def needed_words(found: Variety, possible: Variety, scatter: str) -> str:
+    """Return how the poses scatter if that matters, what they need and what to do."""
     if len(found.axes) < min(2, len(possible.axes)):
         several = "two axes" if len(possible.axes) > 1 else "an axis"
         more = "tilted about another axis too" if len(found.axes) else "turned against each other"
-        return f"needed rotations about {several}; add poses that are {more}"
+        return f", needed rotations about {several}; add poses that are {more}"
     if found.n_shifts < possible.n_shifts:
         return (
-            f"needed displacements in {possible.n_shifts} directions; add poses that are "
+            f", needed displacements in {possible.n_shifts} directions; add poses that are "
             "displaced in another direction too"
         )
-    return "needed poses that are further apart; add some from all over the workspace"
+    return (
+        f", with a scatter of {scatter}, needed more or better ones, further apart; add some from "
+        "all over the workspace"
+    )

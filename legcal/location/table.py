@@ -8,11 +8,11 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
-from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.frames import roll_pitch_yaw
 from legcal.location.location import Location
 
+_TURNS = ("roll, x", "pitch, y", "yaw, z")
 MOST_ROWS = 60  # of residuals; the file has them all
 
 
@@ -33,7 +33,7 @@ def location_table(location: Location, written: Sequence[str]) -> RenderableType
 
 
 def _frames(location: Location) -> Table:
-    """Return a line for each component of both frames."""
+    """Return a line for each component; sigma of an angle is that of a turn about the axis."""
     table = Table(box=None, pad_edge=False)
     for column in ("frame", "component"):
         table.add_column(column)
@@ -49,16 +49,11 @@ def _frames(location: Location) -> Table:
         if i == 1 and not location.has_tool_orientation:
             table.add_row(name, "rotation", "not measured", "", "")
             continue
-        for component, value, s in zip(("roll", "pitch", "yaw"), _angles(T), sigma[i, 3:],
-                                       strict=True):  # fmt: skip
+        angles = roll_pitch_yaw(T.rotation.as_matrix())
+        for component, value, s in zip(_TURNS, angles, sigma[i, 3:], strict=True):
             about = f"{np.degrees(s):.5f}"
             table.add_row(name, component, f"{np.degrees(value):z.5f}", about, "deg")
     return table
-
-
-def _angles(T: RigidTransform) -> Sequence[float]:
-    """Return angles about fixed x, y, z; their standard deviations are those about these axes."""
-    return [float(a) for a in roll_pitch_yaw(T.rotation.as_matrix())]
 
 
 def _residuals(location: Location) -> Table:

@@ -137,7 +137,7 @@ def _joint_of_world(mechanism: Mechanism, world: str) -> str:
 def _joint_of_tool(mechanism: Mechanism, tool: str) -> str:
     """Return the fixed joint between the platform and a tool link that carries nothing."""
     urdf = mechanism.urdf
-    (joint,) = [joint for joint in urdf.joints.values() if joint.child == tool] or [None]
+    joint = next((joint for joint in urdf.joints.values() if joint.child == tool), None)
     frames = {name for c in mechanism.chain.closures for name in (c.frame_1, c.frame_2)}
     carries = any(other.parent == tool for other in urdf.joints.values())
     if (
