@@ -16,12 +16,16 @@ from legcal.identify.session import Session
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.simulation.machine import Machine
-from legcal.stages import offsets, platform_joints, rigid_parts, scalar_products
+from legcal.stages import offsets, rigid_parts, scalar_products
 from legcal.stages.joints_in_base import JointsInBase
 from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.stages.laid_together import register_views
 from legcal.stages.least_squares import LeastSquares, structure_jacobian
 from legcal.stages.leg_directions import directions_through_joints
+from legcal.stages.platform_as_printed import build_mean_distances
+from legcal.stages.platform_unknowns import platform_unknowns
+from legcal.stages.rigid_platform import build_rigid
+from legcal.stages.rigid_problem import rigid_problem
 from legcal.stages.solution import Solution
 from legcal.studies.estimators import nominal_of
 
@@ -79,7 +83,8 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
     q0 = machine.parameters.offsets
     step2 = rigid_parts.build_rigid(nominal_of(machine), joints, base.T_Rb_camera)
     step3 = offsets.build_constant_distances(nominal_of(machine), directions, q0, m.sigma_q)
-    step4 = platform_joints.build_rigid(nominal_of(machine), directions, q0, m.sigma_q)
+    rigid = rigid_problem(nominal_of(machine), joints, base, directions, m.sigma_q)
+    step4 = build_rigid(rigid)
     built = [
         3 * int(joints.located.sum()),
         rank_of_first(step2, 12),
@@ -110,8 +115,8 @@ def test_printed_ranks_are_those_of_the_problems_that_the_steps_solve(coplanar: 
         rank_of_first(scalar_products.build_scalar_products(nominal_of(machine), joints), 12),
         rank_of_first(offsets.build_consecutive(nominal_of(machine), directions), 6),
         rank_of_first(
-            platform_joints.build_mean_distances(
-                nominal_of(machine), directions, machine.parameters.offsets
+            build_mean_distances(
+                nominal_of(machine), platform_unknowns(nominal_of(machine)), directions
             ),
             12,
         ),

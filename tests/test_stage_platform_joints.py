@@ -1,6 +1,6 @@
 """Step 4: eq (16), and its rigid replacement."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,30 +11,48 @@ from legcal.mechanism.parameters import KinematicParameters
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.stages.joints_in_base import locate_joints_in_base
-from legcal.stages.joints_in_camera import locate_joints_in_cameras
+from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
+from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.stages.leg_directions import LegDirections, directions_through_joints, select_axes
+from legcal.stages.nominal import Criteria, NominalMechanism
 from legcal.stages.offsets import Offsets, identify_offsets
-from legcal.stages.platform_joints import locate_platform_joints
+from legcal.stages.platform_joints import PlatformJoints, locate_platform_joints
 from legcal.stages.run import run_steps
 from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession, simulate_session
 
 
-def _until_offsets(session: SimulatedSession, nominal: Machine) -> tuple[LegDirections, Offsets]:
+@dataclass(frozen=True, eq=False)
+class Before:
+    """What steps 1 to 3 give."""
+
+    mechanism: NominalMechanism
+    joints: JointsInCamera
+    base: JointsInBase
+    directions: LegDirections
+    offsets: Offsets
+
+    def platform(self, criteria: Criteria = "default") -> PlatformJoints:
+        """Return the result of step 4."""
+        known = (self.joints, self.base, self.directions, self.offsets)
+        return locate_platform_joints(self.mechanism, *known, 2e-6, criteria=criteria)
+
+
+def _until_offsets(session: SimulatedSession, nominal: Machine) -> Before:
     axes, measurements = session.axes, session.measurements
-    joints = locate_joints_in_cameras(nominal_of(nominal), axes, measurements)
-    base = locate_joints_in_base(nominal_of(nominal), joints)
-    directions = directions_through_joints(nominal_of(nominal), axes, measurements, joints, base)
-    return directions, identify_offsets(nominal_of(nominal), directions, measurements.sigma_q)
+    mechanism = nominal_of(nominal)
+    joints = locate_joints_in_cameras(mechanism, axes, measurements)
+    base = locate_joints_in_base(mechanism, joints)
+    directions = directions_through_joints(mechanism, axes, measurements, joints, base)
+    offsets = identify_offsets(mechanism, directions, measurements.sigma_q)
+    return Before(mechanism, joints, base, directions, offsets)
 
 
 @pytest.mark.parametrize("coplanar", [False, True])
 def test_rigid_poses_give_exact_joints_from_five_millimetres(coplanar: bool) -> None:
     session = exact_session(coplanar=coplanar)
     nominal = five_millimetres_away(session.machine)
-    directions, offsets = _until_offsets(session, nominal)
-    platform = locate_platform_joints(nominal_of(nominal), directions, offsets, 2e-6)
+    platform = _until_offsets(session, nominal).platform()
     true = session.machine.parameters
     assert np.abs(platform.B_Re - true.platform_joints).max() < 1e-9
     assert np.abs(platform.q0 - true.offsets).max() < 1e-9
@@ -42,9 +60,9 @@ def test_rigid_poses_give_exact_joints_from_five_millimetres(coplanar: bool) -> 
 
 def test_offsets_heal_when_step_3_left_them_wrong() -> None:
     session = exact_session()
-    directions, offsets = _until_offsets(session, session.machine)
-    wrong = replace(offsets, q0=offsets.q0 + 0.002)
-    platform = locate_platform_joints(nominal_of(session.machine), directions, wrong, 2e-6)
+    before = _until_offsets(session, session.machine)
+    wrong = replace(before.offsets, q0=before.offsets.q0 + 0.002)
+    platform = replace(before, offsets=wrong).platform()
     assert np.abs(platform.q0 - session.machine.parameters.offsets).max() < 1e-9
 
 
@@ -52,13 +70,11 @@ def test_eq16_never_moves_z_from_a_coplanar_nominal_model() -> None:
     session = exact_session()
     true = session.machine.parameters.platform_joints
     nominal = hexapod()
-    directions, offsets = _until_offsets(session, nominal)
-    literal = locate_platform_joints(
-        nominal_of(nominal), directions, offsets, 2e-6, criteria="literal"
-    )
+    before = _until_offsets(session, nominal)
+    literal = before.platform("literal")
     assert np.abs(literal.B_Re[:, 2]).max() < 1e-9
     assert np.abs(literal.B_Re - true).max() > 5e-4
-    default = locate_platform_joints(nominal_of(nominal), directions, offsets, 2e-6)
+    default = before.platform()
     assert np.abs(default.B_Re - true).max() < 1e-9
 
 
@@ -70,12 +86,10 @@ def test_eq16_accepts_a_mirror_image_that_the_rigid_criterion_corrects() -> None
         session.machine,
         parameters=KinematicParameters(true.base_joints, mirrored, true.offsets),
     )
-    directions, offsets = _until_offsets(session, nominal)
-    literal = locate_platform_joints(
-        nominal_of(nominal), directions, offsets, 2e-6, criteria="literal"
-    )
+    before = _until_offsets(session, nominal)
+    literal = before.platform("literal")
     assert np.abs(literal.B_Re - mirrored).max() < 1e-6
-    default = locate_platform_joints(nominal_of(nominal), directions, offsets, 2e-6)
+    default = before.platform()
     assert np.abs(default.B_Re - true.platform_joints).max() < 1e-9
 
 
@@ -129,19 +143,21 @@ def test_a_constant_length_leg_gets_its_length_as_offset() -> None:
 
 def test_no_two_legs_at_once_is_refused() -> None:
     session = exact_session()
-    directions, offsets = _until_offsets(session, session.machine)
+    before = _until_offsets(session, session.machine)
+    directions = before.directions
     names = ("group", "view", "leg", "A", "u", "basis", "covariance", "reading")
     alone = LegDirections(**{n: getattr(directions, n)[directions.leg == 0] for n in names})
     with pytest.raises(NotIdentifiable, match="no pose shows two legs at once"):
-        locate_platform_joints(nominal_of(session.machine), alone, offsets, 2e-6)
+        replace(before, directions=alone).platform()
 
 
 def test_a_joint_that_is_seen_in_pairs_only_is_refused_by_name() -> None:
     session = exact_session()
-    directions, offsets = _until_offsets(session, session.machine)
+    before = _until_offsets(session, session.machine)
+    directions = before.directions
     pair = np.isin(directions.group, directions.group[directions.leg == 5])
     keep = ~pair | np.isin(directions.leg, (4, 5))
     names = ("group", "view", "leg", "A", "u", "basis", "covariance", "reading")
     some = LegDirections(**{n: getattr(directions, n)[keep] for n in names})
     with pytest.raises(NotIdentifiable, match="leg6"):
-        locate_platform_joints(nominal_of(session.machine), some, offsets, 2e-6)
+        replace(before, directions=some).platform()

@@ -28,7 +28,9 @@ def register_points(P_from: Array, P_to: Array) -> RigidTransform:
     return RigidTransform.from_components(t[0], Rotation.from_matrix(R[0]))
 
 
-def register_groups(P_from: Array, P_to: Array, group: IntArray) -> tuple[Array, Array]:
+def register_groups(
+    P_from: Array, P_to: Array, group: IntArray, weight: Array | None = None
+) -> tuple[Array, Array]:
     """Return the motion of :func:`register_points` for each group of points.
 
     Parameters
@@ -37,25 +39,55 @@ def register_groups(P_from: Array, P_to: Array, group: IntArray) -> tuple[Array,
         The same points in two frames [m].
     group : (n,) array of int
         The group of each point: 0, 1 and so on.
+    weight : (n,) array, optional
+        Weight of each point; all weigh the same without it.
 
     Returns
     -------
     (n_groups, 3, 3) array, (n_groups, 3) array
         Rotation matrix and translation [m] of T_to_from.
     """
-    n_points = np.bincount(group)[:, None]
-
-    def total(values: Array) -> Array:
-        found = np.zeros((len(n_points), *values.shape[1:]))
-        np.add.at(found, group, values)
-        return found
-
-    centre_from, centre_to = total(P_from) / n_points, total(P_to) / n_points
-    arm_from, arm_to = P_from - centre_from[group], P_to - centre_to[group]
-    U, _, Vt = np.linalg.svd(total(arm_to[:, :, None] * arm_from[:, None, :]))
+    arm_from, arm_to, centre_from, centre_to, weight = _arms(P_from, P_to, group, weight)
+    moment = np.zeros((len(centre_to), 3, 3))
+    np.add.at(moment, group, weight[:, None, None] * arm_to[:, :, None] * arm_from[:, None, :])
+    U, _, Vt = np.linalg.svd(moment)
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     R = U @ Vt
     return R, centre_to - np.einsum("gij,gj->gi", R, centre_from)
+
+
+def register_in_plane(
+    P_from: Array, P_to: Array, group: IntArray, weight: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the motion in the plane z = 0 that lays points on points best, for each group.
+
+    Two points are enough; heights are not looked at. Otherwise as :func:`register_groups`.
+    """
+    arm_from, arm_to, centre_from, centre_to, weight = _arms(P_from, P_to, group, weight)
+    (x, y), (i, j) = arm_from.T[:2], arm_to.T[:2]
+    sine, cosine = (
+        np.bincount(group, weights=weight * part) for part in (x * j - y * i, x * i + y * j)
+    )
+    R = Rotation.from_rotvec(np.arctan2(sine, cosine)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    t = centre_to - np.einsum("gij,gj->gi", R, centre_from)
+    t[:, 2] = 0.0
+    return R, t
+
+
+def _arms(
+    P_from: Array, P_to: Array, group: IntArray, weight: Array | None
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return points from the centres of their groups, these centres, and the weights."""
+    weight = np.ones(len(group)) if weight is None else weight
+    whole = np.bincount(group, weights=weight)[:, None]
+
+    def centres(points: Array) -> Array:
+        found = np.zeros((len(whole), 3))
+        np.add.at(found, group, weight[:, None] * points)
+        return found / whole
+
+    centre_from, centre_to = centres(P_from), centres(P_to)
+    return P_from - centre_from[group], P_to - centre_to[group], centre_from, centre_to, weight
 
 
 def moved_points(step: ca.SX, R: ca.SX, t: ca.SX, points: ca.SX) -> ca.SX:
@@ -75,10 +107,14 @@ def moved_points(step: ca.SX, R: ca.SX, t: ca.SX, points: ca.SX) -> ca.SX:
     -------
     (3, n) SX
     """
-    w = step[3:]
+    return turned_points(step[3:], R @ points) + ca.repmat(t + step[:3], 1, points.shape[1])
+
+
+def turned_points(w: ca.SX, points: ca.SX) -> ca.SX:
+    """Return points (3, n) turned by the rotation that has the Gibbs vector w (3, 1)."""
     cross = ca.skew(w)
     turn = ca.SX.eye(3) + 2.0 / (1.0 + ca.dot(w, w)) * (cross + ca.mtimes(cross, cross))
-    return turn @ (R @ points) + ca.repmat(t + step[:3], 1, points.shape[1])
+    return turn @ points
 
 
 def moved(step: Array, start: RigidTransform) -> RigidTransform:

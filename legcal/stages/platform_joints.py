@@ -1,82 +1,89 @@
-"""Section 3.5: the platform joint centres in the platform frame R_e, eq (16).
+"""Section 3.5: joints and axes on the platform, universal axes at the base, passive legs.
 
 With the offsets known, the leg ends B of every pose are points of one rigid body, the
-platform: laying the poses on each other gives the joint centres in R_e.
+platform: laying the poses on each other gives the joint centres in R_e. Where the platform is
+tells what its axes are.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array, IntArray
-from legcal.stages.free_joints import (
-    free_values,
-    joint_positions,
-    joints_from,
-    loose_joints,
-    n_free_coordinates,
-)
-from legcal.stages.least_squares import LeastSquares, Term
+from legcal.geometry.types import Array
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.stages.joints_in_base import JointsInBase
+from legcal.stages.joints_in_camera import JointsInCamera
 from legcal.stages.leg_directions import LegDirections
-from legcal.stages.motion import register_groups, whitener
 from legcal.stages.nominal import Criteria, NominalMechanism
-from legcal.stages.offsets import (
-    Offsets,
-    distance_sigma,
-    leg_end_covariance,
-    leg_ends,
-    observed_legs,
-    offset_positions,
-    pairs_of_legs,
+from legcal.stages.offsets import Offsets
+from legcal.stages.open_directions import closure_turns, metres, near_nominal, open_directions
+from legcal.stages.platform_as_printed import platform_as_printed
+from legcal.stages.platform_pose import (
+    Transformation,
+    chosen_transformation,
 )
-from legcal.stages.residuals import (
-    direction_of_leg,
-    distance_of_ends_and_joints,
-    distance_of_joints,
-    length_of_leg,
-)
+from legcal.stages.platform_unknowns import platform_unknowns
+from legcal.stages.rigid_platform import build_rigid
+from legcal.stages.rigid_problem import RigidProblem, rigid_problem
 from legcal.stages.solution import Solution
 from legcal.stages.solve import solve_least_squares
-
-_RELATIVE_LENGTH = 1e-5  # floor of the sigma of a length: keeps exact readings well conditioned
 
 
 @dataclass(frozen=True, eq=False)
 class PlatformJoints:
-    """Platform joint centres in R_e.
+    """The legs with all that step 4 finds.
 
     Attributes
     ----------
-    B_Re : (n_legs, 3) array
-        Platform joint centres [m].
-    q0 : (n_legs,) array
-        Offsets [m]: those of step 3, improved by the default criterion.
+    legs : tuple of LegGeometry
+        A and revolute axes at the base as step 2 found them; offsets of step 3, improved
+        by the default criterion; B, axes on the platform, universal axes at the base, twists.
     solution : Solution
-        The converged problem: free coordinates of B_Re first.
+        The converged problem: free coordinates of B in R_e first.
+    diagnostics : tuple of str
+        What was left at nominal, and why.
     """
 
-    B_Re: Array
-    q0: Array
+    legs: tuple[LegGeometry, ...]
     solution: Solution
+    diagnostics: tuple[str, ...] = ()
+
+    @property
+    def B_Re(self) -> Array:
+        """Platform joint centres in R_e, (n_legs, 3) [m]."""
+        return np.array([leg.B for leg in self.legs])
+
+    @property
+    def q0(self) -> Array:
+        """Offsets and lengths, (n_legs,) [m]; NaN for passive legs."""
+        return np.array([np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in self.legs])
 
 
 def locate_platform_joints(
     mechanism: NominalMechanism,
+    joints: JointsInCamera,
+    base: JointsInBase,
     directions: LegDirections,
     offsets: Offsets,
     sigma_q: float,
     *,
     criteria: Criteria = "default",
+    transformation: Transformation | None = None,
+    free_twists: bool = False,
 ) -> PlatformJoints:
-    """Locate the platform joint centres in R_e from the leg ends.
+    """Locate the joints on the platform from the leg ends, and identify the axes.
 
     Parameters
     ----------
     mechanism : NominalMechanism
-        Its nominal platform joints are the start.
+        Its nominal platform joints and axes are the start.
+    joints : JointsInCamera
+        The result of step 1: how exactly A is known.
+    base : JointsInBase
+        The result of step 2: A and revolute axes in R_b, and where the cameras stand.
     directions : LegDirections
         Legs of each pose.
     offsets : Offsets
@@ -84,7 +91,13 @@ def locate_platform_joints(
     sigma_q : float
         Standard deviation of a reading [m].
     criteria : {"default", "literal"}
-        ``literal`` minimises (16) as printed: mean distances of each view.
+        ``literal`` minimises (16) as printed, mean distances of each view, and then identifies
+        axes and passive ends one by one, every equation with the same weight.
+    transformation : {"points", "cross_product"}, optional
+        How (18) is solved: by point equality, as by default, or as printed, as in the
+        ``literal`` steps. The default criterion only starts there.
+    free_twists : bool
+        Look for the twists of legs without an S joint too; they are nominal otherwise.
 
     Returns
     -------
@@ -93,7 +106,8 @@ def locate_platform_joints(
     Raises
     ------
     NotIdentifiable
-        If the images do not tie all joints together.
+        If the images do not tie all joints together, or leave something open that moves the
+        platform.
     DidNotConverge
         If IPOPT does not.
 
@@ -101,150 +115,65 @@ def locate_platform_joints(
     -----
     Distances decide neither z of coplanar joints nor the handedness (see step 2), so the
     default lays the leg ends on each other rigidly, with one platform pose for every group of
-    three or more legs; two legs give their distance. The platform joint predicts the whole
-    leg: its direction is compared with the observed one, and its length with reading plus
-    offset. The offsets stay free in this: (13) multiplies a noisy direction by the unknown
-    length, which biases (14), while here directions are predicted and not multiplied. A
+    three or more legs (two in a plane); two legs give their distance. The platform joint
+    predicts the whole leg: its direction is compared with the observed one, and its length with
+    reading plus offset. The offsets stay free in this: (13) multiplies a noisy direction by the
+    unknown length, which biases (14), while here directions are predicted and not multiplied. A
     passive leg has no reading, and takes part with its direction alone, which is (19).
+
+    What the joints demand of a leg, that it is normal to its revolute axis, keeps its direction in
+    the platform, does not twist, are further residuals of the same problem, with the axes among the
+    unknowns. One image tells a pose of the platform badly, and an axis that is computed from
+    such poses inherits that; the demands of all legs make the poses much better, and the joints
+    with them. They tell joints too that distances alone leave open.
     """
+    known = with_base_and_offsets(mechanism, base, offsets)
+    how = chosen_transformation(transformation, criteria)
     if criteria == "literal":
-        solution = solve_least_squares(build_mean_distances(mechanism, directions, offsets.q0))
-        return PlatformJoints(joints_from(mechanism, solution.x), offsets.q0, solution)
-    solution = solve_least_squares(build_rigid(mechanism, directions, offsets.q0, sigma_q))
-    _check_identifiable(mechanism, solution)
-    q0 = offsets.q0.copy()
-    q0[np.isfinite(q0)] = solution.x[n_free_coordinates(mechanism) : solution.n_shared]
-    return PlatformJoints(joints_from(mechanism, solution.x), q0, solution)
-
-
-def build_mean_distances(
-    mechanism: NominalMechanism, directions: LegDirections, q0: Array
-) -> LeastSquares:
-    """Build the criterion C_3 of (16): mean distances of a view equal those in R_e."""
-    ends = leg_ends(directions, q0)
-    pairs = pairs_of_legs(directions, q0)
-    distance = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
-    key = np.column_stack([directions.view[pairs[:, 0]], directions.leg[pairs]])
-    distinct, which = np.unique(key, axis=0, return_inverse=True)
-    which = which.ravel()
-    mean = np.bincount(which, weights=distance) / np.bincount(which)
-    index = joint_positions(mechanism)[distinct[:, 1:]].reshape(-1, 6)
-    return LeastSquares(
-        "The platform joints (eq 16)",
-        (Term(distance_of_joints(), index, (mean, np.ones(len(mean)))),),
-        free_values(mechanism, mechanism.parameters.platform_joints),
-        exact_hessian=True,
+        unknowns = platform_unknowns(known, free_twists=free_twists)
+        legs, solution, said = platform_as_printed(known, unknowns, base, directions, how)
+        return PlatformJoints(legs, solution, said)
+    rigid = rigid_problem(
+        known, joints, base, directions, sigma_q, transformation=how, free_twists=free_twists
     )
+    return _minimum(rigid)
 
 
-def build_rigid(
-    mechanism: NominalMechanism, directions: LegDirections, q0: Array, sigma_q: float
-) -> LeastSquares:
-    """Build the rigid criterion: unknown are B in R_e, the offsets and the platform poses.
-
-    Parameters
-    ----------
-    mechanism : NominalMechanism
-        Its nominal platform joints are the start.
-    directions : LegDirections
-        Legs of each pose.
-    q0 : (n_legs,) array
-        Offsets to start from [m].
-    sigma_q : float
-        Standard deviation of a reading [m].
-
-    Returns
-    -------
-    LeastSquares
-        Residuals in standard deviations.
-
-    Raises
-    ------
-    NotIdentifiable
-        If no pose shows two legs at once.
-    """
-    has_end = np.isfinite(q0[directions.leg])
-    _, group = np.unique(directions.group, return_inverse=True)
-    n_ends = np.bincount(group, weights=has_end).astype(np.intp)[group]
-    if not np.any(n_ends >= 2):
-        raise NotIdentifiable(
-            "The platform joints could not be located: no pose shows two legs at once; needed "
-            "images of three or more; add images that show several legs at once."
+def with_base_and_offsets(
+    mechanism: NominalMechanism, base: JointsInBase, offsets: Offsets
+) -> NominalMechanism:
+    """Return the mechanism with what steps 2 and 3 found."""
+    legs = tuple(
+        replace(
+            leg,
+            A=base.A_Rb[j],
+            base_axis=base.base_axes[j] if mechanism.revolute[j] else leg.base_axis,
+            q0=float(offsets.q0[j]) if np.isfinite(offsets.q0[j]) else leg.q0,
         )
-    by_group = np.argsort(group, kind="stable")
-    pairs = by_group[(has_end & (n_ends == 2))[by_group]].reshape(-1, 2)
-    rows = np.flatnonzero(n_ends >= 3)
-    _, pose = np.unique(group[rows], return_inverse=True)
-    start = [free_values(mechanism, mechanism.parameters.platform_joints), q0[np.isfinite(q0)]]
-    n_shared = sum(len(values) for values in start)
-    start.append(np.zeros(6 * (int(pose.max(initial=-1)) + 1)))
-    return LeastSquares(
-        "The platform joints (step 4)",
-        (
-            _pairs_term(mechanism, directions, pairs, q0, sigma_q),
-            *_pose_terms(mechanism, directions, rows, pose, q0, sigma_q),
-        ),
-        np.concatenate(start),
-        n_shared=n_shared,
+        for j, leg in enumerate(mechanism.legs)
     )
+    return replace(mechanism, legs=legs)
 
 
-def _pairs_term(
-    mechanism: NominalMechanism,
-    directions: LegDirections,
-    pairs: IntArray,
-    q0: Array,
-    sigma_q: float,
-) -> Term:
-    """Return the residuals of pairs of legs (n_pairs, 2), whose distance is all they tell."""
-    ends, covariance = leg_ends(directions, q0), leg_end_covariance(directions, q0, sigma_q)
-    legs = directions.leg[pairs]
-    offsets = n_free_coordinates(mechanism) + offset_positions(q0)[legs]
-    joints = joint_positions(mechanism)[legs].reshape(-1, 6)
-    observed = (observed_legs(directions, pairs), distance_sigma(ends, covariance, pairs))
-    return Term(distance_of_ends_and_joints(), np.hstack([offsets, joints]), observed, robust=True)
+def _minimum(rigid: RigidProblem) -> PlatformJoints:
+    """Return the minimum of the rigid criterion, with what it leaves open held at nominal.
 
-
-def _pose_terms(
-    mechanism: NominalMechanism,
-    directions: LegDirections,
-    rows: IntArray,
-    pose: IntArray,
-    q0: Array,
-    sigma_q: float,
-) -> tuple[Term, Term]:
-    """Return the residuals of directions and of lengths of legs whose platform poses are free.
-
-    The legs are rows of the directions; *pose* numbers the pose of each.
+    What is open is judged near the nominal model: there the platform moves as it should.
     """
-    leg = directions.leg[rows]
-    place, n_free = offset_positions(q0), n_free_coordinates(mechanism)
-    end = place[leg] >= 0
-    nominal = mechanism.parameters.platform_joints
-    ends = leg_ends(directions, q0)
-    R, t = register_groups(nominal[leg[end]], ends[rows[end]], pose[end])
-    steps = n_free + int(place.max()) + 1 + 6 * pose[:, None] + np.arange(6)
-    index = np.hstack([joint_positions(mechanism)[leg], steps])
-    start = (R[pose], t[pose], directions.A[rows])
-    direction = (directions.u[rows], directions.basis[rows], whitener(directions.covariance[rows]))
-    sigma = float(np.hypot(sigma_q, _RELATIVE_LENGTH * np.mean(q0[np.isfinite(q0)])))
-    length = (directions.reading[rows[end]], np.full(len(rows[end]), sigma))
-    return (
-        Term(direction_of_leg(), index, start + direction, robust=True),
-        Term(
-            length_of_leg(),
-            np.hstack([index, n_free + place[leg, None]])[end],
-            tuple(values[end] for values in start) + length,
-        ),
+    known, unknowns = rigid.mechanism, rigid.unknowns
+    problem = build_rigid(rigid)
+    n, terms = len(unknowns), problem.terms
+    nominal = unknowns.vector(known.legs)
+    near = near_nominal(closure_turns(unknowns))
+    solution = solve_least_squares(replace(problem, terms=(*terms, *near)))
+    found = unknowns.legs(solution.x[:n], known.legs)
+    shown = solution.without_last(sum(len(term.index) for term in near))
+    still = open_directions(
+        known, unknowns, shown.information(), found, rigid.poses_in_base(solution.x[n:])
     )
-
-
-def _check_identifiable(mechanism: NominalMechanism, solution: Solution) -> None:
-    """Refuse when platform joints can move without any image noticing."""
-    loose = loose_joints(mechanism, solution)
-    if loose:
-        raise NotIdentifiable(
-            f"The platform joints could not be tied together: those of {', '.join(loose)} can "
-            "move without any image noticing; needed images of three or more legs at once that "
-            "share legs with each other; add images that show several legs at once."
-        )
+    if len(still.basis):
+        terms = (*terms, still.holding(metres(unknowns, still.length), nominal))
+    if near or len(still.basis):
+        solution = solve_least_squares(replace(problem, terms=terms, start=solution.x))
+        found = unknowns.legs(solution.x[:n], known.legs)
+    return PlatformJoints(found, solution, still.sentences)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import BoolArray
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
@@ -22,6 +23,7 @@ from legcal.stages.leg_directions import (
 from legcal.stages.nominal import Criteria, NominalMechanism
 from legcal.stages.offsets import Offsets, identify_offsets
 from legcal.stages.platform_joints import PlatformJoints, locate_platform_joints
+from legcal.stages.platform_pose import Transformation
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,23 +32,30 @@ class StagedResult:
 
     Attributes
     ----------
-    parameters : KinematicParameters
-        The identified parameters.
+    legs : tuple of LegGeometry
+        The identified legs in R_b and R_e: joint centres, offsets, axes and twists.
     T_Rb_camera : tuple of RigidTransform or None, length n_views
         Where each camera stood; None for a view that locates fewer than three base joints.
     joints_in_camera, joints_in_base, offsets, platform_joints
         The results of steps 1 to 4.
     diagnostics : tuple of str
-        What was left out, and why.
+        What was left out or left at nominal, and why.
     """
 
-    parameters: KinematicParameters
+    legs: tuple[LegGeometry, ...]
     T_Rb_camera: tuple[RigidTransform | None, ...]
     joints_in_camera: JointsInCamera
     joints_in_base: JointsInBase
     offsets: Offsets
     platform_joints: PlatformJoints
     diagnostics: tuple[str, ...]
+
+    @property
+    def parameters(self) -> KinematicParameters:
+        """Joint centres [m] and offsets [m], NaN for passive legs."""
+        return KinematicParameters(
+            self.joints_in_base.A_Rb, self.platform_joints.B_Re, self.platform_joints.q0
+        )
 
 
 def run_steps(
@@ -55,6 +64,8 @@ def run_steps(
     measurements: Measurements,
     *,
     criteria: Criteria = "default",
+    transformation: Transformation | None = None,
+    free_twists: bool = False,
 ) -> StagedResult:
     """Identify all parameters from leg axes and readings by the four steps (3.2 to 3.5).
 
@@ -67,7 +78,12 @@ def run_steps(
     measurements : Measurements
         Views, poses and readings of the images.
     criteria : {"default", "literal"}
-        ``literal`` takes (6), (9), (14) and (16) as printed, unweighted.
+        ``literal`` takes (6), (7), (9), (14) and (16) to (19) as printed, unweighted.
+    transformation : {"points", "cross_product"}, optional
+        How (18) is solved: by point equality, as by default, or as printed, as in the
+        ``literal`` steps.
+    free_twists : bool
+        Look for the twists of legs without an S joint too; they are nominal otherwise.
 
     Returns
     -------
@@ -94,16 +110,24 @@ def run_steps(
     )
     offsets = identify_offsets(mechanism, directions, measurements.sigma_q, criteria=criteria)
     platform = locate_platform_joints(
-        mechanism, directions, offsets, measurements.sigma_q, criteria=criteria
+        mechanism,
+        joints,
+        base,
+        directions,
+        offsets,
+        measurements.sigma_q,
+        criteria=criteria,
+        transformation=transformation,
+        free_twists=free_twists,
     )
     return StagedResult(
-        parameters=KinematicParameters(base.A_Rb, platform.B_Re, platform.q0),
+        legs=platform.legs,
         T_Rb_camera=base.T_Rb_camera,
         joints_in_camera=joints,
         joints_in_base=base,
         offsets=offsets,
         platform_joints=platform,
-        diagnostics=diagnostics,
+        diagnostics=diagnostics + platform.diagnostics,
     )
 
 

@@ -7,7 +7,7 @@ contain them, so that no large matrix is ever filled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -50,6 +50,11 @@ class Solution:
         """Half the sum of squared residuals."""
         return 0.5 * float(self.residuals @ self.residuals)
 
+    def without_last(self, n_rows: int) -> Solution:
+        """Return what is left without the last residuals, at the same place."""
+        n_kept = len(self.residuals) - n_rows
+        return replace(self, residuals=self.residuals[:n_kept], jacobian=self.jacobian[:n_kept])
+
     def covariance(self) -> Array:
         """Return the covariance of the shared unknowns when residuals have unit variance.
 
@@ -59,6 +64,15 @@ class Solution:
         triangle = _shared_triangle(self.jacobian, scale, self.n_shared)
         scaled = np.linalg.pinv(triangle, rcond=_RANK) * scale[: self.n_shared, None]
         return np.asarray(scaled @ scaled.T)
+
+    def information(self) -> Array:
+        """Return whitened rows (n_shared, n_shared) that say the same of the shared unknowns.
+
+        They are derivatives of residuals in standard deviations, the other unknowns being free.
+        """
+        scale = column_scale(self.jacobian)
+        triangle = _shared_triangle(self.jacobian, scale, self.n_shared)
+        return np.asarray(triangle / scale[: self.n_shared])
 
     def unseen(self, n_first: int) -> BoolArray:
         """Return which of the first unknowns can move without changing any residual, (n_first,).
