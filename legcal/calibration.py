@@ -12,6 +12,7 @@ from legcal.dataset.folder import Dataset
 from legcal.geometry.types import IntArray
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.observations.canonical_order import Order, inverse
+from legcal.observations.corners import Corners
 from legcal.refinement.held_out import HeldOut
 from legcal.refinement.known_parameters import known_parameters
 from legcal.refinement.platform_accuracy import PlatformAccuracy, platform_accuracy
@@ -91,6 +92,8 @@ class Calibration:
         What else a reader should know.
     held_out : HeldOut or None
         What images that were kept aside say of the fit; None where there are none.
+    corners : Corners or None
+        The corners of the calibration board in all images; None without a board.
     """
 
     dataset: Dataset
@@ -100,6 +103,7 @@ class Calibration:
     verdict: Verdict
     notes: tuple[str, ...]
     held_out: HeldOut | None = None
+    corners: Corners | None = None
 
 
 def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[str]) -> Calibration:
@@ -149,7 +153,9 @@ def _verdict_on_platform(platform: PlatformAccuracy, focal_doubt: float) -> Verd
 
 def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
     """Compare the change of joints and lengths with their uncertainty."""
-    known = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
+    known = known_parameters(
+        dataset.mechanism, dataset.measurements.views, with_board=dataset.board is not None
+    ).by_name
     lengths = [
         (solution.values[name] - known[name].nominal, sigma)
         for name, sigma in zip(solution.names, solution.sigma.tolist(), strict=True)

@@ -28,9 +28,9 @@ def residuals(problem: FitProblem, state: State, whitening: Array) -> Array:
 def jacobian(problem: FitProblem, linear: Linearization) -> Array:
     """Return the derivatives of all residuals by all unknowns, (n, size), as the fit has them."""
     kinds = (
-        (problem.outline_places, linear.outlines),
-        (problem.reading_places, linear.readings),
-        (problem.axis_places, linear.axes),
+        (problem.couplings.outlines, linear.outlines),
+        (problem.couplings.readings, linear.readings),
+        (problem.couplings.axes, linear.axes),
     )
     blocks = [_dense(problem, where, rows) for where, rows in kinds]
     priors = np.zeros((len(linear.prior_r), problem.layout.size))

@@ -12,7 +12,6 @@ from legcal.observations.leg_axes import axes_from_outlines
 from legcal.refinement import build_fit
 from legcal.refinement import minimise as solver
 from legcal.refinement.biases import N_KINDS, SharedShifts
-from legcal.refinement.build import with_biases
 from legcal.refinement.choices import Choices, Prior
 from legcal.refinement.constraints import on_constraints, tangent
 from legcal.refinement.linearize import linearize
@@ -20,6 +19,7 @@ from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import normal_equations
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.rows import Rows
+from legcal.refinement.shifted import with_biases
 from legcal.refinement.state import State
 
 K = 0.1
@@ -87,7 +87,7 @@ def _state(problem: FitProblem, session: MachineSession) -> State:
 def test_rows_have_the_derivatives_of_finite_differences(name: str) -> None:
     problem = _problem(name)
     state, T = _state(problem, _small(name)), _whitening(problem)
-    assert problem.axis_places.index.shape[0] == 0 or name == "6-sps"
+    assert problem.couplings.axes.index.shape[0] == 0 or name == "6-sps"
     J = jacobian(problem, linearize(problem, state, T))
     unit = np.eye(problem.layout.size)
     expected = by_differences(problem, state, lambda s: residuals(problem, s, T), unit)

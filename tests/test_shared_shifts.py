@@ -19,11 +19,12 @@ from legcal.geometry.types import Array
 from legcal.observations.outlines import Outlines
 from legcal.refinement.bias_scores import scores_of_shifts, with_shifts
 from legcal.refinement.biases import N_KINDS, estimated_shifts, possible_shifts
-from legcal.refinement.build import build_fit, with_biases
+from legcal.refinement.build import build_fit
 from legcal.refinement.linearize import linearize
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.observed import ObservedOutlines, observed_outlines
 from legcal.refinement.refine import refine
+from legcal.refinement.shifted import with_biases
 from legcal.refinement.variances import Effects, estimate_variances
 
 LEAST_GAIN = 25.0
@@ -100,8 +101,8 @@ def test_scores_are_those_of_the_residuals_that_a_fit_leaves(session: Session) -
     # All at once: outlines, readings and priors, without elimination.
     layout, rows = problem.layout, list[tuple[Array, Array]]()
     for where, part in (
-        (problem.outline_places, linear.outlines),
-        (problem.reading_places, linear.readings),
+        (problem.couplings.outlines, linear.outlines),
+        (problem.couplings.readings, linear.readings),
     ):
         J = np.zeros((*part.r.shape, layout.size + 1))
         place = np.where(where.index < layout.n_kept, where.index, layout.size)

@@ -12,6 +12,7 @@ from legcal.refinement.covariance import named_covariance, worst_directions
 from legcal.refinement.determinacy import Held, named_units
 from legcal.refinement.focal_length import focal_lengths
 from legcal.refinement.foretold import Posterior
+from legcal.refinement.judged_corners import corner_notes
 from legcal.refinement.linearize import Linearization, linearize, offsets_of
 from legcal.refinement.loss import width_to_k
 from legcal.refinement.minimise import robust_cost
@@ -60,7 +61,8 @@ def assemble_solution(
     estimated = covariance[np.ix_(where, where)]
     offsets = offsets_of(problem, state)
     used = offsets[fit.accepted]
-    n_residuals = used.size + len(problem.readings) + len(problem.priors) + linear.axes.r.size
+    n_residuals = used.size + len(problem.readings) + len(problem.priors)
+    n_residuals += linear.axes.r.size + linear.corners.r.size
     chi2, dof = _chi2(linear), n_residuals - problem.n_unknowns + len(held.basis)
     units = dict(zip(problem.named, problem.named_units, strict=True))
     units |= dict(
@@ -89,8 +91,10 @@ def assemble_solution(
         cost=comparable_cost(problem, state, settings),
         chi2=chi2,
         dof=dof,
-        rms_px=float(np.sqrt(np.mean(used**2))) if used.size else None,
-        rms_axes=float(np.sqrt(np.mean(linear.axes.r**2))) if linear.axes.r.size else None,
+        rms_px=_rms(used),
+        rms_axes=_rms(linear.axes.r),
+        T_Rb_board=state.T_Rb_board if len(problem.board) else None,
+        rms_corners_px=_rms(linear.corners.r * problem.board.sigma[:, None]),
         noise=fit.noise,
         biases=_biases(problem, state),
         shared_px=fit.shifts.sizes,
@@ -103,6 +107,7 @@ def assemble_solution(
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
+            *corner_notes(problem),
             *scale_notes(problem, state, settings),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
             *(str(f) for f in doubtful),
@@ -161,8 +166,19 @@ def _biases(problem: FitProblem, state: State) -> dict[str, float]:
     return dict(zip(names, state.biases.tolist(), strict=True))
 
 
+def _rms(values: Array) -> float | None:
+    """Return the root mean square of values, None of none."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
 def _chi2(linear: Linearization) -> float:
-    parts = (linear.outlines.r, linear.readings.r, linear.prior_r, linear.axes.r)
+    parts = (
+        linear.outlines.r,
+        linear.readings.r,
+        linear.prior_r,
+        linear.axes.r,
+        linear.corners.r,
+    )
     return float(sum(np.sum(part**2) for part in parts))
 
 

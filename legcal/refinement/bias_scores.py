@@ -9,10 +9,10 @@ from scipy.linalg import null_space
 
 from legcal.geometry.types import Array
 from legcal.refinement.biases import SharedShifts
-from legcal.refinement.build import with_biases
 from legcal.refinement.linearize import linearize
 from legcal.refinement.normal import inverse_on_range, normal_equations
 from legcal.refinement.problem import FitProblem
+from legcal.refinement.shifted import with_biases
 from legcal.refinement.state import State
 
 

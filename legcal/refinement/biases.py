@@ -110,15 +110,17 @@ def possible_shifts(
     """
     o = outlines
     parts = [f"{leg_names[leg]}.{part}" for leg, part in o.parts]
-    found, group = np.unique(np.column_stack([o.view, o.radius]), axis=0, return_inverse=True)
+    known = o if fitted is None else fitted
+    view = known.series[o.view]
+    found, group = np.unique(np.column_stack([view, o.radius]), axis=0, return_inverse=True)
     group = group.ravel()
     inward, sideways = o.epsilon, np.full(len(o), SIDEWAYS)
-    x, y = _places_in_groups(o, o if fitted is None else fitted).T
+    x, y = _places_in_groups(o, known).T
     together = [f"{o.views[v]}.{parts[p]}.inward" for v, p in found.tolist()]
     aside = [f"{o.views[v]}.{parts[p]}.sideways" for v, p in found.tolist()]
     levels = [
         (("all",), np.zeros(len(o), dtype=np.intp), inward, "", 0),
-        (o.views, o.view, inward, "", 0),
+        (o.views, view, inward, "", 0),
         (parts, o.radius, inward, "", 0),
         (together, group, inward, "", 2),
         (aside, group, sideways, "", 2),
@@ -168,7 +170,7 @@ def _places_in_groups(outlines: ObservedOutlines, others: ObservedOutlines) -> A
     Where a group has no others, places count as their middle.
     """
     n_parts = len(outlines.parts)
-    group, of_others = (o.view * n_parts + o.radius for o in (outlines, others))
+    group, of_others = (others.series[o.view] * n_parts + o.radius for o in (outlines, others))
     places = others.pixels.mean(axis=1)
     counts = np.bincount(of_others, minlength=len(others.views) * n_parts)
     sums = [np.bincount(of_others, weights=x, minlength=len(counts)) for x in places.T]

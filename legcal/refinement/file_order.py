@@ -43,7 +43,8 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     geometry = footed([solution.legs[j] for j in legs], origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
-    known = known_parameters(mechanism, measurements.views).by_name
+    with_board = dataset.board is not None
+    known = known_parameters(mechanism, measurements.views, with_board=with_board).by_name
     ordered = [name for name in known if name in solution.values]
     names = tuple(name for name in ordered if name in solution.names)
     names_of_legs, frame_legs = mechanism.leg_names, mechanism.frame_legs

@@ -16,7 +16,7 @@ from legcal.refinement.influence import reduced_jacobian
 from legcal.refinement.linearize import Linearization
 from legcal.refinement.normal import NormalEquations, normal_equations
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.sensitivity import offsets_change
+from legcal.refinement.sensitivity import corners_change, offsets_change
 from legcal.refinement.state import State, intrinsic_of
 from legcal.vision.intrinsics import shared_cameras, undistort_derivatives
 
@@ -102,10 +102,11 @@ def focal_lengths(
     for owner in tested:
         views = np.array([v for v in known if owners[v] == owner], dtype=np.intp)
         changes.append(_by_focal_length(problem, state, views))
-    columns = whitening @ np.stack(changes, axis=-1)
+    columns = whitening @ np.stack([offsets for offsets, _ in changes], axis=-1)
+    of_corners = np.stack([corners for _, corners in changes], axis=-1)
     normal = normal_equations(problem, state, linear, 0.0)
-    score, information = _left_by_the_fit(problem, linear, normal, columns)
-    whole = np.sum(columns**2, axis=(0, 1))
+    score, information = _left_by_the_fit(problem, linear, normal, columns, of_corners)
+    whole = np.sum(columns**2, axis=(0, 1)) + np.sum(of_corners**2, axis=(0, 1))
     seen = np.flatnonzero(np.diagonal(information) > _ROUNDED * whole)
     covariance = np.linalg.pinv(information[np.ix_(seen, seen)], rcond=_ROUNDED, hermitian=True)
     change, sigma = -covariance @ score[seen], np.sqrt(np.diagonal(covariance))
@@ -120,23 +121,36 @@ def focal_lengths(
     )
 
 
-def _by_focal_length(problem: FitProblem, state: State, views: IntArray) -> Array:
-    """Return the change of offsets (n, 2) [px] by a relative change of the views' focal length."""
-    o = problem.outlines
-    moved = np.zeros(o.feet.shape)
+def _by_focal_length(problem: FitProblem, state: State, views: IntArray) -> tuple[Array, Array]:
+    """Return the change by a relative change of the views' focal length.
+
+    Of offsets (n, 2) [px], and of the whitened residuals of corners (m, 2).
+    """
+    o, c = problem.outlines, problem.board
+    moved, corners = np.zeros(o.feet.shape), np.zeros(c.feet.shape)
     for v in views.tolist():
-        camera, of_view = state.cameras[v], o.view == v
-        slopes = undistort_derivatives(camera, o.pixels[of_view], _KEYS)
-        moved[of_view] = slopes @ np.array([intrinsic_of(camera, key) for key in _KEYS])
-    return offsets_change(problem, state, moved)
+        camera, of_view, shown = state.cameras[v], o.view == v, c.view == v
+        lengths = np.array([intrinsic_of(camera, key) for key in _KEYS])
+        moved[of_view] = undistort_derivatives(camera, o.pixels[of_view], _KEYS) @ lengths
+        corners[shown] = undistort_derivatives(camera, c.pixels[shown], _KEYS) @ lengths
+    return offsets_change(problem, state, moved), corners_change(problem, corners)
 
 
 def _left_by_the_fit(
-    problem: FitProblem, linear: Linearization, normal: NormalEquations, columns: Array
+    problem: FitProblem,
+    linear: Linearization,
+    normal: NormalEquations,
+    columns: Array,
+    of_corners: Array,
 ) -> tuple[Array, Array]:
-    """Return what the fit leaves of v^T r (c,) and v^T v (c, c), v whitened columns (n, 2, c)."""
-    where, rows = problem.outline_places, linear.outlines
+    """Return what the fit leaves of v^T r (c,) and v^T v (c, c).
+
+    The v are whitened columns (n, 2, c) of outlines and (m, 2, c) of corners, which no pose moves.
+    """
+    where, rows = problem.couplings.outlines, linear.outlines
+    corners = reduced_jacobian(problem.couplings.corners, linear.corners, normal)
     kept = np.einsum("nqk,nqc->kc", reduced_jacobian(where, rows, normal), columns, optimize=True)
+    kept += np.einsum("nqk,nqc->kc", corners, of_corners, optimize=True)
     J_pose = rows.J_pose
     if normal.tangent is not None:
         J_pose = J_pose @ normal.tangent.Z[where.pose]
@@ -148,6 +162,8 @@ def _left_by_the_fit(
         "akp,kpq,kq->a", normal.W, normal.V_inverse, normal.g_pose, optimize=True
     )
     score = np.einsum("nqc,nq->c", columns, rows.r) - kept.T @ covariance @ g_kept
+    score += np.einsum("nqc,nq->c", of_corners, linear.corners.r)
     score -= np.einsum("kpc,kp->c", following, normal.g_pose)
     information = np.einsum("nqc,nqd->cd", columns, columns) - kept.T @ covariance @ kept
+    information += np.einsum("nqc,nqd->cd", of_corners, of_corners)
     return score, information - np.einsum("kpc,kpd->cd", following, by_pose)

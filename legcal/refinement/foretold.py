@@ -12,10 +12,10 @@ from legcal.geometry.types import Array
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.refinement.biases import SharedShifts, possible_shifts
-from legcal.refinement.build import with_measurements
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.observed import observed_outlines, of_parts, seen_by
 from legcal.refinement.problem import FitProblem
+from legcal.refinement.shifted import with_measurements
 from legcal.refinement.state import State, components
 
 

@@ -140,7 +140,7 @@ def compare_held_out(
     _refuse_unseen(linear)
     readings = of_one_kind(problem, state, linear, "readings")
     _refuse_undetermined(readings)
-    places, of_fit = problem.outline_places, foretold.covariance
+    places, of_fit = problem.couplings.outlines, foretold.covariance
     expected = np.eye(2) + explained_share(places, linear.outlines, readings, of_fit)
     offsets = (L @ linear.outlines.r[..., None])[..., 0]
     norm = _norms(linear.outlines.r, expected)

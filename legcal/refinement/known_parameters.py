@@ -1,4 +1,4 @@
-"""The parameters that somebody may name: kinematic ones, radii of legs, intrinsics of cameras."""
+"""The parameters that somebody may name: of the mechanism, of legs, of cameras, of the board."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from legcal.vision.intrinsics import (
     shared_cameras,
 )
 
-Kind = Literal["kinematic", "radius", "intrinsic"]
+Kind = Literal["kinematic", "radius", "intrinsic", "board"]
+BOARD_SCALE = "board.scale"  # the factor on the dimensions of a calibration board
 _RATIO = 10.0  # between a radius or length and its nominal value: more is a mistake of the unit
 _FOCAL_RATIO = 2.0
 _COEFFICIENT = 1e3  # of distortion; far more than any lens has
@@ -35,8 +36,8 @@ class KnownParameter:
     nominal : float
         Its value in the model or camera file [unit].
     unit : {"m", "rad", "px", ""}
-        Its unit; "" for coefficients of distortion.
-    kind : {"kinematic", "radius", "intrinsic"}
+        Its unit; "" for coefficients of distortion and for the size of a board.
+    kind : {"kinematic", "radius", "intrinsic", "board"}
         What it belongs to.
     least, most : float
         Between these a stated value is believed [unit].
@@ -56,7 +57,8 @@ class KnownParameters:
     Attributes
     ----------
     by_name : mapping
-        The parameters, in the order kinematic ones with twists, radii, intrinsics.
+        The parameters, in the order kinematic ones with twists, radii, intrinsics, the size of the
+        calibration board.
     others : mapping
         Names that look like parameters and are none, and why: the end of a sentence.
     synonyms : mapping
@@ -78,7 +80,11 @@ class KnownParameters:
 
 
 def known_parameters(
-    mechanism: Mechanism, views: Sequence[View], *, axes_given: bool = False
+    mechanism: Mechanism,
+    views: Sequence[View],
+    *,
+    axes_given: bool = False,
+    with_board: bool = False,
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views.
 
@@ -90,16 +96,21 @@ def known_parameters(
         The views of the dataset.
     axes_given : bool
         Leg axes were measured in place of outlines: radii and intrinsics are in them already.
+    with_board : bool
+        A calibration board stands on the base.
     """
     by_name, others = _kinematic(mechanism), _no_parameters(mechanism)
     seen: dict[str, KnownParameter] = dict(_radii(mechanism))
     intrinsics, synonyms = _intrinsics(views)
     seen |= intrinsics
+    board = (
+        {BOARD_SCALE: KnownParameter(1.0, "", "board", 1.0 / _RATIO, _RATIO)} if with_board else {}
+    )
     if axes_given:
         reason = "measured axes, in which cameras and radii are contained already"
         others |= dict.fromkeys((*seen, *synonyms), reason)
-        return KnownParameters(by_name, others, {})
-    return KnownParameters(by_name | seen, others, synonyms)
+        return KnownParameters(by_name | board, others, {})
+    return KnownParameters(by_name | seen | board, others, synonyms)
 
 
 def _kinematic(mechanism: Mechanism) -> dict[str, KnownParameter]:

@@ -1,7 +1,8 @@
 """Where each unknown sits in the vector x that the solver moves.
 
-The vector is kinematic parameters, radii, biases, intrinsics, cameras, platform poses, in this
-order; it holds changes of a state [m, rad, px].
+The vector is kinematic parameters, radii, biases, intrinsics, the size of the calibration board,
+cameras, the place of that board, platform poses, in this order; it holds changes of a state
+[m, rad, px].
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ class Layout:
         Intrinsics of each view; views with one camera share them.
     camera : (n_views, 6) array of int
         Rotation and translation of each camera; cameras that show nothing are no unknowns.
+    board_scale : (1,) array of int
+        The factor on the dimensions of the calibration board.
+    board : (6,) array of int
+        Rotation and translation of the calibration board.
     n_poses : int
         Number of platform poses; each has six numbers at the end of x.
     n_kept : int
@@ -48,6 +53,8 @@ class Layout:
     bias: IntArray
     intrinsic: IntArray
     camera: IntArray
+    board_scale: IntArray
+    board: IntArray
     n_poses: int
     n_kept: int
     parts: tuple[tuple[int, str], ...]
@@ -65,9 +72,10 @@ class Layout:
 
     @property
     def n_named(self) -> int:
-        """Number of unknowns that have a name and a prior: all but cameras and poses."""
-        cameras = self.camera[self.camera < self.size]
-        return int(cameras.min()) if cameras.size else self.n_kept
+        """Number of unknowns that have a name and a prior: all but cameras, board and poses."""
+        without = np.concatenate([self.camera.ravel(), self.board])
+        without = without[without < self.size]
+        return int(without.min()) if without.size else self.n_kept
 
     def of_poses(self, n_poses: int) -> Layout:
         """Return the layout of the same unknowns with another number of platform poses."""
@@ -83,6 +91,8 @@ class Layout:
             radius=marked(self.radius),
             intrinsic=marked(self.intrinsic),
             camera=marked(self.camera),
+            board_scale=marked(self.board_scale),
+            board=marked(self.board),
             n_poses=n_poses,
         )
 
@@ -95,6 +105,7 @@ def lay_out(
     intrinsic: IntArray,
     intrinsic_keys: Sequence[str],
     camera_is_seen: BoolArray,
+    board_is_free: tuple[bool, bool],
     n_poses: int,
 ) -> Layout:
     """Return the layout of the unknowns, without shifts of outlines.
@@ -114,12 +125,24 @@ def lay_out(
     intrinsic_keys : sequence of str
         What its columns are.
     camera_is_seen : (n_views,) array of bool
-        Which views have outlines or axes.
+        Which views have outlines, axes or corners of a calibration board.
+    board_is_free : (bool, bool)
+        Whether the size and the place of the calibration board are unknowns.
     n_poses : int
         Number of platform poses.
     """
     n_intrinsics = int(intrinsic.max(initial=-1)) + 1
-    counts = [is_free.sum(), radius_is_free.sum(), n_intrinsics, 6 * camera_is_seen.sum()]
+    scale, place_of_board = (
+        np.full(n, free) for n, free in zip((1, 6), board_is_free, strict=True)
+    )
+    counts = [
+        is_free.sum(),
+        radius_is_free.sum(),
+        n_intrinsics,
+        scale.sum(),
+        6 * camera_is_seen.sum(),
+        place_of_board.sum(),
+    ]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
     n_kept = int(first[-1])
     size = n_kept + 6 * n_poses
@@ -131,7 +154,9 @@ def lay_out(
         radius=_numbered(radius_is_free, first[1], size),
         bias=np.zeros(0, dtype=np.intp),
         intrinsic=np.where(intrinsic < 0, size, first[2] + intrinsic),
-        camera=_numbered(np.repeat(camera_is_seen[:, None], 6, axis=1), first[3], size),
+        board_scale=_numbered(scale, first[3], size),
+        camera=_numbered(np.repeat(camera_is_seen[:, None], 6, axis=1), first[4], size),
+        board=_numbered(place_of_board, first[5], size),
         n_poses=n_poses,
         n_kept=n_kept,
         parts=tuple(parts),

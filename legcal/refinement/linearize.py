@@ -13,7 +13,12 @@ import numpy as np
 
 from legcal.geometry.types import Array, IntArray
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.residuals import axis_residual, encoder_residual, outline_residual
+from legcal.refinement.residuals import (
+    axis_residual,
+    corner_residual,
+    encoder_residual,
+    outline_residual,
+)
 from legcal.refinement.rows import Rows
 from legcal.refinement.state import State
 
@@ -24,14 +29,15 @@ class Linearization:
 
     Attributes
     ----------
-    outlines, readings, axes : Rows
-        Two, one and four rows a measurement.
+    outlines, readings, axes, corners : Rows
+        Two, one, four and two rows a measurement.
     prior_r, prior_J : (n,) and (n, n_kept) array
     """
 
     outlines: Rows
     readings: Rows
     axes: Rows
+    corners: Rows
     prior_r: Array
     prior_J: Array
 
@@ -77,6 +83,7 @@ def linearize(problem: FitProblem, state: State, whitening: Array) -> Linearizat
         outline_rows(problem, state).whitened(whitening),
         _reading_rows(problem, state),
         _axis_rows(problem, state),
+        corner_rows(problem, state),
         r,
         J,
     )
@@ -132,6 +139,37 @@ def _axis_rows(problem: FitProblem, state: State) -> Rows:
         np.concatenate([a.M, a.basis.reshape(-1, 6)], axis=1),
     )
     return Rows(r, slope, ends.by_unknowns).whitened(a.whitening)
+
+
+def corner_rows(problem: FitProblem, state: State) -> Rows:
+    """Return the whitened residuals of the corners of a calibration board; no pose moves them."""
+    c = problem.board
+    R_camera = state.R_camera[c.view]
+    arm = c.point @ state.R_board[0].T
+    grown = state.board_scale[0] * arm
+    turned = _times(R_camera, grown + state.t_board)
+    xy, by_intrinsics = problem.measured_corners(state)
+    local = np.concatenate([turned + state.t_camera[c.view], xy], axis=1)
+    r, slope = corner_residual().evaluate(local, c.constants)
+
+    def chain(slope: Array) -> tuple[Array, Array]:
+        in_camera = slope[..., :3]
+        in_base = in_camera @ R_camera
+        J = np.concatenate(
+            [
+                _cross(turned[:, None], in_camera),
+                in_camera,
+                _cross(grown[:, None], in_base),
+                in_base,
+                in_base @ arm[..., None],
+                slope[..., 3:] @ by_intrinsics,
+            ],
+            axis=-1,
+        )
+        return J, np.zeros((*slope.shape[:2], 6))
+
+    by_sigma = 1.0 / c.sigma[:, None]
+    return Rows(by_sigma * r, by_sigma[..., None] * slope, chain)
 
 
 def _ends_in_camera(state: State, leg: IntArray, view: IntArray, pose: IntArray) -> _Ends:

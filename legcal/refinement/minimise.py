@@ -131,17 +131,20 @@ def minimise(
 
 
 def robust_cost(linear: Linearization, k: float) -> float:
-    """Return the cost: the loss of outlines and axes, half the squares of readings and priors."""
+    """Return the cost: half the squares of readings and priors, the loss of everything else."""
     plain = np.sum(linear.readings.r**2) + np.sum(linear.prior_r**2)
-    robust = (cost_of(rows.squared_norms, k) for rows in (linear.outlines, linear.axes))
+    kinds = linear.outlines, linear.axes, linear.corners
+    robust = (cost_of(rows.squared_norms, k) for rows in kinds)
     return float(0.5 * plain + sum(robust))
 
 
 def _width(linear: Linearization, width: float, before: float) -> float:
     """Return the width of the loss: some medians while most measurements are far off."""
-    norms = np.concatenate([linear.outlines.squared_norms, linear.axes.squared_norms])
-    norms = norms[norms > 0.0]
-    median = float(np.sqrt(np.median(norms))) if len(norms) else 0.0
+    medians = [0.0]
+    for rows in (linear.outlines, linear.axes, linear.corners):
+        norms = rows.squared_norms[rows.squared_norms > 0.0]
+        medians += [float(np.sqrt(np.median(norms)))] if len(norms) else []
+    median = max(medians)  # corners agree with each other before anything else does
     wanted = width if median <= width else _MEDIANS * median
     return wanted if wanted == width or wanted < _NARROWING * before else before
 
@@ -162,6 +165,7 @@ def _tried(
     layout = problem.layout
     turns = [step[layout.n_kept :].reshape(-1, 6)[:, :3].ravel()]
     turns += [step[layout.camera[layout.camera[:, 0] < layout.size][:, :3]].ravel()]
+    turns += [step[layout.board[layout.board < layout.size][:3]]]
     largest = float(np.abs(np.concatenate(turns)).max(initial=0.0))
     moved = state.moved(step * min(1.0, _LARGEST_TURN / max(largest, 1e-300)), layout)
     if np.any(moved.radii <= 0.0):

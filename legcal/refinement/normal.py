@@ -8,6 +8,7 @@ then neither move nor carry information.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -20,7 +21,7 @@ from legcal.refinement.constraints import Tangent, tangent
 from legcal.refinement.linearize import Linearization
 from legcal.refinement.loss import efficiency
 from legcal.refinement.problem import FitProblem
-from legcal.refinement.rows import Sums, summed
+from legcal.refinement.rows import Rows, Sums, summed
 from legcal.refinement.state import State
 
 _RANGE = 1e-13  # eigenvalues below this part of the largest are rounding
@@ -131,15 +132,9 @@ def normal_equations(
         Where *linear* was taken.
     linear : Linearization
     k : float
-        Narrowness of the loss on outlines and axes, 0 for plain least squares.
+        Narrowness of the loss on all but readings, 0 for plain least squares.
     """
-    kinds = [
-        (problem.outline_places, linear.outlines.softened(k)),
-        (problem.reading_places, linear.readings),
-        (problem.axis_places, linear.axes.softened(k)),
-    ]
-    sums = summed(kinds, problem.layout.n_kept, problem.layout.n_poses)
-    return _constrained(problem, state, linear, sums)
+    return _of_rows(problem, state, linear, lambda rows, n_rows: rows.softened(k))
 
 
 def information(
@@ -152,13 +147,27 @@ def information(
     problem, state, linear
         As in :func:`normal_equations`.
     k : float
-        Narrowness of the loss, which does not keep all information of outlines and axes
+        Narrowness of the loss, which does not keep all information of what it is on
         (:func:`legcal.refinement.loss.efficiency`); 0 for what the data hold.
     """
+    return _of_rows(
+        problem, state, linear, lambda rows, n_rows: rows.scaled(np.sqrt(efficiency(k, n_rows)))
+    )
+
+
+def _of_rows(
+    problem: FitProblem,
+    state: State,
+    linear: Linearization,
+    weighted: Callable[[Rows, int], Rows],
+) -> NormalEquations:
+    """Return the normal equations of all kinds; *weighted* is done to those with a robust loss."""
+    of = problem.couplings
     kinds = [
-        (problem.outline_places, linear.outlines.scaled(np.sqrt(efficiency(k, 2)))),
-        (problem.reading_places, linear.readings),
-        (problem.axis_places, linear.axes.scaled(np.sqrt(efficiency(k, 4)))),
+        (of.outlines, weighted(linear.outlines, 2)),
+        (of.readings, linear.readings),
+        (of.axes, weighted(linear.axes, 4)),
+        (of.corners, weighted(linear.corners, 2)),
     ]
     sums = summed(kinds, problem.layout.n_kept, problem.layout.n_poses)
     return _constrained(problem, state, linear, sums)
@@ -172,8 +181,8 @@ def of_one_kind(
     Their poses are those that this kind alone tells: V and W are without the other kinds.
     """
     of_kind = {
-        "outlines": (problem.outline_places, linear.outlines),
-        "readings": (problem.reading_places, linear.readings),
+        "outlines": (problem.couplings.outlines, linear.outlines),
+        "readings": (problem.couplings.readings, linear.readings),
     }
     sums = summed([of_kind[kind]], problem.layout.n_kept, problem.layout.n_poses)
     return _constrained(problem, state, linear, sums)

@@ -13,6 +13,7 @@ from legcal.observations.outlines import Outlines
 from legcal.refinement.legs import FittedLegs
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
+from legcal.vision.intrinsics import shared_cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,9 @@ class ObservedOutlines:
         Leg index and part of each radius, sorted by leg and name.
     views : tuple of str
         Names of the views.
+    series : (n_views,) array of int
+        The view that stands for each: the first of those that show one image each with the same
+        camera, as one that is held in the hand does; else itself.
     bias_index : (n, c) array of int
         The shared shifts that each outline has a part in.
     bias_shift : (n, c, 2) array
@@ -55,6 +59,7 @@ class ObservedOutlines:
     covariance: Array
     parts: tuple[tuple[int, str], ...]
     views: tuple[str, ...]
+    series: IntArray
     bias_index: IntArray
     bias_shift: Array
 
@@ -140,9 +145,23 @@ def observed_outlines(
         covariance,
         parts,
         tuple(view.name for view in measurements.views),
+        _series(measurements),
         np.zeros((len(index), 0), dtype=np.intp),
         np.zeros((len(index), 0, 2)),
     )
+
+
+def _series(measurements: Measurements) -> IntArray:
+    """Return the view that stands for each, (n_views,)."""
+    views = measurements.views
+    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
+    images = np.bincount(measurements.view, minlength=len(views))
+    first: dict[str, int] = {}
+    found = [
+        first.setdefault(owner, v) if n == 1 else v
+        for v, (owner, n) in enumerate(zip(owners, images.tolist(), strict=True))
+    ]
+    return np.array(found, dtype=np.intp)
 
 
 def of_parts(outlines: ObservedOutlines, parts: Sequence[tuple[int, str]]) -> ObservedOutlines:

@@ -1,6 +1,7 @@
 """The unknowns that have names, and what is known of them beforehand.
 
-Named are kinematic parameters, radii, biases and intrinsics; they stand first in x. Their values
+Named are kinematic parameters, radii, biases, intrinsics and the size of the calibration board;
+they stand first in x. Their values
 are what a user means by their names: an axis is two angles from the nominal one, whereas its
 unknowns are turns of where it is now.
 """
@@ -63,7 +64,8 @@ def named_values(state: State, layout: Layout, legs: FittedLegs) -> Array:
     """Return the values of the named unknowns, (n_named,), in the order of x."""
     kinematic = legs.vector(state.legs)[layout.kinematic < layout.size]
     radii = state.radii[layout.radius < layout.size]
-    return np.concatenate([kinematic, radii, state.biases, _intrinsics(state, layout)])
+    scale = state.board_scale[layout.board_scale < layout.size]
+    return np.concatenate([kinematic, radii, state.biases, _intrinsics(state, layout), scale])
 
 
 @lru_cache(maxsize=2)  # several ask for it at one state

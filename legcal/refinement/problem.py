@@ -7,18 +7,19 @@ from functools import cached_property
 
 import numpy as np
 
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parametrization import tied_twist
 from legcal.mechanism.sensitivity import freedoms
 from legcal.refinement.choices import Choices
 from legcal.refinement.constraints import n_bonds
+from legcal.refinement.couplings import Couplings
 from legcal.refinement.layout import Layout
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.observed import ObservedOutlines, Readings
 from legcal.refinement.observed_axes import ObservedAxes
+from legcal.refinement.observed_board import ObservedBoard
 from legcal.refinement.priors import Priors
-from legcal.refinement.rows import Places
 from legcal.refinement.start import Start, with_values
 from legcal.refinement.state import State, components
 from legcal.vision.camera import Camera
@@ -27,7 +28,7 @@ from legcal.vision.intrinsics import intrinsic_names, undistort_derivatives
 
 @dataclass(frozen=True, eq=False)
 class FirstValues:
-    """Where radii and intrinsics begin; those that are fixed stay there.
+    """Where radii, intrinsics and the size of the board begin; those that are fixed stay there.
 
     Attributes
     ----------
@@ -35,10 +36,13 @@ class FirstValues:
         Radii [m].
     cameras : tuple of Camera
         The camera of each view.
+    board_scale : float
+        Factor on the dimensions of the calibration board.
     """
 
     radii: Array
     cameras: tuple[Camera, ...]
+    board_scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +58,22 @@ class FitProblem:
     outlines : ObservedOutlines
     readings : Readings
     axes : ObservedAxes
+    board : ObservedBoard
+        The corners of a calibration board that stands on the base.
     priors : Priors
     first : FirstValues
         Where what no start tells begins.
-    outline_places, reading_places, axis_places : Places
+    couplings : Couplings
         The unknowns of each measurement.
     named : tuple of str
-        Names of the first unknowns of x: kinematic parameters, radii, biases, intrinsics.
+        Names of the first unknowns of x: kinematic parameters, radii, biases, intrinsics, the size
+        of the calibration board.
     named_units : tuple of str
         Their units: ``m``, ``rad``, ``px`` or none.
     held : (w, n_kept) array
         Orthonormal directions of x that the solver must not move along.
+    rejected_corners : tuple of (int, int)
+        View and number of the corners of the board that were left out.
     """
 
     legs: FittedLegs
@@ -73,14 +82,14 @@ class FitProblem:
     outlines: ObservedOutlines
     readings: Readings
     axes: ObservedAxes
+    board: ObservedBoard
     priors: Priors
     first: FirstValues
-    outline_places: Places
-    reading_places: Places
-    axis_places: Places
+    couplings: Couplings
     named: tuple[str, ...]
     named_units: tuple[str, ...]
     held: Array
+    rejected_corners: tuple[tuple[int, int], ...] = ()
 
     @property
     def n_unknowns(self) -> int:
@@ -91,7 +100,9 @@ class FitProblem:
     @property
     def n_equations(self) -> int:
         """Number of residuals, priors left out."""
-        return 2 * len(self.outlines) + len(self.readings) + 4 * len(self.axes)
+        return (
+            2 * len(self.outlines) + len(self.readings) + 4 * len(self.axes) + 2 * len(self.board)
+        )
 
     def begin(self, start: Start) -> State:
         """Return the state at a start, with everything that is fixed at its value."""
@@ -102,6 +113,8 @@ class FitProblem:
             self.first.cameras,
             *components(start.T_camera_Rb),
             *components(start.T_Rb_Re),
+            *components([start.T_Rb_board]),
+            np.array([self.first.board_scale]),
         )
 
     def tied(self, geometry: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
@@ -159,17 +172,32 @@ class FitProblem:
         by_intrinsics : (n, 2, 2, n_keys) array
             Their derivatives by the intrinsics that are unknowns.
         """
-        o, layout = self.outlines, self.layout
-        keys = layout.intrinsic_keys
-        xy, slopes = o.feet.copy(), np.zeros((len(o), 2, 2, len(keys)))
+        return self._on_sensor(state, self.outlines.view, self.outlines.feet, self.outlines.pixels)
+
+    def measured_corners(self, state: State) -> tuple[Array, Array]:
+        """Return the corners of the board on the sensor plane, and how they move with intrinsics.
+
+        Returns
+        -------
+        xy : (n, 2) array
+        by_intrinsics : (n, 2, n_keys) array
+        """
+        return self._on_sensor(state, self.board.view, self.board.feet, self.board.pixels)
+
+    def _on_sensor(
+        self, state: State, view: IntArray, feet: Array, pixels: Array
+    ) -> tuple[Array, Array]:
+        """Return points (n, ..., 2) of images on the sensor plane, and (n, ..., 2, n_keys)."""
+        keys = self.layout.intrinsic_keys
+        xy, slopes = feet.copy(), np.zeros((*feet.shape, len(keys)))
         if not keys:
             return xy, slopes
-        for v in np.unique(o.view):
-            camera, of_view = state.cameras[v], o.view == v
+        for v in np.unique(view):
+            camera, of_view = state.cameras[v], view == v
             known = [k for k, key in enumerate(keys) if key in intrinsic_names(camera)]
-            pixels = o.pixels[of_view]
-            xy[of_view] = camera.undistort(pixels)
-            some = np.zeros((*pixels.shape, len(keys)))
-            some[..., known] = undistort_derivatives(camera, pixels, [keys[k] for k in known])
+            seen = pixels[of_view]
+            xy[of_view] = camera.undistort(seen)
+            some = np.zeros((*seen.shape, len(keys)))
+            some[..., known] = undistort_derivatives(camera, seen, [keys[k] for k in known])
             slopes[of_view] = some
         return xy, slopes

@@ -18,7 +18,7 @@ from legcal.refinement.assembly import assemble_solution, comparable_cost
 from legcal.refinement.build import build_fit
 from legcal.refinement.choices import NO_CHOICES, Choices
 from legcal.refinement.constraints import on_constraints
-from legcal.refinement.contradictions import refuse_contradicted_priors
+from legcal.refinement.contradictions import refuse_contradicted_priors, refuse_other_board
 from legcal.refinement.determinacy import held_at_nominal, open_directions, refuse_lost
 from legcal.refinement.fixed_values import refuse_contradicted_values
 from legcal.refinement.legs import FittedLegs
@@ -27,6 +27,7 @@ from legcal.refinement.loss import width_to_k
 from legcal.refinement.minimise import Minimum
 from legcal.refinement.noise import NoiseModel, noise_of_the_median
 from legcal.refinement.normal import information
+from legcal.refinement.observed_board import SeenBoard
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.rounds import first_minimum, fit_in_rounds
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
@@ -47,6 +48,7 @@ def refine(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
+    board: SeenBoard | None = None,
     choices: Choices = NO_CHOICES,
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii to all data at once.
@@ -66,6 +68,8 @@ def refine(
     axes : LegAxes, optional
         Measured axes, beside outlines or instead of them (give
         :func:`legcal.observations.sets.no_outlines`). Their covariances are taken as they are.
+    board : SeenBoard, optional
+        A calibration board that stands still on the base, and its corners in images.
     choices : Choices
         Parameters that are fixed, freed or known beforehand.
 
@@ -82,7 +86,9 @@ def refine(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    problem = build_fit(legs, measurements, outlines, settings, axes=axes, choices=choices)
+    problem = build_fit(
+        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
+    )
     return solve_fit(problem, outlines, start, settings)
 
 
@@ -105,6 +111,7 @@ def refine_from_best(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
+    board: SeenBoard | None = None,
     choices: Choices = NO_CHOICES,
 ) -> Solution:
     """Fit everything from several starts and keep the lowest cost.
@@ -118,7 +125,9 @@ def refine_from_best(
     NotIdentifiable, DidNotConverge
         If no start leads to a fit.
     """
-    problem = build_fit(legs, measurements, outlines, settings, axes=axes, choices=choices)
+    problem = build_fit(
+        legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
+    )
     candidates: list[_Candidate] = []
     notes: list[str] = []
     failures: list[LegcalError] = []
@@ -129,7 +138,8 @@ def refine_from_best(
             failures.append(failure)
             notes.append(f"The start {start.label} was skipped. {failure}")
             continue
-        notes.append(f"The start {start.label} led to a cost of {candidate.cost:.6g}.")
+        if len(starts) > 1:
+            notes.append(f"The start {start.label} led to a cost of {candidate.cost:.6g}.")
         place = sum(other.cost <= (1.0 + _EQUAL_COSTS) * candidate.cost for other in candidates)
         candidates.insert(place, candidate)
     for candidate in candidates:
@@ -191,7 +201,9 @@ def _refined(
     first = candidate.minimum
     refuse_contradicted_values(problem, candidate.start, first.state, settings)
     k = width_to_k(settings.loss_width)
-    held = open_directions(problem, first.state, information(problem, first.state, first.linear, k))
+    normal = information(problem, first.state, first.linear, k)
+    held = open_directions(problem, first.state, normal)
+    refuse_other_board(problem, first.state, normal)
     free, state, iterations = problem, first.state, first.iterations
     try:
         if len(held.basis):

@@ -112,6 +112,18 @@ def axis_residual() -> Residual:
 
 
 @cache
+def corner_residual() -> Residual:
+    """Return how far a predicted corner of the calibration board is from the measured one [px].
+
+    local (5): the corner in the camera frame [m], the measured one on the sensor plane. data (4):
+    the derivative of pixels by the sensor plane there (2 x 2, column by column).
+    """
+    local, data = ca.SX.sym("local", 5), ca.SX.sym("data", 4)
+    away = local[:2] / local[2] - local[3:]
+    return _residual("corner", local, data, ca.reshape(data, 2, 2) @ away)
+
+
+@cache
 def encoder_residual() -> Residual:
     """Return the closure of a leg, |AB| - sign q - q0 [m].
 

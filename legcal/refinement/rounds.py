@@ -14,8 +14,8 @@ from legcal.refinement.biases import (
     estimated_shifts,
     possible_shifts,
 )
-from legcal.refinement.build import with_biases
 from legcal.refinement.influence import explained_share
+from legcal.refinement.judged_corners import with_judged_corners
 from legcal.refinement.linearize import linearize, offsets_of
 from legcal.refinement.loss import width_to_k
 from legcal.refinement.minimise import Minimum, minimise
@@ -24,8 +24,10 @@ from legcal.refinement.normal import information
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.settings import RefinementSettings
 from legcal.refinement.settling import NO_CHANGES, Changes, sizes, unsettled
+from legcal.refinement.shifted import with_biases
 from legcal.refinement.state import State
 
+_BOARD_ROUNDS = 3
 _NEAR_ENOUGH = 0.005  # of the cost a step: rejecting need not wait for the rest
 
 
@@ -120,6 +122,11 @@ def fit_in_rounds(
         minimum = solved(_NEAR_ENOUGH)
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(offsets_of(problem, state), accepted, settings)
+    for _ in range(_BOARD_ROUNDS if len(problem.board) else 0):
+        whitening = noise.whitening(claimed, accepted)
+        problem = with_judged_corners(problem, state, whitening, settings)
+        minimum = solved(_NEAR_ENOUGH)
+        state, iterations = minimum.state, iterations + minimum.iterations
     asked, changes = with_biases(problem, possible), NO_CHANGES
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before, accepted_before = sizes(noise, shifts), accepted
@@ -161,7 +168,7 @@ def _noise(
     linear = linearize(problem, state, noise.whitening(claimed, accepted))
     normal = information(problem, state, linear, width_to_k(settings.loss_width))
     L = np.linalg.cholesky(noise.covariance(claimed))
-    share = explained_share(problem.outline_places, linear.outlines, normal)
+    share = explained_share(problem.couplings.outlines, linear.outlines, normal)
     explained = L @ share @ np.swapaxes(L, -1, -2)
     offsets = np.einsum("nij,nj->ni", L, linear.outlines.r)
     return estimate_noise(offsets[accepted], explained[accepted], claimed[accepted])

@@ -57,12 +57,15 @@ class _Change:
         The mistake.
     offsets : (n, 2) array
         Change of the offsets of outlines [px].
+    corners : (m, 2) array
+        Change of the whitened residuals of corners of the calibration board.
     priors : (n_priors,) array
         Change of the means of priors [m, rad, px].
     """
 
     what: str
     offsets: Array
+    corners: Array
     priors: Array
 
 
@@ -100,7 +103,9 @@ def sensitivities(
         return twisted
     offsets = efficiency(k, 2) * whitening @ np.stack([c.offsets for c in changes], axis=-1)
     pulls = np.column_stack([c.priors for c in changes]) / problem.priors.sigma[:, None]
-    steps = response(problem.outline_places, linear.outlines, normal, offsets)
+    steps = response(problem.couplings.outlines, linear.outlines, normal, offsets)
+    corners = efficiency(k, 2) * np.stack([c.corners for c in changes], axis=-1)
+    steps += response(problem.couplings.corners, linear.corners, normal, corners)
     steps += normal.kept_covariance() @ linear.prior_J.T @ pulls
     padded = np.vstack([steps, np.zeros(len(changes))])
     kinematic = padded[np.minimum(problem.layout.kinematic, problem.layout.n_kept)]
@@ -122,10 +127,10 @@ def _of_twists(
     for i, leg in enumerate(fixed):
         motion = _OF_TWISTS * following(state, problem.legs.frame_legs, leg, _TWIST)
         moved = np.zeros((layout.n_kept + 1, 1))
-        for where, rows, kept in (
-            (problem.outline_places, linear.outlines, efficiency(k, 2)),
-            (problem.reading_places, linear.readings, 1.0),
-            (problem.axis_places, linear.axes, efficiency(k, 4)),
+        for where, rows, kept in (  # corners do not know of poses
+            (problem.couplings.outlines, linear.outlines, efficiency(k, 2)),
+            (problem.couplings.readings, linear.readings, 1.0),
+            (problem.couplings.axes, linear.axes, efficiency(k, 4)),
         ):
             change = kept * rows.J_pose @ motion[where.pose][..., None]
             moved[:-1] += response(where, rows, normal, change)
@@ -136,20 +141,22 @@ def _of_twists(
 
 def _in_cameras(problem: FitProblem, state: State, mistake: _Mistake) -> _Change:
     """Return what a mistake in all cameras changes."""
-    layout, o = problem.layout, problem.outlines
-    moved = np.zeros(o.feet.shape)
+    layout, o, c = problem.layout, problem.outlines, problem.board
+    moved, corners = np.zeros(o.feet.shape), np.zeros(c.feet.shape)
     priors = np.zeros(len(problem.priors))
-    for v in np.unique(o.view).tolist():
-        camera, of_view = state.cameras[v], o.view == v
+    for v in np.unique(np.append(o.view, c.view)).tolist():
+        camera, of_view, shown = state.cameras[v], o.view == v, c.view == v
         steps = {k: part * intrinsic_of(camera, k) for k, part in mistake.relative.items()}
         steps |= mistake.added
         places = dict(zip(layout.intrinsic_keys, layout.intrinsic[v].tolist(), strict=True))
         for name, step in steps.items():
             priors[problem.priors.position == places.get(name, -1)] = step
         fixed = [name for name in steps if places.get(name, layout.size) >= layout.size]
-        slopes = undistort_derivatives(camera, o.pixels[of_view], fixed)
-        moved[of_view] = slopes @ np.array([steps[name] for name in fixed])
-    return _Change(mistake.what, offsets_change(problem, state, moved), priors)
+        by = np.array([steps[name] for name in fixed])
+        moved[of_view] = undistort_derivatives(camera, o.pixels[of_view], fixed) @ by
+        corners[shown] = undistort_derivatives(camera, c.pixels[shown], fixed) @ by
+    offsets = offsets_change(problem, state, moved)
+    return _Change(mistake.what, offsets, corners_change(problem, corners), priors)
 
 
 def _in_radii(problem: FitProblem, state: State) -> _Change:
@@ -162,7 +169,14 @@ def _in_radii(problem: FitProblem, state: State) -> _Change:
     fixed = np.where(layout.radius >= layout.size, steps, 0.0)
     thicker = replace(state, radii=state.radii + _PART * fixed)
     offsets = (offsets_of(problem, thicker) - offsets_of(problem, state)) / _PART
-    return _Change("radii 1 % larger", offsets, priors)
+    return _Change("radii 1 % larger", offsets, np.zeros((len(problem.board), 2)), priors)
+
+
+def corners_change(problem: FitProblem, moved: Array) -> Array:
+    """Return how whitened residuals of corners (n, 2) change as these move [sensor plane]."""
+    board = problem.board
+    change = (board.pixels_per_unit @ moved[..., None])[..., 0]
+    return np.asarray(-change / board.sigma[:, None])
 
 
 def offsets_change(problem: FitProblem, state: State, moved: Array) -> Array:

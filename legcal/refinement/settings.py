@@ -11,6 +11,9 @@ class RefinementSettings:
     ----------
     radius_sigma : float
         Standard deviation of the prior on radii, as a part of the radius.
+    board_scale_sigma : float
+        Standard deviation of the dimensions of a calibration board, as a part of them: what
+        printers and paper do.
     loss_width : float
         Whitened distance at which the loss of an outline turns from quadratic to linear.
     rejection : float
@@ -31,6 +34,7 @@ class RefinementSettings:
     """
 
     radius_sigma: float = 0.02
+    board_scale_sigma: float = 0.001
     loss_width: float = 3.0
     rejection: float = 4.5
     rejection_rounds: int = 6

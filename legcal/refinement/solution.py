@@ -60,7 +60,8 @@ class Solution:
         All kinematic parameters.
     values : mapping
         Value of every parameter by its name [m, rad, px]: kinematic ones, observed radii, then the
-        intrinsics that the fit was asked for. Axes are angles from the nominal axis.
+        intrinsics that the fit was asked for and the size of the calibration board. Axes are angles
+        from the nominal axis.
     units : mapping
         Their units.
     status : mapping
@@ -98,6 +99,10 @@ class Solution:
     rms_axes : float or None
         Root mean square of the residuals of measured axes, over their claimed standard
         deviations; None if there are none.
+    rms_corners_px : float or None
+        Root mean square of the residuals of corners of the calibration board [px]; None without.
+    T_Rb_board : RigidTransform or None
+        The calibration board in R_b; None if no image shows one.
     noise : NoiseModel
         The estimated errors of outlines; ``noise.bias_px`` is tau.
     biases : mapping
@@ -144,6 +149,8 @@ class Solution:
     dof: int
     rms_px: float | None
     rms_axes: float | None
+    rms_corners_px: float | None
+    T_Rb_board: RigidTransform | None
     noise: NoiseModel
     biases: Mapping[str, float]
     shared_px: Mapping[str, float]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -39,12 +39,15 @@ class Start:
         Platform poses, one a pose.
     label : str
         Where it comes from: ``nominal`` or ``staged``.
+    T_Rb_board : RigidTransform
+        The calibration board, where images show one.
     """
 
     legs: tuple[LegGeometry, ...]
     T_camera_Rb: tuple[RigidTransform, ...]
     T_Rb_Re: tuple[RigidTransform, ...]
     label: str
+    T_Rb_board: RigidTransform = field(default_factory=RigidTransform.identity)
 
 
 def start_from(

@@ -35,6 +35,10 @@ class State:
         Rotation and translation [m] of T_camera_Rb.
     R_pose, t_pose : (n_poses, 3, 3) and (n_poses, 3) array
         Rotation and translation [m] of T_Rb_Re.
+    R_board, t_board : (1, 3, 3) and (1, 3) array
+        Rotation and translation [m] of T_Rb_board, the calibration board in R_b.
+    board_scale : (1,) array
+        Factor on the dimensions of the board.
     """
 
     legs: tuple[LegGeometry, ...]
@@ -45,6 +49,9 @@ class State:
     t_camera: Array
     R_pose: Array
     t_pose: Array
+    R_board: Array
+    t_board: Array
+    board_scale: Array
 
     @cached_property
     def A(self) -> Array:
@@ -67,6 +74,11 @@ class State:
         return motions(self.R_camera, self.t_camera)
 
     @property
+    def T_Rb_board(self) -> RigidTransform:
+        """The calibration board in R_b; of no meaning where no image shows one."""
+        return motions(self.R_board, self.t_board)[0]
+
+    @property
     def T_Rb_Re(self) -> tuple[RigidTransform, ...]:
         """Platform poses."""
         return motions(self.R_pose, self.t_pose)
@@ -78,6 +90,7 @@ class State:
         if np.any(layout.place < layout.size):
             legs = moved_legs(legs, layout.place, x)
         camera, pose = change[layout.camera], x[layout.n_kept :].reshape(-1, 6)
+        board = change[layout.board]
         return State(
             legs,
             self.radii + change[layout.radius],
@@ -87,6 +100,9 @@ class State:
             self.t_camera + camera[:, 3:],
             turned(self.R_pose, pose[:, :3]),
             self.t_pose + pose[:, 3:],
+            turned(self.R_board, board[None, :3]),
+            self.t_board + board[3:],
+            self.board_scale + change[layout.board_scale],
         )
 
 

@@ -92,7 +92,9 @@ def estimate_variances(effects: Effects, least_gain: float) -> tuple[Array, floa
             if likelihood >= best:
                 variances, best = trial, likelihood
                 break
-        if best - before < _SETTLED:
+        # Even steps like this to the end would not gain enough.
+        hopeless = best < 0.25 * least_gain and best - before < least_gain / (8.0 * _MAX_STEPS)
+        if best - before < _SETTLED or hopeless:
             break
     gain = 2.0 * best
     return (variances if gain > least_gain else np.zeros_like(variances)), gain

@@ -44,7 +44,8 @@ def parameter_rows(calibration: Calibration) -> list[ParameterRow]:
     numbers = vector_of(found, solution.legs, geometries(mechanism))
     values |= zip(found.names, numbers.tolist(), strict=True)
     sigma_of = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
-    known = known_parameters(mechanism, dataset.measurements.views).by_name
+    with_board = dataset.board is not None
+    known = known_parameters(mechanism, dataset.measurements.views, with_board=with_board).by_name
     return [
         ParameterRow(
             name,

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration import Calibration
 from legcal.dataset.folder import OBSERVATIONS_NAME
+from legcal.dataset.given_corners import CORNERS_NAME
 from legcal.errors import DidNotConverge
 from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.mechanism.home import home_with
@@ -20,8 +21,10 @@ from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.parameter_words import describe_direction
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
+from legcal.observations.corners_file import write_corners
 from legcal.observations.table import write_observations
 from legcal.report.axis_turns import nominal_axes
+from legcal.report.board_report import board_document
 from legcal.report.files import result_folder
 from legcal.report.held_out_report import held_out_document
 from legcal.report.parameter_rows import parameter_rows
@@ -64,6 +67,7 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
             "noise": asdict(solution.noise),
             "shared_px": dict(solution.shared_px),
         },
+        **board_document(calibration),
         "start": solution.start,
         "platform": platform_document(calibration),
         **_held_out(calibration),
@@ -85,7 +89,8 @@ def write_result(calibration: Calibration, destination: Path) -> None:
         If the written model does not load as what was computed.
     """
     dataset, solution = calibration.dataset, calibration.solution
-    with result_folder(destination, stale=[Path(OBSERVATIONS_NAME)]) as folder:
+    stale = [Path(OBSERVATIONS_NAME), Path(CORNERS_NAME)]
+    with result_folder(destination, stale=stale) as folder:
         urdf, yaml = folder / "calibrated.urdf", folder / "calibrated.yaml"
         write_urdf(dataset.mechanism, solution.legs, urdf)
         write_calibrated_yaml(dataset.mechanism, yaml, urdf.name, _home(calibration))
@@ -99,6 +104,9 @@ def write_result(calibration: Calibration, destination: Path) -> None:
                 dataset.measurements,
                 dataset.mechanism.leg_names,
             )
+        if calibration.corners is not None:
+            corners = folder / CORNERS_NAME
+            write_corners(corners, calibration.corners, dataset.measurements)
 
 
 def _held_out(calibration: Calibration) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from legcal.mechanism.platform import pose_differences
 from legcal.refinement.platform_accuracy import poses_at_readings
 from legcal.refinement.platform_error import PlatformError
 from legcal.refinement.start import with_joints
+from legcal.report.board_report import board_lines
 from legcal.report.held_out_report import held_out_lines
 from legcal.report.parameter_rows import ParameterRow, parameter_rows
 
@@ -33,6 +34,7 @@ def summary(calibration: Calibration, output: Path) -> RenderableType:
     lines = [
         *(f"Note: {note}" for note in calibration.notes),
         _observation_line(calibration),
+        *board_lines(calibration),
         _steps_line(calibration),
         _fit_line(calibration),
         *_direction_lines(calibration),

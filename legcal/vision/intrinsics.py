@@ -88,6 +88,8 @@ def undistort_derivatives(camera: Camera, pixels: Array, names: Sequence[str]) -
         number].
     """
     flat = pixels.reshape(-1, 2)
+    if len(flat) == 0:  # OpenCV refuses to project nothing
+        return np.zeros((*pixels.shape, len(names)))
     xy = camera.undistort(flat)
     moved = _distort_derivatives(camera, xy, names)
     found = -np.linalg.solve(camera.pixels_per_unit(xy), moved)
