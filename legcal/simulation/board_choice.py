@@ -15,7 +15,7 @@ from legcal.vision.board import Board, BoardKind
 from legcal.vision.board_dictionaries import APRIL_TAGS
 
 KINDS: tuple[BoardKind, ...] = ("chessboard", "charuco", "aprilgrid")
-_WIDTH = 0.35  # of the size of the machine
+_WIDTH = 0.42  # of the size of the machine
 _DIGITS = 3  # of a side in metres: whole millimetres
 
 
@@ -48,7 +48,7 @@ def chosen_board(
         return Board(choice, 4, 3, side, spacing=0.3, dictionary=APRIL_TAGS)
     if choice == "charuco":
         side = max(round(width / 7.0, _DIGITS), 0.002)
-        marker = round(0.76 * side, _DIGITS)
+        marker = round(0.72 * side, _DIGITS)
         return Board("charuco", 7, 5, side, marker=marker, dictionary="DICT_4X4_50")
     return Board("chessboard", 9, 6, max(round(width / 9.0, _DIGITS), 0.001))
 

@@ -15,6 +15,7 @@ from legcal.geometry.types import BoolArray, IntArray
 from legcal.simulation.rendering.footprint import footprint
 from legcal.simulation.rendering.intersect import intersect
 from legcal.simulation.rendering.parts import Part, shares_of_lamps
+from legcal.simulation.rendering.printed import printed, printed_inside
 from legcal.simulation.rendering.rays import PixelRays, Single
 from legcal.simulation.rendering.shading import Lighting, shade
 from legcal.simulation.rendering.shadows import Occluders
@@ -86,7 +87,8 @@ class Painter:
             inside = foot[(key[foot] // _FACES == i + 1) & ~edge[foot]]
             if len(inside):
                 x, y = self.rays.x.take(inside), self.rays.y.take(inside)
-                shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light)
+                ink = printed_inside(solid, self.rays, inside, face[inside], self.samples)
+                shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light, ink)
                 parts.append(Part(i, inside, shaded))
         seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
         for part, shares in zip(parts, seen, strict=True):
@@ -193,9 +195,9 @@ class Painter:
             at = here[who.take(here) == i + 1]
             if len(at):
                 at, first, weight = _some_of_each(at, at // S)
-                shaded = shade(
-                    solids[i], X.take(at), Y.take(at), Z.take(at), faces.take(at), self.light
-                )
+                x, y, face = X.take(at), Y.take(at), faces.take(at)
+                ink = printed(solids[i], x, y, face)
+                shaded = shade(solids[i], x, y, Z.take(at), face, self.light, ink)
                 parts.append(Part(i, at[first] // S, shaded, first))
                 weights.append(weight)
         seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)

@@ -70,7 +70,13 @@ class Shaded:
 
 
 def shade(
-    solid: SolidInView, x: Single, y: Single, z: Single, face: Faces, light: Lighting
+    solid: SolidInView,
+    x: Single,
+    y: Single,
+    z: Single,
+    face: Faces,
+    light: Lighting,
+    ink: Single | None = None,
 ) -> Shaded:
     """Return the light that points of a solid send to the camera.
 
@@ -82,6 +88,8 @@ def shade(
         Rays (x, y, 1), depths [m] and faces.
     light : Lighting
         The light.
+    ink : (n,) array, optional
+        Factors of the albedo by what is printed on the solid.
     """
     material = solid.material
     P = np.stack([x * z, y * z, z])
@@ -90,6 +98,8 @@ def shade(
     vx, vy, vz = x * to_eye, y * to_eye, to_eye
     facing = np.clip(n[0] * vx + n[1] * vy + n[2] * vz, 0.0, 1.0)
     albedo = np.full(len(x), material.albedo, dtype=np.float32)
+    if ink is not None:
+        albedo *= ink
     limb = material.limb * light.limb
     if limb:
         albedo *= 1.0 - limb + limb * facing
