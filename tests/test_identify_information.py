@@ -52,6 +52,7 @@ def random_session(seed: int, n_legs: int = 4, n_views: int = 2) -> Session:
         camera=rng.normal(size=(n_views, 3)) * 5.0,
         focal=rng.uniform(800.0, 2000.0, n_views),
         sigma_q=2e-6,
+        board=np.zeros(n_views, dtype=np.bool_),
     )
 
 
@@ -170,6 +171,31 @@ def test_elimination_keeps_what_is_said_whatever_the_own_unknowns_do(
     np.testing.assert_allclose(found.T @ found, expected, atol=1e-9)
     upper = compress(found)
     np.testing.assert_allclose(upper.T @ upper, expected, atol=1e-9)
+
+
+@FAST
+@given(seed=SEEDS, shown=st.lists(st.booleans(), min_size=3, max_size=3))
+def test_views_with_a_board_have_one_camera_in_common(seed: int, shown: list[bool]) -> None:
+    """Against the normal equations of all unknowns, one camera for all views with a board."""
+    session = replace(random_session(seed, n_views=3), board=np.array(shown))
+    n_p, images, demands = len(session.unit), image_rows(session), demands_of(session)
+    cameras = ["board" if board else v for v, board in enumerate(shown)]
+    places = list(dict.fromkeys(cameras))
+    rows = np.zeros((3, session.n_legs * 4, 6 + 6 * len(places) + n_p))
+    for v, camera in enumerate(cameras):
+        seen, at = images[v].reshape(-1, 12 + n_p), 6 + 6 * places.index(camera)
+        rows[v, :, :6], rows[v, :, at : at + 6] = seen[:, :6], seen[:, 6:12]
+        rows[v, :, 6 + 6 * len(places) :] = seen[:, 12:]
+    other = np.zeros((demands.by_pose.shape[1], rows.shape[2]))
+    other[:, :6], other[:, 6 + 6 * len(places) :] = demands.by_pose[0], demands.by_parameters[0]
+    every = np.concatenate([other, *rows])
+    own, shared = np.split(every, [every.shape[1] - n_p], axis=1)
+    basis, singular, _ = np.linalg.svd(own, full_matrices=False)
+    kept = basis[:, singular > 1e-3]
+    rest = shared - kept @ (kept.T @ shared)
+    found = information(session, images, demands)
+    scale = max(1.0, float(np.abs(rest).max()) ** 2)
+    np.testing.assert_allclose(found.T @ found / scale, rest.T @ rest / scale, atol=1e-6)
 
 
 @FAST

@@ -9,7 +9,8 @@ import pytest
 from authoring import made
 
 import legcal
-from legcal.identify.analysis import Identifiability, identifiability
+from legcal.identify.analysis import identifiability
+from legcal.identify.identifiability import Identifiability
 from legcal.identify.planned import planned_session
 from legcal.identify.ranks import Analysis
 from legcal.mechanism.model import Mechanism

@@ -30,12 +30,28 @@ def identify(
     images: Annotated[
         int | None, typer.Option(help="Images a view, each of another pose; 15 without it.")
     ] = None,
+    board: Annotated[
+        bool,
+        typer.Option(
+            "--board",
+            help="A calibration board on the base is seen in every image: cameras are tied to "
+            "each other.",
+        ),
+    ] = False,
+    hand_held: Annotated[
+        bool,
+        typer.Option(
+            "--hand-held",
+            help="Every image of a view is taken from a place of its own; with --board.",
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Say which parameters a calibration can find, and what would mend what is missing."""
     from legcal.identify.request import answer
 
-    report = answer(model, [text.split(",") for text in view or []], images)
+    views = [text.split(",") for text in view or []]
+    report = answer(model, views, images, board=board, hand_held=hand_held)
     if as_json:
         print_json(report.document())
     else:

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
+from legcal.errors import UsageError
 from legcal.geometry.types import Array
+from legcal.identify.board import judge_board
 from legcal.identify.conditions import (
     Condition,
     count_conditions,
     three_legs_at_once,
     two_directions,
 )
+from legcal.identify.identifiability import Identifiability, Paper
 from legcal.identify.known import known_rows
 from legcal.identify.planned import THIN, planned_session
-from legcal.identify.ranks import Analysis, StepRank
+from legcal.identify.ranks import Analysis
 from legcal.identify.recommend import Recommendation, recommend
-from legcal.identify.remedies import ENOUGH_IMAGES, Remedy, Replanning, find_remedies
+from legcal.identify.remedies import ENOUGH_IMAGES, Replanning, find_remedies
 from legcal.identify.session import Session
 from legcal.identify.views import read_views
-from legcal.identify.weak import PlatformError, Ranks
 from legcal.identify.words import legs_in_words
 from legcal.mechanism.home_travel import NEAR, legs_outside
 from legcal.mechanism.model import Mechanism
@@ -32,86 +34,13 @@ if TYPE_CHECKING:
     from legcal.dataset.folder import Dataset
 
 
-@dataclass(frozen=True)
-class Paper:
-    """What the paper's conditions say together.
-
-    Attributes
-    ----------
-    ok : bool
-        Whether all of them hold.
-    """
-
-    ok: bool
-
-
-@dataclass(frozen=True)
-class Identifiability:
-    """An identifiability report.
-
-    Attributes
-    ----------
-    spatial : bool
-        Whether the platform moves in space and not in a plane.
-    legs : tuple of str
-        Their names.
-    n, n_d, r, n_ac : int
-        Legs; joint centres that define a frame; legs with a revolute joint at the base; legs whose
-        length is measured or constant.
-    conditions : tuple of Condition
-        The paper's, as printed.
-    paper : Paper
-        All of them together.
-    staged, full : Ranks
-        The four default steps, and everything at once.
-    identifiable : bool
-        Whether everything at once determines all directions that move the platform.
-    steps : tuple of StepRank
-        Each step, by legcal's criteria and by the printed ones.
-    views : tuple of tuples of str
-        The legs that each view shows.
-    images : tuple of int
-        Number of images of each view.
-    platform_sigma : PlatformError or None
-        Standard deviation of the platform that is to be expected from outlines good to 0.1 px,
-        rms over the poses. None where something that moves the platform is not determined, or the
-        motors do not determine its pose.
-    remedies : tuple of Remedy
-        What would mend what is missing; each was tried.
-    recommendation : tuple of Recommendation or None
-        The smallest sets of views, fewest first; None where views were given.
-    notes : tuple of str
-        What the reader should know.
-    """
-
-    spatial: bool
-    legs: tuple[str, ...]
-    n: int
-    n_d: int
-    r: int
-    n_ac: int
-    conditions: tuple[Condition, ...]
-    paper: Paper
-    staged: Ranks
-    full: Ranks
-    identifiable: bool
-    steps: tuple[StepRank, ...]
-    views: tuple[tuple[str, ...], ...]
-    images: tuple[int, ...]
-    platform_sigma: PlatformError | None
-    remedies: tuple[Remedy, ...]
-    recommendation: tuple[Recommendation, ...] | None
-    notes: tuple[str, ...]
-
-    def document(self) -> dict[str, Any]:
-        """Return the report as plain JSON types; see the documentation of the files."""
-        document = asdict(self)
-        document["conditions"] = [_condition(c, self.legs) for c in self.conditions]
-        return {key: _plain(value) for key, value in document.items()}
-
-
 def identifiability(
-    mechanism: Mechanism, views: Sequence[Sequence[str]] = (), images: int = 15
+    mechanism: Mechanism,
+    views: Sequence[Sequence[str]] = (),
+    images: int = 15,
+    *,
+    board: bool = False,
+    hand_held: bool = False,
 ) -> Identifiability:
     """Judge what images of some views can tell of a mechanism's parameters.
 
@@ -124,6 +53,10 @@ def identifiability(
         views that suffice are recommended and the first of them is judged.
     images : int
         Images a view, each of another pose.
+    board : bool
+        A calibration board on the base is seen in every image and ties the cameras to each other.
+    hand_held : bool
+        Every image of a view is taken from a place of its own.
 
     Returns
     -------
@@ -132,7 +65,8 @@ def identifiability(
     Raises
     ------
     UsageError
-        If a view names no leg, an unknown one or one twice, or images is not positive.
+        If a view names no leg, an unknown one or one twice, images is not positive, or
+        hand-held images are without a board or without views.
     DidNotConverge
         If the machine cannot move inside its travel.
 
@@ -145,17 +79,34 @@ def identifiability(
     tenth of it, undetermined ones above a multiple.
     """
     legs = read_views(views, mechanism.leg_names, images)
+    if hand_held:
+        return _judge_hand_held(mechanism, legs, images, board=board)
     recommendation = None
     if not legs:
-        recommendation = recommend(mechanism, images)
+        recommendation = recommend(mechanism, images, board=board)
         names = recommendation[0].views if recommendation else (mechanism.leg_names,)
         legs = read_views(names, mechanism.leg_names, images)
-    session = planned_session(mechanism, legs, images)
+    session = planned_session(mechanism, legs, images, board=board)
     replanning = Replanning(
-        lambda more: planned_session(mechanism, legs, more),
-        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES)),
+        lambda more: planned_session(mechanism, legs, more, board=board),
+        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
     )
     return _judge(mechanism, session, recommendation, replanning)
+
+
+def _judge_hand_held(
+    mechanism: Mechanism, legs: tuple[tuple[int, ...], ...], images: int, *, board: bool
+) -> Identifiability:
+    """Return the report on images each of which has a place of its own."""
+    if not board or not legs:
+        found = "no board" if not board else "no views"
+        raise UsageError(
+            f"Hand-held images could not be judged: found {found}, needed a calibration board on "
+            "the base in every image, which alone tells where a hand-held camera was, and the legs "
+            "that the images show; give --board and --view."
+        )
+    each = tuple(view for view in legs for _ in range(images))
+    return _judge(mechanism, planned_session(mechanism, each, 1, board=True), None, None)
 
 
 def identifiability_of_dataset(dataset: Dataset, choices: Choices = NO_CHOICES) -> Identifiability:
@@ -194,6 +145,10 @@ def _judge(
     """Return the report on a session."""
     analysis = Analysis(session, known=known)
     conditions = conditions_of(mechanism, session)
+    board = judge_board(
+        analysis,
+        *(conditions_of(mechanism, session.with_board(board=b)) for b in (False, True)),
+    )
     staged, full = analysis.staged, analysis.full
     enough = staged.complete and full.complete
     notes = []
@@ -214,13 +169,14 @@ def _judge(
         r=sum(leg.base_joint == "R" for leg in mechanism.legs),
         n_ac=int(session.with_length.sum()),
         conditions=conditions,
-        paper=Paper(all(c.ok for c in conditions)),
+        paper=Paper(not any(c.fails for c in conditions)),
         staged=staged,
         full=full,
         identifiable=full.complete,
         steps=analysis.step_ranks,
         views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
         images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
+        board=board,
         platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
         remedies=() if enough else find_remedies(analysis, replanning),
         recommendation=recommendation,
@@ -252,37 +208,27 @@ def _machine_notes(mechanism: Mechanism) -> list[str]:
 
 
 def conditions_of(mechanism: Mechanism, session: Session) -> tuple[Condition, ...]:
-    """Return the paper's conditions for a session."""
+    """Return the paper's conditions for a session.
+
+    Counts are those of the views, as printed. Directions of a leg may differ between views that
+    show a board: they are known in one frame.
+    """
     image, leg = session.seen[session.view].nonzero()
+    counts = count_conditions(
+        session.views,
+        session.n_legs,
+        spatial=session.spatial,
+        revolute=[j for j, x in enumerate(session.legs) if x.base_joint == "R"],
+        passive=[j for j, has in enumerate(session.with_length) if not has],
+        board=bool(session.board.all()),
+    )
     return (
-        *count_conditions(
-            session.views,
-            session.n_legs,
-            spatial=session.spatial,
-            revolute=[j for j, x in enumerate(session.legs) if x.base_joint == "R"],
-            passive=[j for j, has in enumerate(session.with_length) if not has],
-        ),
+        *counts,
         two_directions(
-            session.view[image], leg, session.u[session.pose[image], leg], session.n_legs
+            session.frame[session.view[image]],
+            leg,
+            session.u[session.pose[image], leg],
+            session.n_legs,
         ),
         three_legs_at_once(session.views, geometries(mechanism), spatial=session.spatial),
     )
-
-
-def _condition(condition: Condition, legs: Sequence[str]) -> dict[str, Any]:
-    """Return a condition as a document: a count with its numbers, or the legs that fail it."""
-    document: dict[str, Any] = {"name": condition.name, "ok": condition.ok}
-    if condition.equations is not None:
-        document |= {"equations": condition.equations, "unknowns": condition.unknowns}
-    else:
-        document["failing"] = [legs[j] for j in condition.legs]
-    return document
-
-
-def _plain(value: Any) -> Any:
-    """Return tuples as lists, all the way down."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_plain(inner) for inner in value]
-    return value

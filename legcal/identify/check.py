@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from legcal.dataset.folder import Dataset
 from legcal.errors import NotIdentifiable
-from legcal.identify.analysis import Identifiability, identifiability_of_dataset
+from legcal.identify.analysis import identifiability_of_dataset
+from legcal.identify.identifiability import Identifiability
 from legcal.identify.weak import Ranks
 from legcal.refinement.choices import NO_CHOICES, Choices
 

@@ -8,7 +8,7 @@ than the steps): ranks decide.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
@@ -37,6 +37,9 @@ class Condition:
         Both sides of a count; None for a condition that is not one.
     legs : tuple of int
         The legs for which it does not hold, where it speaks of legs.
+    needed : bool
+        False for (12) where a calibration board ties the cameras to each other: then there is
+        nothing to join by scalar products.
     """
 
     name: str
@@ -44,6 +47,12 @@ class Condition:
     equations: int | None = None
     unknowns: int | None = None
     legs: tuple[int, ...] = ()
+    needed: bool = True
+
+    @property
+    def fails(self) -> bool:
+        """Whether it is needed and does not hold."""
+        return self.needed and not self.ok
 
 
 def count_conditions(
@@ -53,6 +62,7 @@ def count_conditions(
     spatial: bool = True,
     revolute: Collection[int] = (),
     passive: Collection[int] = (),
+    board: bool = False,
 ) -> tuple[Condition, ...]:
     """Return the conditions that depend only on which legs each view shows.
 
@@ -68,6 +78,8 @@ def count_conditions(
         Legs with a revolute joint on the base.
     passive : collection of int
         Legs whose length is neither measured nor constant.
+    board : bool
+        Whether a calibration board ties the cameras to each other, so that (12) is not needed.
 
     Returns
     -------
@@ -89,7 +101,7 @@ def count_conditions(
         distances += comb(len(set(legs) - set(passive)), 2)
     unseen = set(range(n_legs)).difference(*views)
     return (
-        _count("eq12", products, joints_base),
+        replace(_count("eq12", products, joints_base), needed=not board),
         _count("eq15", distances, n_legs - len(set(passive))),
         _count("eq17", distances, joints_platform),
         _for_legs("every_leg_seen", unseen),

@@ -88,10 +88,24 @@ def image_rows(session: Session) -> Array:
     return np.concatenate([by_pose[..., columns], by_camera, by_parameters], axis=3)
 
 
-def information(
-    session: Session, images: Array, demands: WhitenedDemands, *, common_cameras: bool = False
-) -> Array:
+def information(session: Session, images: Array, demands: WhitenedDemands) -> Array:
     """Return what everything at once says of the parameters, (p, p) whitened rows [1/m].
+
+    The arguments are those of :func:`by_cameras`.
+    """
+    return of_parameters(session, by_cameras(session, images, demands))
+
+
+def of_parameters(session: Session, rows: Array) -> Array:
+    """Return what rows of cameras and parameters say of the parameters, (p, p)."""
+    return compress(eliminate(rows[None], rows.shape[1] - len(session.parametrization)))
+
+
+def by_cameras(session: Session, images: Array, demands: WhitenedDemands) -> Array:
+    """Return what everything says of cameras and parameters, (m, 6 n_frames + p) [1/m].
+
+    The motions of the platform are free. Views that show a board share one camera: that of the
+    board.
 
     Parameters
     ----------
@@ -101,24 +115,21 @@ def information(
         What :func:`image_rows` says of them.
     demands : WhitenedDemands
         What :func:`demands_of` says of them.
-    common_cameras : bool
-        Whether a calibration board on the base shows how the cameras stand to each other.
     """
     n_f, n_p = len(freedoms(session.frame_legs)), len(session.parametrization)
     seen = images.reshape(len(session.view), -1, n_f + 6 + n_p)
-    camera_of_view = np.arange(session.n_views) * (not common_cameras)
-    n_cameras = 6 * len(np.unique(camera_of_view))
+    n_cameras = 6 * session.n_frames
     wide = np.zeros((*seen.shape[:2], n_f + n_cameras + n_p))
     wide[..., :n_f], wide[..., n_f + n_cameras :] = seen[..., :n_f], seen[..., n_f + 6 :]
-    for v, camera in enumerate(camera_of_view):
+    for v, frame in enumerate(session.frame.tolist()):
         here = session.view == v
-        place = n_f + 6 * int(camera)
+        place = n_f + 6 * frame
         wide[here, :, place : place + 6] = seen[here, :, n_f : n_f + 6]
     equations = np.zeros((len(session.t), demands.by_pose.shape[1], wide.shape[2]))
     equations[..., :n_f] = demands.by_pose
     equations[..., n_f + n_cameras :] = demands.by_parameters
     rows = np.concatenate([equations, by_group(wide, session.pose, len(session.t))], axis=1)
-    return compress(eliminate(compress_groups(eliminate(rows, n_f))[None], n_cameras))
+    return compress_groups(eliminate(rows, n_f))
 
 
 def compress_groups(rows: Array) -> Array:

@@ -19,12 +19,12 @@ _FLOOR = 1e-12  # of a variance [m^2]
 
 
 def scalar_products(session: Session, located: Located) -> Step:
-    """Return what (9) says: all products of vectors A_j A_g and revolute axes of each view."""
+    """Return what (9) says: all products of vectors A_j A_g and revolute axes of each frame."""
     columns = identify_base(session, located).columns
     scatter = session.local_to_parameters
     rows = [np.zeros((0, len(session.unit)))]
-    for v in range(session.n_views):
-        vectors, slopes = _vectors_of(session, located, v)
+    for f in range(session.n_frames):
+        vectors, slopes = _vectors_of(session, located, f)
         pairs = [
             (p, q)
             for p, q in combinations_with_replacement(range(len(vectors)), 2)
@@ -33,30 +33,30 @@ def scalar_products(session: Session, located: Located) -> Step:
         if not pairs:
             continue
         G = np.array([vectors[p] @ slopes[q] + vectors[q] @ slopes[p] for p, q in pairs])
-        variance = np.einsum("pi,ij,pj->p", G, _covariance(session, located, v), G)
+        variance = np.einsum("pi,ij,pj->p", G, _covariance(session, located, f), G)
         by_local = np.concatenate([scatter[:, :3], session.mean_length * scatter[:, 7:9]], axis=1)
         rows.append(G @ by_local.reshape(G.shape[1], -1) / np.sqrt(variance + _FLOOR)[:, None])
     return Step("base_joints", columns, np.concatenate(rows)[:, columns])
 
 
 def consecutive_distances(rows: Array, weight: Array, key: IntArray, columns: IntArray) -> Step:
-    """Return what (14) says: distances equal those of the next position of the view.
+    """Return what (14) says: distances equal those of the next position of the frame.
 
     The rows, weights and keys are those of :func:`legcal.identify.steps.distance_rows`.
     """
     last: dict[tuple[int, int, int], int] = {}
     found = [np.zeros((0, len(columns)))]
-    for k, (v, _, j, g) in enumerate(key.tolist()):
-        before = last.get((v, j, g))
+    for k, (f, _, j, g) in enumerate(key.tolist()):
+        before = last.get((f, j, g))
         if before is not None:
             change = rows[k] / weight[k] - rows[before] / weight[before]
             found.append((change / np.hypot(1.0 / weight[k], 1.0 / weight[before]))[None])
-        last[v, j, g] = k
+        last[f, j, g] = k
     return Step("offsets", columns, np.concatenate(found))
 
 
 def mean_distances(session: Session, weight: Array, key: IntArray) -> Step:
-    """Return what (16) says: mean distances of leg ends in each view are those of the joints."""
+    """Return what (16) says: mean distances of leg ends in each frame are those of the joints."""
     columns = session.columns((3, 4, 5))
     B = np.array([leg.B for leg in session.legs])
     distinct, which = np.unique(key[:, [0, 2, 3]], axis=0, return_inverse=True)
@@ -69,15 +69,15 @@ def mean_distances(session: Session, weight: Array, key: IntArray) -> Step:
     return Step("platform_joints", columns, rows[:, columns])
 
 
-def _vectors_of(session: Session, located: Located, v: int) -> tuple[list[Array], list[Array]]:
+def _vectors_of(session: Session, located: Located, f: int) -> tuple[list[Array], list[Array]]:
     """Return the set V of (8) and the derivative of each by A and axes of all legs, (3, 5 n)."""
     vectors, slopes = [], []
     eye = np.eye(3 * session.n_legs).reshape(session.n_legs, 3, -1)
     n_axes = 2 * session.n_legs
-    for j, g in combinations(np.flatnonzero(located.joint[v]).tolist(), 2):
+    for j, g in combinations(np.flatnonzero(located.joint[f]).tolist(), 2):
         vectors.append(session.A[g] - session.A[j])
         slopes.append(_by_leg(eye[g] - eye[j], np.zeros((3, n_axes))))
-    for j in np.flatnonzero(located.axis[v]).tolist():
+    for j in np.flatnonzero(located.axis[f]).tolist():
         axis = np.asarray(session.legs[j].base_axis)
         turn = np.zeros((3, n_axes))
         turn[:, 2 * j : 2 * j + 2] = np.cross(normal_basis(axis), axis).T / session.mean_length
@@ -92,12 +92,12 @@ def _by_leg(by_joints: Array, by_axes: Array) -> Array:
     return both.reshape(3, -1)
 
 
-def _covariance(session: Session, located: Located, v: int) -> Array:
-    """Return the covariance of A and axes of a view as step 1 found them, (5 n, 5 n) [m^2]."""
+def _covariance(session: Session, located: Located, f: int) -> Array:
+    """Return the covariance of A and axes of a frame as step 1 found them, (5 n, 5 n) [m^2]."""
     n = session.n_legs
     covariance = np.zeros((5 * n, 5 * n))
-    for j in np.flatnonzero(located.joint[v]).tolist():
-        F = located.information[v, j]
+    for j in np.flatnonzero(located.joint[f]).tolist():
+        F = located.information[f, j]
         inverse = np.linalg.pinv(F.T @ F, hermitian=True)
         covariance[5 * j : 5 * j + 5, 5 * j : 5 * j + 5] = inverse
     return covariance

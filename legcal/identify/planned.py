@@ -25,7 +25,11 @@ THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg lengt
 
 
 def planned_session(
-    mechanism: Mechanism, views: Sequence[Sequence[int]], images: int = 15
+    mechanism: Mechanism,
+    views: Sequence[Sequence[int]],
+    images: int = 15,
+    *,
+    board: bool = False,
 ) -> Session:
     """Return a session with cameras in default places and random poses inside the travel.
 
@@ -38,6 +42,8 @@ def planned_session(
         The legs that each view shows.
     images : int
         Number of images, and poses, a view.
+    board : bool
+        Whether every image shows a calibration board on the base.
 
     Raises
     ------
@@ -70,6 +76,7 @@ def planned_session(
         camera=default_cameras(A, B, views, mechanism.spatial, rng),
         focal=np.full(len(views), FOCAL_PX),
         sigma_q=SIGMA_Q,
+        board=np.full(len(views), board, dtype=np.bool_),
     )
 
 

@@ -10,7 +10,13 @@ import numpy as np
 from legcal.geometry.types import Array, IntArray
 from legcal.identify import literal, steps
 from legcal.identify.elimination import compress
-from legcal.identify.full import WhitenedDemands, demands_of, image_rows, information
+from legcal.identify.full import (
+    WhitenedDemands,
+    by_cameras,
+    demands_of,
+    image_rows,
+    of_parameters,
+)
 from legcal.identify.session import Session
 from legcal.identify.weak import (
     PlatformMotion,
@@ -50,20 +56,24 @@ class Analysis:
     ----------
     session : Session
         The session.
-    common_cameras : bool
-        Whether a calibration board on the base ties the cameras to each other.
     known : (m, p) array or None
         What is known of the parameters without looking, as whitened rows [1/m].
     """
 
     session: Session
-    common_cameras: bool = False
     known: Array | None = None
 
     def elsewhere(self, session: Session, poses: IntArray) -> Analysis:
         """Return the analysis of other images of the same machine, at some of the same poses."""
-        other = Analysis(session, self.common_cameras, self.known)
+        other = Analysis(session, self.known)
         other.__dict__.update(motion=self.motion, demands=self.demands.at(poses))
+        return other
+
+    def with_board(self, *, board: bool = True) -> Analysis:
+        """Return the analysis of the same images with a calibration board in all or in none."""
+        session = self.session.with_board(board=board)
+        other = self.elsewhere(session, np.arange(len(session.t)))
+        other.__dict__.update(images=self.images)
         return other
 
     @cached_property
@@ -90,7 +100,7 @@ class Analysis:
     def default_steps(self) -> tuple[steps.Step, ...]:
         """Steps 2, 3 and 4, default criteria."""
         return (
-            steps.identify_base(self.session, self.located, common_cameras=self.common_cameras),
+            steps.identify_base(self.session, self.located),
             steps.offsets_from_distances(self.session, *self.distances),
             steps.identify_platform(self.session, self.located, self.images, self.demands),
         )
@@ -106,11 +116,14 @@ class Analysis:
         )
 
     @cached_property
+    def of_cameras(self) -> Array:
+        """Everything at once, of cameras and parameters, (m, 6 n_frames + p)."""
+        return by_cameras(self.session, self.images, self.demands)
+
+    @cached_property
     def information(self) -> Array:
         """Everything at once, (p, p)."""
-        found = information(
-            self.session, self.images, self.demands, common_cameras=self.common_cameras
-        )
+        found = of_parameters(self.session, self.of_cameras)
         return found if self.known is None else compress(np.concatenate([found, self.known]))
 
     @cached_property

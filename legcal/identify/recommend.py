@@ -15,13 +15,14 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.identify.around import legs_around, neighbours
 from legcal.identify.conditions import count_conditions, three_legs_at_once
-from legcal.identify.elimination import compress
+from legcal.identify.elimination import compress, eliminate
 from legcal.identify.planned import cameras_for, planned_session
 from legcal.identify.ranks import Analysis, missing, scattered
-from legcal.identify.steps import offsets_from_distances
+from legcal.identify.steps import base_by_frames, offsets_from_distances
 from legcal.identify.weak import PlatformError
 from legcal.mechanism.model import Mechanism
 
+_CAMERA = 6  # unknowns of its pose
 _MOST_VIEWS = 4
 _MOST_WINDOWS = 12  # views of one size that are tried; of more legs, evenly around the base
 
@@ -46,7 +47,9 @@ class Recommendation:
     platform_sigma: PlatformError | None
 
 
-def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
+def recommend(
+    mechanism: Mechanism, images: int, *, board: bool = False
+) -> tuple[Recommendation, ...]:
     """Return the smallest sets of views that suffice, fewest camera positions first.
 
     For each number of camera positions the fewest legs a view; of all sets of that size the
@@ -59,6 +62,8 @@ def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
         The nominal model.
     images : int
         Images a view.
+    board : bool
+        Whether a calibration board on the base ties the cameras to each other.
 
     Returns
     -------
@@ -66,7 +71,7 @@ def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
         Empty where no set was found.
     """
     found = list[Recommendation]()
-    candidates = _Candidates(mechanism, images)
+    candidates = _Candidates(mechanism, images, board=board)
     most = mechanism.n_legs + 1
     for n_views in range(1, _MOST_VIEWS + 1):
         for size in range(1, most):
@@ -81,9 +86,9 @@ def recommend(mechanism: Mechanism, images: int) -> tuple[Recommendation, ...]:
 class _Candidates:
     """Views of neighbouring legs, and what each says."""
 
-    def __init__(self, mechanism: Mechanism, images: int) -> None:
+    def __init__(self, mechanism: Mechanism, images: int, *, board: bool) -> None:
         self.mechanism, self.images = mechanism, images
-        self.session = planned_session(mechanism, [range(mechanism.n_legs)], images)
+        self.session = planned_session(mechanism, [range(mechanism.n_legs)], images, board=board)
         self.every = Analysis(self.session)
         self.motion = self.every.motion
         self.ring = legs_around(self.session)
@@ -98,7 +103,7 @@ class _Candidates:
             if not self.counts_hold(views):
                 continue
             chosen = [self.analyses(size)[k] for k in which]
-            information = compress(np.concatenate([a.information for a in chosen]))
+            information = self.together(chosen)
             if not self.suffices(chosen, information):
                 continue
             sigma = self.motion.sigma(information)
@@ -125,9 +130,25 @@ class _Candidates:
             spatial=s.spatial,
             revolute=[j for j, leg in enumerate(s.legs) if leg.base_joint == "R"],
             passive=np.flatnonzero(~s.with_length).tolist(),
+            board=bool(s.board.all()),
         )
         at_once = three_legs_at_once(views, s.legs, spatial=s.spatial)
-        return all(c.ok for c in (*counts, at_once))
+        return not any(c.fails for c in (*counts, at_once))
+
+    def together(self, chosen: Sequence[Analysis]) -> Array:
+        """Return what views say of the parameters at once; a board makes them one camera."""
+        if not self.session.board.all():
+            return compress(np.concatenate([a.information for a in chosen]))
+        rows = np.concatenate([a.of_cameras for a in chosen])
+        return compress(eliminate(rows[None], _CAMERA))
+
+    def base_together(self, chosen: Sequence[Analysis]) -> Array:
+        """Return what views say in step 2."""
+        if not self.session.board.all():
+            return np.concatenate([a.default_steps[0].information for a in chosen])
+        by_view = [base_by_frames(a.session, a.located)[1] for a in chosen]
+        rows = np.concatenate([x.reshape(-1, x.shape[2]) for x in by_view])
+        return eliminate(rows[None], _CAMERA)[:, chosen[0].default_steps[0].columns]
 
     def analyses(self, size: int) -> list[Analysis]:
         """Return what each view of so many legs says alone."""
@@ -151,8 +172,8 @@ class _Candidates:
         session, n_p = self.session, len(self.session.unit)
         if missing(session, information, self.motion):
             return False
-        for k in (0, 2):
-            rows = np.concatenate([a.default_steps[k].information for a in chosen])
+        last = np.concatenate([a.default_steps[2].information for a in chosen])
+        for k, rows in ((0, self.base_together(chosen)), (2, last)):
             step = replace(chosen[0].default_steps[k], information=rows)
             if missing(session, scattered(step, n_p), self.motion):
                 return False

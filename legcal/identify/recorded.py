@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from legcal.dataset.folder import Dataset
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, BoolArray
 from legcal.identify.cameras import default_cameras
 from legcal.identify.planned import REACHED, joints_at, machine_near, radii, travel_of
 from legcal.identify.poses import random_poses
@@ -81,7 +81,19 @@ def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
         camera=camera,
         focal=np.array([_focal(view.camera.K) for view in views]),
         sigma_q=m.sigma_q,
+        board=_with_board(dataset)[used],
     )
+
+
+def _with_board(dataset: Dataset) -> BoolArray:
+    """Return which views show the board, (n_views,): all of them where nobody has looked yet."""
+    m = dataset.measurements
+    shown = np.full(len(m.views), dataset.board is not None, dtype=np.bool_)
+    if dataset.board is not None and dataset.corners is not None:
+        corners = dataset.corners
+        shown[:] = False
+        shown[m.view[corners.row[corners.used]]] = True
+    return shown
 
 
 def _focal(K: Array) -> float:

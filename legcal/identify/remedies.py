@@ -193,9 +193,9 @@ def _further_cameras(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Sc
 
 def _board(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
     """Yield a calibration board that ties the cameras to each other."""
-    if analysis.session.n_views > 1:
+    if analysis.session.n_frames > 1:
         text = "put a calibration board on the base that every camera sees"
-        yield text, partial(_score, replace(analysis, common_cameras=True))
+        yield text, lambda: _score(analysis.with_board())
 
 
 def _known_parameters(analysis: Analysis) -> Iterator[tuple[str, Callable[[], _Score]]]:
@@ -264,4 +264,5 @@ def _extended(session: Session, legs: Sequence[int]) -> Session:
         seen=np.concatenate([session.seen, seen]),
         camera=np.concatenate([session.camera, cameras_for(session, [legs])]),
         focal=np.append(session.focal, FOCAL_PX),
+        board=np.append(session.board, session.board.all()),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -46,6 +46,9 @@ class Session:
         Their focal lengths [px].
     sigma_q : float
         Standard deviation of a reading [m].
+    board : (n_views,) array of bool
+        The views whose images show a calibration board on the base: how these cameras stand to
+        each other is known.
     """
 
     leg_names: tuple[str, ...]
@@ -63,6 +66,7 @@ class Session:
     camera: Array
     focal: Array
     sigma_q: float
+    board: BoolArray
 
     @property
     def n_legs(self) -> int:
@@ -73,6 +77,24 @@ class Session:
     def n_views(self) -> int:
         """Number of camera positions."""
         return len(self.seen)
+
+    @cached_property
+    def frame(self) -> IntArray:
+        """The frame in which each view shows the legs, (n_views,): with a board one for all."""
+        first = int(np.argmax(self.board))
+        frame = np.where(self.board, first, np.arange(self.n_views))
+        return np.asarray(np.unique(frame, return_inverse=True)[1])
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames: of cameras that nothing ties to others, and of the board."""
+        return int(self.frame.max(initial=-1)) + 1
+
+    @cached_property
+    def frames(self) -> tuple[tuple[int, ...], ...]:
+        """The legs that are seen in each frame."""
+        seen = [self.seen[self.frame == f].any(axis=0) for f in range(self.n_frames)]
+        return tuple(tuple(np.flatnonzero(row).tolist()) for row in seen)
 
     @property
     def spatial(self) -> bool:
@@ -127,6 +149,10 @@ class Session:
     def with_length(self) -> BoolArray:
         """Which legs have a length that is measured or constant, (n_legs,)."""
         return np.array([leg.kind is not LegKind.PASSIVE for leg in self.legs], dtype=np.bool_)
+
+    def with_board(self, *, board: bool = True) -> Session:
+        """Return the same with a calibration board in all images, or in none."""
+        return replace(self, board=np.full(self.n_views, board, dtype=np.bool_))
 
     def columns(self, kinds: Sequence[int]) -> IntArray:
         """Return the parameters that stand for given ones of the legs' twelve numbers."""

@@ -34,14 +34,14 @@ _APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance ha
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Step 1: base joints and revolute axes in the camera frames.
+    """Step 1: base joints and revolute axes in the frames of cameras, or of the board.
 
     Attributes
     ----------
-    information : (n_views, n_legs, r, 5) array
+    information : (n_frames, n_legs, r, 5) array
         Whitened rows by A along the axes of R_b [m] and the two turns of the axis [m at the leg's
         length]; zero where the leg is not seen.
-    joint, axis : (n_views, n_legs) array of bool
+    joint, axis : (n_frames, n_legs) array of bool
         Which joints are located, and which revolute axes.
     rank, of : int
         Unknowns that are determined, and all of them.
@@ -82,49 +82,51 @@ def revolute_axes(session: Session) -> BoolArray:
 
 
 def locate_joints(session: Session) -> Located:
-    """Return what step 1 says: all axes of a leg in a view meet in A (6), and v . u = 0 (7)."""
+    """Return what step 1 says: all axes of a leg in a frame meet in A (6), and v . u = 0 (7)."""
     A, B = at_base_joints(session), at_platform_joints(session)
     revolute = revolute_axes(session)
-    found = np.zeros((session.n_views, session.n_legs, 5, 5))
-    for v in range(session.n_views):
-        here = np.flatnonzero(session.view == v)
-        for j in session.views[v]:
+    found = np.zeros((session.n_frames, session.n_legs, 5, 5))
+    frame, wanted = session.frame[session.view], 0
+    for f, legs in enumerate(session.frames):
+        for j in legs:
+            here = np.flatnonzero((frame == f) & session.seen[session.view, j])
+            wanted += 3 + 2 * int(revolute[j])
             if revolute[j]:
-                found[v, j] = compress(_joint_and_axis(session, A, B, here, j))
+                found[f, j] = compress(_joint_and_axis(session, A, B, here, j))
             else:
-                found[v, j, :3, :3] = compress(A.gradient[here, j].reshape(-1, 3))
+                found[f, j, :3, :3] = compress(A.gradient[here, j].reshape(-1, 3))
     limit = 1.0 / (LARGEST_SIGMA * session.mean_length)
     singular = np.linalg.svd(found, compute_uv=False)
     joint = np.linalg.svd(found[..., :3], compute_uv=False)[..., -1] > limit
     axis = revolute & joint & (singular[..., -1] > limit)
-    wanted = (3 + 2 * revolute) * session.seen
-    return Located(found, joint, axis, int(np.sum(singular > limit)), int(wanted.sum()))
+    return Located(found, joint, axis, int(np.sum(singular > limit)), wanted)
 
 
-def identify_base(session: Session, located: Located, *, common_cameras: bool = False) -> Step:
-    """Return what step 2 says of base joints and revolute axes, cameras being free.
+def identify_base(session: Session, located: Located) -> Step:
+    """Return what step 2 says of base joints and revolute axes, the frames being free."""
+    columns, by_frame = base_by_frames(session, located)
+    return Step("base_joints", columns, eliminate(by_frame, 6)[:, columns])
 
-    With *common_cameras* a calibration board ties the cameras to each other.
-    """
+
+def base_by_frames(session: Session, located: Located) -> tuple[IntArray, Array]:
+    """Return the parameters of step 2, and rows by each frame and all parameters, (k, r, 6 + p)."""
     columns = np.union1d(
         session.columns(_BASE),
         _of_legs(session, _BASE_AXIS, revolute_axes(session)),
     )
     pairs = np.argwhere(located.joint)
     rows = np.zeros((len(pairs), 5, 6 + len(session.unit)))
-    for row, (v, j) in zip(rows, pairs, strict=True):
-        F = located.information[v, j]
-        if not located.axis[v, j]:  # what is known of A alone
+    for row, (f, j) in zip(rows, pairs, strict=True):
+        F = located.information[f, j]
+        if not located.axis[f, j]:  # what is known of A alone
             F = np.zeros_like(F)
             F[:3, :3] = compress(
-                eliminate(located.information[v, j][None][:, :, [3, 4, 0, 1, 2]], 2)
+                eliminate(located.information[f, j][None][:, :, [3, 4, 0, 1, 2]], 2)
             )[:3]
         row[:, :6] = _by_camera(session, j, F)
         scatter = session.local_to_parameters[j]
         row[:, 6:] = F[:, :3] @ scatter[:3] + F[:, 3:] @ scatter[7:9] * session.mean_length
-    frame = np.zeros_like(pairs[:, 0]) if common_cameras else pairs[:, 0]
-    by_view = by_group(rows, frame, session.n_views)
-    return Step("base_joints", columns, eliminate(by_view, 6)[:, columns])
+    return columns, by_group(rows, pairs[:, 0], session.n_frames)
 
 
 def distance_rows(session: Session, located: Located) -> tuple[Array, Array, IntArray]:
@@ -139,7 +141,7 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
     (m,) array
         One over the standard deviation of each distance [1/m].
     (m, 4) array of int
-        View, pose, and both legs of each distance.
+        Frame, pose, and both legs of each distance.
     """
     columns = session.columns(_LENGTH)
     place = np.full(session.n_legs, -1)
@@ -148,16 +150,18 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
     ends = located.joint & session.with_length
     centres = np.array([leg.B for leg in session.legs])
     gaps = np.linalg.norm(centres[:, None] - centres, axis=2)
+    frame = session.frame[session.view]
+    shown = ends[frame] & session.seen[session.view]
     keys = [
-        (v, i, j, g)
-        for v in range(session.n_views)
-        for i in np.flatnonzero(session.view == v)
-        for j, g in combinations(np.flatnonzero(ends[v]).tolist(), 2)
+        (f, i, j, g)
+        for f in range(session.n_frames)
+        for i in np.flatnonzero(frame == f)
+        for j, g in combinations(np.flatnonzero(shown[i]).tolist(), 2)
         if gaps[j, g] > _APART * session.mean_length
     ]
     if not keys:
         return np.zeros((0, len(columns))), np.zeros(0), np.zeros((0, 4), dtype=np.intp)
-    v, i, j, g = np.array(keys, dtype=np.intp).T
+    f, i, j, g = np.array(keys, dtype=np.intp).T
     apart = B.point[i, j] - B.point[i, g]
     n = apart / np.linalg.norm(apart, axis=1, keepdims=True)
     pose = session.pose[i]
@@ -167,7 +171,7 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
     each = np.arange(len(keys))
     rows[each, place[j]] = weight * np.einsum("ki,ki->k", n, session.u[pose, j])
     rows[each, place[g]] = -weight * np.einsum("ki,ki->k", n, session.u[pose, g])
-    return rows, np.asarray(weight), np.stack([v, pose, j, g], axis=1)
+    return rows, np.asarray(weight), np.stack([f, pose, j, g], axis=1)
 
 
 def identify_platform(
@@ -191,7 +195,7 @@ def identify_platform(
     groups = _groups(session, located)
     seen = np.delete(images[:, :, 2:], np.s_[n_f : n_f + 6], axis=3)  # at B
     seen = seen * groups.used[groups.of_image][:, :, None, None]
-    seen = seen * located.joint[session.view][:, :, None, None]
+    seen = seen * located.joint[session.frame[session.view]][:, :, None, None]
     seen = seen.reshape(len(session.view), 2 * session.n_legs, n_f + n_p)
     rows = np.concatenate([demands.by_pose, demands.by_parameters], axis=2)[groups.pose]
     wanted = _step_4_demands(demands, groups)
@@ -267,12 +271,13 @@ class _Groups:
 def _groups(session: Session, located: Located) -> _Groups:
     """Return the groups of a session, with the legs that take part in step 4."""
     n_d = len(session.frame_legs)
-    in_base = (located.joint.sum(axis=1) >= n_d)[session.view]
-    key = np.stack([session.pose, np.where(in_base, -1, session.view)], axis=1)
+    frame = session.frame[session.view]
+    in_base = (located.joint.sum(axis=1) >= n_d)[frame]
+    key = np.stack([session.pose, np.where(in_base, -1, frame)], axis=1)
     distinct, of_image = np.unique(key, axis=0, return_inverse=True)
     of_image = of_image.ravel()
     legs = np.zeros((len(distinct), session.n_legs), dtype=np.bool_)
-    np.logical_or.at(legs, of_image, located.joint[session.view])
+    np.logical_or.at(legs, of_image, located.joint[frame] & session.seen[session.view])
     ends = legs & session.with_length
     number = ends.sum(axis=1)
     enough = number >= n_d

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import groupby
 from math import degrees
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.identify.analysis import Identifiability
+from legcal.identify.board import BoardReport
+from legcal.identify.identifiability import Identifiability
 from legcal.identify.weak import Ranks, WeakDirection
 from legcal.identify.words import legs_in_words, views_in_words
 from legcal.mechanism.parameter_words import joined, leg_labels
@@ -31,7 +33,9 @@ _LEGEND = (
     "as printed: the rank with the equations of the paper as it prints them\n"
     "known length law: a leg with a reading (length = reading + offset), or constant"
 )
+_NEEDS = {"staged": "the four steps", "full": "the fit of everything"}
 _MOST_WEAK = 6  # directions shown
+_MOST_MENDED = 3
 _FAR, _HALF_TURN = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
@@ -55,6 +59,7 @@ def identify_table(report: Identifiability) -> RenderableType:
             parts += [Text(), _weak(title, ranks)]
     if report.remedies:
         parts += [Text(), _remedies(report)]
+    parts += [Text(), Text(_board(report.board, report.full.of))]
     return Group(*parts, Text(), *_verdict(report))
 
 
@@ -64,9 +69,17 @@ def _heading(report: Identifiability) -> RenderableType:
     r = f", {report.r} with a revolute joint at the base" if report.r else ""
     lines = [Text(f"{space}, {report.n} legs ({report.n_ac} of known length law{r})")]
     labels = leg_labels(report.legs)
-    for k, (view, images) in enumerate(zip(report.views, report.images, strict=True), start=1):
+    first = 0
+    for (view, images), group in groupby(zip(report.views, report.images, strict=True)):
+        last = first + len(list(group))
+        between = " and " if last == first + 2 else " to "
+        which = f"view {last}" if last == first + 1 else f"views {first + 1}{between}{last}"
+        each = "" if last == first + 1 else " each"
         legs = ", ".join(labels[name] for name in view)
-        lines.append(Text(f"view {k}: legs {legs} in {images} image{'s' * (images != 1)}"))
+        lines.append(Text(f"{which}: legs {legs} in {images} image{'s' * (images != 1)}{each}"))
+        first = last
+    if report.board.present:
+        lines.append(Text("a calibration board on the base in every view"))
     return Group(*lines)
 
 
@@ -94,7 +107,9 @@ def _conditions(report: Identifiability) -> Table:
     for c in report.conditions:
         legs = f": {legs_in_words(c.legs, report.legs)}" if c.legs else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
-        table.add_row(_CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}")
+        verdict = f"{'ok' if c.ok else 'fails'}{legs}"
+        remark = "" if c.needed else ", not needed with the board"
+        table.add_row(_CONDITIONS[c.name], *numbers, f"{verdict}{remark}")
     return table
 
 
@@ -147,6 +162,32 @@ def _two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):.12g}"
 
 
+def _board(board: BoardReport, of: int) -> str:
+    """Return what a calibration board does, in a few sentences."""
+    subject = "The calibration board on the base" if board.present else "A calibration board"
+    before, after = board.without, board.with_board
+    if not board.needed_for and before == after:
+        return f"{subject} is not needed: the ranks are the same without it."
+    verb = "raises" if board.present else "on the base would raise"
+    text = f"{subject} {verb}"
+    if board.needed_for:
+        needed = joined(
+            [_NEEDS.get(name, _CONDITIONS.get(name, name)) for name in board.needed_for]
+        )
+        where = "" if board.present else " on the base"
+        text = f"{subject}{where} is needed for {needed}; it raises"
+    text += (
+        f" the ranks from {before.staged_rank} to {after.staged_rank} of {of} step by step, and "
+        f"from {before.full_rank} to {after.full_rank} at once"
+    )
+    if not board.mends:
+        return f"{text}."
+    shown = list(board.mends[:_MOST_MENDED])
+    if len(board.mends) > _MOST_MENDED:
+        shown.append(f"{len(board.mends) - _MOST_MENDED} more (see --json)")
+    return f"{text}, and mends: {'; '.join(shown)}."
+
+
 def _remedies(report: Identifiability) -> Table:
     """Return what would help."""
     table = _plain_table("what would mend it", "steps", "at once", "")
@@ -186,7 +227,7 @@ def _verdict(report: Identifiability) -> list[RenderableType]:
                 style="dim",
             )
         )
-    failed = [_CONDITIONS[c.name] for c in report.conditions if not c.ok]
+    failed = [_CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:
         lines.append(Text(f"The paper's conditions fail: {joined(failed)}."))
     return [*lines, *(Text(f"note: {note}") for note in report.notes)]
