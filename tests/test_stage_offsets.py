@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from staged_hexapods import exact_session, five_millimetres_away, noisy_session
+from staged_machines import shipped, three_steps
 
 from legcal.errors import NotIdentifiable
+from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import BoolArray
+from legcal.mechanism.leg import LegKind
 from legcal.simulation.machine import Machine
 from legcal.simulation.observe import OutlineNoise
 from legcal.stages.joints_in_base import locate_joints_in_base
@@ -18,7 +21,7 @@ from legcal.stages.leg_directions import (
     observed_directions,
 )
 from legcal.stages.nominal import Criteria
-from legcal.stages.offsets import build_consecutive, identify_offsets, leg_ends
+from legcal.stages.offsets import build_consecutive, identify_offsets, leg_ends, pairs_apart
 from legcal.studies.estimators import nominal_of
 from legcal.studies.session import SimulatedSession
 
@@ -117,3 +120,81 @@ def test_no_two_legs_at_once_is_refused() -> None:
     directions = _directions(session, session.machine, "default")
     with pytest.raises(NotIdentifiable, match="no image shows two legs"):
         identify_offsets(nominal_of(session.machine), _some(directions, directions.leg == 0), 2e-6)
+
+
+def test_a_leg_of_constant_length_reads_zero_whatever_the_table_says() -> None:
+    observed = shipped("hexapod-rod")
+    assert np.isnan(observed.measurements.q[:, 5]).all()
+    steps = three_steps(observed)
+    constant = steps.directions.leg == 5
+    assert not steps.directions.reading[constant].any()
+    assert steps.directions.reading[~constant].all()
+    assert steps.offsets.q0[5] == pytest.approx(observed.true_legs[5].q0, abs=1e-9)
+
+
+@pytest.mark.parametrize("criteria", ["default", "literal"])
+def test_two_legs_that_meet_in_one_platform_joint_are_no_pair(criteria: Criteria) -> None:
+    session = exact_session()
+    machine = session.machine
+    B = machine.parameters.platform_joints.copy()
+    B[1] = B[0]
+    parameters = replace(machine.parameters, platform_joints=B)
+    lengths = [np.linalg.norm(T.apply(B) - parameters.base_joints, axis=1) for T in session.T_Rb_Re]
+    m = session.measurements
+    q = np.array([length - parameters.offsets for length in lengths])[m.pose]
+    axes = session.axes
+    u = axes.u.copy()
+    for i in np.flatnonzero(axes.leg == 1):
+        camera = session.cameras[m.view[axes.row[i]]].T_Rb_camera
+        end = session.T_Rb_Re[m.pose[axes.row[i]]].apply(B[1])
+        u[i] = camera.inv().rotation.apply(end - parameters.base_joints[1])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    A = np.array([c.T_Rb_camera.inv().apply(parameters.base_joints) for c in session.cameras])
+    M = np.where((axes.leg == 1)[:, None], A[m.view[axes.row], axes.leg], axes.M)
+    met = replace(
+        session,
+        machine=replace(machine, parameters=parameters),
+        axes=replace(axes, u=u, M=M, basis=normal_basis(u)),
+        measurements=replace(m, q=q),
+    )
+    nominal = five_millimetres_away(met.machine)
+    nominal.parameters.platform_joints[1] = nominal.parameters.platform_joints[0]
+    directions = _directions(met, nominal, criteria)
+    pairs = pairs_apart(nominal_of(nominal), directions)
+    together = directions.leg[pairs]
+    assert not np.any(np.isin(together, (0, 1)).all(axis=1))
+    assert np.any(np.isin(together, 1))
+    found = identify_offsets(nominal_of(nominal), directions, 2e-6, criteria=criteria)
+    assert np.abs(found.q0 - parameters.offsets).max() < 1e-8
+
+
+def test_a_leg_fixed_to_the_platform_takes_no_part() -> None:
+    observed = shipped("tricept")
+    legs = list(observed.nominal.legs)
+    legs[3] = replace(legs[3], kind=LegKind.ACTUATED, q0=0.1)
+    nominal = replace(observed.nominal, legs=tuple(legs))
+    q = np.where(np.isnan(observed.measurements.q), 0.4, observed.measurements.q)
+    steps = three_steps(
+        replace(observed, nominal=nominal, measurements=replace(observed.measurements, q=q))
+    )
+    assert steps.offsets.q0[3] == 0.1
+    expected = [leg.q0 for leg in observed.true_legs[:3]]
+    assert np.abs(steps.offsets.q0[:3] - expected).max() < 1e-9
+
+
+def test_legs_that_do_not_turn_against_each_other_are_refused_with_what_is_seen() -> None:
+    session = exact_session()
+    directions = _directions(session, session.machine, "default")
+    some = _some(directions, (directions.view == 0) & np.isin(directions.leg, (0, 1)))
+    parallel = replace(some, u=np.repeat(some.u[::2], 2, axis=0))
+    with pytest.raises(NotIdentifiable, match=r"leg1 hardly turns against .* in 6 poses"):
+        identify_offsets(nominal_of(session.machine), parallel, 2e-6)
+
+
+def test_legs_in_too_few_poses_are_refused_with_their_number() -> None:
+    session = exact_session()
+    directions = _directions(session, session.machine, "default")
+    groups = np.unique(directions.group[directions.leg == 5])[:1]
+    few = _some(directions, (directions.leg != 5) | np.isin(directions.group, groups))
+    with pytest.raises(NotIdentifiable, match=r"fixes that of leg6 \(leg6 .* in 1 pose\)"):
+        identify_offsets(nominal_of(session.machine), few, 2e-6)

@@ -39,7 +39,9 @@ class CameraStart:
     fixed: bool
 
 
-def camera_starts(A_Rb: Array, v_Rb: Array, A_camera: Array, v_camera: Array) -> list[CameraStart]:
+def camera_starts(
+    A_Rb: Array, v_Rb: Array, A_camera: Array, v_camera: Array, *, signed: bool = False
+) -> list[CameraStart]:
     """Return where a camera may have stood, the most likely place first.
 
     Parameters
@@ -47,7 +49,9 @@ def camera_starts(A_Rb: Array, v_Rb: Array, A_camera: Array, v_camera: Array) ->
     A_Rb, A_camera : (n, 3) array
         The located joints of a view in R_b, as a model has them, and in its camera frame [m].
     v_Rb, v_camera : (r, 3) array
-        The located revolute axes in both frames, of any sign.
+        The located revolute axes in both frames.
+    signed : bool
+        Their signs are known; otherwise they are lines.
 
     Returns
     -------
@@ -70,7 +74,7 @@ def camera_starts(A_Rb: Array, v_Rb: Array, A_camera: Array, v_camera: Array) ->
     if not across.any():
         return [CameraStart(first.inv(), False)]
     along = first.rotation.apply(line)
-    turns = _alike_turns(along, first.rotation.apply(v_Rb[across]), v_camera[across])
+    turns = _alike_turns(along, first.rotation.apply(v_Rb[across]), v_camera[across], signed)
     middle = A_camera.mean(axis=0)
     return [
         CameraStart((_about(middle, Rotation.from_rotvec(turn * along)) * first).inv(), True)
@@ -95,8 +99,8 @@ def _laid_along(A_Rb: Array, line: Array, A_camera: Array) -> RigidTransform:
     return RigidTransform.from_components(shift, rotation)
 
 
-def _alike_turns(along: Array, v: Array, seen: Array) -> Array:
-    """Return the turns about a unit vector that lay lines v (r, 3) on those seen, best first."""
+def _alike_turns(along: Array, v: Array, seen: Array, signed: bool) -> Array:
+    """Return the turns about a unit vector that lay axes v (r, 3) on those seen, best first."""
     turn = 2.0 * np.pi / _TURNS * np.arange(_TURNS)
     axial = (v @ along)[:, None] * along
     across = v - axial
@@ -105,7 +109,7 @@ def _alike_turns(along: Array, v: Array, seen: Array) -> Array:
         + np.cos(turn)[:, None] * np.sum(seen * across, axis=1)
         + np.sin(turn)[:, None] * np.sum(seen * np.cross(along, across), axis=1)
     )
-    miss = 1.0 - np.mean(product**2, axis=1)
+    miss = 1.0 - np.mean(np.maximum(product, 0.0) ** 2 if signed else product**2, axis=1)
     least = np.flatnonzero((miss <= np.roll(miss, 1)) & (miss < np.roll(miss, -1)))
     least = least[np.argsort(miss[least], kind="stable")]
     return np.asarray(turn[least[miss[least] < miss.min() + _ALIKE]])

@@ -44,17 +44,12 @@ def condition_on_joint(
         Covariance of u along e1 and e2 [rad^2].
     """
     here = np.arange(len(axes))
-    residual, spread = miss_of_joint(axes, here, A, v)
+    residual, spread, cross = miss_of_joint(axes, here, A, v)
     doubt = np.einsum("ni,nij,nj->n", axes.u, covariance, axes.u) + _EXACT
     spread[:, 2, 2] += np.where(np.any(v != 0.0, axis=1), doubt, _NO_AXIS)
-    s = np.sum((A - axes.M) * axes.u, axis=-1)
-    C = axes.covariance
-    to_point = C[:, :2, 2:] + s[:, None, None] * C[:, :2, :2]  # cov(alpha, beta + s alpha)
-    to_normal = C[:, :2, :2] @ (axes.basis @ v[..., None])
-    cross = np.concatenate([to_point, to_normal], axis=2)
     gain = cross @ np.linalg.inv(spread)
     alpha = (gain @ residual[..., None])[..., 0]
-    left = C[:, :2, :2] - gain @ np.swapaxes(cross, 1, 2)
+    left = axes.covariance[:, :2, :2] - gain @ np.swapaxes(cross, 1, 2)
     u = axes.u + np.einsum("nia,ni->na", axes.basis, alpha)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     e1 = axes.basis[:, 0] - u * np.sum(u * axes.basis[:, 0], axis=-1, keepdims=True)

@@ -8,7 +8,7 @@ from legcal.geometry.types import Array
 
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
 _LARGEST_SIGMA = 0.1  # of the distance to the camera
-_LARGEST_TURN = 0.2  # [rad] of an axis; beyond, it says nothing
+_LARGEST_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
 
 
 def too_few_directions(information: Array, n_images: int) -> str:

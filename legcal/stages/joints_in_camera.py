@@ -14,7 +14,7 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, BoolArray, IntArray
-from legcal.observations.leg_axes import LegAxes
+from legcal.observations.leg_axes import LegAxes, choose_axes
 from legcal.observations.measurements import Measurements
 from legcal.stages.base_unknowns import nominal_axes
 from legcal.stages.bundles import Bundles
@@ -23,6 +23,7 @@ from legcal.stages.doubts import too_few_directions, too_tilted, too_uncertain
 from legcal.stages.meeting_axes import flipped, plain_axes, weighted_joints
 from legcal.stages.meeting_points import nearest_points, plain_information, weighted_points
 from legcal.stages.nominal import Criteria, NominalMechanism
+from legcal.stages.plane_sides import side_of_plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,9 @@ class JointsInCamera:
         mechanism, that of each leg and the common normal.
     diagnostics : tuple of str
         Which legs were left out of which views, and why.
+    sided : (n_views,) array of bool
+        Planar mechanisms: where lengths of legs say from which side the camera sees the plane, so
+        that the sign of the normal is known.
     """
 
     A_camera: Array
@@ -54,6 +58,7 @@ class JointsInCamera:
     axis_located: BoolArray
     covariance: Array
     diagnostics: tuple[str, ...]
+    sided: BoolArray
 
 
 def locate_joints_in_cameras(
@@ -123,9 +128,11 @@ def locate_joints_in_cameras(
         _laid_out(shape, at, good_axis),
         _laid_out(shape, at, np.where(good[:, None, None], C, 0.0)),
         diagnostics,
+        np.zeros(shape[0], dtype=np.bool_),
     )
     _check_every_leg(mechanism, found.located, diagnostics)
-    return oriented(mechanism, found)
+    found = oriented(mechanism, found)
+    return found if mechanism.spatial else _sided(mechanism, axes, measurements, found)
 
 
 def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCamera:
@@ -136,7 +143,8 @@ def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCam
     points to the side of its nominal axis. Where the joints lie on one line, the base is
     turned about it until the axes agree best, as lines. Where two turns agree alike, as for
     axes normal to the line between two joints, the sign remains a matter of choice, and so does
-    that of an axis whose joint is alone in its view.
+    that of an axis whose joint is alone in its view; step 2 tries both. In a planar mechanism all
+    axes are normal to that line, and lengths of legs decide (:mod:`legcal.stages.plane_sides`).
     """
     nominal, A_Rb = nominal_axes(mechanism), mechanism.parameters.base_joints
     signs = np.ones(joints.located.shape)
@@ -146,6 +154,23 @@ def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCam
         if starts:
             signs[v, with_axis] = signs_seen(nominal[with_axis], seen, starts[0].T_Rb_camera)
     return with_signs(joints, signs)
+
+
+def _sided(
+    mechanism: NominalMechanism, axes: LegAxes, measurements: Measurements, joints: JointsInCamera
+) -> JointsInCamera:
+    """Return joints whose normals point up where the lengths of legs say which way that is."""
+    signs, sided = np.ones(joints.located.shape), joints.sided.copy()
+    view = measurements.view[axes.row]
+    for v, with_axis in enumerate(joints.axis_located):
+        legs = np.flatnonzero(with_axis)
+        if len(legs) < 2:
+            continue
+        of_view = choose_axes(axes, np.flatnonzero(view == v))
+        seen = joints.A_camera[v, legs], joints.v_camera[v, legs[0]], legs
+        side = side_of_plane(mechanism, of_view, measurements, *seen)
+        sided[v], signs[v] = side != 0.0, -1.0 if side < 0.0 else 1.0
+    return replace(with_signs(joints, signs), sided=sided)
 
 
 def with_signs(joints: JointsInCamera, signs: Array) -> JointsInCamera:

@@ -47,9 +47,16 @@ def register_views(
 def _starts(A_Rb: Array, v_Rb: Array, joints: JointsInCamera) -> list[list[CameraStart]]:
     """Return where the camera of each view may have stood."""
     return [
-        camera_starts(A_Rb[located], v_Rb[with_axis], A_camera[located], v_camera[with_axis])
-        for A_camera, located, v_camera, with_axis in zip(
-            joints.A_camera, joints.located, joints.v_camera, joints.axis_located, strict=True
+        camera_starts(
+            A_Rb[located], v_Rb[axis], A_camera[located], v_camera[axis], signed=bool(sided)
+        )
+        for A_camera, located, v_camera, axis, sided in zip(
+            joints.A_camera,
+            joints.located,
+            joints.v_camera,
+            joints.axis_located,
+            joints.sided,
+            strict=True,
         )
     ]
 

@@ -85,11 +85,13 @@ def find_misses(
             A[view == i] = T.inv().apply(base.A_Rb[axes.leg[view == i]])
             known |= view == i
     here, v = np.arange(len(axes)), joints.v_camera[view, axes.leg]
-    residual, spread = miss_of_joint(axes, here, A, v)
+    residual, spread, _ = miss_of_joint(axes, here, A, v)
     with_axis = joints.axis_located[view, axes.leg]
     slope = np.zeros((len(axes), 3, 5))
     slope[:, :2, :3] = axes.basis
-    slope[with_axis] = derivative_of_miss(axes, here[with_axis], v[with_axis])
+    slope[with_axis] = derivative_of_miss(
+        axes, here[with_axis], v[with_axis], np.zeros((int(with_axis.sum()), 2))
+    )
     spread = spread + slope @ joints.covariance[view, axes.leg] @ np.swapaxes(slope, 1, 2)
     spread[~with_axis, 2, 2] = 1.0  # of nothing: the residual is zero
     chi = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(spread), residual))

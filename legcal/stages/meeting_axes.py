@@ -19,6 +19,8 @@ from legcal.stages.meeting_points import (
     robust_weights,
 )
 
+_LONGEST = 0.2  # step: [rad] of an axis, and in its distance of a centre
+
 
 def plain_axes(axes: LegAxes, bundles: Bundles, pool: IntArray) -> tuple[Array, Array]:
     """Return v of (7), every equation with the same weight, and the inverse of its normal matrix.
@@ -54,7 +56,8 @@ def weighted_joints(
 
     What an image knows badly is the tilt of a leg towards the camera. It enters the miss
     of A, in proportion to the distance, and the angle to v: both are weighted together, by their
-    joint covariance.
+    joint covariance. The derivatives are those at the adjusted directions, which meet in A and are
+    normal to v; at the observed ones, tilts would pass for turns, and v would come out biased.
 
     Parameters
     ----------
@@ -78,13 +81,15 @@ def weighted_joints(
     """
     rows, bundle = bundles.rows, bundles.bundle
     for _ in range(REWEIGHTINGS):
-        residual, spread = miss_of_joint(axes, rows, A[bundle], v[bundle])
+        residual, spread, tilt = miss_of_joint(axes, rows, A[bundle], v[bundle])
         weight = robust_weights(bundles, residual, spread)
-        J = derivative_of_miss(axes, rows, v[bundle])
+        alpha = (tilt @ np.linalg.solve(spread, residual[..., None]))[..., 0]
+        J = derivative_of_miss(axes, rows, v[bundle], alpha)
         back = np.swapaxes(J, 1, 2) @ weight
         step, C = _pooled(
             bundles.total(back @ J), bundles.total((back @ residual[..., None])[..., 0]), pool
         )
+        step = _limited(step, np.linalg.norm(A, axis=1))
         A, v = A - step[:, :3], turned(v, -step[:, 3:])
     return A, v, C
 
@@ -94,6 +99,14 @@ def turned(v: Array, turn: Array) -> Array:
     w = np.einsum("ni,nia->na", turn, normal_basis(v))
     moved = v + np.cross(w, v)
     return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
+
+
+def _limited(step: Array, distance: Array) -> Array:
+    """Return steps (n, 5) within which their equations are nearly linear, shorter if need be."""
+    size = np.maximum(
+        np.linalg.norm(step[:, :3], axis=1) / distance, np.linalg.norm(step[:, 3:], axis=1)
+    )
+    return np.asarray(step / np.maximum(size / _LONGEST, 1.0)[:, None])
 
 
 def flipped(covariance: Array) -> Array:

@@ -96,7 +96,7 @@ def miss(axes: LegAxes, here: IntArray, A: Array) -> tuple[Array, Array]:
     return residual, spread
 
 
-def miss_of_joint(axes: LegAxes, here: IntArray, A: Array, v: Array) -> tuple[Array, Array]:
+def miss_of_joint(axes: LegAxes, here: IntArray, A: Array, v: Array) -> tuple[Array, Array, Array]:
     """Return by how much axes miss points and are not normal to directions, (6) and (7).
 
     Parameters
@@ -110,9 +110,13 @@ def miss_of_joint(axes: LegAxes, here: IntArray, A: Array, v: Array) -> tuple[Ar
 
     Returns
     -------
-    (k, 3) array [m, m, -], (k, 3, 3) array
-        The miss in e1 and e2, as in :func:`miss`, and -v . u. The direction of the axis is
+    residual : (k, 3) array
+        The miss in e1 and e2, as in :func:`miss` [m], and -v . u. The direction of the axis is
         u + e alpha, so that the last is (e v) . alpha for the right v.
+    spread : (k, 3, 3) array
+        Its covariance.
+    tilt : (k, 2, 3) array
+        Covariance of alpha with it.
     """
     arm, u, E = A - axes.M[here], axes.u[here], axes.basis[here]
     across = np.einsum("kia,ka->ki", E, arm)
@@ -121,14 +125,28 @@ def miss_of_joint(axes: LegAxes, here: IntArray, A: Array, v: Array) -> tuple[Ar
     T[:, :2, :2] = np.sum(arm * u, axis=1)[:, None, None] * np.eye(2)
     T[:, :2, 2:] = np.eye(2)
     T[:, 2, :2] = np.einsum("kia,ka->ki", E, v)
-    return residual, np.asarray(T @ axes.covariance[here] @ np.swapaxes(T, 1, 2))
+    tilt = axes.covariance[here, :2] @ np.swapaxes(T, 1, 2)
+    return residual, np.asarray(T @ axes.covariance[here] @ np.swapaxes(T, 1, 2)), tilt
 
 
-def derivative_of_miss(axes: LegAxes, here: IntArray, v: Array) -> Array:
-    """Return the derivative (k, 3, 5) of :func:`miss_of_joint` by A and turns of v (k, 3)."""
-    N, u = normal_basis(v), axes.u[here]
+def derivative_of_miss(axes: LegAxes, here: IntArray, v: Array, alpha: Array) -> Array:
+    """Return the derivative of the miss by A and turns of v, (k, 3, 5).
+
+    Parameters
+    ----------
+    axes : LegAxes
+        Axes.
+    here : (k,) array of int
+        Which of them.
+    v : (k, 3) array
+        Unit directions.
+    alpha : (k, 2) array
+        Where the axes really are, as far as is known: their directions are u + e alpha.
+    """
+    N, E, u = normal_basis(v), axes.basis[here], axes.u[here]
+    better = u + np.einsum("kia,ki->ka", E, alpha)
     J = np.zeros((len(here), 3, 5))
-    J[:, :2, :3] = axes.basis[here]
-    J[:, 2, 3] = np.sum(N[:, 1] * u, axis=1)
-    J[:, 2, 4] = -np.sum(N[:, 0] * u, axis=1)
+    J[:, :2, :3] = E - alpha[:, :, None] * u[:, None, :]
+    J[:, 2, 3] = np.sum(N[:, 1] * better, axis=1)
+    J[:, 2, 4] = -np.sum(N[:, 0] * better, axis=1)
     return J

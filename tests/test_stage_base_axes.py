@@ -1,0 +1,432 @@
+"""Revolute base joints: eqs (7) and (8), planes, and cameras that axes help to place."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from machine_session import PINHOLE
+from scipy.spatial.transform import RigidTransform, Rotation
+from staged_machines import Observed, made_up_base, seen_from, shipped, three_steps
+
+from legcal.errors import NotIdentifiable
+from legcal.geometry.lines import normal_basis
+from legcal.geometry.types import Array, BoolArray
+from legcal.mechanism.leg import LegKind
+from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.observations.leg_axes import LegAxes
+from legcal.observations.measurements import Measurements, View
+from legcal.stages.base_unknowns import BaseUnknowns, turned_axis
+from legcal.stages.camera_starts import camera_starts
+from legcal.stages.joints_in_base import locate_joints_in_base
+from legcal.stages.joints_in_camera import (
+    locate_joints_in_cameras,
+    oriented,
+)
+from legcal.stages.least_squares import structure_jacobian, structure_residuals
+from legcal.stages.leg_directions import directions_through_joints, find_misses, select_axes
+from legcal.stages.meeting_axes import turned
+from legcal.stages.meeting_points import derivative_of_miss, miss_of_joint
+from legcal.stages.nominal import NominalMechanism
+from legcal.stages.rigid_parts import build_rigid
+from legcal.stages.scalar_products import build_scalar_products
+
+SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+ACROSS = np.array([[0.3, 1.0, 0.0], [-0.2, 1.0, 0.1], [1.0, 0.2, 0.0], [0.1, 0.4, 1.0]])
+ACROSS /= np.linalg.norm(ACROSS, axis=1, keepdims=True)
+
+
+def legs_seen(*views: tuple[int, ...], n_legs: int = 4) -> BoolArray:
+    seen = np.zeros((len(views), n_legs), dtype=np.bool_)
+    for row, legs in zip(seen, views, strict=True):
+        row[list(legs)] = True
+    return seen
+
+
+def away(A_Rb: Array, v_Rb: Array, seed: int = 0) -> tuple[Array, Array]:
+    """Return joints 3 mm and axes 1 degree off; R_b is still on the first three joints."""
+    rng = np.random.default_rng(seed)
+    step = 0.003 * rng.choice([-1.0, 1.0], A_Rb.shape)
+    step[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] = 0.0
+    turn = np.deg2rad(1.0) * normal_basis(v_Rb)[:, 0]
+    return A_Rb + step, Rotation.from_rotvec(turn).apply(v_Rb)
+
+
+# Step 1
+
+
+@pytest.mark.parametrize("name", ["3-rps", "3-rpr"])
+def test_eq07_axes_are_normal_to_all_directions_of_their_leg(name: str) -> None:
+    observed = shipped(name)
+    for criteria in ("default", "literal"):
+        joints = locate_joints_in_cameras(
+            observed.nominal, observed.axes, observed.measurements, criteria=criteria
+        )
+        assert joints.axis_located.all()
+        view = observed.measurements.view[observed.axes.row]
+        v = joints.v_camera[view, observed.axes.leg]
+        assert np.abs(np.sum(v * observed.axes.u, axis=1)).max() < 1e-9
+        for k, T in enumerate(observed.T_camera_Rb):
+            assert np.abs(joints.v_camera[k] - T.rotation.apply(observed.v_Rb)).max() < 1e-7
+
+
+def test_all_legs_of_a_planar_mechanism_have_one_normal_in_a_view() -> None:
+    observed = shipped("3-rpr", noise=0.3)
+    joints = locate_joints_in_cameras(observed.nominal, observed.axes, observed.measurements)
+    assert np.array_equal(joints.v_camera, joints.v_camera[:, :1] + np.zeros((1, 3, 1)))
+    spread = joints.covariance[:, :, 3:, 3:]
+    assert np.allclose(spread, spread[:, :1])
+
+
+@pytest.mark.parametrize("name", ["3-rps", "3-rpr"])
+def test_weights_make_joints_far_better_axes_no_worse_and_their_covariance_true(name: str) -> None:
+    squares: dict[str, list[Array]] = {"default": [], "literal": []}
+    normalised = []
+    for seed in range(4):
+        observed = shipped(name, n_poses=10, noise=0.2, seed=seed)
+        nominal, axes, m = observed.nominal, observed.axes, observed.measurements
+        weighted = locate_joints_in_cameras(nominal, axes, m)
+        plain = locate_joints_in_cameras(nominal, axes, m, criteria="literal")
+        for k, T in enumerate(observed.T_camera_Rb):
+            A, v = T.apply(observed.A_Rb), T.rotation.apply(observed.v_Rb)
+            for key, joints in (("default", weighted), ("literal", plain)):
+                miss, turn = joints.A_camera[k] - A, np.cross(v, joints.v_camera[k])
+                squares[key].append(np.array([np.sum(miss**2), np.sum(turn**2)]))
+            for j in range(3):
+                turns = normal_basis(weighted.v_camera[k, j]) @ np.cross(
+                    v[j], weighted.v_camera[k, j]
+                )
+                error = np.concatenate([weighted.A_camera[k, j] - A[j], turns])
+                normalised.append(error @ np.linalg.solve(weighted.covariance[k, j], error))
+    gain = np.sum(squares["default"], axis=0) / np.sum(squares["literal"], axis=0)
+    assert gain[0] < 0.05
+    assert gain[1] < 1.0
+    assert 3.0 < np.mean(normalised) < 6.5  # 5 by rights; outlier weights cost a little
+
+
+def test_a_revolute_leg_of_one_direction_has_no_axis_in_that_view() -> None:
+    observed = shipped("3-rps")
+    axes, m = observed.axes, observed.measurements
+    here = np.flatnonzero((m.view[axes.row] == 1) & (axes.leg == 0))
+    u, M, basis = axes.u.copy(), axes.M.copy(), axes.basis.copy()
+    u[here], M[here], basis[here] = u[here[0]], M[here[0]], basis[here[0]]
+    stopped = replace(axes, u=u, M=M, basis=basis)
+    joints = locate_joints_in_cameras(observed.nominal, stopped, m)
+    assert joints.axis_located[:, 0].tolist() == [True, False, True]
+    assert "leg1 in view c2 was left out: its direction is the same in all" in joints.diagnostics[0]
+    base = locate_joints_in_base(observed.nominal, joints)
+    assert np.abs(np.cross(base.base_axes, observed.v_Rb)).max() < 1e-7
+
+
+def test_an_axis_that_nearly_equal_directions_leave_open_is_left_out_with_its_uncertainty() -> None:
+    observed = shipped("3-rps")
+    axes, m = observed.axes, observed.measurements
+    coarse = replace(axes, covariance=30.0**2 * axes.covariance)
+    joints = locate_joints_in_cameras(observed.nominal, coarse, m)
+    assert not joints.axis_located.all()
+    assert any("revolute axis of leg leg" in d and "deg)" in d for d in joints.diagnostics)
+
+
+def test_the_derivative_of_the_miss_is_that_of_differences() -> None:
+    observed = shipped("3-rps")
+    axes = observed.axes
+    here, h = np.arange(len(axes)), 1e-6
+    rng = np.random.default_rng(0)
+    A = axes.M + 0.1 * rng.normal(size=axes.M.shape)
+    v = np.cross(axes.u, rng.normal(size=axes.u.shape))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    found = derivative_of_miss(axes, here, v, np.zeros((len(axes), 2)))
+    for k in range(5):
+        step = np.zeros((len(axes), 5))
+        step[:, k] = h
+        ahead, behind = (
+            miss_of_joint(axes, here, A + s * step[:, :3], turned(v, s * step[:, 3:]))[0]
+            for s in (1.0, -1.0)
+        )
+        assert np.allclose((ahead - behind) / (2.0 * h), found[:, :, k], atol=1e-8)
+
+
+# Signs of axes
+
+
+def test_axes_take_the_side_of_the_nominal_ones_whatever_their_signs_were() -> None:
+    seen = legs_seen((0, 1, 2, 3), (0, 1), (2, 3))
+    joints, cameras = seen_from(SQUARE, ACROSS, seen)
+    nominal = made_up_base(*away(SQUARE, ACROSS))
+    found = oriented(nominal, joints)
+    for v, T in enumerate(cameras):
+        expected = T.rotation.inv().apply(ACROSS)[seen[v]]
+        assert np.allclose(found.v_camera[v, seen[v]], expected, atol=1e-12)
+    assert np.any(found.v_camera != joints.v_camera)
+
+
+def test_the_covariance_turns_with_the_sign_of_an_axis() -> None:
+    observed = shipped("3-rps", noise=0.3)
+    joints = locate_joints_in_cameras(observed.nominal, observed.axes, observed.measurements)
+    legs = tuple(
+        replace(leg, base_axis=-axis)
+        for leg, axis in zip(observed.nominal.legs, observed.nominal.base_axes, strict=True)
+    )
+    nominal = replace(observed.nominal, legs=legs)
+    other = oriented(nominal, joints)
+    assert np.allclose(other.v_camera, -joints.v_camera)
+    first, second = (
+        locate_joints_in_base(n, j) for n, j in ((observed.nominal, joints), (nominal, other))
+    )
+    assert np.allclose(first.A_Rb, second.A_Rb, atol=1e-9)
+    assert np.allclose(first.base_axes, -second.base_axes, atol=1e-8)
+
+
+# Step 2
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_joints_and_an_axis_across_their_line_place_a_camera(seed: int) -> None:
+    seen = legs_seen((0, 1), (1, 2), (2, 3), (3, 0))
+    joints, cameras = seen_from(SQUARE, ACROSS, seen)
+    base = locate_joints_in_base(made_up_base(*away(SQUARE, ACROSS, seed)), joints)
+    assert np.abs(base.A_Rb - SQUARE).max() < 1e-8
+    assert np.abs(base.base_axes - ACROSS).max() < 1e-7
+    for T, true in zip(base.T_Rb_camera, cameras, strict=True):
+        assert T is not None
+        assert (T.inv() * true).rotation.magnitude() < 1e-7
+
+
+def test_opposite_legs_of_a_symmetric_machine_do_not_mislead() -> None:
+    """Half a turn about their line lays both joints and axes, as lines, on themselves."""
+    A, v = SQUARE, np.array([[1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
+    v = v / np.sqrt(2.0)
+    true_A, true_v = away(A, v, seed=3)
+    seen = legs_seen((0, 1, 2, 3), (0, 2), (1, 3))
+    assert len(camera_starts(A[[0, 2]], v[[0, 2]], A[[0, 2]], v[[0, 2]])) == 2
+    joints, cameras = seen_from(true_A, true_v, seen, sigma=1e-5)
+    base = locate_joints_in_base(made_up_base(A, v), joints)
+    assert np.abs(base.A_Rb - true_A).max() < 1e-8
+    assert np.abs(base.base_axes - true_v).max() < 1e-7
+    for T, true in zip(base.T_Rb_camera, cameras, strict=True):
+        assert T is None or (T.inv() * true).rotation.magnitude() < 1e-7
+    assert base.T_Rb_camera[1] is not None  # the first view says which half turn is right
+
+
+def test_where_two_places_of_a_camera_fit_alike_the_view_says_distances_only() -> None:
+    A, v = SQUARE, np.array([[1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
+    v = v / np.sqrt(2.0)
+    seen = legs_seen((0, 1, 2, 3), (0, 2))
+    joints, _ = seen_from(A, v, seen)
+    base = locate_joints_in_base(made_up_base(*away(A, v)), joints)
+    assert np.abs(base.A_Rb - A).max() < 1e-8
+    assert [T is None for T in base.T_Rb_camera] == [False, True]
+
+
+def test_axes_along_the_line_between_two_joints_do_not_place_a_camera() -> None:
+    v = np.tile([1.0, 0.0, 0.0], (4, 1))
+    seen = legs_seen((0, 1, 2, 3), (0, 1))
+    joints, _ = seen_from(SQUARE, v, seen)
+    base = locate_joints_in_base(made_up_base(*away(SQUARE, v)), joints)
+    assert np.abs(base.A_Rb - SQUARE).max() < 1e-8
+    assert [T is None for T in base.T_Rb_camera] == [False, True]
+
+
+def test_joints_in_one_place_are_no_direction() -> None:
+    A = SQUARE.copy()
+    A[3] = A[2]
+    none = np.full((4, 3), np.nan)
+    joints, _ = seen_from(A, none, legs_seen((0, 1, 2, 3), (2, 3)))
+    base = locate_joints_in_base(made_up_base(A, none), joints)
+    assert np.abs(base.A_Rb - A).max() < 1e-8
+    assert [T is None for T in base.T_Rb_camera] == [False, True]
+
+
+def test_an_axis_that_no_view_locates_is_refused_by_name() -> None:
+    joints, _ = seen_from(SQUARE, ACROSS, legs_seen((0, 1, 2, 3), (0, 1, 2)))
+    axis_located = joints.axis_located.copy()
+    axis_located[:, 2] = False
+    with pytest.raises(NotIdentifiable, match=r"those of leg3 can turn.*axes: 3, 2"):
+        locate_joints_in_base(
+            made_up_base(SQUARE, ACROSS), replace(joints, axis_located=axis_located)
+        )
+
+
+def test_views_that_share_one_leg_leave_joints_and_axes_loose() -> None:
+    joints, _ = seen_from(SQUARE, ACROSS, legs_seen((0, 1, 2), (2,), (3,)))
+    with pytest.raises(
+        NotIdentifiable, match=r"those of leg4 can move and the revolute axes of leg4 can turn"
+    ) as refusal:
+        locate_joints_in_base(made_up_base(SQUARE, ACROSS), joints)
+    assert "a revolute axis across the line between them" in str(refusal.value)
+    assert "calibration board" in str(refusal.value)
+
+
+def test_the_covariance_of_step_2_agrees_with_monte_carlo() -> None:
+    seen = legs_seen((0, 1, 2), (1, 2, 3), (0, 3))
+    nominal = made_up_base(SQUARE, ACROSS)
+    unknowns = BaseUnknowns.of(nominal)
+    normalised = []
+    for seed in range(16):
+        joints, _ = seen_from(SQUARE, ACROSS, seen, sigma=1e-3, seed=seed)
+        solution = locate_joints_in_base(nominal, joints).solution
+        error = solution.x[: len(unknowns)] - unknowns.start
+        normalised.append(error @ np.linalg.solve(solution.covariance(), error))
+    assert np.mean(normalised) == pytest.approx(len(unknowns), rel=0.25)
+
+
+def test_derivatives_of_both_criteria_are_those_of_differences() -> None:
+    nominal = made_up_base(*away(SQUARE, ACROSS))
+    seen = legs_seen((0, 1, 2), (1, 2, 3), (0, 3))
+    joints, cameras = seen_from(SQUARE, ACROSS, seen, sigma=1e-2)
+    joints = oriented(nominal, joints)
+    plane = shipped("3-rpr", noise=0.3)
+    in_plane = locate_joints_in_cameras(plane.nominal, plane.axes, plane.measurements)
+    problems = [
+        build_rigid(nominal, joints, [*cameras[:2], None]),
+        build_scalar_products(nominal, joints),
+        build_rigid(plane.nominal, in_plane, [T.inv() for T in plane.T_camera_Rb]),
+    ]
+    for problem in problems:
+        x = problem.start + 0.01 * np.random.default_rng(0).normal(size=len(problem.start))
+        residuals, h = structure_residuals(problem.structure), 1e-6
+        numeric = np.hstack(
+            [
+                (
+                    residuals(x + h * e, problem.observed) - residuals(x - h * e, problem.observed)
+                ).full()
+                / (2.0 * h)
+                for e in np.eye(len(x))
+            ]
+        )
+        found = structure_jacobian(problem.structure)(x, problem.observed).full()
+        assert np.allclose(found, numeric, atol=1e-6 * np.abs(found).max())
+
+
+def test_turns_of_an_axis_are_rotations_about_its_normal_basis_to_second_order() -> None:
+    v = ACROSS[0]
+    basis = normal_basis(v)
+    turns, frame = ca.SX.sym("turns", 2), ca.SX.sym("frame", 3, 3)
+    axis = ca.Function("axis", [turns, frame], [turned_axis(turns, frame)])
+    for size in (1e-3, 1e-2):
+        w = size * np.array([0.6, -0.8])
+        found = axis(w, np.column_stack([v, *basis])).full().ravel()
+        assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-15)
+        assert np.abs(found - Rotation.from_rotvec(w @ basis).apply(v)).max() < size**3
+
+
+# A plane
+
+
+def test_two_joints_of_a_plane_take_their_side_from_the_lengths_of_legs() -> None:
+    observed = shipped("3-rpr")
+    axes, m = observed.axes, observed.measurements
+    some = select_axes(axes, (m.view[axes.row] > 0) | (axes.leg < 2))
+    seen = locate_joints_in_cameras(observed.nominal, some, m)
+    assert seen.sided.tolist() == [True, False, False]  # the others see three joints
+    base = locate_joints_in_base(observed.nominal, seen)
+    for T, true in zip(base.T_Rb_camera, observed.T_camera_Rb, strict=True):
+        assert T is not None
+        assert (T * true).rotation.magnitude() < 1e-7
+
+
+def plane_with_joints_on_a_line(A: Array, B: Array, nominal_A: Array) -> Observed:
+    """Return a 3-RPR whose base joints are nearly collinear, seen from both sides."""
+    rng = np.random.default_rng(0)
+    rows = np.arange(12)
+    R = Rotation.from_rotvec(np.outer(rng.uniform(-0.4, 0.4, 12), [0.0, 0.0, 1.0])).as_matrix()
+    t = np.column_stack([rng.uniform(0.2, 0.5, (12, 2)), np.zeros(12)])
+    legs = np.einsum("nij,kj->nki", R, B) + t[:, None] - A
+    length = np.linalg.norm(legs, axis=2)
+    view, leg = rows // 6, np.tile(np.arange(3), 12)
+    T = [
+        RigidTransform.from_components([-0.4, 0.2, 1.5], Rotation.from_rotvec([2.8, 0.3, 0.1])),
+        RigidTransform.from_components([-0.4, -0.3, 1.4], Rotation.from_rotvec([-0.3, 0.1, 0.4])),
+    ]
+    u, M = legs / length[..., None], np.broadcast_to(A, legs.shape)
+    u = np.array([T[v].rotation.apply(d) for v, d in zip(view, u, strict=True)]).reshape(-1, 3)
+    M = np.array([T[v].apply(p) for v, p in zip(view, M, strict=True)]).reshape(-1, 3)
+    covariance = np.tile(np.diag([1e-6, 1e-6, 1e-8, 1e-8]), (36, 1, 1))
+    nominal, true = (
+        tuple(LegGeometry("R", "R", LegKind.ACTUATED, a, b, 0.1) for a, b in zip(P, B, strict=True))
+        for P in (nominal_A, A)
+    )
+    return Observed(
+        NominalMechanism(("leg1", "leg2", "leg3"), nominal, np.ones(3), (0, 1)),
+        LegAxes(np.repeat(rows, 3), leg, u, M, normal_basis(u), covariance),
+        Measurements(
+            (View("c1", PINHOLE), View("c2", PINHOLE)), ("",) * 12, view, rows, length - 0.1, 2e-6
+        ),
+        true,
+        tuple(T),
+    )
+
+
+def test_collinear_joints_of_a_plane_take_their_side_from_the_platform() -> None:
+    A = np.array([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0], [0.4, 0.002, 0.0]])
+    B = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.1, 0.15, 0.0]])
+    step = np.array([[0.0, 0.0, 0.0], [3e-3, 0.0, 0.0], [0.0, -3e-3, 0.0]])
+    observed = plane_with_joints_on_a_line(A, B, A + step)
+    steps = three_steps(observed)
+    assert steps.joints.sided.all()
+    assert np.abs(steps.base.A_Rb - A).max() < 1e-8
+    assert all(T is not None for T in steps.base.T_Rb_camera)
+
+
+def test_a_plane_without_any_side_is_refused() -> None:
+    """Nothing but the heights of both triangles tells left from right."""
+    A = np.array([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0], [0.4, 0.0, 0.0]])
+    B = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    with pytest.raises(NotIdentifiable, match="those of leg3 can move"):
+        three_steps(plane_with_joints_on_a_line(A, B, A))
+
+
+def test_heights_of_a_plane_stay_nominal() -> None:
+    observed = shipped("3-rpr")
+    heights = np.array([0.0, 0.05, -0.03])
+    u, M, m = observed.axes.u, observed.axes.M.copy(), observed.measurements
+    for k, T in enumerate(observed.T_camera_Rb):
+        here = m.view[observed.axes.row] == k
+        up = T.rotation.apply([0.0, 0.0, 1.0])
+        M[here] += heights[observed.axes.leg[here], None] * up
+    legs = tuple(
+        replace(leg, A=leg.A + np.array([0.0, 0.0, z]))
+        for leg, z in zip(observed.nominal.legs, heights, strict=True)
+    )
+    raised = replace(
+        observed,
+        nominal=replace(observed.nominal, legs=legs),
+        axes=replace(observed.axes, M=M, u=u),
+    )
+    for criteria in ("default", "literal"):
+        steps = three_steps(raised, criteria)
+        assert np.allclose(steps.base.A_Rb[:, 2], heights, atol=0.0)
+        assert np.abs(steps.base.A_Rb[:, :2] - observed.A_Rb[:, :2]).max() < 1e-8
+
+
+# Directions
+
+
+@pytest.mark.parametrize("name", ["3-rps", "3-rpr"])
+def test_being_normal_to_an_axis_improves_the_direction_of_a_leg(name: str) -> None:
+    observed = shipped(name, n_poses=10, noise=0.3)
+    nominal, axes, m = observed.nominal, observed.axes, observed.measurements
+    joints = locate_joints_in_cameras(nominal, axes, m)
+    base = locate_joints_in_base(nominal, joints)
+    known = directions_through_joints(nominal, axes, m, joints, base)
+    assert np.all(np.linalg.eigvalsh(known.covariance)[:, 0] > 0.0)
+    without = replace(joints, axis_located=np.zeros_like(joints.axis_located))
+    legs = tuple(replace(leg, base_joint="S", base_axis=None) for leg in nominal.legs)
+    point_like = replace(nominal, legs=legs)
+    free = directions_through_joints(point_like, axes, m, without, base)
+    off = [np.sum(d.u * observed.v_Rb[d.leg], axis=1) for d in (known, free)]
+    assert np.std(off[0]) < 0.7 * np.std(off[1])
+
+
+def test_an_axis_off_the_plane_of_its_leg_is_found() -> None:
+    observed = shipped("3-rps", n_poses=10, noise=0.1)
+    nominal, axes, m = observed.nominal, observed.axes, observed.measurements
+    joints = locate_joints_in_cameras(nominal, axes, m)
+    base = locate_joints_in_base(nominal, joints)
+    assert not find_misses(axes, m, joints, base).any()
+    A, v = (part[m.view[axes.row[7]], axes.leg[7]] for part in (joints.A_camera, joints.v_camera))
+    turn = Rotation.from_rotvec(0.1 * np.cross(axes.u[7], v))
+    u, M, basis = axes.u.copy(), axes.M.copy(), axes.basis.copy()
+    u[7], M[7], basis[7] = turn.apply(u[7]), A + turn.apply(M[7] - A), turn.apply(basis[7])
+    wrong = find_misses(replace(axes, u=u, M=M, basis=basis), m, joints, base)
+    assert np.flatnonzero(wrong).tolist() == [7]
