@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.dataset.folder import Dataset
-from legcal.geometry.types import IntArray
-from legcal.mechanism.parameters import KinematicParameters
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.observations.canonical_order import Order, inverse
 from legcal.observations.corners import Corners
 from legcal.refinement.held_out import HeldOut
@@ -28,17 +27,17 @@ class Steps:
 
     Attributes
     ----------
-    parameters : KinematicParameters or None
-        None if the steps could not be run to the end.
+    legs : tuple of LegGeometry or None
+        The legs in R_b and R_e; None if the steps could not be run to the end.
     T_Rb_camera : tuple of RigidTransform or None
         The cameras that step 2 places; None as a whole if the steps failed.
     failure : str
         Why they failed; "" if they did not.
     diagnostics : tuple of str
-        What they left out, and why.
+        What they left out or at nominal, and why.
     """
 
-    parameters: KinematicParameters | None
+    legs: tuple[LegGeometry, ...] | None
     T_Rb_camera: tuple[RigidTransform | None, ...] | None
     failure: str
     diagnostics: tuple[str, ...] = ()
@@ -48,7 +47,7 @@ class Steps:
         legs, views = inverse(order.legs), inverse(order.views)
         return replace(
             self,
-            parameters=None if self.parameters is None else _permuted(self.parameters, legs),
+            legs=None if self.legs is None else tuple(self.legs[j] for j in legs.tolist()),
             T_Rb_camera=None
             if self.T_Rb_camera is None
             else tuple(self.T_Rb_camera[v] for v in views.tolist()),
@@ -178,11 +177,4 @@ def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
         False,
         f"Do not load this into the controller: {found}, and a predicted improvement below two "
         "sigma is no improvement; take more images or better ones.",
-    )
-
-
-def _permuted(parameters: KinematicParameters, legs: IntArray) -> KinematicParameters:
-    """Return parameters whose leg k is leg ``legs[k]`` of the given ones."""
-    return KinematicParameters(
-        parameters.base_joints[legs], parameters.platform_joints[legs], parameters.offsets[legs]
     )

@@ -3,8 +3,7 @@
 1. The nominal model and the readings say where each leg is (section 2).
 2. Each view's camera is aligned with what its images show, and the outlines of the legs are
    measured near where they should be (section 3.1).
-3. The four steps give joint centres and offsets (3.2 to 3.5), where they have equations for the
-   machine.
+3. The four steps give joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. One fit of everything, started from the nominal model and from the steps, ends the work.
 5. Photographs in which anything was left in doubt are searched again close to that fit, and 3
    and 4 are repeated.
@@ -32,8 +31,6 @@ from legcal.detection.observe import (
 )
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry.types import IntArray
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries
 from legcal.mechanism.platform import platform_in_base
 from legcal.observations.canonical_order import (
@@ -46,12 +43,10 @@ from legcal.observations.sets import choose_outlines, join_outlines, reject_unus
 from legcal.progress import Report
 from legcal.refinement.refine import refine, refine_from_best
 from legcal.refinement.solution import Solution
-from legcal.refinement.start import Start, start_from, with_joints
+from legcal.refinement.start import Start, start_from
 from legcal.stages.nominal import nominal_mechanism
 from legcal.stages.run import run_steps
 from legcal.workpiece import Workpiece
-
-NO_STEPS = "They have equations for legs with sliders between point-like joints only."
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +171,8 @@ def _fitted_scene(work: Workpiece, solution: Solution) -> Scene:
 
 def _four_steps(work: Workpiece, outlines: Outlines, progress: Report) -> Steps:
     """Return what the four steps give, or why they give nothing: the fit may do without."""
-    if work.criteria is None or not _have_steps(work.mechanism):
-        return Steps(None, None, NO_STEPS)
+    if work.criteria is None:
+        return Steps(None, None, "They were left out.")
     progress("Four steps", 0, 1)
     radii = {part: r for leg in work.mechanism.legs for part, r in leg.radius_of_part.items()}
     try:
@@ -185,20 +180,19 @@ def _four_steps(work: Workpiece, outlines: Outlines, progress: Report) -> Steps:
         if axes is None:
             axes = axes_from_outlines(outlines, work.measurements, radii)
         nominal = nominal_mechanism(work.mechanism)
-        found = run_steps(nominal, axes, work.measurements, criteria=work.criteria)
+        found = run_steps(
+            nominal,
+            axes,
+            work.measurements,
+            criteria=work.criteria,
+            transformation=work.transformation,
+            free_twists=any(name.endswith(".twist") for name in work.choices.free),
+        )
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
     finally:
         progress("Four steps", 1, 1)
-    return Steps(found.parameters, found.T_Rb_camera, "", found.diagnostics)
-
-
-def _have_steps(mechanism: Mechanism) -> bool:
-    """Say whether the four steps have equations for all legs: sliders between point-like joints."""
-    return all(
-        leg.kind is not LegKind.CONSTANT and "S" in leg.type and "R" not in leg.type
-        for leg in mechanism.legs
-    )
+    return Steps(found.legs, found.T_Rb_camera, "", found.diagnostics)
 
 
 def _starts(work: Workpiece, outlines: Outlines, scene: Scene, steps: Steps) -> list[Start]:
@@ -209,9 +203,8 @@ def _starts(work: Workpiece, outlines: Outlines, scene: Scene, steps: Steps) -> 
     rough = [None if T is None else T.inv() * mechanism.T_base_Rb for T in scene.T_base_camera]
     staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
     starts = [(legs, _cameras(work, outlines, rough, staged, steps), "nominal")]
-    if steps.parameters is not None:
-        cameras = _cameras(work, outlines, staged, rough, steps)
-        starts.append((with_joints(legs, steps.parameters), cameras, "staged"))
+    if steps.legs is not None:
+        starts.append((steps.legs, _cameras(work, outlines, staged, rough, steps), "staged"))
     return [
         start_from(legs, work.measurements, work.fitted_legs, cameras, platform, label)
         for legs, cameras, label in starts

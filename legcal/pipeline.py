@@ -32,6 +32,7 @@ from legcal.refinement.settings import DEFAULT_SETTINGS
 from legcal.report.destination import check_destination, output_path
 from legcal.report.result import write_result
 from legcal.stages.nominal import Criteria
+from legcal.stages.platform_pose import Transformation
 from legcal.workers import worker_pool
 from legcal.workpiece import Workpiece, workpiece
 
@@ -44,6 +45,7 @@ def calibrate(
     output: str | Path | None = None,
     progress: Report = no_progress,
     criteria: Criteria = "default",
+    transformation: Transformation | None = None,
     use_cache: bool = True,
     workers: int = 1,
     priors: Mapping[str, tuple[float, float] | str] | Sequence[str] = (),
@@ -63,6 +65,9 @@ def calibrate(
         Called as ``progress(stage, done, total)``.
     criteria : {"default", "literal"}
         What the four steps minimise: legcal's criteria, or the paper's as printed.
+    transformation : {"points", "cross_product"}, optional
+        How they compute where the platform is, eq (18): by point equality, or as printed. By
+        default as the criteria are.
     use_cache : bool
         Use the outlines that an earlier run left beside the dataset, if they still fit.
     workers : int
@@ -117,7 +122,9 @@ def calibrate(
     fitted = dataset_at(dataset, split.fitted)
     left_open = check_identifiable(fitted, choices)
     with worker_pool(workers) as run:
-        work = workpiece(dataset, run, criteria, choices, use_cache=use_cache)
+        work = workpiece(
+            dataset, run, criteria, choices, use_cache=use_cache, transformation=transformation
+        )
         found = observe_and_fit(work, split.fitted, progress)
     notes = [*dataset.notes, *choices.notes, *left_open, *work.keep_outlines(found.outlines)]
     order = found.part.order

@@ -38,6 +38,7 @@ from legcal.refinement.choices import Choices
 from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.start import platform_poses, start_from
 from legcal.stages.nominal import Criteria
+from legcal.stages.platform_pose import Transformation
 from legcal.workers import Run
 
 
@@ -67,6 +68,8 @@ class Workpiece:
         Parameters that are fixed, freed or known.
     every_leg : bool
         Whether every leg must be seen that views say they show.
+    transformation : {"points", "cross_product"} or None
+        How the steps solve (18); None for what their criteria say.
     """
 
     dataset: Dataset
@@ -80,6 +83,7 @@ class Workpiece:
     criteria: Criteria | None
     choices: Choices
     every_leg: bool
+    transformation: Transformation | None = None
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -146,6 +150,7 @@ def workpiece(
     *,
     use_cache: bool,
     every_leg: bool = True,
+    transformation: Transformation | None = None,
 ) -> Workpiece:
     """Put a dataset into the order of work, and see which images are still to be searched.
 
@@ -163,6 +168,8 @@ def workpiece(
         Use the outlines that an earlier run left, if they still fit.
     every_leg : bool
         Whether every leg must be seen that views say they show.
+    transformation : {"points", "cross_product"}, optional
+        How the steps solve (18).
     """
     names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, names)
@@ -180,4 +187,5 @@ def workpiece(
         criteria=criteria,
         choices=choices,
         every_leg=every_leg,
+        transformation=transformation,
     )

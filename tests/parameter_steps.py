@@ -1,13 +1,17 @@
 """Legs with other parameters, and the models that are written of them, for tests."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from legcal.geometry.types import Array
+from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.leg_steps import footed, moved_legs
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
+from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.parametrization import Parametrization, geometries
 from legcal.report.urdf import write_calibrated_yaml, write_urdf
 
@@ -29,3 +33,14 @@ def written_with(
     write_urdf(nominal, legs, folder / "other.urdf")
     write_calibrated_yaml(nominal, folder / "other.yaml", "other.urdf")
     return load_mechanism(folder / "other.yaml")
+
+
+def with_joints(
+    geometry: Sequence[LegGeometry], parameters: KinematicParameters
+) -> tuple[LegGeometry, ...]:
+    """Return legs with other joint centres and offsets; passive legs keep theirs."""
+    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
+    return tuple(
+        replace(leg, A=A, B=B, q0=leg.q0 if np.isnan(q0) else float(q0))
+        for leg, (A, B), q0 in zip(geometry, joints, parameters.offsets, strict=True)
+    )

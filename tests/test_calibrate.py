@@ -107,12 +107,12 @@ def test_a_second_run_reads_the_outlines_and_gives_the_same_result(example_run: 
 def test_the_criteria_as_printed_end_far_away_and_do_not_harm_the_fit(example_run: Run) -> None:
     literal = calibrate(example_run.folder, criteria="literal")
     default = example_run.calibration
-    assert literal.steps.parameters is not None
-    assert default.steps.parameters is not None
+    assert literal.steps.legs is not None
+    assert default.steps.legs is not None
     fitted = default.solution.parameters
     off = [
-        np.abs(steps.base_joints - fitted.base_joints).max()
-        for steps in (default.steps.parameters, literal.steps.parameters)
+        np.abs(np.array([leg.A for leg in legs]) - fitted.base_joints).max()
+        for legs in (default.steps.legs, literal.steps.legs)
     ]
     assert off[1] > 3.0 * off[0]
     assert np.abs(literal.solution.parameters.base_joints - fitted.base_joints).max() < 1e-9

@@ -64,7 +64,7 @@ def test_the_result_is_right_by_its_own_sigmas(run: tuple[Path, Machine, Calibra
 
 
 def test_the_four_steps_run_on_the_axes_too(run: tuple[Path, Machine, Calibration]) -> None:
-    assert run[2].steps.parameters is not None
+    assert run[2].steps.legs is not None
 
 
 def test_the_result_has_residuals_of_axes_and_no_outlines(

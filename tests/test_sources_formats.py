@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mechanism_formats import FORMATS, mjcf, numbers, with_loops_at_joints, write_format
+from parameter_steps import with_joints
 
 from legcal import load_mechanism
 from legcal.cli import main
@@ -15,7 +16,6 @@ from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries
-from legcal.refinement.start import with_joints
 from legcal.report.model_files import write_model
 from legcal.report.urdf import reload_and_check, write_calibrated_yaml, write_urdf
 

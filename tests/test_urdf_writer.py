@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mechanisms import LAYOUTS, SHIPPED_URDF, SHIPPED_YAML, Layout, geometry, moved, write_hexapod
+from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass
@@ -15,7 +16,6 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.parametrization import geometries
-from legcal.refinement.start import with_joints
 from legcal.report.leg_origins import moved_origins
 from legcal.report.urdf import (
     check_closes,

@@ -23,6 +23,13 @@ class Criteria(StrEnum):
     LITERAL = "literal"
 
 
+class Transformation(StrEnum):
+    """How the four steps compute where the platform is, eq (18)."""
+
+    POINTS = "points"
+    CROSS_PRODUCT = "cross_product"
+
+
 _TESTS = "Tests of a result"
 _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeated"
 
@@ -40,6 +47,13 @@ def calibrate(
         Criteria,
         typer.Option(help="What the four steps minimise: legcal's criteria, or the paper's."),
     ] = Criteria.DEFAULT,
+    transformation: Annotated[
+        Transformation | None,
+        typer.Option(
+            help="How they find the platform, eq (18): point equality, or as printed. By default "
+            "as the criteria are."
+        ),
+    ] = None,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Detect again, even where a cached detection fits.")
     ] = False,
@@ -128,6 +142,7 @@ def calibrate(
             output=output,
             progress=progress,
             criteria=criteria.value,
+            transformation=None if transformation is None else transformation.value,
             use_cache=not fresh,
             workers=min(processors(), MOST_WORKERS),
             priors=prior or (),

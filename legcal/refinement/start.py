@@ -12,7 +12,6 @@ from legcal.errors import DatasetError
 from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.leg_steps import turn_of
-from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.parametrization import tied_twist
 from legcal.mechanism.sensitivity import freedoms
 from legcal.observations.measurements import Measurements
@@ -81,17 +80,6 @@ def start_from(
     lengths = legs.sign * measurements.q[measurements.first_rows] + q0
     poses = platform_poses(geometry, lengths, T_Rb_Re, legs.frame_legs)
     return Start(tuple(geometry), tuple(T_camera_Rb), poses, label)
-
-
-def with_joints(
-    geometry: Sequence[LegGeometry], parameters: KinematicParameters
-) -> tuple[LegGeometry, ...]:
-    """Return legs with other joint centres and offsets; passive legs keep theirs."""
-    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
-    return tuple(
-        replace(leg, A=A, B=B, q0=leg.q0 if np.isnan(q0) else float(q0))
-        for leg, (A, B), q0 in zip(geometry, joints, parameters.offsets, strict=True)
-    )
 
 
 def with_values(

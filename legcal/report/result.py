@@ -196,12 +196,7 @@ def _cameras(calibration: Calibration) -> dict[str, Any]:
 def _steps(calibration: Calibration) -> dict[str, Any]:
     """Return what the four steps gave, or why they gave nothing."""
     steps = calibration.steps
-    if steps.parameters is None:
+    if steps.legs is None:
         return {"failure": steps.failure}
-    found = steps.parameters
-    return {
-        "base_joints": found.base_joints.tolist(),
-        "platform_joints": found.platform_joints.tolist(),
-        "offsets": [None if np.isnan(q0) else q0 for q0 in found.offsets.tolist()],
-        "diagnostics": list(steps.diagnostics),
-    }
+    names = calibration.dataset.mechanism.leg_names
+    return {**_geometry(names, steps.legs), "diagnostics": list(steps.diagnostics)}

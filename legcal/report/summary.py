@@ -12,11 +12,9 @@ from rich.text import Text
 
 from legcal.calibration import Calibration
 from legcal.mechanism.parameter_words import describe_direction
-from legcal.mechanism.parametrization import geometries
 from legcal.mechanism.platform import pose_differences
 from legcal.refinement.platform_accuracy import poses_at_readings
 from legcal.refinement.platform_error import PlatformError
-from legcal.refinement.start import with_joints
 from legcal.report.board_report import board_lines
 from legcal.report.held_out_report import held_out_lines
 from legcal.report.parameter_rows import ParameterRow, parameter_rows
@@ -98,16 +96,18 @@ def _observation_line(calibration: Calibration) -> str:
 
 def _steps_line(calibration: Calibration) -> str:
     steps = calibration.steps
-    if steps.parameters is None:
+    if steps.legs is None:
         return f"The four steps alone gave no result: {steps.failure}"
-    left_out = f" They left out {len(steps.diagnostics)} axes or joints." * bool(steps.diagnostics)
+    left_out = (
+        f" They left out or at nominal {len(steps.diagnostics)} axes, joints or directions."
+        * bool(steps.diagnostics)
+    )
     if calibration.platform is None:
         return f"The four steps alone gave a result.{left_out}"
     mechanism, measurements = calibration.dataset.mechanism, calibration.dataset.measurements
     near, q = calibration.solution.T_Rb_Re, measurements.q[measurements.first_rows]
-    staged = with_joints(geometries(mechanism), steps.parameters)
     displacement, rotation = pose_differences(
-        poses_at_readings(mechanism, staged, q, near),
+        poses_at_readings(mechanism, steps.legs, q, near),
         poses_at_readings(mechanism, calibration.solution.legs, q, near),
     )
     return (

@@ -32,6 +32,7 @@ from legcal.stages.platform_unknowns import (
 )
 
 _LARGEST_SIGMA = 0.1  # of the mean leg length, or [rad]: what is known worse is not determined
+_NEAR = 0.03  # [rad], how far axes may be from the nominal ones, about
 _HARMLESS = 0.01  # of the change of the parameters: the platform hardly moves
 _TURNS = slice(7, 12)  # of both axes, and the twist: places among the numbers of a leg
 _STEP = 1e-6  # [rad], of differences
@@ -136,13 +137,13 @@ def closure_turns(unknowns: PlatformUnknowns) -> IntArray:
 
 
 def near_nominal(index: IntArray) -> tuple[Term, ...]:
-    """Return residuals that keep turns from nominal axes, by their places, at a tenth of a radian.
+    """Return residuals that keep turns from nominal axes, by their places, near zero.
 
     Poses that leave them open let them go anywhere, to where the platform moves otherwise.
     """
     if not len(index):
         return ()
-    rows = np.full((len(index), 1), 1.0 / _LARGEST_SIGMA)
+    rows = np.full((len(index), 1), 1.0 / _NEAR)
     return (Term(_projection(1), index[:, None], (rows, np.zeros(len(index)))),)
 
 
