@@ -24,7 +24,7 @@ SINGULAR = 1e-9  # of the largest singular value: what is below is open
 _SMALL = 1e-12  # [m / length, rad]
 _SAME_FACTOR = 1e-7
 _HALVINGS = 12
-_ROUNDING = 1e-9  # of a sum of squares
+_WORSE = 1e-3  # a sum of squares may become before a step is halved
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +123,11 @@ def _most_likely(
     """Return the frames after Gauss-Newton, variances held; steps that do not help are halved."""
     y, A = system(pairs, frames, noise, motions)
     for _ in range(STEPS):
-        found = _least_squares(A, y)
-        step, left = found[:N_FRAME], y - A[:, N_FRAME:] @ found[N_FRAME:]
+        step, before = _least_squares(A, y)[:N_FRAME], _profile(A, y)
         for _ in range(_HALVINGS):
             tried = frames.moved(step * pairs.scale)
             y_tried, A_tried = system(pairs, tried, noise, motions)
-            left_tried = y_tried - A_tried[:, N_FRAME:] @ found[N_FRAME:]
-            if left_tried @ left_tried <= (1.0 + _ROUNDING) * (left @ left) + _ROUNDING:
+            if _profile(A_tried, y_tried) <= (1.0 + _WORSE) * before + _WORSE:
                 break
             step = 0.5 * step
         frames, y, A = tried, y_tried, A_tried
@@ -139,6 +137,13 @@ def _most_likely(
         "The frames could not be found: the fit still moved after "
         f"{STEPS} steps, needed a minimum; check that readings and poses belong together."
     )
+
+
+def _profile(A: Array, y: Array) -> float:
+    """Return the sum of squares at some frames, the likeliest errors of the model taken out."""
+    E = A[:, N_FRAME:]
+    left = y - E @ np.linalg.lstsq(E, y, rcond=None)[0] if E.shape[1] else y
+    return float(left @ left)
 
 
 def _typical(A: Array) -> float:
@@ -155,15 +160,27 @@ def system(
     pairs: PosePairs, frames: Frames, noise: Noise, motions: PlatformMotions | None = None
 ) -> tuple[Array, Array]:
     """Return whitened residuals and their design, priors of errors of the model below."""
-    W = noise.whitening(pairs.oriented)
-    y = (W @ residuals(frames, pairs)[:, :, None]).ravel()
-    A = (W @ (jacobian(frames, pairs) * pairs.scale)).reshape(-1, N_FRAME)
-    if motions is None:
+    return _whitened(*_unweighted(pairs, frames, motions), noise.whitening(pairs.oriented))
+
+
+def _unweighted(
+    pairs: PosePairs, frames: Frames, motions: PlatformMotions | None
+) -> tuple[Array, Array]:
+    """Return residuals (n, 6) and their design (n, 6, 12 + k)."""
+    design = jacobian(frames, pairs) * pairs.scale
+    if motions is not None:
+        design = np.concatenate([design, motions.of_tool(frames, pairs)], axis=2)
+    return residuals(frames, pairs), design
+
+
+def _whitened(r: Array, design: Array, W: Array) -> tuple[Array, Array]:
+    """Return residuals and design in standard deviations, with the priors below."""
+    y, A = (W @ r[:, :, None]).ravel(), (W @ design).reshape(r.size, -1)
+    k = A.shape[1] - N_FRAME
+    if k == 0:
         return y, A
-    E = (W @ motions.of_tool(frames, pairs)).reshape(len(y), -1)
-    k = E.shape[1]
     priors = np.hstack([np.zeros((k, N_FRAME)), np.eye(k)])
-    return np.concatenate([y, np.zeros(k)]), np.vstack([np.hstack([A, E]), priors])
+    return np.concatenate([y, np.zeros(k)]), np.vstack([A, priors])
 
 
 def variances(
@@ -178,13 +195,13 @@ def variances(
     factor, dof = noise.factor, np.zeros(2)
     base = np.repeat(noise.sigma, 3, axis=1)
     floor = noise.floor
+    raw = _unweighted(pairs, frames, motions)
     for _ in range(REML_STEPS):
-        current = noise.scaled(factor)
-        y, A = system(pairs, frames, current, motions)
+        W = noise.scaled(factor).whitening(pairs.oriented)
+        y, A = _whitened(*raw, W)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
         U = U[:, s > SINGULAR * s[0]]
         left = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
-        W = current.whitening(pairs.oriented)
         back = np.swapaxes(W, 1, 2)
         Py = (back @ left[:, :, None])[:, :, 0] * base
         spread = back @ U[: base.size].reshape(*base.shape, -1) * base[:, :, None]

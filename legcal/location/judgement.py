@@ -199,7 +199,8 @@ def _sentence(
         )
     start = "Base and tool are located" + " in part" * bool(determined.held)
     return (
-        f"{start} from {rows}: the base in the world to {base}{tool} (1 sigma)."
+        f"{start} from {rows}: the base in the world to {base}{tool} "
+        f"(1 sigma{'' if problem.by_model is not None else ', if the model is right'})."
         f"{' ' * bool(determined.words)}{determined.words}{out}"
     )
 
@@ -216,9 +217,9 @@ def _notes(
     notes = [*problem.poses.notes, *determined.weak]
     if problem.by_model is None:
         notes.append(
-            "Nothing is known of the errors of the model: what they do differently from pose to "
-            "pose is in the residuals, and what they do to all poses alike in no standard "
-            "deviation."
+            "Nothing is known of the errors of the model, which move all poses at once: the "
+            "standard deviations hold for a model without errors; locate the model in the folder "
+            "of its calibration, or state how precise the measurement is to have it tested."
         )
     if int(agreement.agrees.sum()) == problem.fewest:
         notes.append(

@@ -245,9 +245,8 @@ def _are_one(one: Frames, other: Frames, length: float) -> bool:
 
 def _apart(one: Frames, other: Frames) -> tuple[float, float]:
     """Return how far the frames of two answers are apart, the worse of base and tool [m, rad]."""
-    (base, tool), (other_base, other_tool) = one.transforms(), other.transforms()
-    differences = [base.inv() * other_base, tool.inv() * other_tool]
-    return (
-        max(float(np.linalg.norm(T.translation)) for T in differences),
-        max(float(T.rotation.magnitude()) for T in differences),
-    )
+    shifts = (one.t_base - other.t_base, one.t_tool - other.t_tool)
+    # The matrices of two orientations are sqrt(8) sin(turn / 2) apart.
+    chords = (one.R_base - other.R_base, one.R_tool - other.R_tool)
+    half = min(1.0, max(float(np.linalg.norm(chord)) for chord in chords) / np.sqrt(8.0))
+    return max(float(np.linalg.norm(shift)) for shift in shifts), 2.0 * float(np.arcsin(half))

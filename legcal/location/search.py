@@ -28,12 +28,12 @@ from legcal.location.pose_pairs import (
     stacked,
 )
 
-MOST_ROWS = 60  # that starts are tried on
-SUBSETS = 40
+MOST_ROWS = 40  # that starts are tried on
+SUBSETS = 30
 SUBSET = 4  # rows
 AT_FIRST = 8  # steps on the rows that a start came from, and for all starts
 MOST_PROMISING = 12  # starts that go on
-STEPS = 60
+STEPS = 30
 _SETTLED = 1e-9  # relative change of the cost
 
 
@@ -89,7 +89,8 @@ def _starts(pairs: PosePairs, fewest: int, *, robust: bool) -> tuple[Frames, Boo
     chance = np.random.default_rng(0)
     everywhere = Rotation.create_group("O").as_matrix()
     everything = np.ones(n, dtype=np.bool_)
-    found = [with_positions(R, tool_orientation(R, pairs), pairs) for R in everywhere]
+    batch = with_positions(everywhere, tool_orientation(everywhere, pairs), pairs)
+    found = [batch.at(i) for i in range(len(everywhere))]
     rows: list[BoolArray] = [everything] * len(found)
     if pairs.oriented.any():
         closed = [solve_by_opencv(pairs), solve_by_kronecker(pairs)]
