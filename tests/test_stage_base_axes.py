@@ -82,7 +82,7 @@ def test_all_legs_of_a_planar_mechanism_have_one_normal_in_a_view() -> None:
 def test_weights_make_joints_far_better_axes_no_worse_and_their_covariance_true(name: str) -> None:
     squares: dict[str, list[Array]] = {"default": [], "literal": []}
     normalised = []
-    for seed in range(4):
+    for seed in range(3):
         observed = shipped(name, n_poses=10, noise=0.2, seed=seed)
         nominal, axes, m = observed.nominal, observed.axes, observed.measurements
         weighted = locate_joints_in_cameras(nominal, axes, m)
@@ -262,12 +262,12 @@ def test_the_covariance_of_step_2_agrees_with_monte_carlo() -> None:
     nominal = made_up_base(SQUARE, ACROSS)
     unknowns = BaseUnknowns.of(nominal)
     normalised = []
-    for seed in range(16):
+    for seed in range(10):
         joints, _ = seen_from(SQUARE, ACROSS, seen, sigma=1e-3, seed=seed)
         solution = locate_joints_in_base(nominal, joints).solution
         error = solution.x[: len(unknowns)] - unknowns.start
         normalised.append(error @ np.linalg.solve(solution.covariance(), error))
-    assert np.mean(normalised) == pytest.approx(len(unknowns), rel=0.25)
+    assert np.mean(normalised) == pytest.approx(len(unknowns), rel=0.3)
 
 
 def test_derivatives_of_both_criteria_are_those_of_differences() -> None:

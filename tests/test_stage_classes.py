@@ -17,6 +17,7 @@ from legcal.stages.joints_in_camera import locate_joints_in_cameras
 from legcal.stages.nominal import Criteria
 
 FULL_RANK = ("3-rpr", "3-spr", "3-upu-tilted")  # of (9): in a plane, or three joints and no axis
+LIKE_HEXAPOD = ("nategh-agheli", "6-sps", "hexapod-strut")
 EVEN = ("3-rps", "tricept", "hexapod-rod")
 
 
@@ -37,7 +38,9 @@ def offset_error(observed: Observed, steps: Steps) -> float:
     return float(np.nanmax(np.abs(steps.offsets.q0 - q0)))
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LIKE_HEXAPOD else n for n in SHIPPED]
+)
 def test_exact_outlines_give_joints_axes_cameras_and_offsets_from_3_mm_and_1_degree(
     name: str,
 ) -> None:
@@ -82,7 +85,11 @@ def test_the_ranks_of_9_tell_for_which_machines_it_is_exact() -> None:
 
 
 VIEWS = [
-    ("hexapod-rod", ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))),
+    pytest.param(
+        "hexapod-rod",
+        ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5)),
+        marks=pytest.mark.slow,
+    ),
     ("hexapod", ((0, 1, 2, 3), (3, 4, 5))),
     ("3-rpr", ((0, 1, 2),)),
     ("3-rpr", ((0, 1), (1, 2), (0, 2))),
@@ -90,7 +97,7 @@ VIEWS = [
     ("3-rps", ((0, 1, 2), (0, 1))),
     ("3-rps", ((0, 1), (1, 2), (0, 2))),
     ("3-rps", ((0, 1), (1, 2))),
-    ("tricept", ((0, 1, 2, 3),)),
+    pytest.param("tricept", ((0, 1, 2, 3),), marks=pytest.mark.slow),
     ("tricept", ((0, 1, 2), (1, 2, 3))),
 ]
 
