@@ -17,16 +17,19 @@ from legcal.refinement.legs import FittedLegs
 from legcal.refinement.solution import Solution
 from legcal.studies import bound as bound_study
 from legcal.studies import convergence as convergence_study
-from legcal.studies.bound import BoundStudy
-from legcal.studies.bound_statistics import BoundStatistics, RunErrors, Tally, band_of_ratio
+from legcal.studies.bound import BoundJudge
+from legcal.studies.bound_record import RunErrors, errors_record
+from legcal.studies.bound_statistics import BoundStatistics, BoundTally
 from legcal.studies.closed_poses import closed_poses, unmeasured
-from legcal.studies.convergence import ConvergenceStudy
+from legcal.studies.convergence import ConvergenceJudge
 from legcal.studies.outline_bound import Bound, bound_of
 from legcal.studies.outline_design import OutlineDesign, design_of
 from legcal.studies.outline_estimate import errors_of, nominal_start, one_fit
 from legcal.studies.outline_experiment import OutlineExperiment
+from legcal.studies.outline_figures import band_of_ratio
 from legcal.studies.outline_machines import MACHINES
 from legcal.studies.outline_session import Noise, OutlineSession, StartErrors, draw_session
+from legcal.studies.outline_study import OutlineStudy
 from legcal.studies.runner import run_study
 from legcal.studies.workers import child_seed
 
@@ -75,15 +78,15 @@ def _statistics(
     """Return the statistics of a Gaussian estimator, so many times worse than the bound."""
     bound, rng = _correlated(), np.random.default_rng(seed)
     root, inverse = np.linalg.cholesky(bound.covariance), np.linalg.inv(bound.covariance)
-    tally, n = Tally("synthetic", bound), len(bound.names)
+    tally, n = BoundTally("synthetic", bound), len(bound.names)
     for _ in range(n_runs):
         error = worse * root @ rng.normal(size=n)
         error[3] += bias * bound.sigma[3]
         nse = float(error @ inverse @ error) / n / stated**2
-        tally.add(RunErrors(error, error / bound.sigma / stated, nse))
+        tally.add(errors_record(RunErrors(error, error / bound.sigma / stated, nse)))
     for _ in range(failures):
-        tally.add("DidNotConverge")
-    return tally.statistics()
+        tally.add({"failure": {"kind": "DidNotConverge", "message": "It did not."}})
+    return tally.found()
 
 
 def test_an_estimator_at_the_bound_meets_all_limits() -> None:
@@ -259,7 +262,7 @@ def test_the_start_is_the_nominal_model_at_the_readings(machine: str) -> None:
 def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the study of the bound once, with a few runs."""
     folder = tmp_path_factory.mktemp("study") / "bound"
-    run_study(BoundStudy(_small(bound_study.ERRORS)), 3, output=folder)
+    run_study(OutlineStudy(BoundJudge(), _small(bound_study.ERRORS)), 3, output=folder)
     return folder
 
 
@@ -284,7 +287,7 @@ def test_a_study_of_the_bound_goes_on_where_it_was(output: Path) -> None:
     lines = (output / "runs.jsonl").read_text().splitlines(keepends=True)
     (output / "runs.jsonl").write_text("".join(lines[:2]))
     before = (output / "study.json").read_bytes()
-    study = BoundStudy(_small(bound_study.ERRORS))
+    study = OutlineStudy(BoundJudge(), _small(bound_study.ERRORS))
     result = run_study(study, 3, output=output)
     assert (output / "runs.jsonl").read_text().splitlines(keepends=True) == lines
     assert (output / "study.json").read_bytes() == before
@@ -293,16 +296,16 @@ def test_a_study_of_the_bound_goes_on_where_it_was(output: Path) -> None:
     for words in ("each/bound", "3 runs are too few", "at the bound"):
         assert words in told
     with pytest.raises(UsageError, match="other settings"):
-        run_study(BoundStudy(_small(FAR)), 3, output=output)
+        run_study(OutlineStudy(BoundJudge(), _small(FAR)), 3, output=output)
 
 
 def test_the_session_of_a_machine_does_not_depend_on_the_others(output: Path) -> None:
     line = json.loads((output / "runs.jsonl").read_text().splitlines()[2])
-    both = BoundStudy(_small(bound_study.ERRORS, ("3-upu-tilted", "3-rpr")))
+    both = OutlineStudy(BoundJudge(), _small(bound_study.ERRORS, ("3-upu-tilted", "3-rpr")))
     record = both.one_run(child_seed(0, 1))
     assert record["3-rpr"] == line["record"]["3-rpr"]
     assert both.is_record(record)
-    study = BoundStudy(_small(bound_study.ERRORS))
+    study = OutlineStudy(BoundJudge(), _small(bound_study.ERRORS))
     assert study.is_record(line["record"])
     errors = line["record"]["3-rpr"]
     wrongs: tuple[object, ...] = (
@@ -323,8 +326,8 @@ def test_a_fit_that_fails_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
         raise DidNotConverge("It did not.")
 
     for module, study in (
-        (bound_study, BoundStudy(_small(bound_study.ERRORS))),
-        (convergence_study, ConvergenceStudy(_small(FAR))),
+        (bound_study, OutlineStudy(BoundJudge(), _small(bound_study.ERRORS))),
+        (convergence_study, OutlineStudy(ConvergenceJudge(), _small(FAR))),
     ):
         monkeypatch.setattr(module, "one_fit", fails)
         result = run_study(study, 2)
@@ -345,7 +348,7 @@ def test_a_parameter_that_was_not_estimated_is_a_failure() -> None:
 def test_convergence_counts_the_truth_as_right_and_another_answer_as_wrong(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    study = ConvergenceStudy(_small(FAR))
+    study = OutlineStudy(ConvergenceJudge(), _small(FAR))
     result = run_study(study, 2, output=tmp_path / "out")
     (found,) = result.document()["machines"]
     assert (found["right"], found["wrong"], found["refused"]) == (2, 0, 0)

@@ -13,6 +13,8 @@ from legcal.cli.output import print_json, print_table
 from legcal.processors import processors
 
 if TYPE_CHECKING:
+    from legcal.studies.outline_experiment import OutlineExperiment
+    from legcal.studies.outline_study import F, Judge, OutlineStudy
     from legcal.studies.study import Study
 
 RunsOption = Annotated[int, typer.Option(help="Number of runs.")]
@@ -66,6 +68,14 @@ MachineOption = Annotated[
         "without it.",
     ),
 ]
+ModelOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--machine",
+        metavar="NAME",
+        help="The name of a shipped model; may be repeated, all without it.",
+    ),
+]
 
 
 @study.command()
@@ -78,10 +88,9 @@ def bound(
     as_json: JsonOption = False,
 ) -> None:
     """Compare the errors of a calibration, and its sigmas, with the Cramer-Rao bound."""
-    from legcal.studies.bound import EXPERIMENT, BoundStudy
+    from legcal.studies.bound import EXPERIMENT, BoundJudge
 
-    chosen = replace(EXPERIMENT, machines=tuple(machine)) if machine else EXPERIMENT
-    _run(BoundStudy(chosen), runs, seed, workers, output, as_json=as_json)
+    _run(_outlines(BoundJudge(), EXPERIMENT, machine), runs, seed, workers, output, as_json=as_json)
 
 
 @study.command()
@@ -94,10 +103,36 @@ def convergence(
     as_json: JsonOption = False,
 ) -> None:
     """Count where calibrations end that start 5 mm and 3 deg off in everything."""
-    from legcal.studies.convergence import EXPERIMENT, ConvergenceStudy
+    from legcal.studies.convergence import EXPERIMENT, ConvergenceJudge
 
-    chosen = replace(EXPERIMENT, machines=tuple(machine)) if machine else EXPERIMENT
-    _run(ConvergenceStudy(chosen), runs, seed, workers, output, as_json=as_json)
+    chosen = _outlines(ConvergenceJudge(), EXPERIMENT, machine)
+    _run(chosen, runs, seed, workers, output, as_json=as_json)
+
+
+@study.command()
+def classes(
+    runs: RunsOption = 200,
+    machine: ModelOption = None,
+    seed: SeedOption = 0,
+    workers: WorkersOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate every shipped machine, by the four steps and by the fit, beside the bound."""
+    from legcal.studies.classes import EXPERIMENT, ClassesJudge
+
+    chosen = _outlines(ClassesJudge(), EXPERIMENT, machine)
+    _run(chosen, runs, seed, workers, output, as_json=as_json)
+
+
+def _outlines(
+    judge: Judge[F], experiment: OutlineExperiment, machines: list[str] | None
+) -> OutlineStudy[F]:
+    """Return the study of a judge, on the machines that were asked for or on all."""
+    from legcal.studies.outline_study import OutlineStudy
+
+    chosen = replace(experiment, machines=tuple(machines)) if machines else experiment
+    return OutlineStudy(judge, chosen)
 
 
 def _run(

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
 import numpy as np
 
-from legcal.studies.bound_statistics import RunErrors
+from legcal.geometry.types import Array
 from legcal.studies.checkpoint_lines import is_failure
 from legcal.studies.paper_record import has_keys
 from legcal.studies.study import Record
+
+
+@dataclass(frozen=True, eq=False)
+class RunErrors:
+    """The errors of one run.
+
+    Attributes
+    ----------
+    error : (n,) array
+        Of the parameters, axes as angles from the true ones [m, rad].
+    of_sigma : (n,) array
+        The same over the standard deviations that the estimator states.
+    nse : float
+        Normalised squared error per parameter by the covariance that it states.
+    """
+
+    error: Array
+    of_sigma: Array
+    nse: float
 
 
 def errors_record(errors: RunErrors) -> Record:
@@ -22,10 +42,8 @@ def errors_record(errors: RunErrors) -> Record:
     }
 
 
-def run_errors(record: Record) -> RunErrors | str:
-    """Return the errors of a record, or the kind of error with which its run failed."""
-    if "failure" in record:
-        return str(record["failure"]["kind"])
+def run_errors(record: Record) -> RunErrors:
+    """Return the errors of the record of a fit that ended."""
     return RunErrors(np.array(record["error"]), np.array(record["of_sigma"]), record["nse"])
 
 

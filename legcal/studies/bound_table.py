@@ -8,7 +8,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from legcal.studies.bound_statistics import BoundStatistics, Figure
+from legcal.studies.bound_statistics import BoundStatistics
+from legcal.studies.outline_figures import figure_remarks
 
 COLUMNS = ("runs", "each/bound", "all/bound", "nse", "covered", "verdict")
 
@@ -55,19 +56,4 @@ def remarks(found: BoundStatistics) -> list[str]:
         f"{found.machine}: 99.9 % of all ratios of {found.n} runs are within {low:.3f} to "
         f"{high:.3f} at the bound; {told}."
     )
-    said += [_missed(found.machine, figure) for figure in found.pooled if not figure.is_met]
-    few = [figure.name for figure in found.pooled if figure.by_chance]
-    if few:
-        said.append(
-            f"{found.machine}: {found.n} runs are too few for the limits of {', '.join(few)}; "
-            "those of chance are taken."
-        )
-    return said
-
-
-def _missed(machine: str, figure: Figure) -> str:
-    """Return that a figure is outside its limits."""
-    return (
-        f"{machine}: {figure.name} is {figure.value:.4f}, outside {figure.low:.4f} to "
-        f"{figure.high:.4f}."
-    )
+    return said + figure_remarks(found.machine, found.n, found.pooled)

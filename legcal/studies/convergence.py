@@ -7,73 +7,60 @@ error. What is left is wrong with a small sigma: nothing is worse.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legcal.studies.convergence_outcomes import ConvergenceTally
+from legcal.studies.convergence_outcomes import ConvergenceTally, Outcomes
 from legcal.studies.convergence_record import fit_record, is_outcome
-from legcal.studies.convergence_summary import ConvergenceSummary
 from legcal.studies.outline_design import OutlineDesign
 from legcal.studies.outline_estimate import errors_of, one_fit
 from legcal.studies.outline_experiment import OutlineExperiment
 from legcal.studies.outline_platform import platform_misses, predicted_misses
 from legcal.studies.outline_session import OutlineSession, StartErrors
-from legcal.studies.paper_record import has_keys
 from legcal.studies.study import Record
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 ERRORS = StartErrors(0.005, float(np.deg2rad(3.0)), 0.005, float(np.deg2rad(3.0)), full=True)
 EXPERIMENT = OutlineExperiment(ERRORS)
 
 
 @dataclass(frozen=True)
-class ConvergenceStudy:
-    """Fits from nominal models and camera poses that are wrong in everything.
+class ConvergenceJudge:
+    """Asks where fits end from nominal models and camera poses that are wrong in everything."""
 
-    Attributes
-    ----------
-    experiment : OutlineExperiment
-        The calibrations.
-    """
+    name: str = "convergence"
 
-    experiment: OutlineExperiment = EXPERIMENT
-
-    @property
-    def name(self) -> str:
-        """Its name on the command line."""
-        return "convergence"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Everything that decides a run beside its seed."""
-        return self.experiment.settings
-
-    def one_run(self, seed: np.random.SeedSequence) -> Record:
-        """Return where the fit of one session of every machine ends."""
-        return self.experiment.judged(seed, self._fit)
-
-    def is_record(self, found: Any) -> bool:
-        """Return whether a document says where the fit of every machine ended."""
-        machines = set(self.experiment.machines)
-        return has_keys(found, machines) and all(map(is_outcome, found.values()))
-
-    def summary(self, records: Iterable[Record]) -> ConvergenceSummary:
-        """Return how many fits were right, refused and wrong."""
-        tallies = {machine: ConvergenceTally(machine) for machine in self.experiment.machines}
-        for record in records:
-            for machine, tally in tallies.items():
-                tally.add(record[machine])
-        found = tuple(tally.outcomes() for tally in tallies.values())
-        return ConvergenceSummary(found, self.experiment.readings)
-
-    def _fit(self, design: OutlineDesign, session: OutlineSession) -> Record:
+    def record(
+        self, experiment: OutlineExperiment, design: OutlineDesign, session: OutlineSession
+    ) -> Record:
         """Return where the fit of a session ends."""
-        solution = one_fit(session, self.experiment.noise.radius_sigma)
+        solution = one_fit(session, experiment.noise.radius_sigma)
         return fit_record(
             float(np.abs(errors_of(design, session, solution).of_sigma).max()),
             platform_misses(design, session.nominal),
             platform_misses(design, solution.legs),
             predicted_misses(design, solution),
         )
+
+    def is_record(self, found: Any) -> bool:
+        """Return whether a document says where a fit ended."""
+        return is_outcome(found)
+
+    def tally(self, experiment: OutlineExperiment, machine: str) -> ConvergenceTally:
+        """Return what counts right, refused and wrong fits of a machine."""
+        return ConvergenceTally(machine)
+
+    def table(self, found: Sequence[Outcomes], readings: Sequence[str]) -> RenderableType:
+        """Return one row a machine."""
+        from legcal.studies.convergence_table import convergence_table
+
+        return convergence_table(found, readings)
+
+    def files(self, found: Sequence[Outcomes], readings: Sequence[str]) -> dict[str, bytes]:
+        """Return nothing: there is no figure."""
+        return {}

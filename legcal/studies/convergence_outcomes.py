@@ -97,7 +97,7 @@ class ConvergenceTally:
         else:
             self._wrong += 1
 
-    def outcomes(self) -> Outcomes:
+    def found(self) -> Outcomes:
         """Return where they ended."""
         before, after, predicted = np.sqrt(self._squares / max(self._right + self._wrong, 1))
         return Outcomes(

@@ -56,6 +56,24 @@ def bound_of(design: OutlineDesign, sigma_q: float, radius_sigma: float) -> Boun
 
     Parameters
     ----------
+    design, sigma_q, radius_sigma
+        As in :func:`information_of`.
+
+    Raises
+    ------
+    NotIdentifiable
+        If the data do not determine a parameter.
+    """
+    rows = information_of(design, sigma_q, radius_sigma)
+    units = (*design.parametrization.units, *("m" for _ in design.parts))
+    return Bound(design.names, units, _inverse(rows, design.names))
+
+
+def information_of(design: OutlineDesign, sigma_q: float, radius_sigma: float) -> Array:
+    """Return what all outlines, all readings and what is known of the radii say of a machine.
+
+    Parameters
+    ----------
     design : OutlineDesign
         What is measured.
     sigma_q : float
@@ -63,21 +81,20 @@ def bound_of(design: OutlineDesign, sigma_q: float, radius_sigma: float) -> Boun
     radius_sigma : float
         Standard deviation of what is known of a radius, as a part of it.
 
-    Raises
-    ------
-    NotIdentifiable
-        If the data do not determine a parameter.
+    Returns
+    -------
+    (m, n) array
+        Whitened rows: their squares are the Fisher matrix of the kinematic parameters and then the
+        radii, cameras and poses unknown [1/m], [1/rad].
     """
-    parametrization, parts = design.parametrization, design.parts
-    n_cameras, n_parameters = 6 * len(design.T_Rb_camera), len(parametrization)
+    parts = design.parts
+    n_cameras, n_parameters = 6 * len(design.T_Rb_camera), len(design.parametrization)
     rows = [*_rows_of_poses(design, sigma_q)]
     known = np.zeros((len(parts), n_cameras + n_parameters + len(parts)))
     radius = np.array([design.radii[part] for part in parts])
     known[:, n_cameras + n_parameters :] = np.diag(1.0 / (radius_sigma * radius))
     rows.append(known)
-    left = compress(eliminate(np.concatenate(rows)[None], n_cameras))
-    units = (*parametrization.units, *("m" for _ in parts))
-    return Bound(design.names, units, _inverse(left, design.names))
+    return compress(eliminate(np.concatenate(rows)[None], n_cameras))
 
 
 def _rows_of_poses(design: OutlineDesign, sigma_q: float) -> list[Array]:
@@ -115,7 +132,7 @@ def _outline_rows(design: OutlineDesign) -> tuple[Array, Array]:
 
     The others are six motions of each camera, then the kinematic parameters, then the radii.
     """
-    truth = _Numbers(design.legs, design.R, design.t, design.T_Rb_camera, design.radii)
+    truth = _numbers(design)
     motions, unit = np.eye(6), np.eye(len(design.parametrization))
     of_poses = [partial(_with_poses, truth, motion) for motion in motions]
     of_others = [
@@ -145,6 +162,16 @@ class _Numbers:
     t: Array
     T_Rb_camera: Sequence[RigidTransform]
     radii: Mapping[tuple[int, str], float]
+
+
+def offsets_from(design: OutlineDesign, other: OutlineDesign) -> Array:
+    """Return how far (n, 2) [px] the ends of a design's outlines are from those of another."""
+    ends = design.camera.undistort(design.outlines.ends)
+    return _offsets(design, ends, _numbers(other))
+
+
+def _numbers(design: OutlineDesign) -> _Numbers:
+    return _Numbers(design.legs, design.R, design.t, design.T_Rb_camera, design.radii)
 
 
 def _with_poses(truth: _Numbers, motion: Array, size: float) -> _Numbers:

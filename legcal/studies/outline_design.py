@@ -104,14 +104,14 @@ class OutlineDesign:
         return tuple(sorted(set(shown)))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)  # a study goes through all of its machines in every run
 def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> OutlineDesign:
     """Return the design of a machine; the same one in all processes.
 
     Parameters
     ----------
     name : str
-        The machine, one of :data:`legcal.studies.outline_machines.MACHINES`.
+        The machine, one of those of :mod:`legcal.studies.outline_machines`.
     n_views : int
         Number of cameras.
     n_poses : int

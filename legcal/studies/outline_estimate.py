@@ -12,7 +12,7 @@ from legcal.refinement.refine import refine
 from legcal.refinement.settings import RefinementSettings
 from legcal.refinement.solution import Solution
 from legcal.refinement.start import Start, cameras_from_hints, start_from
-from legcal.studies.bound_statistics import RunErrors
+from legcal.studies.bound_record import RunErrors
 from legcal.studies.outline_design import OutlineDesign
 from legcal.studies.outline_session import OutlineSession
 

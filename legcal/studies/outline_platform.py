@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.types import Array
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.sensitivity import pose_sensitivity
 from legcal.refinement.solution import Solution
@@ -31,6 +32,15 @@ class Misses(NamedTuple):
 
 
 def platform_misses(design: OutlineDesign, legs: Sequence[LegGeometry]) -> Misses:
+    """Return how far from the truth legs put the platform at the exact readings, rms over poses.
+
+    See :func:`platform_errors`.
+    """
+    shift, turn = platform_errors(design, legs)
+    return Misses(float(np.sqrt(np.mean(shift**2))), float(np.sqrt(np.mean(turn**2))))
+
+
+def platform_errors(design: OutlineDesign, legs: Sequence[LegGeometry]) -> tuple[Array, Array]:
     """Return how far from the truth legs put the platform at the exact readings.
 
     Parameters
@@ -40,6 +50,11 @@ def platform_misses(design: OutlineDesign, legs: Sequence[LegGeometry]) -> Misse
     legs : sequence of LegGeometry
         Nominal or found, in R_b and R_e. Where they cannot have these readings, the platform
         stands where it misses them least.
+
+    Returns
+    -------
+    shift, turn : (n_poses,) array
+        Displacement of the origin of R_e [m] and angle [rad].
     """
     together = RigidTransform.from_components(design.t, Rotation.from_matrix(design.R))
     poses = tuple(together[k] for k in range(len(design.t)))
@@ -50,10 +65,7 @@ def platform_misses(design: OutlineDesign, legs: Sequence[LegGeometry]) -> Misse
         (T_true.rotation.inv() * T.rotation).magnitude()
         for T, T_true in zip(there, poses, strict=True)
     ]
-    return Misses(
-        float(np.sqrt(np.mean(np.sum(np.square(shift), axis=1)))),
-        float(np.sqrt(np.mean(np.square(turn)))),
-    )
+    return np.linalg.norm(shift, axis=1), np.array(turn)
 
 
 def predicted_misses(design: OutlineDesign, solution: Solution) -> Misses:

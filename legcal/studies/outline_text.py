@@ -6,15 +6,19 @@ import numpy as np
 
 from legcal.studies.outline_session import Noise, StartErrors
 
+IN_WORDS = (
+    "Machines: the shipped hexapod (coplanar), the same with joints 2, 4 and 6 moved 30 mm out "
+    "of the planes of 1, 3 and 5 (non-coplanar), the shipped 3-upu-tilted and 3-rpr."
+)
+SHIPPED_IN_WORDS = "Machines: the shipped models are the true ones."
+
 
 def readings(noise: Noise, errors: StartErrors, n_views: int, n_poses: int) -> tuple[str, ...]:
     """Return how an experiment is made, one sentence each."""
     return (
-        "Machines: the shipped hexapod (coplanar), the same with joints 2, 4 and 6 moved 30 mm out "
-        "of the planes of 1, 3 and 5 (non-coplanar), the shipped 3-upu-tilted and 3-rpr.",
         f"{n_views} cameras of 1024 x 768 px see {n_poses} extreme poses each, no two the same; of "
-        "a hexapod each is said to see the four legs that it sees best. Machine, poses and cameras "
-        "are drawn once: the bound is one matrix, at the truth.",
+        "a machine with six legs or more each is said to see the four legs that it sees best. "
+        "Machine, poses and cameras are drawn once: the bound is one matrix, at the truth.",
         f"Every pixel along an outline is an edge point with {noise.sigma_px:g} px of white noise "
         "(1 sigma): the covariance of a fitted line is known. Readings have "
         f"{1e6 * noise.sigma_q:g} um.",
