@@ -17,7 +17,7 @@ from legcal.location.search import search
 
 BETTER = 10.0  # times
 CLEAR = 0.01  # of the spread of positions: what is left then asks for no other mistake
-ROWS = 12  # that mistakes are tried on
+ROWS, SUBSETS = 12, 8  # that mistakes are tried on, and starts from a few of them
 
 _LENGTHS = (
     (1e-3, "millimetres", "divide x, y and z by 1000"),
@@ -49,7 +49,7 @@ def likely_mistake(pairs: PosePairs, cost: float, fewest: int) -> tuple[str, str
     best, found = cost / _spread(pairs) / BETTER**2, None
     few = pairs.of(np.linspace(0, len(pairs) - 1, min(len(pairs), ROWS)).astype(np.intp))
     for changed, looks_like, remedy in _alternatives(few):
-        other = float(search(changed, fewest).cost[0]) / _spread(changed)
+        other = float(search(changed, fewest, subsets=SUBSETS).cost[0]) / _spread(changed)
         if other < best:
             best, found = other / BETTER**2, (looks_like, remedy)
             if other < CLEAR**2:

@@ -58,7 +58,7 @@ def kept_rows(n: int, fewest: int) -> int:
     return max(min(n, fewest), (n + fewest + 1) // 2)
 
 
-def search(pairs: PosePairs, fewest: int, *, robust: bool = True) -> Candidates:
+def search(pairs: PosePairs, fewest: int, *, subsets: int = SUBSETS) -> Candidates:
     """Return the frames that agree best with most rows, from starts all over the rotations.
 
     Parameters
@@ -67,14 +67,14 @@ def search(pairs: PosePairs, fewest: int, *, robust: bool = True) -> Candidates:
         What was measured.
     fewest : int
         Rows that determine the frames.
-    robust : bool
-        Whether wrong rows are looked for; else every start is fitted to all rows.
+    subsets : int
+        How many starts come from a few rows each.
     """
     if len(pairs) > MOST_ROWS:
         pairs = pairs.of(np.linspace(0, len(pairs) - 1, MOST_ROWS).astype(np.intp))
     n = len(pairs)
-    n_kept = kept_rows(n, fewest) if robust else n
-    start, chosen = _starts(pairs, fewest, robust=robust)
+    n_kept = kept_rows(n, fewest)
+    start, chosen = _starts(pairs, fewest, subsets)
     frames = _descend(pairs, start, AT_FIRST, chosen.astype(np.float64))
     order = np.argsort(_trimmed(frames, pairs, n_kept), kind="stable")[:MOST_PROMISING]
     frames = _descend(pairs, frames.at(order), STEPS, n_kept)
@@ -83,7 +83,7 @@ def search(pairs: PosePairs, fewest: int, *, robust: bool = True) -> Candidates:
     return Candidates(frames.at(order), cost[order] / n_kept)
 
 
-def _starts(pairs: PosePairs, fewest: int, *, robust: bool) -> tuple[Frames, BoolArray]:
+def _starts(pairs: PosePairs, fewest: int, subsets: int) -> tuple[Frames, BoolArray]:
     """Return starts and the rows (k, n) that each came from."""
     n = len(pairs)
     chance = np.random.default_rng(0)
@@ -97,7 +97,7 @@ def _starts(pairs: PosePairs, fewest: int, *, robust: bool) -> tuple[Frames, Boo
         found += [frames for frames in closed if frames is not None]
         rows += [everything] * (len(found) - len(rows))
     size = max(SUBSET, fewest)
-    for k in range(SUBSETS if robust and n > size else 0):
+    for k in range(subsets if n > size else 0):
         chosen = np.sort(chance.choice(n, size, replace=False)).astype(np.intp)
         found.append(_start_of(pairs.of(chosen), everywhere[k % len(everywhere)]))
         rows.append(np.isin(np.arange(n), chosen))
