@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from legcal.vision.board import Board
 from legcal.vision.board_dictionaries import DICTIONARIES
-from legcal.vision.chessboard import inner_corners
+from legcal.vision.chessboard import goes_on, inner_corners
 from legcal.vision.tag_search import search_charuco, search_tags
 
 _FEWEST_CORNERS = 3  # along a side of a chessboard, for OpenCV
@@ -38,19 +38,20 @@ def described(board: Board, image: NDArray[np.generic]) -> str | None:
 def _other_squares(board: Board, grey: NDArray[np.uint8]) -> str | None:
     """Return which grid of squares is seen."""
     nx, ny = board.grid
-    near = [(nx + a, ny + b) for a in (0, 1, -1, 2, -2) for b in (0, 1, -1, 2, -2)]
-    tried = [(ny, nx)] if nx != ny else []
-    tried += [grid for grid in near if min(grid) >= _FEWEST_CORNERS and grid != (nx, ny)]
-    tried += [(nx // 2 + 1, ny // 2 + 1)]
+    steps = (0, 1, -1, 2, -2)
+    tried = [(nx + a, ny + b) for a in steps for b in steps] + [(nx // 2 + 1, ny // 2 + 1)]
+    part = None
     for x, y in dict.fromkeys(tried):
-        if min(x, y) < _FEWEST_CORNERS or inner_corners(grey, (x, y), quick=True) is None:
+        if min(x, y) < _FEWEST_CORNERS:
             continue
-        if (x, y) == (ny, nx):
-            continue  # the same squares counted the other way are found either way
-        what = f"a chessboard of {x + 1} x {y + 1} squares"
-        smaller = x <= nx and y <= ny
-        return what + (" or a part of a larger one, a part of which cannot be used" * smaller)
-    return None
+        grid = inner_corners(grey, (x, y), quick=True)
+        if grid is None:
+            continue
+        if not goes_on(grid, grey):
+            seen = f"a chessboard of {x + 1} x {y + 1} squares"
+            return seen + (" or that part of one" if x <= nx and y <= ny else "")
+        part = part or "a part of a chessboard of more squares"
+    return part
 
 
 def _other_markers(board: Board, grey: NDArray[np.uint8]) -> str | None:
