@@ -14,12 +14,17 @@ kept aside are searched like the others, and not fitted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.board_views import (
+    BoardViews,
+    base_of_board,
+    board_without_place,
+    observe_board,
+)
 from legcal.calibration import Steps
 from legcal.detection.observe import (
     Scene,
@@ -29,23 +34,19 @@ from legcal.detection.observe import (
     given_outlines,
     scene_at_poses,
 )
-from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.errors import NotVisible
 from legcal.geometry.types import IntArray
-from legcal.mechanism.parametrization import geometries
-from legcal.mechanism.platform import platform_in_base
 from legcal.observations.canonical_order import (
     inverse,
 )
-from legcal.observations.leg_axes import axes_from_outlines
+from legcal.observations.corners import Corners
 from legcal.observations.outlines import Outlines
 from legcal.observations.parts import outlines_at
 from legcal.observations.sets import choose_outlines, join_outlines, reject_unused_legs
 from legcal.progress import Report
-from legcal.refinement.refine import refine, refine_from_best
+from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
-from legcal.refinement.start import Start, start_from
-from legcal.stages.nominal import nominal_mechanism
-from legcal.stages.run import run_steps
+from legcal.starting import four_steps, starts_of_fit
 from legcal.workpiece import Workpiece
 
 
@@ -65,6 +66,8 @@ class Found:
         What the four steps make of them.
     solution : Solution
         The fit, in the order of the part.
+    corners : Corners or None
+        Of the calibration board in all images, in the order of work; None without a board.
     """
 
     outlines: Outlines
@@ -72,6 +75,7 @@ class Found:
     part: Workpiece
     steps: Steps
     solution: Solution
+    corners: Corners | None
 
     @property
     def judged(self) -> Outlines:
@@ -101,21 +105,42 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
     photographs, part = work.photographs, work.part(rows)
     fitted = inverse(work.order.rows)[rows[part.order.rows]]
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
+    board = observe_board(work, progress)
+    if board is not None:
+        place = base_of_board(work, board, scene.T_base_camera)
+        if place is None and len(photographs.detect):
+            raise board_without_place(work)
+        scene = _placed_by_board(scene, board, place)
     if len(photographs.detect) == 0:
-        return _fit(part, fitted, given_outlines(photographs), scene, progress)
+        return _fit(part, fitted, given_outlines(photographs), scene, board, progress)
     scene = align(photographs, scene, progress)
-    found = _fit(part, fitted, detect(photographs, scene, progress), scene, progress)
+    if board is not None:
+        scene = _placed_by_board(scene, board, board.placed(scene.T_base_camera))
+    outlines = detect(photographs, scene, progress)
+    found = _fit(part, fitted, outlines, scene, board, progress)
     doubtful = doubtful_rows(photographs, found.judged)
     if len(doubtful) == 0:
         return found
     scene = _fitted_scene(work, found.solution)
     again = photographs.narrowed(doubtful, found.outlines)
     outlines = detect(again, scene, progress, near_fit=True)
-    return _fit(part, fitted, outlines, scene, progress)
+    return _fit(part, fitted, outlines, scene, board, progress)
+
+
+def _placed_by_board(scene: Scene, board: BoardViews, T: RigidTransform | None) -> Scene:
+    """Return a scene whose cameras stand to each other as the board at T_base_board shows them."""
+    if T is None:
+        return scene
+    return replace(scene, T_base_camera=board.cameras(T, scene.T_base_camera))
 
 
 def _fit(
-    part: Workpiece, fitted: IntArray, outlines: Outlines, scene: Scene, progress: Report
+    part: Workpiece,
+    fitted: IntArray,
+    outlines: Outlines,
+    scene: Scene,
+    board: BoardViews | None,
+    progress: Report,
 ) -> Found:
     """Run the four steps, then the fit of everything from the nominal model and from the steps.
 
@@ -125,16 +150,21 @@ def _fit(
     seen = reject_unused_legs(seen, part.measurements, part.mechanism.leg_names)
     if part.every_leg:
         _refuse_unseen_legs(part, seen)
-    steps = _four_steps(part, seen, progress)
+    steps = four_steps(part, seen, board, progress)
     progress("Fit of everything", 0, 1)
-    starts = _starts(part, seen, scene, steps)
-    everything = part.fitted_legs, part.measurements, seen
-    if len(starts) == 1:
-        solution = refine(*everything, starts[0], axes=part.axes, choices=part.choices)
-    else:
-        solution = refine_from_best(*everything, starts, axes=part.axes, choices=part.choices)
+    starts = starts_of_fit(part, seen, scene, steps, board)
+    solution = refine_from_best(
+        part.fitted_legs,
+        part.measurements,
+        seen,
+        starts,
+        axes=part.axes,
+        board=None if board is None else board.seen(fitted),
+        choices=part.choices,
+    )
     progress("Fit of everything", 1, 1)
-    return Found(outlines, fitted, part, steps, solution)
+    corners = None if board is None else board.corners
+    return Found(outlines, fitted, part, steps, solution, corners)
 
 
 def _refuse_unseen_legs(work: Workpiece, outlines: Outlines) -> None:
@@ -167,68 +197,3 @@ def _fitted_scene(work: Workpiece, solution: Solution) -> Scene:
     at_row = work.measurements.pose
     cameras = tuple(T_base_Rb * T.inv() for T in solution.T_camera_Rb)
     return Scene(np.broadcast_to(A, placed.shape)[at_row], placed[at_row], cameras)
-
-
-def _four_steps(work: Workpiece, outlines: Outlines, progress: Report) -> Steps:
-    """Return what the four steps give, or why they give nothing: the fit may do without."""
-    if work.criteria is None:
-        return Steps(None, None, "They were left out.")
-    progress("Four steps", 0, 1)
-    radii = {part: r for leg in work.mechanism.legs for part, r in leg.radius_of_part.items()}
-    try:
-        axes = work.axes
-        if axes is None:
-            axes = axes_from_outlines(outlines, work.measurements, radii)
-        nominal = nominal_mechanism(work.mechanism)
-        found = run_steps(
-            nominal,
-            axes,
-            work.measurements,
-            criteria=work.criteria,
-            transformation=work.transformation,
-            free_twists=any(name.endswith(".twist") for name in work.choices.free),
-        )
-    except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
-        return Steps(None, None, str(failure))
-    finally:
-        progress("Four steps", 1, 1)
-    return Steps(found.legs, found.T_Rb_camera, "", found.diagnostics)
-
-
-def _starts(work: Workpiece, outlines: Outlines, scene: Scene, steps: Steps) -> list[Start]:
-    """Return the starts of the fit: the nominal model, and the steps where they gave a result."""
-    mechanism = work.mechanism
-    legs = geometries(mechanism)
-    platform = [platform_in_base(mechanism, T) for T in work.nominal_poses]
-    rough = [None if T is None else T.inv() * mechanism.T_base_Rb for T in scene.T_base_camera]
-    staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
-    starts = [(legs, _cameras(work, outlines, rough, staged, steps), "nominal")]
-    if steps.legs is not None:
-        starts.append((steps.legs, _cameras(work, outlines, staged, rough, steps), "staged"))
-    return [
-        start_from(legs, work.measurements, work.fitted_legs, cameras, platform, label)
-        for legs, cameras, label in starts
-    ]
-
-
-def _cameras(
-    work: Workpiece,
-    outlines: Outlines,
-    first: Sequence[RigidTransform | None],
-    second: Sequence[RigidTransform | None],
-    steps: Steps,
-) -> list[RigidTransform]:
-    """Return a camera pose for every view, the first choice where there is one."""
-    cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
-    shown = outlines.row[outlines.used] if work.axes is None else work.axes.row
-    needed = set(work.measurements.view[shown].tolist())
-    problems = [
-        f"view {view.name}: its camera could not be placed: found no T_base_camera, and the four "
-        f"steps do not locate it ({steps.failure or 'fewer than three base joints are seen'}); "
-        "needed one of them; add a rough T_base_camera to dataset.yaml."
-        for v, view in enumerate(work.measurements.views)
-        if v in needed and cameras[v] is None
-    ]
-    if problems:
-        raise NotIdentifiable(problems)
-    return [T if T is not None else RigidTransform.identity() for T in cameras]

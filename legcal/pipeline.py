@@ -19,7 +19,7 @@ from legcal.dataset.wishes import Wish, wishes_of_call
 from legcal.errors import UsageError
 from legcal.fitting import Found, observe_and_fit
 from legcal.identify.check import check_identifiable
-from legcal.observations.canonical_order import inverse
+from legcal.observations.canonical_order import inverse, restore_corners
 from legcal.observations.parts import outlines_at
 from legcal.observations.sets import reject_unused_legs
 from legcal.progress import Report, no_progress
@@ -134,6 +134,9 @@ def calibrate(
         found.steps.in_file_order(order),
         (*notes, *found.solution.notes),
     )
+    if found.corners is not None:
+        corners = restore_corners(found.corners, work.order)
+        calibration = replace(calibration, corners=corners)
     if len(split.kept_aside):
         held_out = _compare_held_out(work, found, split)
         calibration = replace(calibration, held_out=held_out)
@@ -149,7 +152,9 @@ def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
     error of its twist, and one that was left at nominal would spoil what is told of the others.
     """
     views, axes_given = dataset.measurements.views, dataset.axes is not None
-    known = known_parameters(dataset.mechanism, views, axes_given=axes_given)
+    known = known_parameters(
+        dataset.mechanism, views, axes_given=axes_given, with_board=dataset.board is not None
+    )
     choices = resolve([*dataset.wishes, *wishes], known)
     twists = {
         name: Prior(parameter.nominal, TWIST_SIGMA)

@@ -24,6 +24,8 @@ LAYERS = (
     "report",
     "location",
     "workpiece",
+    "board_views",
+    "starting",
     "fitting",
     "pipeline",
     "checking",

@@ -1,0 +1,142 @@
+"""What a calibration board on the base says of the cameras of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.detection.board_corners import detect_corners, require_board
+from legcal.errors import DatasetError
+from legcal.geometry.types import IntArray
+from legcal.observations.board_poses import camera_poses
+from legcal.observations.canonical_order import reorder_corners
+from legcal.observations.corners import Corners
+from legcal.observations.parts import corners_at
+from legcal.progress import Report
+from legcal.refinement.observed_board import SeenBoard
+from legcal.vision.board import Board
+from legcal.workpiece import Workpiece
+
+_FAR, _TURNED = 0.05, float(np.radians(5.0))  # [m], [rad]: hints are good to less
+
+
+@dataclass(frozen=True, eq=False)
+class BoardViews:
+    """The board and how each camera stands to it.
+
+    Attributes
+    ----------
+    board : Board
+    corners : Corners
+        Of all images, in the order of work.
+    T_board_camera : tuple of RigidTransform or None
+        The camera of each view; None where it does not show the board.
+    """
+
+    board: Board
+    corners: Corners
+    T_board_camera: tuple[RigidTransform | None, ...]
+
+    def seen(self, rows: IntArray) -> SeenBoard:
+        """Return the board in some of the images."""
+        return SeenBoard(self.board, corners_at(self.corners, rows))
+
+    def placed(self, cameras: Sequence[RigidTransform | None]) -> RigidTransform | None:
+        """Return where cameras have the board on the average, T_x_board; None if none shows it.
+
+        Parameters
+        ----------
+        cameras : sequence of RigidTransform or None
+            T_x_camera of each view; x is any frame.
+        """
+        found = [
+            T_x_camera * T_board_camera.inv()
+            for T_x_camera, T_board_camera in zip(cameras, self.T_board_camera, strict=True)
+            if T_x_camera is not None and T_board_camera is not None
+        ]
+        if not found:
+            return None
+        together = RigidTransform.concatenate(found)
+        middle = np.median(together.translation, axis=0)
+        return RigidTransform.from_components(middle, together.rotation.mean())
+
+    def cameras(
+        self, T_x_board: RigidTransform, others: Sequence[RigidTransform | None]
+    ) -> tuple[RigidTransform | None, ...]:
+        """Return T_x_camera of every view: by the board, and *others* where it is not shown."""
+        return tuple(
+            other if T is None else T_x_board * T
+            for T, other in zip(self.T_board_camera, others, strict=True)
+        )
+
+
+def observe_board(work: Workpiece, progress: Report) -> BoardViews | None:
+    """Return what the images of a session show of its board, None if it has none.
+
+    Raises
+    ------
+    NotVisible
+        If no image shows the board, or none of a view whose camera nobody placed.
+    DatasetError
+        If what is shown cannot be the board that the dataset describes, or it has moved.
+    """
+    dataset, measurements = work.dataset, work.measurements
+    if dataset.board is None:
+        return None
+    used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
+    needed = {view.name for view in used if view.T_base_camera is None}
+    if dataset.corners is not None:
+        corners = reorder_corners(dataset.corners, work.order)
+    else:
+        rows = [row for row, image in enumerate(measurements.image) if image]
+        load = dataset.image_reader(work.order.rows.tolist())
+        corners = detect_corners(dataset.board, load, rows, work.run, progress)
+        shown = needed if len(corners) else {view.name for view in used}
+        require_board(dataset.board, corners, load, measurements, shown)
+    poses = camera_poses(corners, dataset.board, measurements, needed)
+    return BoardViews(dataset.board, poses.corners, poses.views)
+
+
+def base_of_board(
+    work: Workpiece, board: BoardViews, hints: Sequence[RigidTransform | None]
+) -> RigidTransform | None:
+    """Return a rough T_base_board: as the dataset has it, or by the rough poses of cameras.
+
+    Parameters
+    ----------
+    work : Workpiece
+    board : BoardViews
+    hints : sequence of RigidTransform or None
+        T_base_camera of the views that have one.
+
+    Raises
+    ------
+    DatasetError
+        If what the dataset says of both cannot be true together.
+    """
+    given, by_cameras = work.dataset.T_base_board, board.placed(hints)
+    if given is None or by_cameras is None:
+        return given if by_cameras is None else by_cameras
+    apart = given.inv() * by_cameras
+    far, turned = float(np.linalg.norm(apart.translation)), float(apart.rotation.magnitude())
+    if far > _FAR or turned > _TURNED:
+        raise DatasetError(
+            f"{work.dataset.yaml_path}: board.T_base_board and the T_base_camera of the views "
+            f"could not be used together: found the board {1e3 * far:.0f} mm and "
+            f"{np.degrees(turned):.1f} deg from where these cameras see it, needed "
+            f"{1e3 * _FAR:.0f} mm and {np.degrees(_TURNED):.0f} deg; correct the pose of the "
+            "board, those of the cameras, or the dimensions of the board."
+        )
+    return given
+
+
+def board_without_place(work: Workpiece) -> DatasetError:
+    """Return the refusal of photographs in which nobody says where to look for legs."""
+    return DatasetError(
+        f"{work.dataset.yaml_path}: the images could not be searched for legs: found a calibration "
+        "board but neither its pose nor that of any camera that sees it, needed one of them to "
+        "about 2 cm and 2 degrees; add T_base_board to the block board, or T_base_camera to a view."
+    )
