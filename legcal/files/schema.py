@@ -35,6 +35,7 @@ _NEEDED = {
     "int_type": "a whole number",
     "int_parsing": "a whole number",
     "int_from_float": "a whole number",
+    "bool_type": "true or false",
     "string_type": "a text",
     "list_type": "a list",
     "tuple_type": "a list",

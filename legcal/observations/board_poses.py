@@ -144,6 +144,8 @@ def _view_pose(
             sigma = corners.sigma_px[own]
             of_row[row] = plane_poses(camera, points, corners.px[own], sigma)
             candidates += of_row[row]
+    if not candidates and of_row:
+        raise DatasetError(_another_board(name, board, "no pose of", "showing them there"))
     if not candidates:
         return None
     everything = board.points[corners.corner], corners.px, corners.sigma_px
@@ -189,15 +191,21 @@ def _check_fit(name: str, pose: PlanePose, corners: Corners, board: Board) -> No
     sigma = float(np.median(corners.sigma_px))
     if usual <= max(WORST_PX, WORST_SIGMA * sigma):
         return
+    limit = f"{max(WORST_PX, WORST_SIGMA * sigma):.2g} px"
+    raise DatasetError(_another_board(name, board, f"{usual:.2g} px from the best pose of", limit))
+
+
+def _another_board(name: str, board: Board, found: str, needed: str) -> str:
+    """Return that corners are not those of this board by the camera file."""
     sizes = {
         "chessboard": "the numbers of squares",
         "charuco": "the numbers of squares, marker and square",
         "aprilgrid": "the numbers of tags and tag_spacing",
     }[board.kind]
-    raise DatasetError(
-        f"view {name}: its camera could not be placed: found the corners {usual:.2g} px from where "
-        f"the best pose of the {board.kind} shows them, needed {max(WORST_PX, 5 * sigma):.2g} px; "
-        f"check {sizes} in the dataset file, and that the camera file is of this camera and lens."
+    return (
+        f"view {name}: its camera could not be placed by the corners of the board: found {found} "
+        f"the {board.kind} of the dataset file, needed {needed}; check {sizes} there, and that the "
+        "camera file is of this camera and lens."
     )
 
 

@@ -14,7 +14,7 @@ from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
 
 _ITERATIONS = 50
-_STOP = 1e-13  # what a step would change of the cost, as a part of it
+_STOP = 1e-10  # what a step would change of the cost, as a part of it
 _HUBER = 3.0  # standard deviations from which a corner counts less and less
 _SAME = 1e-3  # [rad] between solutions that are one
 
