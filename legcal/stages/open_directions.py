@@ -31,7 +31,8 @@ from legcal.stages.platform_unknowns import (
     turns_of,
 )
 
-_LARGEST_SIGMA = 0.1  # of the mean leg length, or [rad]: what is known worse is not determined
+_OPEN = 10.0  # mean leg lengths, or [rad]: what is known worse is not determined at all
+_POOR = 0.1  # the same: nominal models know it better, and the platform does not ask for it
 _NEAR = 0.03  # [rad], how far axes may be from the nominal ones, about
 _HARMLESS = 0.01  # of the change of the parameters: the platform hardly moves
 _TURNS = slice(7, 12)  # of both axes, and the twist: places among the numbers of a leg
@@ -113,16 +114,17 @@ def open_directions(
     _, singular, vectors = np.linalg.svd(
         np.vstack([information * unit, np.zeros((len(unit),) * 2)])
     )
-    basis = vectors[singular * _LARGEST_SIGMA * length < 1.0]
-    if not len(basis):
-        return OpenDirections(basis, length)
+    poor, unseen = (vectors[singular * sigma * length < 1.0] for sigma in (_POOR, _OPEN))
+    if not len(poor):
+        return OpenDirections(poor, length)
     motion = _motion(mechanism, unknowns, legs, poses, length)
     motion = None if motion is None else motion[:, :, wanted]
-    moving, still = split_by_motion(motion, basis, length, _HARMLESS)
+    moving, _ = split_by_motion(motion, unseen, length, _HARMLESS)
     if len(moving):
         _refuse(mechanism, unknowns, sparse_basis(moving), wanted)
+    _, still = split_by_motion(motion, poor, length, _HARMLESS)
     sentences = tuple(
-        f"Step 4 left {_in_words(mechanism, unknowns, row, wanted)} at nominal: the poses do not "
+        f"Step 4 left {_in_words(mechanism, unknowns, row, wanted)} at nominal: the poses hardly "
         "show it, and the platform does not move with it."
         for row in sparse_basis(still)
     )

@@ -76,6 +76,7 @@ def locate_platform(
     centre: Array,
     transformation: Transformation,
     spatial: bool = True,
+    on_a_line: bool = False,
     weight: Array | None = None,
 ) -> PlatformPoses:
     """Locate the platform in the frame of every group that shows enough leg ends.
@@ -94,6 +95,8 @@ def locate_platform(
         Point equality, or the form in which (18) is printed, started from the former.
     spatial : bool
         False for a planar mechanism: two ends are enough, in R_b.
+    on_a_line : bool
+        Take ends in one line too, about which nothing says how the platform is turned.
     weight : (n,) array, optional
         Weights of the ends in point equality.
 
@@ -109,7 +112,8 @@ def locate_platform(
     known = np.isfinite(ends[:, 0])
     pose, n_poses = np.full(len(directions), -1), 0
     for rows in directions.groups():
-        if _span_a_frame(B_Re[directions.leg[rows[known[rows]]]], spatial=spatial):
+        points = B_Re[directions.leg[rows[known[rows]]]]
+        if _span_a_frame(points, spatial=spatial) or (on_a_line and len(points) > 2):
             pose[rows], n_poses = n_poses, n_poses + 1
     used = np.flatnonzero(known & (pose >= 0))
     if not len(used):

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray, IntArray
@@ -133,6 +132,6 @@ def turned_axis(nominal: Array | None, turns: Array) -> Array | None:
     if nominal is None or not turns.any():
         return nominal
     gibbs = 0.5 * turns @ normal_basis(nominal)
-    size = float(np.linalg.norm(gibbs))
-    turn = Rotation.from_rotvec(2.0 * np.arctan(size) / size * gibbs)
-    return np.asarray(turn.apply(nominal))
+    across = np.cross(gibbs, nominal)
+    axis = nominal + 2.0 / (1.0 + gibbs @ gibbs) * (across + np.cross(gibbs, across))
+    return np.asarray(axis / np.linalg.norm(axis))

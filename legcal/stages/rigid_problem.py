@@ -128,6 +128,7 @@ def rigid_problem(
         centre=centre,
         transformation=transformation,
         spatial=known.spatial,
+        on_a_line=True,
         weight=1.0 / np.einsum("nii->n", covariance),
     )
     unknowns = platform_unknowns(known, free_twists=free_twists)
