@@ -1,0 +1,181 @@
+"""Boards in simulated datasets: where they stand, what images show of them, and what is refused."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from boards import CHARUCO
+
+from legcal.dataset.board_entry import described_board
+from legcal.dataset.folder import load_dataset
+from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.geometry.frames import motion_from_xyz_quat
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.model import Mechanism
+from legcal.observations.board_poses import camera_poses
+from legcal.simulation.board_choice import chosen_board
+from legcal.simulation.request import Request, requested
+from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.simulate import simulate
+from legcal.vision.board import Board
+from legcal.vision.corner_search import find_corners
+
+
+@cache
+def machine() -> Mechanism:
+    return load_mechanism("3-rps")
+
+
+def _truth(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "truth" / "truth.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("board") / "standing"
+    settings = SimulationSettings(
+        level=Level.OUTLINES, poses=2, views=1, board="charuco", board_pose=True, seed=3
+    )
+    simulate(machine(), folder, settings)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("board") / "held"
+    settings = SimulationSettings(
+        level=Level.AXES, poses=3, views=1, board="aprilgrid", hand_held=True, sigma_px=0.0
+    )
+    simulate(machine(), folder, settings)
+    return folder
+
+
+def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
+    dataset = load_dataset(standing)
+    corners, board, T_base_board = dataset.corners, dataset.board, dataset.T_base_board
+    assert corners is not None
+    assert board is not None
+    assert T_base_board is not None
+    view = dataset.measurements.views[0]
+    truth = _truth(standing)["views"]["c1"]["T_base_camera"]
+    T = motion_from_xyz_quat(**truth).inv() * T_base_board
+    exact = view.camera.project(T.apply(board.points))[corners.corner]
+    assert len(corners) >= 2 * 0.5 * board.n_corners
+    assert np.std(corners.px - exact) == pytest.approx(0.1, rel=0.3)
+    assert np.all(corners.sigma_px == 0.1)
+
+
+def test_the_truth_says_where_the_board_is(standing: Path, held: Path) -> None:
+    for folder in (standing, held):
+        _, T = described_board(_truth(folder)["board"], folder)
+        assert T is not None
+        given = load_dataset(folder).T_base_board
+        assert (given is None) == (folder == held)
+        assert given is None or np.allclose(given.as_matrix(), T.as_matrix())
+
+
+def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Path) -> None:
+    dataset = load_dataset(held)
+    m = dataset.measurements
+    assert dataset.corners is not None
+    assert dataset.board is not None
+    assert [view.name for view in m.views] == [f"c1-{k + 1}" for k in range(m.n_rows)]
+    poses = camera_poses(dataset.corners, dataset.board, m, [view.name for view in m.views])
+    truth = _truth(held)
+    _, T_base_board = described_board(truth["board"], held)
+    assert T_base_board is not None
+    places = []
+    for view, T_board_camera in zip(m.views, poses.views, strict=True):
+        assert T_board_camera is not None
+        there = motion_from_xyz_quat(**truth["views"][view.name]["T_base_camera"])
+        assert (T_base_board * T_board_camera).translation == pytest.approx(
+            there.translation, abs=1e-7
+        )
+        places.append(there.translation)
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 0.05
+
+
+def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
+    settings = SimulationSettings(poses=1, views=1, board="aprilgrid", seed=3)
+    simulate(machine(), tmp_path / "seen", settings)
+    dataset = load_dataset(tmp_path / "seen")
+    assert dataset.corners is None
+    assert dataset.board is not None
+    number, px, sigma = find_corners(dataset.board, dataset.read_image(0))
+    truth = _truth(tmp_path / "seen")
+    _, T_base_board = described_board(truth["board"], tmp_path)
+    assert T_base_board is not None
+    T = motion_from_xyz_quat(**truth["views"]["c1"]["T_base_camera"]).inv() * T_base_board
+    exact = dataset.measurements.views[0].camera.project(T.apply(dataset.board.points))
+    error = px - exact[number]
+    assert len(number) >= 20
+    assert np.sqrt(np.mean(error**2)) < 0.04
+    assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 2.0
+
+
+def test_a_board_without_a_place_is_refused(tmp_path: Path) -> None:
+    settings = SimulationSettings(
+        level=Level.OUTLINES, poses=1, views=1, board=replace(CHARUCO, side=1.0, marker=0.7)
+    )
+    with pytest.raises(NotVisible, match="The board could not be placed: found no place near the"):
+        simulate(machine(), tmp_path / "none", settings)
+
+
+def test_a_board_comes_from_a_file_or_fits_the_machine(tmp_path: Path) -> None:
+    path = tmp_path / "board.yaml"
+    path.write_text("board: {kind: chessboard, squares_x: 9, squares_y: 6, square: 0.02}\n")
+    found = chosen_board(path, [])
+    assert found is not None
+    assert (found.kind, found.columns, found.rows, found.side) == ("chessboard", 9, 6, 0.02)
+    assert chosen_board(CHARUCO, []) is CHARUCO
+    assert chosen_board(None, []) is None
+    path.write_text("kind: chessboard\n")
+    with pytest.raises(DatasetError, match="found no block board, needed one as in"):
+        chosen_board(path, [])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"hand_held": True}, "found a camera in the hand without a board"),
+        ({"board_pose": True}, "found the pose of a board without a board"),
+        ({"board": CHARUCO, "hand_held": True, "images": 2}, "2 images of each pose from a camera"),
+        ({"board": CHARUCO, "hand_held": True, "views": "c.yaml"}, "and a file of cameras"),
+        ({"board": 3}, "found 3 as board, needed a Board"),
+    ],
+)
+def test_settings_of_boards_that_contradict_others_are_refused(
+    settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        SimulationSettings(**settings)
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        (Request(hand_held=True), "--hand-held could not be used: found no --board"),
+        (Request(board_pose=True), "--board-pose could not be used: found no --board"),
+        (
+            Request(board="charuco", hand_held=True, cameras=Path("c.yaml")),
+            "found both --hand-held and --cameras",
+        ),
+        (Request(board="charucoo"), "--board could not be used: .* did you mean 'charuco'"),
+        (Request(level="axes", pixel_noise="0.2px"), "--pixel-noise could not be used"),
+    ],
+)
+def test_options_of_boards_that_contradict_others_are_refused(
+    request_: Request, message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        requested(request_, machine())
+
+
+def test_pixel_noise_of_axes_is_that_of_the_board() -> None:
+    settings = requested(Request(level="axes", board="charuco", pixel_noise="0.2px"), machine())
+    assert settings.sigma_px == pytest.approx(0.2)
+    assert not isinstance(settings.board, Board)
