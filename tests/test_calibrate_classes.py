@@ -1,6 +1,7 @@
 """Machines of every class from outlines, and images that cannot do it: one sentence, no result."""
 
 import csv
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,10 @@ from simulated import settings
 
 from legcal import calibrate, evaluate
 from legcal.errors import LegcalError, NotIdentifiable, NotVisible
+from legcal.mechanism.load import load_mechanism
+from legcal.mechanism.parametrization import geometries
+from legcal.mechanism.platform import pose_differences
+from legcal.refinement.platform_accuracy import poses_at_readings
 from legcal.simulation.simulate import simulate
 
 Row = dict[str, str]
@@ -27,6 +32,41 @@ def test_a_machine_of_any_class_comes_much_nearer_to_its_truth(model: str, tmp_p
     twists = {n: s for n, s in found.solution.status.items() if n.endswith(".twist")}
     assert twists
     assert "fixed" not in twists.values()
+    legs = found.steps.legs
+    assert legs is not None
+    staged = json.loads((tmp_path / "result/result.json").read_text())["stages"]["staged"]
+    names = found.dataset.mechanism.leg_names
+    assert staged["twists"] == {
+        name: leg.twist for name, leg in zip(names, legs, strict=True) if leg.twist is not None
+    }
+    assert staged["platform_axes"].keys() == staged["twists"].keys()
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        "3-rpr",
+        "3-spr",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("3-rps", "3-upu-tilted", "6-sps", "hexapod-rod", "hexapod-strut")
+        ),
+    ],
+)
+def test_the_steps_alone_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
+    made = simulate(model, tmp_path / "set", settings(poses=8, views=3))
+    found = calibrate(made.folder, transformation="cross_product")
+    assert found.steps.failure == ""
+    legs, mechanism = found.steps.legs, found.dataset.mechanism
+    assert legs is not None
+    T, q = found.solution.T_Rb_Re, found.dataset.measurements.q
+    true, nominal, staged = (
+        poses_at_readings(mechanism, g, q, T)
+        for g in (geometries(load_mechanism(made.truth_path)), geometries(mechanism), legs)
+    )
+    before, after = (pose_differences(poses, true)[0].mean() for poses in (nominal, staged))
+    assert before > 1e-3
+    assert after < 0.2 * before
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from machine_session import SHIPPED
 from scipy.sparse import csc_array
+from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, five_millimetres_away
 from staged_machines import Observed, planned, shipped, three_steps
 
@@ -229,3 +230,42 @@ def test_two_platform_joints_at_one_place_are_found() -> None:
     )
     found = run_steps(nominal_of(nominal), session.axes, session.measurements)
     assert errors(found.parameters, machine).max() < 1e-9
+
+
+def test_what_a_translating_platform_does_not_show_stays_at_nominal_and_is_named() -> None:
+    observed = shipped("3-upu")
+    found = run(observed)
+    assert all("the platform does not move with it" in text for text in found.diagnostics)
+    assert "angle 1 of base axis of leg 1 and angle 1 of platform axis of leg 1" in "".join(
+        found.diagnostics
+    )
+    for leg, nominal in zip(found.legs, observed.nominal.legs, strict=True):
+        a, b, a_nominal, b_nominal = (
+            np.asarray(v)
+            for v in (leg.base_axis, leg.platform_axis, nominal.base_axis, nominal.platform_axis)
+        )
+        R = found_rotation(observed)
+        assert np.linalg.norm(np.cross(a, R @ b)) < 1e-7
+        middle = a_nominal + R @ b_nominal
+        assert np.linalg.norm(np.cross(a, middle / np.linalg.norm(middle))) < 1e-3
+
+
+def found_rotation(observed: Observed) -> Array:
+    """Return the rotation of a platform that only translates, with which its axes are parallel."""
+    rows = [
+        (np.asarray(leg.base_axis), np.asarray(leg.platform_axis)) for leg in observed.true_legs
+    ]
+    a, b = (np.array(part) for part in zip(*rows, strict=True))
+    a *= np.sign(np.sum(a * b, axis=1))[:, None]
+    return np.asarray(Rotation.align_vectors(a, b)[0].as_matrix())
+
+
+def test_axes_that_no_three_legs_at_once_show_are_refused_in_geometric_words() -> None:
+    mechanism = load_mechanism("3-spr")
+    session = planned_session(mechanism, ((0, 1), (1, 2), (0, 2)), 8)
+    observed = planned(session, mechanism.sign)
+    with pytest.raises(NotIdentifiable, match="no pose shows three legs of known length at once"):
+        run(observed, "literal")
+    words = r"angle \d of platform axis of leg \d can change without any image noticing"
+    with pytest.raises(NotIdentifiable, match=words):
+        run(observed)
