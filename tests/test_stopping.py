@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -25,10 +27,19 @@ if __name__ == "__main__":
 """
 
 
+@contextmanager
+def handled(number: signal.Signals, by: signal.Handlers) -> Iterator[None]:
+    """Handle a signal in one way for a while, whatever the tests were started under."""
+    before = signal.signal(number, by)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_any_signal_stops_once_and_lets_the_clean_up_end(name: str) -> None:
-    number = getattr(signal, name)
-    before, ended = signal.getsignal(number), []
+    number, ended = signal.Signals[name], []
 
     @stopped_by_signals()
     def work() -> None:
@@ -38,19 +49,20 @@ def test_any_signal_stops_once_and_lets_the_clean_up_end(name: str) -> None:
             signal.raise_signal(number)
             ended.append(True)
 
-    with pytest.raises(KeyboardInterrupt):
-        work()
-    assert ended
-    assert signal.getsignal(number) is before
+    with handled(number, signal.SIG_DFL):
+        with pytest.raises(KeyboardInterrupt):
+            work()
+        assert ended
+        assert signal.getsignal(number) is signal.SIG_DFL
 
 
-def test_a_signal_that_was_ignored_stays_so() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
+@pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
+def test_a_signal_that_was_ignored_stays_so(name: str) -> None:
+    number = signal.Signals[name]
+    with handled(number, signal.SIG_IGN):
         with stopped_by_signals():
-            signal.raise_signal(signal.SIGHUP)
-    finally:
-        signal.signal(signal.SIGHUP, before)
+            signal.raise_signal(number)
+        assert signal.getsignal(number) is signal.SIG_IGN
 
 
 def test_processes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:

@@ -84,5 +84,6 @@ class Deadly(Draws):
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests may run with it ignored
     with stopped_by_signals():
         run_study(Draws(seconds=0.05), 400, workers=2, output=Path(sys.argv[1]))
