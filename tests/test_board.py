@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from boards import APRILGRID, BOARDS, CHARUCO, CHESSBOARD
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from legcal.dataset.board_entry import board_document, described_board, read_board
@@ -88,6 +88,7 @@ def test_what_is_printed_lies_inside_the_extent(board: Board) -> None:
     assert np.all(board.points <= high + 1e-12)
 
 
+@settings(max_examples=50)
 @given(
     st.sampled_from(["chessboard", "charuco", "aprilgrid"]),
     st.integers(2, 12),

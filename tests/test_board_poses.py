@@ -80,11 +80,11 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     T = before(CHARUCO, 0.6)
     rng = np.random.default_rng(4)
     squares = []
-    for _ in range(25):
+    for _ in range(12):
         poses = camera_poses(_corners(CHARUCO, [T, T], rng), CHARUCO, _measurements((2,)))
         d = _error(poses, 0, T)
         squares.append(d @ np.linalg.solve(poses.covariance[0], d) / 6.0)
-    assert 0.7 < np.mean(squares) < 1.35
+    assert 0.6 < np.mean(squares) < 1.5
 
 
 def test_images_of_a_view_are_joined() -> None:

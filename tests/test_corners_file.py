@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from boards import CHARUCO, LENS
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from legcal.errors import DatasetError
@@ -55,6 +55,7 @@ def _same(one: Corners, other: Corners) -> bool:
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in vars(one))
 
 
+@settings(max_examples=40)
 @given(tables())
 def test_corners_are_read_as_they_were_written(corners: Corners) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -63,6 +64,7 @@ def test_corners_are_read_as_they_were_written(corners: Corners) -> None:
         assert _same(read_corners(path, CHARUCO, MEASUREMENTS), corners)
 
 
+@settings(max_examples=40)
 @given(tables())
 def test_order_of_work_and_back_is_the_order_of_rows_and_numbers(corners: Corners) -> None:
     order = canonical_order(MEASUREMENTS, ["leg1"])
