@@ -218,6 +218,16 @@ def test_where_two_places_of_a_camera_fit_alike_the_view_says_distances_only() -
     assert [T is None for T in base.T_Rb_camera] == [False, True]
 
 
+def test_views_that_leave_two_places_of_a_camera_do_not_crowd_out_the_others() -> None:
+    A, v = SQUARE, np.array([[1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]])
+    v = v / np.sqrt(2.0)
+    seen = legs_seen(*[(0, 2)] * 6, (0, 1, 2, 3))
+    joints, _ = seen_from(A, v, seen)
+    base = locate_joints_in_base(made_up_base(*away(A, v)), joints)
+    assert np.abs(base.A_Rb - A).max() < 1e-8
+    assert base.T_Rb_camera[-1] is not None
+
+
 def test_axes_along_the_line_between_two_joints_do_not_place_a_camera() -> None:
     v = np.tile([1.0, 0.0, 0.0], (4, 1))
     seen = legs_seen((0, 1, 2, 3), (0, 1))

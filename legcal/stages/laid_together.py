@@ -1,6 +1,7 @@
 """Where cameras stood, found together with the base: step 2 from every place that looks alike.
 
-Where a view leaves several places of its camera, the rigid criterion is tried from all of them.
+Where a view leaves several places of its camera, the rigid criterion is tried from all of them,
+up to a number of trials; of more such views it takes distances between joints only.
 """
 
 from __future__ import annotations
@@ -70,8 +71,11 @@ def lay_together(
     n_trials = 1
     for places, located in zip(_starts(A_Rb, v_Rb, joints), joints.located, strict=True):
         usable = places and (places[0].fixed or located.sum() > 2)
-        n_trials *= max(len(places), 1)
-        starts.append(places if usable and n_trials <= _MOST_TRIALS else [None])
+        if usable and n_trials * len(places) <= _MOST_TRIALS:
+            n_trials *= len(places)
+            starts.append(places)
+        else:
+            starts.append([None])
     trials = [_Trial.of(mechanism, joints, v_Rb, choice) for choice in product(*starts)]
     best = min(trials, key=lambda trial: trial.cost)
     doubtful = np.zeros(len(starts), dtype=np.bool_)
