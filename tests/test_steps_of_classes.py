@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, five_millimetres_away
 from staged_machines import Observed, planned, shipped, three_steps
 
-from legcal.errors import NotIdentifiable
+from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.identify.planned import planned_session
 from legcal.identify.ranks import Analysis
@@ -22,13 +22,15 @@ from legcal.mechanism.parametrization import Parametrization, parametrize, vecto
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.stages.least_squares import structure_jacobian, structure_residuals
+from legcal.stages import platform_joints
+from legcal.stages.least_squares import LeastSquares, structure_jacobian, structure_residuals
 from legcal.stages.nominal import Criteria
 from legcal.stages.platform_pose import Transformation
 from legcal.stages.rigid_platform import build_rigid
 from legcal.stages.rigid_problem import rigid_problem
 from legcal.stages.run import StagedResult, run_steps
 from legcal.stages.solution import Solution
+from legcal.stages.solve import solve_least_squares
 from legcal.studies.estimators import nominal_of
 from legcal.studies.session import simulate_session
 
@@ -269,3 +271,24 @@ def test_axes_that_no_three_legs_at_once_show_are_refused_in_geometric_words() -
     words = r"angle \d of platform axis of leg \d can change without any image noticing"
     with pytest.raises(NotIdentifiable, match=words):
         run(observed)
+
+
+def test_axes_stay_near_nominal_where_step_4_does_not_converge_without_that(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = list[int]()
+
+    def fails_once(problem: LeastSquares) -> Solution:
+        calls.append(len(problem.terms))
+        if len(calls) == 2:
+            raise DidNotConverge("The platform joints (step 4) could not be computed.")
+        return solve_least_squares(problem)
+
+    observed = shipped("3-upu-tilted")
+    monkeypatch.setattr(platform_joints, "solve_least_squares", fails_once)
+    found = run(observed)
+    assert found.diagnostics == (platform_joints.KEPT_NEAR,)
+    assert calls == [calls[0], calls[0] - 1, calls[0]]
+    is_angle = np.array([unit == "rad" for unit in parameters_of(observed).units])
+    error, before = off(observed, found.legs), off(observed, observed.nominal.legs)
+    assert np.linalg.norm(error[is_angle]) < np.linalg.norm(before[is_angle])

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_geometry import LegGeometry
@@ -30,6 +31,11 @@ from legcal.stages.rigid_platform import build_rigid
 from legcal.stages.rigid_problem import RigidProblem, rigid_problem
 from legcal.stages.solution import Solution
 from legcal.stages.solve import solve_least_squares
+
+KEPT_NEAR = (
+    "Step 4 kept the axes of legs without an S joint near the nominal ones: the poses show them "
+    "too poorly to find them alone."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +164,8 @@ def with_base_and_offsets(
 def _minimum(rigid: RigidProblem) -> PlatformJoints:
     """Return the minimum of the rigid criterion, with what it leaves open held at nominal.
 
-    What is open is judged near the nominal model: there the platform moves as it should.
+    What is open is judged near the nominal model: there the platform moves as it should. Axes that
+    the poses show too poorly to converge without it stay near the nominal ones.
     """
     known, unknowns = rigid.mechanism, rigid.unknowns
     problem = build_rigid(rigid)
@@ -173,7 +180,13 @@ def _minimum(rigid: RigidProblem) -> PlatformJoints:
     )
     if len(still.basis):
         terms = (*terms, still.holding(metres(unknowns, still.length), nominal))
+    said = still.sentences
     if near or len(still.basis):
-        solution = solve_least_squares(replace(problem, terms=terms, start=solution.x))
+        problem = replace(problem, terms=terms, start=solution.x)
+        try:
+            solution = solve_least_squares(problem)
+        except DidNotConverge:
+            solution = solve_least_squares(replace(problem, terms=(*terms, *near)))
+            said = (*said, KEPT_NEAR)
         found = unknowns.legs(solution.x[:n], known.legs)
-    return PlatformJoints(found, solution, still.sentences)
+    return PlatformJoints(found, solution, said)
