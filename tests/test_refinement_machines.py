@@ -20,6 +20,8 @@ from legcal.refinement.linearize import linearize
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.normal import information
 from legcal.refinement.priors import named_values
+from legcal.refinement.rounds import first_minimum
+from legcal.refinement.settings import DEFAULT_SETTINGS
 from legcal.refinement.start import with_values
 from legcal.refinement.state import State, components
 
@@ -42,6 +44,7 @@ def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> Se
         view=session.measurements.view,
         pose=session.measurements.pose,
         seen=np.ones((len(cameras), len(legs.names)), dtype=np.bool_),
+        board=np.zeros(len(cameras), dtype=np.bool_),
         camera=np.array([T.inv().translation for T in cameras]),
         focal=np.full(len(cameras), session.measurements.views[0].camera.K[0, 0]),
         sigma_q=session.measurements.sigma_q,
@@ -165,6 +168,25 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
         between = np.linalg.norm(np.cross(a, b), axis=1)
         assert between.max() < 1e-6  # as far as the written model has them from parallel
     assert max(turned) > np.deg2rad(0.5)  # held where the nominal ones are, and harmless
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_first_fit_stays_near_the_nominal_model_where_nothing_is_known(seed: int) -> None:
+    session = machine_session("3-upu")
+    problem = build_fit(session.legs, *session.noisy(seed))
+    begin = problem.begin(session.start)
+    first = first_minimum(problem, begin, DEFAULT_SETTINGS)
+    turned = [
+        np.arccos(abs(np.asarray(leg.base_axis) @ np.asarray(nominal.base_axis)))
+        for leg, nominal in zip(first.state.legs, session.legs.nominal, strict=True)
+    ]
+    assert max(turned) < np.deg2rad(3.0)
+    held = open_directions(
+        problem, first.state, information(problem, first.state, first.linear, 0.0)
+    )
+    assert len(held.directions) == 7
+    # The knowledge that keeps it there is no measurement, and is not counted.
+    assert len(first.linear.prior_r) == len(problem.priors) < len(problem.named)
 
 
 def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array, Array]:

@@ -215,6 +215,7 @@ def _refined(
         refuse_lost(fit.problem, fit.state, normal, held)
         _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
+        refuse_contradicted_values(free, candidate.start, state, settings, with_priors=True)
         _refuse_contradicted(free, state)
         _refuse_undetermined(free, state)
         if isinstance(failure, DidNotConverge):

@@ -18,7 +18,7 @@ from legcal.refinement.influence import explained_share
 from legcal.refinement.judged_corners import with_judged_corners
 from legcal.refinement.linearize import linearize, offsets_of
 from legcal.refinement.loss import width_to_k
-from legcal.refinement.minimise import Minimum, minimise
+from legcal.refinement.minimise import Minimum, minimise, robust_cost
 from legcal.refinement.noise import NoiseModel, estimate_noise, noise_of_the_median
 from legcal.refinement.normal import information
 from legcal.refinement.problem import FitProblem
@@ -26,6 +26,7 @@ from legcal.refinement.settings import RefinementSettings
 from legcal.refinement.settling import NO_CHANGES, Changes, sizes, unsettled
 from legcal.refinement.shifted import with_biases
 from legcal.refinement.state import State
+from legcal.refinement.steady import steadied
 
 _BOARD_ROUNDS = 3
 _NEAR_ENOUGH = 0.005  # of the cost a step: rejecting need not wait for the rest
@@ -63,7 +64,9 @@ class Fit:
 
 
 def first_minimum(problem: FitProblem, begin: State, settings: RefinementSettings) -> Minimum:
-    """Solve with all observations and claimed covariances.
+    """Solve with all observations and claimed covariances, kept near the nominal model.
+
+    What is kept of the minimum, its cost and its derivatives, is without that knowledge.
 
     Raises
     ------
@@ -72,7 +75,11 @@ def first_minimum(problem: FitProblem, begin: State, settings: RefinementSetting
     """
     whitening = NoiseModel().whitening(problem.outlines.covariance)
     width, n_steps = settings.loss_width, settings.max_iterations
-    return minimise(problem, begin, whitening, width, n_steps, _NEAR_ENOUGH)
+    steady = steadied(problem, begin)
+    found = minimise(steady, begin, whitening, width, n_steps, _NEAR_ENOUGH)
+    linear = linearize(problem, found.state, whitening)
+    cost = robust_cost(linear, width_to_k(width))
+    return Minimum(found.state, linear, cost, found.iterations)
 
 
 def fit_in_rounds(
