@@ -140,7 +140,7 @@ class BoundTally:
         n, count, n_parameters = self._n, max(self._n, 1), len(self._bound.names)
         coverage = self._inside / count
         covered = float(coverage.mean())
-        spread = max(self._shares / count - covered**2, 0.0) ** 0.5 if n > 1 else 1.0
+        spread = max(self._shares / count - covered**2, 0.0) ** 0.5
         pooled = (
             ratio_figure((self._joint / count) ** 0.5, n, n_parameters, LARGEST_RATIO),
             nse_figure(self._nse / count, n, n_parameters, NSE),

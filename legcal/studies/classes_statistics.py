@@ -171,7 +171,7 @@ class ClassTally:
     def _figures(self) -> tuple[Figure, ...]:
         """Return the figures of all fits; every determined direction counts alike."""
         n, total = len(self._shares), sum(rank * k for rank, k in self._ranks.items())
-        spread = float(np.std(self._shares)) if n > 1 else 1.0
+        spread = float(np.std(self._shares))
         return (
             ratio_figure(float(np.sqrt(self._joint / total)), 1, total, LARGEST_RATIO),
             nse_figure(self._nse / total, 1, total, NSE),

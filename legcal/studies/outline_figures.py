@@ -12,6 +12,7 @@ LEVEL = 0.999  # of sampling bands
 COVERED, COVERAGE = 0.95, (0.94, 0.96)
 INSIDE = float(norm.ppf(0.5 + 0.5 * COVERED))  # standard deviations on either side
 _WIDE = float(norm.ppf(0.5 + 0.5 * LEVEL))
+_TOGETHER = 10  # runs: what is believed of the spread of coverage before any, see below
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,21 @@ def nse_figure(value: float, n: int, n_parameters: int, limits: tuple[float, flo
 
 
 def coverage_figure(value: float, spread: float, n: int) -> Figure:
-    """Return the figure of all intervals; intervals of one run hold the truth together or not."""
-    half = _WIDE * spread / np.sqrt(max(n, 1))
+    """Return the figure of all intervals; intervals of one run hold the truth together or not.
+
+    Parameters
+    ----------
+    value : float
+        Part of all intervals that hold the truth.
+    spread : float
+        Standard deviation, over runs, of the part of a run. Few runs may show none: it counts
+        beside some in which all intervals of a run hold the truth together.
+    n : int
+        Number of runs.
+    """
+    together = COVERED * (1.0 - COVERED)
+    variance = (n * spread**2 + _TOGETHER * together) / (n + _TOGETHER)
+    half = _WIDE * np.sqrt(variance / max(n, 1))
     by_chance = bool(half > COVERED - COVERAGE[0])
     low, high = min(COVERAGE[0], COVERED - half), max(COVERAGE[1], COVERED + half)
     return Figure("coverage", value, float(low), float(high), by_chance)
