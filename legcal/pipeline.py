@@ -126,7 +126,9 @@ def calibrate(
             dataset, run, criteria, choices, use_cache=use_cache, transformation=transformation
         )
         found = observe_and_fit(work, split.fitted, progress)
-    notes = [*dataset.notes, *choices.notes, *left_open, *work.keep_outlines(found.outlines)]
+    kept = work.keep_outlines(found.outlines)
+    unreached = found.part.reached.notes(found.part.measurements)
+    notes = [*dataset.notes, *choices.notes, *left_open, *kept, *unreached]
     order = found.part.order
     calibration = judge(
         fitted,

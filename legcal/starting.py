@@ -12,7 +12,6 @@ from legcal.calibration import Steps
 from legcal.detection.observe import Scene
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.mechanism.parametrization import geometries
-from legcal.mechanism.platform import platform_in_base
 from legcal.observations.leg_axes import axes_from_outlines
 from legcal.observations.one_camera import in_one_camera
 from legcal.observations.outlines import Outlines
@@ -67,7 +66,7 @@ def starts_of_fit(
     """Return the starts of the fit: the nominal model, and the steps where they gave a result."""
     mechanism = work.mechanism
     legs = geometries(mechanism)
-    platform = [platform_in_base(mechanism, T) for T in work.nominal_poses]
+    platform = work.reached.T_Rb_Re
     rough = [None if T is None else T.inv() * mechanism.T_base_Rb for T in scene.T_base_camera]
     staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
     starts = [(legs, _cameras(work, outlines, rough, staged, steps), "nominal")]

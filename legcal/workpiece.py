@@ -17,11 +17,8 @@ from legcal.detection.observe import (
     detection_settings,
 )
 from legcal.geometry.types import IntArray
-from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries
-from legcal.mechanism.platform import platform_in_base
 from legcal.observations.canonical_order import (
     Order,
     canonical_order,
@@ -36,7 +33,8 @@ from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.refinement.choices import Choices
 from legcal.refinement.legs import FittedLegs, fitted_legs
-from legcal.refinement.start import platform_poses, start_from
+from legcal.refinement.nominal_poses import NominalPoses, nominal_poses
+from legcal.refinement.start import start_from
 from legcal.stages.nominal import Criteria
 from legcal.stages.platform_pose import Transformation
 from legcal.workers import Run
@@ -103,23 +101,20 @@ class Workpiece:
         return fitted_legs(self.mechanism)
 
     @cached_property
+    def reached(self) -> NominalPoses:
+        """The platform poses of the nominal model."""
+        return nominal_poses(self.mechanism, self.measurements)
+
+    @property
     def nominal_poses(self) -> list[RigidTransform]:
         """T_base_platform of every pose by the nominal model."""
-        mechanism = self.mechanism
-        q = self.measurements.q[self.measurements.first_rows]
-        if mechanism.is_determined:
-            return forward_kinematics_many(mechanism, q)
-        home = [platform_in_base(mechanism, mechanism.home)] * len(q)
-        lengths = mechanism.sign * q + mechanism.q0
-        near = platform_poses(geometries(mechanism), lengths, home, mechanism.frame_legs)
-        back = mechanism.T_platform_Re.inv()
-        return [mechanism.T_base_Rb * T * back for T in near]
+        back = self.mechanism.T_platform_Re.inv()
+        return [self.mechanism.T_base_Rb * T * back for T in self.reached.T_Rb_Re]
 
     def poses_by(self, legs: Sequence[LegGeometry]) -> tuple[RigidTransform, ...]:
         """Return T_Rb_Re of every pose by the readings and other legs, in R_b and R_e."""
-        nominal = [platform_in_base(self.mechanism, T) for T in self.nominal_poses]
         here = self.fitted_legs
-        return start_from(legs, self.measurements, here, (), nominal, "").T_Rb_Re
+        return start_from(legs, self.measurements, here, (), self.reached.T_Rb_Re, "").T_Rb_Re
 
     def part(self, rows: IntArray) -> Workpiece:
         """Return some of the images, by their rows in the files."""

@@ -26,6 +26,7 @@ _RANK = 1e-9  # of the largest singular value
 _FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
 _ATTEMPTS = 12
 _SHRINKING = 0.6  # each attempt with that part of the travel of the one before, but
+_LOOSE = 0.01  # of a hold by motors and joints, without unit
 _LEAST_SHARE = 0.078  # of the travel at least
 
 
@@ -70,7 +71,7 @@ def random_poses(
     closing.drive(R0, t0)
     home_lengths = closing.lengths(R0, t0)[0]
     found_R, found_t = np.zeros((0, 3, 3)), np.zeros((0, 3))
-    share = 1.0
+    share, tried, near_singular = 1.0, 0, 0
     for _ in range(_ATTEMPTS):
         n = 2 * (count - len(found_t)) + 10
         wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))
@@ -80,6 +81,7 @@ def random_poses(
         for part in np.linspace(0.0, 1.0, _STEPS + 1)[1:]:
             R, t = closing.close(R, t, first + part * (wanted - first), _ITERATIONS)
             good &= closing.is_regular(R, t, R0, t0)
+        tried, near_singular = tried + n, near_singular + int(np.sum(~good))
         R, t = closing.close(R, t, wanted, _LAST_ITERATIONS - _ITERATIONS)
         good &= closing.is_closed(R, t, wanted)
         good &= _inside(closing.lengths(R, t), travel, home_lengths)
@@ -87,10 +89,16 @@ def random_poses(
         if len(found_t) >= count:
             return found_R[:count], found_t[:count]
         share = max(_SHRINKING * share, _LEAST_SHARE)
+    found = f"found {len(found_t)} of {count} random poses inside the travel"
+    if 2 * near_singular > tried and closing.hold(R0, t0) < _LOOSE:
+        raise DidNotConverge(
+            f"The observations could not be predicted: {found}, needed all; most ways there come "
+            "near a singular pose, in which motors and joints do not hold the platform: choose a "
+            "home further from it, or joints that do not make the same figure on base and platform."
+        )
     raise DidNotConverge(
-        f"The observations could not be predicted: found {len(found_t)} of {count} random poses "
-        "inside the travel, needed all; check the travel (limit lower, upper) and the home pose "
-        "of the model."
+        f"The observations could not be predicted: {found}, needed all; check the travel (limit "
+        "lower, upper) and the home pose of the model."
     )
 
 
@@ -123,6 +131,13 @@ class _Closing:
         """Return the number of independent equations at a pose."""
         slopes = self.system(R, t, self.lengths(R, t))[1][0]
         return int(np.linalg.matrix_rank(slopes, tol=_DEPENDENT)) if slopes.size else 0
+
+    def hold(self, R: Array, t: Array) -> float:
+        """Return how well motors and joints hold the platform at a pose: 0 where singular."""
+        lengths = self.lengths(R, t)
+        scale = np.where(np.array(self.columns) < 3, 1.0 / lengths.mean(), 1.0)
+        slopes = self.system(R, t, lengths)[1][0] * scale
+        return float(np.linalg.svd(slopes, compute_uv=False)[-1]) if slopes.size else 0.0
 
     def lengths(self, R: Array, t: Array) -> Array:
         """Return the leg lengths, (k, n_legs) [m]."""

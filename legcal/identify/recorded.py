@@ -10,8 +10,9 @@ from legcal.identify.cameras import default_cameras
 from legcal.identify.planned import REACHED, joints_at, machine_near, radii, travel_of
 from legcal.identify.poses import random_poses
 from legcal.identify.session import Session
-from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.parametrization import parametrization_of
+from legcal.refinement.nominal_poses import nominal_poses
+from legcal.refinement.state import components
 
 
 def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
@@ -29,17 +30,15 @@ def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
 
     Raises
     ------
-    DidNotConverge
-        If the readings do not lead to closed poses.
+    DatasetError
+        If readings are out of reach of the model by more than its errors may be.
     """
     mechanism, m = dataset.mechanism, dataset.measurements
     to_Rb, from_Re = mechanism.T_base_Rb.inv(), mechanism.T_platform_Re
     home = to_Rb * mechanism.home * from_Re
     legs, length, rng = machine_near(mechanism, home)
     if mechanism.is_determined:
-        poses = forward_kinematics_many(mechanism, m.q[m.first_rows])
-        T = [to_Rb * pose * from_Re for pose in poses]
-        R, t = np.array([x.rotation.as_matrix() for x in T]), np.array([x.translation for x in T])
+        R, t = components(nominal_poses(mechanism, m).T_Rb_Re)
     else:
         travel = travel_of(mechanism)
         R, t = random_poses(legs, mechanism.frame_legs, home, travel, m.n_poses, rng)

@@ -14,6 +14,7 @@ length only.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -129,7 +130,7 @@ class _Row:
 
     def depends_on_base_axis(self, gradient: Array) -> None:
         """Add the dependence on the axis at the base."""
-        e1, e2 = normal_basis(_given(self.state.leg.base_axis))
+        e1, e2 = _basis(_given(self.state.leg.base_axis))
         self.by_local[:, 7] -= gradient @ e2
         self.by_local[:, 8] += gradient @ e1
 
@@ -138,7 +139,7 @@ class _Row:
         axis = _given(self.state.leg.platform_axis)
         self.by_pose[:, :3] += _cross(self.state.turned(vector), gradient)
         inside = _back(self.state.R, gradient)
-        for column, e in zip((9, 10), normal_basis(axis), strict=True):
+        for column, e in zip((9, 10), _basis(axis), strict=True):
             self.by_local[:, column] += inside @ _cross(e, vector)
 
 
@@ -166,7 +167,7 @@ def _platform_axis(state: _State) -> _Row:
 
 def _along(which: int, state: _State) -> _Row:
     """Return a component of u across the direction that the platform gives the leg."""
-    return _component(state, normal_basis(_given(state.leg.platform_axis))[which])
+    return _component(state, _basis(_given(state.leg.platform_axis))[which])
 
 
 def _component(state: _State, vector: Array) -> _Row:
@@ -186,7 +187,7 @@ def _twist(state: _State) -> _Row:
     reach = np.linalg.norm(across, axis=1)[:, None]
     p = np.broadcast_to(a, u.shape) if leg.base_joint == "R" else across / reach
     b = _given(leg.platform_axis)
-    outer = normal_basis(b)[0] if leg.platform_joint == "" else b
+    outer = _basis(b)[0] if leg.platform_joint == "" else b
     far = _cross(state.turned(outer), u)
     far_reach = np.linalg.norm(far, axis=1)[:, None]
     w = far / far_reach if leg.platform_joint == "U" else state.turned(outer)
@@ -223,10 +224,26 @@ def _given(vector: Array | None) -> Array:
     return vector
 
 
+def _basis(axis: Array) -> Array:
+    """Return the two directions across an axis of a leg, which is asked for at every pose."""
+    return _basis_of(np.ascontiguousarray(axis, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=1024)
+def _basis_of(axis: bytes) -> Array:
+    """Return the basis of an axis by its three numbers, not to be written to."""
+    basis = normal_basis(np.frombuffer(axis))
+    basis.flags.writeable = False
+    return basis
+
+
 def _cross(a: Array, b: Array) -> Array:
     """Return vector products of rows or single vectors; np.cross is slow on few of them."""
     (x, y, z), (i, j, k) = a.T, b.T
-    return np.stack([y * k - z * j, z * i - x * k, x * j - y * i], axis=-1)
+    first = y * k - z * j
+    product = np.empty((*first.shape, 3))
+    product[..., 0], product[..., 1], product[..., 2] = first, z * i - x * k, x * j - y * i
+    return product
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -9,6 +9,7 @@ Where the joints of the chain stop Newton the platform itself is followed, and t
 where it arrives.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,6 +122,39 @@ def follow(
             "cut spherical joints with 3d."
         )
     return closed
+
+
+def follow_rows(
+    mechanism: Mechanism, readings: Array
+) -> Iterator[tuple[Array, DidNotConverge | None]]:
+    """Yield the closed configuration at each of many readings, or the nearest that is known.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+    readings : (n_rows, n_motors) array
+        Readings [m]; each row starts from the nearest one that is solved already, or from home.
+
+    Yields
+    ------
+    configuration : (nq,) array
+        At the readings of the row; where it started, if these are not reached.
+    failure : DidNotConverge or None
+        Why they are not.
+    """
+    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
+    configurations = [mechanism.home_configuration]
+    for i, row in enumerate(readings):
+        nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
+        try:
+            configuration = follow(mechanism, nearest, row, f" of row {i + 1}")
+        except DidNotConverge as failure:
+            yield nearest, failure
+            continue
+        known.append(row)
+        configurations.append(configuration)
+        yield configuration, None
 
 
 def _closed(

@@ -6,14 +6,16 @@ constraints, followed from home or from a given pose so that it stays in one ass
 cheapest way along a path.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import NotIdentifiable, UsageError
+from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.closing import close_near, platform_pose, readings_at, slider_columns
+from legcal.mechanism.closing import close_near, platform_pose, readings_at
 from legcal.mechanism.demands import unmet
-from legcal.mechanism.following import follow
+from legcal.mechanism.following import follow, follow_rows
 from legcal.mechanism.home import settle
 from legcal.mechanism.leg import LegKind
 from legcal.mechanism.mobility import mobility
@@ -21,6 +23,7 @@ from legcal.mechanism.model import Mechanism
 
 __all__ = [
     "Follower",
+    "followed_poses",
     "forward_kinematics",
     "forward_kinematics_many",
     "inverse_kinematics",
@@ -144,17 +147,25 @@ def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransfo
     NotIdentifiable, DidNotConverge, UsageError
         As :func:`forward_kinematics`.
     """
-    readings = _readings(mechanism, np.asarray(q, dtype=np.float64))
-    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
-    configurations = [mechanism.home_configuration]
     poses = []
-    for i, row in enumerate(readings):
-        nearest = int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))
-        configuration = follow(mechanism, configurations[nearest], row, f" of row {i + 1}")
-        known.append(row)
-        configurations.append(configuration)
-        poses.append(platform_pose(mechanism, configuration))
+    for pose, failure in followed_poses(mechanism, q):
+        if failure is not None:
+            raise failure
+        poses.append(pose)
     return poses
+
+
+def followed_poses(
+    mechanism: Mechanism, q: Array
+) -> Iterator[tuple[RigidTransform, DidNotConverge | None]]:
+    """Yield the platform pose at each of many rows of readings, or one nearby, and why.
+
+    Where a row is not reached, the pose is that of the nearest row that is, or home. Arguments and
+    other exceptions are those of :func:`forward_kinematics_many`.
+    """
+    readings = _readings(mechanism, np.asarray(q, dtype=np.float64))
+    for configuration, failure in follow_rows(mechanism, readings):
+        yield platform_pose(mechanism, configuration), failure
 
 
 def inverse_kinematics(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:

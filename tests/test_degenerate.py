@@ -1,0 +1,222 @@
+"""Geometry that is nearly or quite degenerate: the right answer, or what is missing, by name."""
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from authoring import made
+from scipy.spatial.transform import RigidTransform, Rotation
+from simulated import settings
+
+import legcal
+from legcal import calibrate, simulate
+from legcal.calibration import Calibration
+from legcal.errors import DatasetError, DidNotConverge, NotVisible
+from legcal.mechanism.model import Mechanism
+
+LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
+SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]
+READINGS = np.random.default_rng(7).uniform(0.035, 0.12, (9, 3))
+
+
+def planar(folder: Path, base: Any, platform: Any, home: Any) -> Mechanism:
+    """Return a 3-RPR with given joints."""
+    return made(
+        folder, name="3-rpr", type="3-RPR", base_joints=base, platform_joints=platform,
+        offsets=250, travel=[0, 250], radius={"tube": 12, "rod": 8}, home=home,
+    )  # fmt: skip
+
+
+def tripod(folder: Path, platform_radius: float) -> Mechanism:
+    """Return a 3-UPU that translates; with a platform as wide as its base it is singular."""
+    turns = [Rotation.from_euler("z", a, degrees=True) for a in (0, 120, 240)]
+    base, platform = (
+        [turn.apply([radius, 0.0, 0.0]).tolist() for turn in turns]
+        for radius in (320.0, platform_radius)
+    )
+    return made(
+        folder, name="3-upu", type="3-UPU", base_joints=base, platform_joints=platform,
+        offsets=420, travel=[0, 160], home={"xyz": [0, 0, 500], "rpy_deg": [0, 0, 0]},
+    )  # fmt: skip
+
+
+def errors(calibration: Calibration, folder: Path, result: Path) -> tuple[float, float]:
+    """Return the platform errors of the nominal and the calibrated model, as users ask for them."""
+    truth = next((folder / "truth" / "models").glob("*.yaml"))
+    nominal = calibration.dataset.mechanism
+    before, after = (
+        float(legcal.evaluate(model, truth, dataset=folder).displacement.mean())
+        for model in (nominal, result / "calibrated.yaml")
+    )
+    return before, after
+
+
+def said(calibration: Calibration) -> str:
+    return " ".join(calibration.notes)
+
+
+def with_pose(folder: Path, mechanism: Mechanism, last: Any) -> Path:
+    """Write ordinary readings of a 3-RPR, and another one."""
+    joints = [leg.prismatic for leg in mechanism.legs]
+    with (folder / "poses.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerows([joints, *READINGS.tolist(), list(last)])
+    return folder / "poses.csv"
+
+
+@pytest.mark.parametrize(
+    ("base", "platform", "home"),
+    [
+        pytest.param(
+            LINE,
+            [[-121, 70, 0], [0, -40, 0], [121, 70, 0]],
+            ([20, 300, 0], 20),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            [[0, -400, 0], [346, 200, 0], [-346, 200, 0]],
+            SHORT_LINE,
+            ([20, -10, 0], 65),
+            marks=pytest.mark.slow,
+        ),
+        (LINE, SHORT_LINE, ([20, 330, 0], 10)),
+    ],
+    ids=["base", "platform", "both"],
+)
+def test_collinear_joints_of_a_3_rpr_are_found(
+    base: Any, platform: Any, home: Any, tmp_path: Path
+) -> None:
+    xyz, turn = home
+    model = planar(tmp_path, base, platform, {"xyz": xyz, "rpy_deg": [0, 0, turn]})
+    folder = simulate(model, tmp_path / "set", settings(poses=5, seed=1)).folder
+    calibration = calibrate(folder, output=tmp_path / "out")
+    before, after = errors(calibration, folder, tmp_path / "out")
+    assert calibration.verdict.trustworthy
+    assert calibration.platform is not None
+    assert after < 3.0 * calibration.platform.sigma.mean_displacement
+    assert before > 10.0 * after
+
+
+def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_path: Path) -> None:
+    """Legs that are all 6 mm shorter in the model than on the machine, which nearly meet there."""
+    model = legcal.load_mechanism("3-rpr")
+    turned = Rotation.from_euler("z", 12, degrees=True)
+    near = legcal.inverse_kinematics(model, RigidTransform.from_components([0, 0, 0], turned))
+    poses = with_pose(tmp_path, model, near)
+    made_set = simulate(model, tmp_path / "set", settings(poses=poses, views=2))
+    short = made(
+        tmp_path, name="short", type="3-RPR", offsets=224, travel=[0, 140],
+        base_joints=[[0, -400, 0], [346.41, 200, 0], [-346.41, 200, 0]],
+        platform_joints=[[0, -140, 0], [121.24, 70, 0], [-121.24, 70, 0]],
+        radius={"tube": 12, "rod": 8}, home={"xyz": [20, -10, 0], "rpy_deg": [0, 0, 35]},
+    )  # fmt: skip
+    with pytest.raises(DidNotConverge, match="the legs meet no more or the mechanism is singular"):
+        legcal.forward_kinematics(short, near)
+    dataset = replace(legcal.load_dataset(made_set.folder), mechanism=short)
+    calibration = calibrate(dataset, output=tmp_path / "out")
+    assert "The nominal model does not reach the readings of view c1, p10: its" in said(calibration)
+    assert calibration.verdict.trustworthy
+    calibrated = tmp_path / "out" / "calibrated.yaml"
+    apart = legcal.evaluate(calibrated, made_set.truth_path, dataset=made_set.folder)
+    assert apart.displacement.max() < 2e-4
+
+
+def test_a_reading_out_of_reach_is_named(tmp_path: Path) -> None:
+    model = legcal.load_mechanism("3-rpr")
+    poses = with_pose(tmp_path, model, READINGS[0])
+    folder = simulate(model, tmp_path / "set", settings(poses=poses, views=1)).folder
+    table = folder / "measurements.csv"
+    lines = table.read_text().splitlines()
+    typed = lines[4].split(",")
+    lines[4] = ",".join([*typed[:-3], "0.0001", "0.0001", "0.0001"])
+    table.write_text("\n".join(lines) + "\n")
+    with pytest.raises(
+        DatasetError, match=r"readings of view c1, p04 could not be used"
+    ) as refused:
+        calibrate(folder)
+    assert "needed at most" in str(refused.value)
+    assert len(refused.value.problems) == 1
+
+
+def test_a_3_upu_near_its_constraint_singularity_is_refused_by_name(tmp_path: Path) -> None:
+    model = tripod(tmp_path, 310.0)
+    views = [model.leg_names] * 3
+    with pytest.raises(DidNotConverge, match="near a singular pose, in which motors and joints"):
+        legcal.identifiability(model, views)
+
+
+def test_a_3_upu_at_its_constraint_singularity_is_told(tmp_path: Path) -> None:
+    model = tripod(tmp_path, 319.9)
+    assert any("singular at home" in note for note in model.diagnostics)
+
+
+@pytest.mark.slow
+def test_a_3_upu_not_far_from_its_constraint_singularity_is_calibrated(tmp_path: Path) -> None:
+    """Errors of the nominal model are magnified there to centimetres, and found all the same."""
+    folder = simulate(tripod(tmp_path, 280.0), tmp_path / "set", settings(seed=1)).folder
+    calibration = calibrate(folder, output=tmp_path / "out")
+    before, after = errors(calibration, folder, tmp_path / "out")
+    assert calibration.platform is not None
+    assert calibration.verdict.trustworthy
+    assert before > 1e-2
+    assert after < 3.0 * calibration.platform.sigma.mean_displacement
+
+
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Outlines of a hexapod of which two cameras see three legs each, and no leg in common."""
+    folder = tmp_path_factory.mktemp("halves") / "set"
+    simulate("hexapod", folder, settings(poses=12, views=2, seed=1))
+    text = (folder / "dataset.yaml").read_text()
+    for view, legs in (("c1", "leg1, leg2, leg3"), ("c2", "leg4, leg5, leg6")):
+        text = re.sub(
+            rf"(  {view}:\n)((?:    .*\n)*?)(?=  c|\Z)", rf"\1    legs: [{legs}]\n\2", text
+        )
+    (folder / "dataset.yaml").write_text(text)
+    return folder
+
+
+def test_views_that_share_no_leg_are_joined_by_the_readings(halves: Path, tmp_path: Path) -> None:
+    calibration = calibrate(halves, output=tmp_path / "out")
+    before, after = errors(calibration, halves, tmp_path / "out")
+    assert calibration.verdict.trustworthy
+    assert after < 0.1 * before
+    assert "share" in calibration.steps.failure or "together" in calibration.steps.failure
+    assert "board" in calibration.steps.failure
+    assert "The four steps alone leave open" in said(calibration)
+
+
+def test_a_leg_that_no_view_shows_is_found_from_its_readings(tmp_path: Path) -> None:
+    """Legs 1 to 5 are named in the views, leg 6 in none: its encoder says where it is."""
+    folder = simulate("hexapod", tmp_path / "set", settings(poses=12, views=2, seed=1)).folder
+    observations = folder / "observations.csv"
+    with observations.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    leg = header.index("leg")
+    with observations.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *(row for row in rows if row[leg] != "leg6")])
+    with pytest.raises(NotVisible, match=r"found no used outline of leg6 .* name the legs of each"):
+        calibrate(folder)
+    text = (folder / "dataset.yaml").read_text()
+    text = re.sub(r"    legs: .*\n", "", text)
+    five = "    legs: [leg1, leg2, leg3, leg4, leg5]\n    T_base_camera:"
+    (folder / "dataset.yaml").write_text(text.replace("    T_base_camera:", five))
+    calibration = calibrate(folder, output=tmp_path / "out")
+    before, after = errors(calibration, folder, tmp_path / "out")
+    assert calibration.verdict.trustworthy
+    assert after < 0.1 * before
+    assert calibration.solution.status["leg6.base.z"] == "estimated"
+
+
+def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path: Path) -> None:
+    made_set = simulate("3-upu", tmp_path / "set", settings(poses=6, views=2, seed=1))
+    calibration = calibrate(made_set.folder, output=tmp_path / "out")
+    before, after = errors(calibration, made_set.folder, tmp_path / "out")
+    assert calibration.verdict.trustworthy
+    assert after < 0.1 * before
+    assert re.search(r"Not determined, and without effect on the platform: \d", said(calibration))
+    assert calibration.solution.status["leg1.base_axis.1"] == "weak"
