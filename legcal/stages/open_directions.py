@@ -32,7 +32,7 @@ from legcal.stages.platform_unknowns import (
 )
 
 _OPEN = 10.0  # mean leg lengths, or [rad]: what is known worse is not determined at all
-_POOR = 0.05  # the same: nominal models know it better, and the platform does not ask for it
+_POOR = 0.1  # the same: nominal models know it better, and the platform does not ask for it
 _NEAR = 0.03  # [rad], how far axes may be from the nominal ones, about
 _HARMLESS = 0.01  # of the change of the parameters: the platform hardly moves
 _TURNS = slice(7, 12)  # of both axes, and the twist: places among the numbers of a leg
