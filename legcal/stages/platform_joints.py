@@ -133,8 +133,8 @@ def locate_platform_joints(
     unknowns. One image tells a pose of the platform badly, and an axis that is computed from
     such poses inherits that; the demands of all legs make the poses much better, and the joints
     with them. They tell joints too that distances alone leave open.
-    The problem starts at the nominal model: axes in closed form from poses of noisy ends are further
-    off than these, and what it finds is the same from 30 mm and 20 degrees away.
+    The problem starts at the nominal model: axes in closed form from poses of noisy ends are
+    further off than these, and what it finds is the same from 30 mm and 20 degrees away.
     """
     known = with_base_and_offsets(mechanism, base, offsets)
     how = chosen_transformation(transformation, criteria)
