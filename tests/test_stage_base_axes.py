@@ -16,6 +16,7 @@ from legcal.mechanism.leg import LegKind
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements, View
+from legcal.stages import meeting_axes, meeting_points
 from legcal.stages.base_unknowns import BaseUnknowns, turned_axis
 from legcal.stages.camera_starts import camera_starts
 from legcal.stages.joints_in_base import locate_joints_in_base
@@ -125,6 +126,35 @@ def test_an_axis_that_nearly_equal_directions_leave_open_is_left_out_with_its_un
     joints = locate_joints_in_cameras(observed.nominal, coarse, m)
     assert not joints.axis_located.all()
     assert any("revolute axis of leg leg" in d and "deg)" in d for d in joints.diagnostics)
+
+
+def test_weights_are_computed_again_until_joints_and_axes_stay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observed = shipped("3-rps", n_poses=10, noise=3.0, seed=1)
+    inputs = observed.nominal, observed.axes, observed.measurements
+    found = locate_joints_in_cameras(*inputs)
+    monkeypatch.setattr(meeting_axes, "MOST_REWEIGHTINGS", 1000)
+    monkeypatch.setattr(meeting_points, "_SETTLED", 1e-9)
+    longer = locate_joints_in_cameras(*inputs)
+    assert np.array_equal(found.axis_located, longer.axis_located)
+    sigma = np.sqrt(np.einsum("vlii->vli", found.covariance))[found.axis_located]
+    turn = np.cross(found.v_camera, longer.v_camera)[found.axis_located]
+    move = (found.A_camera - longer.A_camera)[found.axis_located]
+    assert np.linalg.norm(turn, axis=1).max() < 1e-4 * sigma[:, 3:].min()
+    assert np.all(np.abs(move) < 1e-4 * sigma[:, :3])
+
+
+@pytest.mark.parametrize(("name", "noise"), [("3-rpr", 10.0), ("3-rpr", 30.0), ("3-rps", 30.0)])
+def test_legs_that_say_nothing_of_their_joint_do_not_stop_the_others(
+    name: str, noise: float
+) -> None:
+    observed = shipped(name, n_poses=10, noise=noise, seed=3)
+    joints = locate_joints_in_cameras(observed.nominal, observed.axes, observed.measurements)
+    assert not joints.located.all()
+    assert joints.located.any(axis=0).all()
+    assert np.all(np.isfinite(joints.A_camera))
+    assert np.all(np.isfinite(joints.covariance))
 
 
 def test_the_derivative_of_the_miss_is_that_of_differences() -> None:

@@ -13,9 +13,10 @@ from legcal.geometry.types import Array, IntArray
 from legcal.observations.leg_axes import LegAxes
 from legcal.stages.bundles import Bundles
 from legcal.stages.meeting_points import (
-    REWEIGHTINGS,
+    MOST_REWEIGHTINGS,
     derivative_of_miss,
     miss_of_joint,
+    progress,
     robust_weights,
 )
 
@@ -75,23 +76,37 @@ def weighted_joints(
     A : (n, 3) array
         Centres [m].
     v : (n, 3) array
-        Unit vectors.
+        Unit vectors, the same in a pool but for bundles that say nothing of their joints.
     covariance : (n, 5, 5) array
         Of A [m^2] and of two turns of v about its normal basis [rad^2].
     """
-    rows, bundle = bundles.rows, bundles.bundle
-    for _ in range(REWEIGHTINGS):
-        residual, spread, tilt = miss_of_joint(axes, rows, A[bundle], v[bundle])
-        weight = robust_weights(bundles, residual, spread)
-        alpha = (tilt @ np.linalg.solve(spread, residual[..., None]))[..., 0]
-        J = derivative_of_miss(axes, rows, v[bundle], alpha)
-        back = np.swapaxes(J, 1, 2) @ weight
-        step, C = _pooled(
-            bundles.total(back @ J), bundles.total((back @ residual[..., None])[..., 0]), pool
-        )
-        step = _limited(step, np.linalg.norm(A, axis=1))
-        A, v = A - step[:, :3], turned(v, -step[:, 3:])
+    A, v, C, going = A.copy(), v.copy(), np.zeros((len(A), 5, 5)), np.arange(len(A))
+    for k in range(MOST_REWEIGHTINGS):
+        some = bundles.some(np.isin(np.arange(len(A)), going))
+        step, C[going] = _step(axes, some, pool[going], A[going], v[going])
+        A[going] -= step[:, :3]
+        v[going] = turned(v[going], -step[:, 3:])
+        moves, sound = progress(k, step, A[going], C[going])
+        going = going[sound & np.isin(pool[going], pool[going[moves & sound]])]
+        if not len(going):
+            break
     return A, v, C
+
+
+def _step(
+    axes: LegAxes, bundles: Bundles, pool: IntArray, A: Array, v: Array
+) -> tuple[Array, Array]:
+    """Return a Gauss-Newton step (n, 5) of A and v and their covariances (n, 5, 5)."""
+    rows, bundle = bundles.rows, bundles.bundle
+    residual, spread, tilt = miss_of_joint(axes, rows, A[bundle], v[bundle])
+    weight = robust_weights(bundles, residual, spread)
+    alpha = (tilt @ np.linalg.solve(spread, residual[..., None]))[..., 0]
+    J = derivative_of_miss(axes, rows, v[bundle], alpha)
+    back = np.swapaxes(J, 1, 2) @ weight
+    right = (back @ residual[..., None])[..., 0]
+    of_pool = np.unique(pool, return_inverse=True)[1].ravel()
+    step, C = _pooled(bundles.total(back @ J), bundles.total(right), of_pool)
+    return _limited(step, np.linalg.norm(A, axis=1)), C
 
 
 def turned(v: Array, turn: Array) -> Array:

@@ -9,11 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from legcal.geometry.lines import normal_basis
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.observations.leg_axes import LegAxes
 from legcal.stages.bundles import Bundles
+from legcal.stages.doubts import too_uncertain
 
-REWEIGHTINGS = 10
+MOST_REWEIGHTINGS = 100
+_FEWEST_REWEIGHTINGS = 10
+_SETTLED = 1e-6  # standard deviations: smaller steps no longer matter
 _OUTLIER = 3.0  # an axis that misses A by this many times the median has half its weight
 _NO_NOISE = 1e-3  # standard deviations: smaller misses are rounding
 
@@ -34,7 +37,7 @@ def nearest_points(information: tuple[Array, Array]) -> tuple[Array, Array]:
 def weighted_points(axes: LegAxes, bundles: Bundles, A: Array) -> tuple[Array, Array]:
     """Return the points nearest to axes in units of their covariances, and their covariances.
 
-    The covariance at A depends on A, so the weights are computed again a few times, and axes that
+    The covariance at A depends on A, so the weights are computed again until A stays, and axes that
     miss the others by far are given less.
 
     Parameters
@@ -50,16 +53,30 @@ def weighted_points(axes: LegAxes, bundles: Bundles, A: Array) -> tuple[Array, A
     -------
     (n, 3) array [m], (n, 3, 3) array [m^2]
     """
-    E, M = axes.basis[bundles.rows], axes.M[bundles.rows]
-    across, bundle = np.swapaxes(E, -1, -2), bundles.bundle
-    C = np.zeros((len(A), 3, 3))
-    for _ in range(REWEIGHTINGS):
-        residual, spread = miss(axes, bundles.rows, A[bundle])
-        weight = robust_weights(bundles, residual, spread)
-        normal = across @ weight @ E
+    A, C, going = A.copy(), np.zeros((len(A), 3, 3)), np.arange(len(A))
+    for k in range(MOST_REWEIGHTINGS):
+        some, before = bundles.some(np.isin(np.arange(len(A)), going)), A[going]
+        E, M = axes.basis[some.rows], axes.M[some.rows]
+        residual, spread = miss(axes, some.rows, before[some.bundle])
+        normal = np.swapaxes(E, -1, -2) @ robust_weights(some, residual, spread) @ E
         right = (normal @ M[..., None])[..., 0]
-        A, C = nearest_points((bundles.total(normal), bundles.total(right)))
+        A[going], C[going] = nearest_points((some.total(normal), some.total(right)))
+        going = going[np.logical_and(*progress(k, A[going] - before, A[going], C[going]))]
+        if not len(going):
+            break
     return A, C
+
+
+def progress(k: int, step: Array, A: Array, covariance: Array) -> tuple[BoolArray, BoolArray]:
+    """Return which bundles (n,) still move after step *k*, and which are sound.
+
+    One that says nothing of its joint would wander off, and is not to be followed.
+    """
+    if k + 1 < _FEWEST_REWEIGHTINGS:
+        return np.ones(len(A), dtype=np.bool_), np.ones(len(A), dtype=np.bool_)
+    moves = np.any(step**2 > _SETTLED**2 * np.einsum("nii->ni", covariance), axis=1)
+    sound = [not too_uncertain(*told) for told in zip(A, covariance[:, :3, :3], strict=True)]
+    return np.asarray(moves), np.array(sound, dtype=np.bool_)
 
 
 def robust_weights(bundles: Bundles, residual: Array, spread: Array) -> Array:
