@@ -118,13 +118,20 @@ def test_positions_alone_find_all_but_the_orientation_of_the_tool() -> None:
     assert np.all(found.covariance[9:] == 0.0)
 
 
-def test_wrong_rows_are_named_and_left_out() -> None:
+@pytest.mark.parametrize("stated", [(None, None), (SIGMA_POSITION, SIGMA_ANGLE)])
+def test_wrong_rows_are_named_and_left_out(stated: tuple[float | None, float | None]) -> None:
     made = located("hexapod")
     position = made.poses.position.copy()
     position[6] += 1e-3
     position[[2, 11]] = position[[11, 2]]
-    found = locate(made.mechanism, replace(made.poses, position=position))
+    found = locate(
+        made.mechanism,
+        replace(made.poses, position=position),
+        position_sigma=stated[0],
+        angle_sigma=stated[1],
+    )
     assert [row.row for row in found.rows if not row.used] == [3, 7, 12]
+    assert found.trustworthy
     assert "Rows 3, 7, 12 disagree with the others and were left out" in found.sentence
     assert found.rows[6].reason.startswith("1.7")
     assert np.abs(motion_error(found.T_world_base, BASE)[:3]).max() < 0.2e-3

@@ -112,7 +112,8 @@ def _probability(pairs: PosePairs, noise: Noise, found: Fit, stated: tuple[bool,
         if dof < _ENOUGH and not at_stated:
             continue
         part = np.linalg.solve(covariance[:, rows, rows], r[:, rows, None])[:, :, 0]
-        distance = (part * r[:, rows]).sum(axis=1) / 3.0
-        here = stats.f.sf(distance, 3, np.inf if at_stated else dof)
+        distance = (part * r[:, rows]).sum(axis=1)
+        # Not F with infinite degrees of freedom: SciPy has no number for that.
+        here = stats.chi2.sf(distance, 3) if at_stated else stats.f.sf(distance / 3.0, 3, dof)
         least = np.minimum(least, np.where(pairs.oriented | (kind == 0), here, 1.0))
     return np.minimum(1.0, 2.0 * least)
