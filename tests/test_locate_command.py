@@ -128,7 +128,7 @@ def test_a_location_comes_back_from_its_file(
     which: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     location: Location = request.getfixturevalue(which)
-    write_location(location, tmp_path / "a.yaml")
+    write_location(location, str(tmp_path / "a.yaml"))
     again = load_location(tmp_path / "a.yaml")
     before, after = location_document(location), location_document(again)
     for frame in ("T_world_base", "T_platform_tool"):

@@ -204,8 +204,15 @@ def check_place(path: Path) -> None:
         )
 
 
-def write_location(location: Location, path: Path) -> None:
+def write_location(location: Location, file: str | Path) -> None:
     """Write a location; an earlier one is replaced, any other file is not.
+
+    Parameters
+    ----------
+    location : Location
+        What was located.
+    file : str or Path
+        The YAML.
 
     Raises
     ------
@@ -214,6 +221,7 @@ def write_location(location: Location, path: Path) -> None:
     OutOfResources
         If the file cannot be written.
     """
+    path = Path(file)
     check_place(path)
     text = yaml.safe_dump(
         location_document(location),
