@@ -287,6 +287,18 @@ def test_an_axis_that_no_view_locates_is_refused_by_name() -> None:
         )
 
 
+def test_eq09_does_not_leave_axes_at_nominal_that_are_in_none_of_its_products() -> None:
+    joints, _ = seen_from(SQUARE, ACROSS, legs_seen((0, 1, 2, 3), (2,)))
+    axis_located = joints.axis_located.copy()
+    axis_located[0, 2] = False
+    with pytest.raises(NotIdentifiable, match="locates the revolute axes of leg3 together"):
+        locate_joints_in_base(
+            made_up_base(SQUARE, ACROSS),
+            replace(joints, axis_located=axis_located),
+            criteria="literal",
+        )
+
+
 def test_views_that_share_one_leg_leave_joints_and_axes_loose() -> None:
     joints, _ = seen_from(SQUARE, ACROSS, legs_seen((0, 1, 2), (2,), (3,)))
     with pytest.raises(

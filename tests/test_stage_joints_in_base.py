@@ -104,3 +104,9 @@ def test_joints_that_were_never_seen_together_are_refused() -> None:
     alone[0, 0] = True
     with pytest.raises(NotIdentifiable, match=r"by view: 1, 0, 0"):
         locate_joints_in_base(nominal_of(session.machine), replace(joints, located=alone))
+
+
+def test_eq09_does_not_leave_joints_at_nominal_that_are_in_none_of_its_products() -> None:
+    session = exact_session(legs=((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (5,)))
+    with pytest.raises(NotIdentifiable, match=r"base joints of leg6 together.*by view: 5, 5, 1"):
+        _locate(session, session.machine, "literal")

@@ -73,7 +73,8 @@ def locate_joints_in_base(
     Raises
     ------
     NotIdentifiable
-        If the views do not tie all joints and axes together.
+        If the views do not tie all joints and axes together; of the ``literal`` criterion, if one
+        of them is in none of its products.
     DidNotConverge
         If IPOPT does not.
 
@@ -87,6 +88,7 @@ def locate_joints_in_base(
     are tried; where they fit alike, the view says no more than distances.
     """
     if criteria == "literal":
+        _check_products(mechanism, joints)
         solution = solve_least_squares(build_scalar_products(mechanism, joints))
         return _found(mechanism, joints, solution, None)
     solution, oriented, placed = lay_together(mechanism, joints)
@@ -117,6 +119,25 @@ def _found(
     return JointsInBase(
         A_Rb, cameras, solution, np.where(mechanism.revolute[:, None], axes, np.nan)
     )
+
+
+def _check_products(mechanism: NominalMechanism, joints: JointsInCamera) -> None:
+    """Refuse when a joint or an axis is in no product of (9), which would leave it at nominal."""
+    several = joints.located.sum(axis=1) > 1
+    shown = joints.located[several].any(axis=0)
+    turning = mechanism.revolute & ~joints.axis_located[several].any(axis=0)
+    what = [
+        f"{kind} of {', '.join(np.array(mechanism.leg_names)[missing])}"
+        for kind, missing in (("base joints", ~shown), ("revolute axes", turning & shown))
+        if missing.any()
+    ]
+    if what:
+        raise NotIdentifiable(
+            f"The base could not be located (eq 9): found no view that locates the "
+            f"{' and the '.join(what)} together with the base joint of another leg (joints located "
+            f"by view: {_counts(joints.located)}), needed one; turn a camera so that it shows more "
+            "legs at once."
+        )
 
 
 def _check_identifiable(

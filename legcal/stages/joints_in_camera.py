@@ -142,9 +142,10 @@ def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCam
     The nominal base is laid on the joints of each view, and each axis takes the sign with which it
     points to the side of its nominal axis. Where the joints lie on one line, the base is
     turned about it until the axes agree best, as lines. Where two turns agree alike, as for
-    axes normal to the line between two joints, the sign remains a matter of choice, and so does
-    that of an axis whose joint is alone in its view; step 2 tries both. In a planar mechanism all
-    axes are normal to that line, and lengths of legs decide (:mod:`legcal.stages.plane_sides`).
+    axes normal to the line between two joints, the sign remains a matter of choice: step 2 by
+    default tries both. That of an axis whose joint is alone in its view does not matter. In a
+    planar mechanism all axes are normal to that line, and lengths of legs decide
+    (:mod:`legcal.stages.plane_sides`).
     """
     nominal, A_Rb = nominal_axes(mechanism), mechanism.parameters.base_joints
     signs = np.ones(joints.located.shape)
