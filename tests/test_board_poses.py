@@ -165,6 +165,20 @@ def test_corners_of_another_board_are_refused(said: Board, words: str) -> None:
         camera_poses(corners, said, _measurements((1,)))
 
 
+def test_corners_that_no_one_pose_has_before_the_camera_are_refused() -> None:
+    """Each image shows one half of the board, and by it the other half is behind the camera."""
+    x, y = CHARUCO.points[:, 0], CHARUCO.points[:, 1]
+    tables = []
+    for row, sign in enumerate((1.0, -1.0)):
+        depth = sign * (x - x.mean())
+        here = np.flatnonzero(depth > 0.1 * np.ptp(x))
+        seen = np.column_stack([y - y.mean(), np.full(len(x), 0.5 * sign * np.ptp(x)), depth])
+        px = LENS.project(seen[here])
+        tables.append(found_corners(np.full(len(here), row), here, px, np.full(len(here), SIGMA)))
+    with pytest.raises(DatasetError, match=r"found no one pose of the charuco .* all its images"):
+        camera_poses(join_corners(tables), CHARUCO, _measurements((2,)))
+
+
 def test_corners_of_another_lens_are_refused() -> None:
     other = replace(LENS, K=LENS.K * np.array([[0.6], [1.0], [1.0]]))
     corners = _corners(CHARUCO, [before(CHARUCO)], np.random.default_rng(0))

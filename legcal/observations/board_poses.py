@@ -30,8 +30,8 @@ class BoardPoses:
     Attributes
     ----------
     rows : tuple of RigidTransform or None, length n_rows
-        T_board_camera of every image by the corners that it shows itself; None where these are too
-        few, or leave two poses.
+        T_board_camera of every image by the corners that it shows itself, of two poses that these
+        leave that nearer to the view's; None where they are too few.
     views : tuple of RigidTransform or None, length n_views
         T_board_camera of every view by all of its images; None where no image shows the board.
     covariance : (n_views, 6, 6) array
@@ -155,6 +155,10 @@ def _view_pose(
         if (pose := refined_pose(camera, *everything, start.T_camera_plane)) is not None
     ]
     joint = _distinct(sorted(joint, key=lambda pose: pose.cost))
+    if not joint:
+        raise DatasetError(
+            _another_board(name, board, "no one pose of", "one that all its images show")
+        )
     best = joint[0]
     scale = _scale(best, corners)
     single = {
