@@ -122,6 +122,26 @@ def test_no_two_legs_at_once_is_refused() -> None:
         identify_offsets(nominal_of(session.machine), _some(directions, directions.leg == 0), 2e-6)
 
 
+def test_one_image_a_view_has_no_consecutive_positions() -> None:
+    session = exact_session()
+    directions = _directions(session, session.machine, "literal")
+    first = [np.flatnonzero(directions.view == v)[0] for v in np.unique(directions.view)]
+    once = _some(directions, np.isin(directions.group, directions.group[first]))
+    with pytest.raises(NotIdentifiable, match="no view shows the same two legs in two images"):
+        identify_offsets(nominal_of(session.machine), once, 2e-6, criteria="literal")
+
+
+def test_legs_that_all_meet_on_the_platform_have_no_distance() -> None:
+    session = exact_session()
+    nominal = nominal_of(session.machine)
+    directions = _directions(session, session.machine, "default")
+    legs = list(nominal.legs)
+    legs[1] = replace(legs[1], B=legs[0].B)
+    pair = _some(directions, np.isin(directions.leg, [0, 1]))
+    with pytest.raises(NotIdentifiable, match="end in different places of it"):
+        identify_offsets(replace(nominal, legs=tuple(legs)), pair, 2e-6)
+
+
 def test_a_leg_of_constant_length_reads_zero_whatever_the_table_says() -> None:
     observed = shipped("hexapod-rod")
     assert np.isnan(observed.measurements.q[:, 5]).all()

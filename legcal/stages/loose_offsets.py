@@ -13,12 +13,12 @@ from legcal.stages.nominal import NominalMechanism
 from legcal.stages.solution import Solution
 
 
-def check_any(found: Sequence[object]) -> None:
-    """Refuse an empty criterion."""
+def check_any(found: Sequence[object], missing: str) -> None:
+    """Refuse an empty criterion; *missing* says what there is none of."""
     if not found:
         raise NotIdentifiable(
-            "The offsets could not be identified: no image shows two legs whose base joints are "
-            "located; needed images that show several legs at once; add such images."
+            f"The offsets could not be identified: no {missing}; needed images at different poses "
+            "that show several legs at once; add such images."
         )
 
 

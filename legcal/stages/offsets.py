@@ -103,7 +103,7 @@ def build_consecutive(mechanism: NominalMechanism, directions: LegDirections) ->
         if key in last:
             found.append((last[key], k))
         last[key] = k
-    check_any(found)
+    check_any(found, "view shows the same two legs in two images")
     before, after = np.array(found, dtype=np.intp).T
     term = Term(
         change_of_distance(),
@@ -189,7 +189,7 @@ def pairs_of_legs(directions: LegDirections, q0: Array) -> IntArray:
         for group in directions.groups()
         for pair in combinations(group[finite[group]].tolist(), 2)
     ]
-    check_any(pairs)
+    check_any(pairs, "image shows two legs of known length whose base joints are located")
     return np.array(pairs, dtype=np.intp)
 
 
@@ -210,7 +210,10 @@ def pairs_apart(mechanism: NominalMechanism, directions: LegDirections) -> IntAr
     gap = np.linalg.norm(B[legs[:, 0]] - B[legs[:, 1]], axis=1)
     apart = gap > _APART * mean_length(directions, q0)
     chosen: IntArray = pairs[apart & ~mechanism.on_platform[legs].any(axis=1)]
-    check_any(chosen.tolist())
+    check_any(
+        chosen.tolist(),
+        "image shows two legs that turn against the platform and end in different places of it",
+    )
     return chosen
 
 
