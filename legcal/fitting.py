@@ -19,12 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.board_views import (
-    BoardViews,
-    base_of_board,
-    board_without_place,
-    observe_board,
-)
+from legcal.board_views import BoardViews, base_of_board, board_without_place, observe_board
 from legcal.calibration import Steps
 from legcal.detection.observe import (
     Scene,
@@ -36,9 +31,7 @@ from legcal.detection.observe import (
 )
 from legcal.errors import NotVisible
 from legcal.geometry.types import IntArray
-from legcal.observations.canonical_order import (
-    inverse,
-)
+from legcal.observations.canonical_order import inverse
 from legcal.observations.corners import Corners
 from legcal.observations.outlines import Outlines
 from legcal.observations.parts import outlines_at

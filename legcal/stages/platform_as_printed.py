@@ -30,10 +30,7 @@ from legcal.stages.platform_pose import (
     locate_platform,
     register_by_rays,
 )
-from legcal.stages.platform_unknowns import (
-    B_COLUMNS,
-    PlatformUnknowns,
-)
+from legcal.stages.platform_unknowns import B_COLUMNS, PlatformUnknowns
 from legcal.stages.residuals import distance_of_known_joints
 from legcal.stages.rigid_platform import APART
 from legcal.stages.solution import Solution

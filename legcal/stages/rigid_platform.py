@@ -18,19 +18,12 @@ from legcal.stages.least_squares import LeastSquares, Term
 from legcal.stages.motion import whitener
 from legcal.stages.offsets import distance_sigma, leg_end_covariance, leg_ends, observed_legs
 from legcal.stages.platform_demands import demand_terms
-from legcal.stages.platform_residuals import (
-    direction_of_leg,
-    length_of_leg,
-)
-from legcal.stages.platform_unknowns import (
-    B_COLUMNS,
-    LENGTH,
-)
+from legcal.stages.platform_residuals import direction_of_leg, length_of_leg
+from legcal.stages.platform_unknowns import B_COLUMNS, LENGTH
 from legcal.stages.residuals import distance_of_ends_and_joints
 from legcal.stages.rigid_problem import RigidProblem
 
-_RELATIVE = 1e-5  # floor of the sigma of a length, and of a demand [rad]: keeps it well conditioned
-_IN_PLANE = np.array([0, 1, -1, -1, -1, 2])  # of displacement and turn of a planar platform
+_RELATIVE = 1e-5  # of the mean length: floor of the sigma of a length, keeps it well conditioned
 APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
 
 
