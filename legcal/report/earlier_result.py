@@ -2,86 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from legcal.errors import DatasetError, ModelError, OutOfClass
-from legcal.files.schema import Number, Version, describe, read_text, validate
 from legcal.geometry.types import Array
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.model import Mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 from legcal.refinement.biases import KINDS
+from legcal.refinement.known_parameters import BOARD_SCALE
 from legcal.refinement.noise import NoiseModel
 from legcal.report.axis_turns import Axes, calibrated_axis, nominal_axes, turns_between
+from legcal.report.earlier_document import (
+    KinematicPart,
+    ResultDocument,
+    Row,
+    read_document,
+    refused,
+)
 
 RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
 _SAME = 1e-9  # [m]: rounding of files
 _SYMMETRIC = 1e-6  # relative
-
-_Axis = Annotated[list[Number], Field(min_length=3, max_length=3)]
-
-
-class _Row(BaseModel):
-    """A row of the parameters."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-    name: str
-    value: Number
-    nominal: Number
-    sigma: Annotated[Number, Field(gt=0.0)] | None
-    unit: str
-    status: Literal["estimated", "fixed", "weak"]
-
-
-class _Noise(BaseModel):
-    """The noise of the outlines."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-    scale: Annotated[Number, Field(gt=0.0)]
-    bias_px: Annotated[Number, Field(ge=0.0)]
-    tilt_px: Annotated[Number, Field(ge=0.0)]
-
-
-class _Kinematic(BaseModel):
-    """What is known of all kinematic parameters."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-    names: list[str]
-    covariance: list[list[Number]]
-    held: list[list[Number]]
-
-
-class _Residuals(BaseModel):
-    """What was left of the observations."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-    dof: int
-    noise: _Noise
-    shared_px: dict[str, Annotated[Number, Field(ge=0.0)]]
-
-
-class _Document(BaseModel):
-    """What is needed of ``result.json``; there is more in it."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-    legcal_result: Version
-    status: Literal["converged"]
-    legs: list[str]
-    parameters: Annotated[list[_Row], Field(min_length=1)]
-    nominal_axes: dict[str, dict[str, _Axis]]
-    covariance: list[list[Number]]
-    kinematic: _Kinematic
-    cameras: dict[str, dict[str, Number | str]]
-    residuals: _Residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +93,7 @@ def read_result(given: str | Path) -> EarlierResult:
     """
     path = Path(given)
     path = path if path.name == RESULT_NAME and not os.path.isdir(path) else path / RESULT_NAME
-    document = _read_document(path)
+    document = read_document(path)
     try:
         mechanism = load_mechanism(path.parent / MODEL_NAME)
     except (ModelError, OutOfClass) as error:
@@ -152,24 +101,11 @@ def read_result(given: str | Path) -> EarlierResult:
     if sorted(document.legs) != sorted(mechanism.leg_names):
         found = f"the legs {', '.join(document.legs)} in {RESULT_NAME}"
         needed = f"{', '.join(mechanism.leg_names)} as in {MODEL_NAME} beside it"
-        raise DatasetError(_refused(path, found, needed))
+        raise DatasetError(refused(path, found, needed))
     return _assembled(path, document, mechanism.with_leg_order(document.legs))
 
 
-def _read_document(path: Path) -> _Document:
-    """Return what the document says."""
-    content = read_text(path, "result of an earlier calibration")
-    try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise DatasetError(_refused(path, "no JSON", "the document of a calibration")) from error
-    if not isinstance(found, dict) or "legcal_result" not in found:
-        what = "another document" if isinstance(found, dict) else describe(found)
-        raise DatasetError(_refused(path, what, "one with 'legcal_result: 1'"))
-    return validate(_Document, found, path)
-
-
-def _assembled(path: Path, document: _Document, mechanism: Mechanism) -> EarlierResult:
+def _assembled(path: Path, document: ResultDocument, mechanism: Mechanism) -> EarlierResult:
     """Return the result, its parts compared with each other."""
     rows = document.parameters
     estimated = [row for row in rows if row.status == "estimated"]
@@ -193,7 +129,7 @@ def _assembled(path: Path, document: _Document, mechanism: Mechanism) -> Earlier
         intrinsics={
             row.name: (row.value, row.sigma)
             for row in estimated
-            if row.name not in known.names and ".radius." not in row.name and row.sigma is not None
+            if _is_intrinsic(row.name, known.names) and row.sigma is not None
         },
         cameras=document.cameras,
         noise=NoiseModel(**document.residuals.noise.model_dump()),
@@ -202,11 +138,16 @@ def _assembled(path: Path, document: _Document, mechanism: Mechanism) -> Earlier
     )
 
 
+def _is_intrinsic(name: str, kinematic: Sequence[str]) -> bool:
+    """Say whether a parameter of a result is one of a camera."""
+    return name not in kinematic and name != BOARD_SCALE and ".radius." not in name
+
+
 def _kinematic(
     path: Path,
-    estimated: Sequence[_Row],
+    estimated: Sequence[Row],
     covariance: Array,
-    found: _Kinematic,
+    found: KinematicPart,
     known: Sequence[str],
 ) -> tuple[Array, Array]:
     """Return covariance (p, p) and held directions (w, p) of all kinematic parameters."""
@@ -214,9 +155,9 @@ def _kinematic(
     needed = f"a covariance and held directions of the {n} kinematic parameters"
     rows = (*found.covariance, *found.held)
     if sorted(found.names) != sorted(known) or len(found.covariance) != n:
-        raise DatasetError(_refused(path, f"those of {len(found.names)} others", needed))
+        raise DatasetError(refused(path, f"those of {len(found.names)} others", needed))
     if any(len(row) != n for row in rows):
-        raise DatasetError(_refused(path, "rows of other lengths", needed))
+        raise DatasetError(refused(path, "rows of other lengths", needed))
     order = [found.names.index(name) for name in known]
     wide = np.array(found.covariance)[np.ix_(order, order)]
     held = np.array(found.held).reshape(-1, n)[:, order]
@@ -225,7 +166,7 @@ def _kinematic(
     sigma = np.sqrt(np.diagonal(covariance))[both]
     apart = (wide[np.ix_(at, at)] - covariance[np.ix_(both, both)]) / np.outer(sigma, sigma)
     if np.abs(apart).max(initial=0.0) > _SYMMETRIC or np.abs(wide - wide.T).max() > _SAME:
-        raise DatasetError(_refused(path, "another matrix in 'kinematic'", needed))
+        raise DatasetError(refused(path, "another matrix in 'kinematic'", needed))
     return wide, held
 
 
@@ -233,12 +174,12 @@ def _check_shared(path: Path, shared_px: Mapping[str, float]) -> None:
     """Refuse sizes of shared errors that are none."""
     others = [name for name in shared_px if name not in KINDS]
     if others:
-        raise DatasetError(_refused(path, f"the shared errors '{others[0]}'", ", ".join(KINDS)))
+        raise DatasetError(refused(path, f"the shared errors '{others[0]}'", ", ".join(KINDS)))
 
 
 def _check_same_model(
     path: Path,
-    document: _Document,
+    document: ResultDocument,
     values: Mapping[str, float],
     mechanism: Mechanism,
     nominal_legs: Sequence[LegGeometry],
@@ -259,7 +200,7 @@ def _check_same_model(
                 other.append(f"the {side} axis of {leg}")
     if other:
         found = f"other values of {', '.join(other[:3])}" + " and more" * (len(other) > 3)
-        raise DatasetError(_refused(path, found, f"those of {MODEL_NAME} beside it"))
+        raise DatasetError(refused(path, found, f"those of {MODEL_NAME} beside it"))
 
 
 def _with_nominal_axes(
@@ -289,13 +230,13 @@ def _is_axis(found: Array, axis: Sequence[float]) -> bool:
     return bool(np.linalg.norm(np.cross(found, axis)) < _SAME)
 
 
-def _covariance(path: Path, estimated: Sequence[_Row], found: list[list[Any]]) -> Array:
+def _covariance(path: Path, estimated: Sequence[Row], found: list[list[Any]]) -> Array:
     """Return the covariance, refused where it is none of the estimated parameters."""
     n = len(estimated)
     needed = f"a covariance of the {n} estimated parameters that fits their sigmas"
     if n == 0 or len(found) != n or any(len(row) != n for row in found):
         shape = f"{len(found)} rows of {len(found[0]) if found else 0} numbers"
-        raise DatasetError(_refused(path, shape, needed))
+        raise DatasetError(refused(path, shape, needed))
     covariance = np.array(found)
     sigma = np.array([row.sigma or 0.0 for row in estimated])
     scaled = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
@@ -306,13 +247,5 @@ def _covariance(path: Path, estimated: Sequence[_Row], found: list[list[Any]]) -
         and bool(np.linalg.eigvalsh(scaled)[0] > -_SYMMETRIC)
     )
     if not good:
-        raise DatasetError(_refused(path, "another matrix", needed))
+        raise DatasetError(refused(path, "another matrix", needed))
     return covariance
-
-
-def _refused(path: Path, found: str, needed: str) -> str:
-    """Return why a result could not be read."""
-    return (
-        f"{path}: the result of the earlier calibration could not be read: found {found}, needed "
-        f"{needed}; give the folder that legcal calibrate wrote."
-    )
