@@ -110,3 +110,10 @@ def test_eq09_does_not_leave_joints_at_nominal_that_are_in_none_of_its_products(
     session = exact_session(legs=((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (5,)))
     with pytest.raises(NotIdentifiable, match=r"base joints of leg6 together.*by view: 5, 5, 1"):
         _locate(session, session.machine, "literal")
+
+
+def test_eq09_with_fewer_products_than_unknowns_is_refused() -> None:
+    session = exact_session(legs=((0, 1), (2, 3), (4, 5)))
+    words = r"found 3 scalar products in all views for 12 unknowns .*by view: 2, 2, 2"
+    with pytest.raises(NotIdentifiable, match=words):
+        _locate(session, session.machine, "literal")

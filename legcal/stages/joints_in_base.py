@@ -74,7 +74,7 @@ def locate_joints_in_base(
     ------
     NotIdentifiable
         If the views do not tie all joints and axes together; of the ``literal`` criterion, if one
-        of them is in none of its products.
+        of them is in none of its products, or these are fewer than the unknowns.
     DidNotConverge
         If IPOPT does not.
 
@@ -89,7 +89,15 @@ def locate_joints_in_base(
     """
     if criteria == "literal":
         _check_products(mechanism, joints)
-        solution = solve_least_squares(build_scalar_products(mechanism, joints))
+        problem = build_scalar_products(mechanism, joints)
+        if problem.n_residuals < len(problem.start):
+            raise NotIdentifiable(
+                f"The base could not be located (eq 9): found {problem.n_residuals} scalar "
+                f"products in all views for {len(problem.start)} unknowns (joints located by view: "
+                f"{_counts(joints.located)}), needed at least as many; turn a camera so that it "
+                "shows more legs at once."
+            )
+        solution = solve_least_squares(problem)
         return _found(mechanism, joints, solution, None)
     solution, oriented, placed = lay_together(mechanism, joints)
     _check_identifiable(mechanism, joints, solution)
