@@ -117,7 +117,7 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
         mechanism,
         solution.legs,
         solution.parametrization,
-        solution.kinematic_covariance,
+        solution.kinematic_covariance + solution.held_covariance,
         measurements.q[measurements.first_rows],
         solution.T_Rb_Re,
         solution.sensitivities,

@@ -17,6 +17,7 @@ from legcal import calibrate, simulate
 from legcal.calibration import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.mechanism.model import Mechanism
+from legcal.refinement.known_parameters import known_parameters
 
 LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
 SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]
@@ -219,4 +220,14 @@ def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path:
     assert calibration.verdict.trustworthy
     assert after < 0.1 * before
     assert re.search(r"Not determined, and without effect on the platform: \d", said(calibration))
-    assert calibration.solution.status["leg1.base_axis.1"] == "weak"
+    solution = calibration.solution
+    assert solution.status["leg1.base_axis.1"] == "weak"
+    spread = solution.held_covariance  # what is held counts in the platform, along itself alone
+    rank = np.linalg.matrix_rank(spread, tol=1e-9 * np.abs(spread).max(initial=0.0))
+    assert 0 < rank == len(solution.held_basis)
+    known = known_parameters(calibration.dataset.mechanism, calibration.dataset.measurements.views)
+    lengths = np.array(solution.parametrization.units) == "m"
+    names = solution.parametrization.names
+    change = [solution.values[name] - known.by_name[name].nominal for name in names]
+    largest = np.sqrt(np.diagonal(spread)[lengths].max())
+    assert largest < 2.0 * np.abs(np.array(change)[lengths]).max()

@@ -12,6 +12,7 @@ from legcal.refinement.covariance import named_covariance, worst_directions
 from legcal.refinement.determinacy import Held, named_units
 from legcal.refinement.focal_length import focal_lengths
 from legcal.refinement.foretold import Posterior
+from legcal.refinement.held_spread import held_spread
 from legcal.refinement.judged_corners import corner_notes
 from legcal.refinement.linearize import Linearization, linearize, offsets_of
 from legcal.refinement.loss import width_to_k
@@ -84,6 +85,7 @@ def assemble_solution(
         covariance=estimated,
         sigma=np.sqrt(np.diagonal(estimated)),
         kinematic_covariance=_of_kinematic(problem, kept),
+        held_covariance=_of_kinematic(problem, held_spread(problem, state, held)),
         value_covariance=_of_kinematic(problem, covariance),
         held_basis=_held_values(problem, held),
         weak=worst_directions(estimated, names, named_units(problem, state)[where]),

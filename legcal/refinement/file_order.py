@@ -66,6 +66,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         covariance=solution.covariance[np.ix_(where, where)],
         sigma=solution.sigma[where],
         kinematic_covariance=solution.kinematic_covariance[np.ix_(steps, steps)],
+        held_covariance=solution.held_covariance[np.ix_(steps, steps)],
         value_covariance=solution.value_covariance[np.ix_(steps, steps)],
         held_basis=solution.held_basis[:, steps],
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),

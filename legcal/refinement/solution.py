@@ -78,8 +78,12 @@ class Solution:
         :func:`legcal.mechanism.leg_steps.moved_legs` and
         :func:`legcal.mechanism.sensitivity.pose_sensitivity` have them (axes turn about the
         vectors of where they are); zero where they are fixed, and along what is held.
+    held_covariance : (p, p) array
+        How far these may be off along what is held, if the nominal model is as wrong there as the
+        fit found it to be elsewhere; zero where nothing is held.
     value_covariance : (p, p) array
-        The same of the values of all kinematic parameters, axes as angles from the nominal axis.
+        The first covariance of the values of all kinematic parameters, axes as angles from the
+        nominal axis.
     held_basis : (w, p) array
         How these values change along each direction that is held, by a metre: angles count at the
         mean length of the legs. As a set of metres, orthonormal but for what is not kinematic.
@@ -140,6 +144,7 @@ class Solution:
     covariance: Array
     sigma: Array
     kinematic_covariance: Array
+    held_covariance: Array
     value_covariance: Array
     held_basis: Array
     weak: tuple[WeakDirection, ...]
