@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -17,6 +17,7 @@ from legcal.observations.corners import Corners
 from legcal.observations.parts import corners_at
 from legcal.progress import Report
 from legcal.refinement.observed_board import SeenBoard
+from legcal.refinement.solution import Solution
 from legcal.vision.board import Board
 from legcal.workpiece import Workpiece
 
@@ -34,15 +35,37 @@ class BoardViews:
         Of all images, in the order of work.
     T_board_camera : tuple of RigidTransform or None
         The camera of each view; None where it does not show the board.
+    view_of_row : tuple of str
+        Name of the view of each image, in the order of work.
     """
 
     board: Board
     corners: Corners
     T_board_camera: tuple[RigidTransform | None, ...]
+    view_of_row: tuple[str, ...]
 
     def seen(self, rows: IntArray) -> SeenBoard:
         """Return the board in some of the images."""
         return SeenBoard(self.board, corners_at(self.corners, rows))
+
+    def judged(self, solution: Solution) -> Corners:
+        """Return the corners of all images, those that a fit left out rejected."""
+        left_out = set(solution.rejected_corners)
+        if not left_out:
+            return self.corners
+        names = [self.view_of_row[row] for row in self.corners.row.tolist()]
+        wrong = [
+            used and (name, corner) in left_out
+            for used, name, corner in zip(
+                self.corners.used.tolist(), names, self.corners.corner.tolist(), strict=True
+            )
+        ]
+        reason = tuple(
+            "disagrees with the fit" if is_wrong else why
+            for is_wrong, why in zip(wrong, self.corners.reason, strict=True)
+        )
+        used = self.corners.used & ~np.array(wrong, dtype=np.bool_)
+        return replace(self.corners, used=used, reason=reason)
 
     def placed(self, cameras: Sequence[RigidTransform | None]) -> RigidTransform | None:
         """Return where cameras have the board on the average, T_x_board; None if none shows it.
@@ -97,7 +120,8 @@ def observe_board(work: Workpiece, progress: Report) -> BoardViews | None:
         shown = needed if len(corners) else {view.name for view in used}
         require_board(dataset.board, corners, load, measurements, shown)
     poses = camera_poses(corners, dataset.board, measurements, needed)
-    return BoardViews(dataset.board, poses.corners, poses.views)
+    names = tuple(measurements.views[v].name for v in measurements.view.tolist())
+    return BoardViews(dataset.board, poses.corners, poses.views, names)
 
 
 def base_of_board(

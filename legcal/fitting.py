@@ -156,7 +156,7 @@ def _fit(
         choices=part.choices,
     )
     progress("Fit of everything", 1, 1)
-    corners = None if board is None else board.corners
+    corners = None if board is None else board.judged(solution)
     return Found(outlines, fitted, part, steps, solution, corners)
 
 

@@ -142,6 +142,8 @@ def test_a_few_wrong_corners_do_little() -> None:
         board=replace(seen, corners=replace(corners, px=px)),
     )
     assert np.abs((errors(session, bent) - errors(session, right)) / right.sigma[:30]).max() < 1.0
+    assert {corner for _, corner in bent.rejected_corners} == {*range(0, BOARD.n_corners, 9)}
+    assert any("disagree with the fit and were left out" in note for note in bent.notes)
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.02])

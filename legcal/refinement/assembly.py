@@ -95,6 +95,9 @@ def assemble_solution(
         dof=dof,
         rms_px=_rms(used),
         rms_axes=_rms(linear.axes.r),
+        rejected_corners=tuple(
+            (problem.outlines.views[view], corner) for view, corner in problem.rejected_corners
+        ),
         T_Rb_board=state.T_Rb_board if len(problem.board) else None,
         rms_corners_px=_rms(linear.corners.r * problem.board.sigma[:, None]),
         noise=fit.noise,

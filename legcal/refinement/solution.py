@@ -105,6 +105,8 @@ class Solution:
         deviations; None if there are none.
     rms_corners_px : float or None
         Root mean square of the residuals of corners of the calibration board [px]; None without.
+    rejected_corners : tuple of (str, int)
+        View and number of the corners that were left out, in all images of the view.
     T_Rb_board : RigidTransform or None
         The calibration board in R_b; None if no image shows one.
     noise : NoiseModel
@@ -155,6 +157,7 @@ class Solution:
     rms_px: float | None
     rms_axes: float | None
     rms_corners_px: float | None
+    rejected_corners: tuple[tuple[str, int], ...]
     T_Rb_board: RigidTransform | None
     noise: NoiseModel
     biases: Mapping[str, float]
