@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.dataset.folder import Dataset
 from legcal.detection.board_corners import detect_corners, require_board
 from legcal.errors import DatasetError
 from legcal.geometry.types import IntArray
@@ -163,4 +164,20 @@ def board_without_place(work: Workpiece) -> DatasetError:
         f"{work.dataset.yaml_path}: the images could not be searched for legs: found a calibration "
         "board but neither its pose nor that of any camera that sees it, needed one of them to "
         "about 2 cm and 2 degrees; add T_base_board to the block board, or T_base_camera to a view."
+    )
+
+
+def place_notes(dataset: Dataset, solution: Solution) -> tuple[str, ...]:
+    """Return a note if the board stands far from where the dataset has it."""
+    given, found = dataset.T_base_board, solution.T_Rb_board
+    if given is None or found is None:
+        return ()
+    apart = given.inv() * dataset.mechanism.T_base_Rb * found
+    far, turned = float(np.linalg.norm(apart.translation)), float(apart.rotation.magnitude())
+    if far <= _FAR and turned <= _TURNED:
+        return ()
+    return (
+        f"The calibration board stands {1e3 * far:.0f} mm and {np.degrees(turned):.1f} deg from "
+        "where T_base_board of the dataset has it, far more than base joints can be off; the "
+        "result does not depend on it; correct T_base_board.",
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.board_views import place_notes
 from legcal.calibration import Calibration, judge
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.dataset.holdout import Split, check_fraction, dataset_at, split_images
@@ -134,7 +135,7 @@ def calibrate(
         fitted,
         in_file_order(found.solution, order, fitted),
         found.steps.in_file_order(order),
-        (*notes, *found.solution.notes),
+        (*notes, *place_notes(dataset, found.solution), *found.solution.notes),
     )
     if found.corners is not None:
         corners = restore_corners(found.corners, work.order)

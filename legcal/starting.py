@@ -18,7 +18,7 @@ from legcal.observations.outlines import Outlines
 from legcal.progress import Report
 from legcal.refinement.start import Start, start_from
 from legcal.stages.nominal import nominal_mechanism
-from legcal.stages.run import run_steps
+from legcal.stages.run import place_cameras, run_steps
 from legcal.workpiece import Workpiece
 
 _NAMED = 5  # views, in a message
@@ -31,29 +31,40 @@ def four_steps(
     if work.criteria is None:
         return Steps(None, None, "They were left out.")
     progress("Four steps", 0, 1)
-    radii = {part: r for leg in work.mechanism.legs for part, r in leg.radius_of_part.items()}
     try:
-        axes = work.axes
-        if axes is None:
-            axes = axes_from_outlines(outlines, work.measurements, radii)
-        nominal, measurements = nominal_mechanism(work.mechanism), work.measurements
-        joined = None if board is None else in_one_camera(axes, measurements, board.T_board_camera)
-        if joined is not None:
-            axes, measurements = joined.axes, joined.measurements
-        found = run_steps(
-            nominal,
-            axes,
-            measurements,
-            criteria=work.criteria,
-            transformation=work.transformation,
-            free_twists=any(name.endswith(".twist") for name in work.choices.free),
-        )
+        return _stepped(work, outlines, board)
     except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
         return Steps(None, None, str(failure))
     finally:
         progress("Four steps", 1, 1)
-    cameras = found.T_Rb_camera if joined is None else joined.cameras(found.T_Rb_camera)
-    return Steps(found.legs, cameras, "", found.diagnostics)
+
+
+def _stepped(work: Workpiece, outlines: Outlines, board: BoardViews | None) -> Steps:
+    """Return what the steps give; cameras alone where only the later steps fail."""
+    axes, measurements = work.axes, work.measurements
+    if axes is None:
+        radii = {part: r for leg in work.mechanism.legs for part, r in leg.radius_of_part.items()}
+        axes = axes_from_outlines(outlines, measurements, radii)
+    joined = None if board is None else in_one_camera(axes, measurements, board.T_board_camera)
+    if joined is not None:
+        axes, measurements = joined.axes, joined.measurements
+    nominal, criteria = nominal_mechanism(work.mechanism), work.criteria or "default"
+    legs, failure = None, ""
+    diagnostics: tuple[str, ...] = ()
+    try:
+        found = run_steps(
+            nominal,
+            axes,
+            measurements,
+            criteria=criteria,
+            transformation=work.transformation,
+            free_twists=any(name.endswith(".twist") for name in work.choices.free),
+        )
+        legs, cameras, diagnostics = found.legs, found.T_Rb_camera, found.diagnostics
+    except (NotIdentifiable, DidNotConverge) as error:
+        failure = str(error)
+        cameras = place_cameras(nominal, axes, measurements, criteria=criteria)
+    return Steps(legs, cameras if joined is None else joined.cameras(cameras), failure, diagnostics)
 
 
 def starts_of_fit(

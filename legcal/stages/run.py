@@ -131,6 +131,18 @@ def run_steps(
     )
 
 
+def place_cameras(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    measurements: Measurements,
+    *,
+    criteria: Criteria = "default",
+) -> tuple[RigidTransform | None, ...]:
+    """Return T_Rb_camera of every view by steps 1 and 2 alone, as :func:`run_steps` does first."""
+    joints = locate_joints_in_cameras(mechanism, axes, measurements, criteria=criteria)
+    return locate_joints_in_base(mechanism, joints, criteria=criteria).T_Rb_camera
+
+
 def _describe_misses(
     mechanism: NominalMechanism, axes: LegAxes, measurements: Measurements, wrong: BoolArray
 ) -> tuple[str, ...]:

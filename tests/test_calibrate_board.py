@@ -1,0 +1,136 @@
+"""Datasets with a calibration board, calibrated as users do, cameras in the hand among them."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import RigidTransform
+
+import legcal
+from legcal.board_views import BoardViews, base_of_board
+from legcal.calibration import Calibration
+from legcal.errors import DatasetError, DidNotConverge
+from legcal.mechanism.parametrization import geometries, vector_of
+from legcal.observations.corners import found_corners
+from legcal.refinement.known_parameters import BOARD_SCALE
+from legcal.simulation.settings import Level
+from legcal.vision.board import Board
+
+Edit = Callable[[dict[str, Any]], None]
+HIDDEN = 5  # corners that are moved
+
+
+@pytest.fixture(scope="module")
+def in_the_hand(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of 3 x 5 images, each from a place of its own, and no place is told."""
+    folder = tmp_path_factory.mktemp("board") / "hand"
+    settings = legcal.SimulationSettings(
+        level=Level.OUTLINES, board="chessboard", hand_held=True, views=3, poses=5, seed=4
+    )
+    legcal.simulate("hexapod", folder, settings)
+    return folder
+
+
+def changed(dataset: Path, to: Path, edit: Edit) -> Path:
+    shutil.copytree(dataset, to)
+    path = to / "dataset.yaml"
+    document = yaml.safe_load(path.read_text())
+    edit(document)
+    path.write_text(yaml.safe_dump(document))
+    return to
+
+
+def of_sigma(calibration: Calibration, dataset: Path) -> np.ndarray[Any, Any]:
+    """Return the errors of kinematic parameters over their standard deviations."""
+    solution = calibration.solution
+    truth = legcal.load_mechanism(dataset / "truth/models/hexapod.yaml")
+    error = vector_of(solution.parametrization, solution.legs, geometries(truth)) - vector_of(
+        solution.parametrization, geometries(truth), geometries(truth)
+    )
+    sigma = np.sqrt(np.diagonal(solution.value_covariance))
+    return np.asarray(error[sigma > 0.0] / sigma[sigma > 0.0])
+
+
+def test_cameras_in_the_hand_need_no_places_of_theirs(in_the_hand: Path, tmp_path: Path) -> None:
+    output = tmp_path / "result"
+    calibration = legcal.calibrate(in_the_hand, output=output)
+    assert len(calibration.solution.T_camera_Rb) == 15
+    assert np.sqrt(np.mean(of_sigma(calibration, in_the_hand) ** 2)) < 1.8
+    assert calibration.verdict.trustworthy
+    assert abs(calibration.solution.values[BOARD_SCALE] - 1.0) < 2e-3
+    assert (output / "corners.csv").is_file()
+    result = yaml.safe_load((output / "result.json").read_text())
+    assert result["board"]["given"] is None
+    assert len(result["views"]) == 15
+
+
+def test_a_board_joins_views_that_share_no_leg(in_the_hand: Path, tmp_path: Path) -> None:
+    """Two legs a view: steps 3 and 4 have too little, yet 1 and 2 place the cameras."""
+
+    def two_legs(document: dict[str, Any]) -> None:
+        for view, legs in zip(document["views"].values(), ((1, 2), (3, 4), (5, 6)), strict=True):
+            view["legs"] = [f"leg{number}" for number in legs]
+
+    calibration = legcal.calibrate(changed(in_the_hand, tmp_path / "pairs", two_legs))
+    assert calibration.steps.legs is None
+    assert np.sqrt(np.mean(of_sigma(calibration, in_the_hand) ** 2)) < 2.0
+
+
+def test_a_place_of_the_board_that_cannot_be_is_told(in_the_hand: Path, tmp_path: Path) -> None:
+    right = legcal.calibrate(in_the_hand)
+    T_Rb_board = right.solution.T_Rb_board
+    assert T_Rb_board is not None
+    found = right.dataset.mechanism.T_base_Rb * T_Rb_board
+
+    def placed(document: dict[str, Any]) -> None:
+        document["board"]["T_base_board"] = {
+            "xyz": (found.translation + np.array([0.0, 0.0, 0.2])).tolist(),
+            "quat_xyzw": found.rotation.as_quat().tolist(),
+        }
+
+    calibration = legcal.calibrate(changed(in_the_hand, tmp_path / "placed", placed))
+    assert any("stands 200 mm" in note for note in calibration.notes)
+    np.testing.assert_allclose(
+        calibration.solution.parameters.base_joints,
+        right.solution.parameters.base_joints,
+        atol=1e-8,
+    )
+    assert not any("stands" in note for note in right.notes)
+
+
+def test_a_board_and_cameras_that_contradict_each_other_are_refused() -> None:
+    shown = (RigidTransform.from_translation([0.0, 0.0, -1.0]), None)
+    none = np.zeros(0)
+    corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
+    board = BoardViews(Board("chessboard", 7, 6, 0.03), corners, shown, ())
+    place = RigidTransform.from_translation([0.3, 0.0, 0.0])
+    work: Any = SimpleNamespace(
+        dataset=SimpleNamespace(T_base_board=place, yaml_path="dataset.yaml")
+    )
+    camera = RigidTransform.from_translation([0.3, 0.04, -1.0])
+    near, far = ((T, None) for T in (camera, camera * camera))
+    assert base_of_board(work, board, (None, None)) is place
+    assert base_of_board(work, board, near) is place
+    with pytest.raises(DatasetError, match=r"T_base_board and the T_base_camera .* found the boa"):
+        base_of_board(work, board, far)
+    work.dataset.T_base_board = None
+    found = base_of_board(work, board, near)
+    assert found is not None
+    np.testing.assert_allclose(found.translation, [0.3, 0.04, 0.0], atol=1e-12)
+    assert base_of_board(work, board, (None, camera)) is None
+
+
+def test_a_board_of_other_squares_is_refused(in_the_hand: Path, tmp_path: Path) -> None:
+    def smaller(document: dict[str, Any]) -> None:
+        document["board"]["square"] *= 0.95
+
+    folder = changed(in_the_hand, tmp_path / "smaller", smaller)
+    with pytest.raises(DidNotConverge, match=r"is 1\.05\d* times as large"):
+        legcal.calibrate(folder)
+    free = legcal.calibrate(folder, free=[BOARD_SCALE])
+    assert abs(free.solution.values[BOARD_SCALE] - 1.0 / 0.95) < 5e-3
