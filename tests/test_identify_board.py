@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,15 @@ from test_identify_command import run
 
 import legcal
 from legcal.errors import UsageError
+from legcal.identify.analysis import identifiability_of_dataset
 from legcal.identify.identifiability import Identifiability
 from legcal.identify.planned import planned_session
+from legcal.identify.recorded import recorded_session
 from legcal.identify.steps import locate_joints
 from legcal.mechanism.model import Mechanism
+from legcal.observations.corners import found_corners
 from legcal.report.identify_table import identify_table
+from legcal.vision.board import Board
 
 LEGS = tuple(f"leg{j}" for j in range(1, 7))
 WEAK_JOINT = [LEGS[:5], LEGS[:5], LEGS[4:]]
@@ -144,3 +149,21 @@ def test_a_dataset_says_itself_whether_it_has_a_board(
     folder = Path(__file__).parents[1] / "examples" / "hexapod"
     assert run(monkeypatch, folder, option, "--json") == 2
     assert f"could not be judged with {option}" in capsys.readouterr().out
+
+
+def test_a_dataset_with_a_board_is_judged_with_it() -> None:
+    """Everywhere until somebody has looked for it, then in the views that show it."""
+    folder = Path(__file__).parents[1] / "examples" / "hexapod"
+    dataset = legcal.load_dataset(folder)
+    with_board = replace(dataset, board=Board("chessboard", 9, 6, 0.03))
+    assert not recorded_session(dataset).board.any()
+    assert recorded_session(with_board).board.all()
+    m = dataset.measurements
+    row = np.flatnonzero(m.view == 1)[:1]
+    one = found_corners(row, np.array([0]), np.array([[10.0, 20.0]]), np.array([0.05]))
+    shown = recorded_session(replace(with_board, corners=one)).board
+    np.testing.assert_array_equal(shown, [False, True, False])
+    report = identifiability_of_dataset(with_board)
+    assert report.board.present
+    assert not report.conditions[0].needed
+    assert not identifiability_of_dataset(dataset).board.present
