@@ -171,6 +171,9 @@ def test_wrong_values_are_refused(folder: Folder, change: dict[str, Any], messag
     [
         ({"camera": ...}, "views.c1.camera could not be read: found no such key, needed it"),
         ({"camera": "none.yaml"}, "none.yaml: the camera file could not be read: found no such"),
+        ({"gamma": 0}, "views.c1.gamma could not be read: found 0, needed 0.2 or more"),
+        ({"gamma": 100}, "views.c1.gamma could not be read: found 100, needed 5 or less"),
+        ({"gamma": True}, "views.c1.gamma could not be read: found True, needed a number"),
         ({"T_base_camer": {}}, "found an unknown key; did you mean 'T_base_camera'?"),
         ({"T_base_camera": [1, 2, 3]}, "T_base_camera could not be read: found [1, 2, 3], needed"),
         (

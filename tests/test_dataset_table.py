@@ -223,7 +223,7 @@ def test_every_problem_of_the_rows_is_listed_at_once(folder: Folder) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"view,image\n\xff\xfe", "needed comma-separated text in UTF-8"),
+        (b"view,image\n\xff\xfe", "found the byte 0xff at place 11, .* comma-separated .* UTF-8"),
         (b'view,image\n"c1,x', "needed comma-separated text in UTF-8"),
         (b"view,image\na\0b,c", "found the unknown|needed comma-separated text|found no column"),
     ],

@@ -33,8 +33,13 @@ def read_lines(path: Path, what: str) -> list[Line]:
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except (UnicodeDecodeError, csv.Error) as error:
+        found = (
+            f"the byte 0x{error.object[error.start]:02x} at place {error.start}, which is no text"
+            if isinstance(error, UnicodeDecodeError)
+            else f"'{error}'"
+        )
         raise DatasetError(
-            f"{path}: the {what} could not be read: found '{error}', needed comma-separated text "
+            f"{path}: the {what} could not be read: found {found}, needed comma-separated text "
             "in UTF-8; save it again as CSV."
         ) from error
     return [(number, cells) for number, cells in lines if any(cells)]

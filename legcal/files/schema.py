@@ -301,6 +301,10 @@ def _sentence(schema: type[BaseModel], error: ErrorDetails, path: Path, prefix: 
             needed = f"a number greater than {context['gt']:g}"
         case "less_than":
             needed = f"a number less than {context['lt']:g}"
+        case "greater_than_equal":
+            needed = f"{context['ge']:g} or more"
+        case "less_than_equal":
+            needed = f"{context['le']:g} or less"
         case "literal_error":
             needed = context["expected"]
         case "too_short":
