@@ -96,8 +96,9 @@ def align_camera(
     """
     if len(legs) < LEAST_LEGS:
         raise NotVisible(
-            f"The camera of view {view!r} could not be aligned: its pose puts {len(legs)} legs "
-            f"inside its images, needed {LEAST_LEGS}; check T_base_camera of the view."
+            f"The camera of view {view!r} could not be aligned: found {len(legs)} legs inside its "
+            f"images as its pose has it, needed {LEAST_LEGS}; check T_base_camera of the view, and "
+            "the dimensions of the calibration board if there is one."
         )
     ends = _Ends.of(legs)
     best, best_gain, agreeing = np.zeros(6), -np.inf, 0
@@ -113,9 +114,10 @@ def align_camera(
     needed = max(LEAST_LEGS, int(np.ceil(LEAST_AGREEMENT * len(legs))))
     if agreeing < needed:
         raise NotVisible(
-            f"The camera of view {view!r} could not be aligned: {agreeing} of {len(legs)} legs "
-            f"predicted in its images agree on one camera pose, needed {needed}; "
-            "check T_base_camera of the view, and that its images belong to their readings."
+            f"The camera of view {view!r} could not be aligned: found {agreeing} of {len(legs)} "
+            f"legs predicted in its images that agree on one camera pose, needed {needed}; check "
+            "T_base_camera of the view, the dimensions of the calibration board if there is one, "
+            "and that the images belong to their readings."
         )
     return T_base_camera * _motion(best)
 
