@@ -40,7 +40,7 @@ def inner_corners(
     grey: NDArray[np.uint8], grid: tuple[int, int], *, quick: bool = False
 ) -> Array | None:
     """Return a grid of so many corners along x and y, (ny, nx, 2) [px]; None if there is none."""
-    for scale, flags in _TRIED[::2] if quick else _TRIED:
+    for scale, flags in _TRIED[:1] if quick else _TRIED:
         found, corners = cv2.findChessboardCornersSB(enlarged(grey, scale), grid, flags=flags)
         if found and corners is not None:
             px = reduced(np.asarray(corners, dtype=np.float64), scale)
