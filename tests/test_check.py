@@ -227,6 +227,8 @@ def test_a_significance_that_is_none_is_refused(
     ("options", "message"),
     [
         (["--check", "r", "-o", "out"], "found --output beside --check"),
+        (["--check", "r", "--criteria", "literal"], "found --criteria beside --check"),
+        (["--check", "r", "--transformation", "points"], "found --transformation beside --check"),
         (["--check", "r", "--holdout", "0.2", "--fix", "*.offset"], "--fix, --holdout beside"),
         (["-o", "out", "--significance", "0.05"], "found --significance without --check"),
         ([], r"found no --output \(-o\)"),

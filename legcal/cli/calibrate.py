@@ -117,6 +117,8 @@ def calibrate(
         "--free": free,
         "--holdout": holdout,
         "--fresh": fresh or None,
+        "--criteria": None if criteria is Criteria.DEFAULT else criteria,
+        "--transformation": transformation,
     }
     if check is not None:
         _refuse("--check", [name for name, value in others.items() if value is not None])
