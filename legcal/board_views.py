@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.dataset.folder import Dataset
+from legcal.dataset.given_corners import CORNERS_NAME, LEAST_CORNERS
 from legcal.detection.board_corners import detect_corners, require_board
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.types import IntArray
 from legcal.observations.board_poses import camera_poses
 from legcal.observations.canonical_order import reorder_corners
@@ -121,6 +122,12 @@ def observe_board(work: Workpiece, progress: Report) -> BoardViews | None:
         shown = needed if len(corners) else {view.name for view in used}
         require_board(dataset.board, corners, load, measurements, shown)
     poses = camera_poses(corners, dataset.board, measurements, needed)
+    if all(T is None for T in poses.views):
+        raise NotVisible(
+            f"{dataset.yaml_path}: the calibration board could not be used: found no image with "
+            f"{LEAST_CORNERS} of its corners or more, needed one; add corners to "
+            f"{CORNERS_NAME}, or remove that table or the block board."
+        )
     names = tuple(measurements.views[v].name for v in measurements.view.tolist())
     return BoardViews(dataset.board, poses.corners, poses.views, names)
 

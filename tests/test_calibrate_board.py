@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 import legcal
 from legcal.board_views import BoardViews, base_of_board
 from legcal.calibration import Calibration
-from legcal.errors import DatasetError, DidNotConverge
+from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.mechanism.parametrization import geometries, vector_of
 from legcal.observations.corners import found_corners
 from legcal.refinement.known_parameters import BOARD_SCALE
@@ -134,3 +134,21 @@ def test_a_board_of_other_squares_is_refused(in_the_hand: Path, tmp_path: Path) 
         legcal.calibrate(folder)
     free = legcal.calibrate(folder, free=[BOARD_SCALE])
     assert abs(free.solution.values[BOARD_SCALE] - 1.0 / 0.95) < 5e-3
+
+
+@pytest.mark.parametrize("rejected", [True, False], ids=["all rejected", "two left"])
+def test_a_board_that_no_image_shows_is_refused_where_cameras_have_places(
+    tmp_path: Path, rejected: bool
+) -> None:
+    dataset = tmp_path / "placed"
+    settings = legcal.SimulationSettings(
+        level=Level.OUTLINES, board="charuco", views=2, poses=2, seed=1
+    )
+    legcal.simulate("hexapod", dataset, settings)
+    table = dataset / "corners.csv"
+    text = table.read_text()
+    table.write_text(
+        text.replace(",used,", ",rejected,") if rejected else "".join(text.splitlines(True)[:3])
+    )
+    with pytest.raises(NotVisible, match="found no image with 4 of its corners or more"):
+        legcal.calibrate(dataset)
