@@ -174,7 +174,32 @@ def board_without_place(work: Workpiece) -> DatasetError:
     )
 
 
-def place_notes(dataset: Dataset, solution: Solution) -> tuple[str, ...]:
+def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -> tuple[str, ...]:
+    """Return what is odd about the board: views without it, and a place that cannot be.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    solution : Solution
+        The fit.
+    corners : Corners or None
+        Of all images, in the order of the dataset's rows; None without a board.
+    """
+    if corners is None:
+        return ()
+    measurements = dataset.measurements
+    shown = set(measurements.view[corners.row[corners.used]].tolist())
+    without = [
+        measurements.views[v].name for v in np.unique(measurements.view).tolist() if v not in shown
+    ]
+    lost = (
+        f"No image of {', '.join(without)} shows the calibration board, or too little of it: these "
+        "cameras are placed by the legs alone.",
+    )
+    return (*(lost if without else ()), *_far_from_its_place(dataset, solution))
+
+
+def _far_from_its_place(dataset: Dataset, solution: Solution) -> tuple[str, ...]:
     """Return a note if the board stands far from where the dataset has it."""
     given, found = dataset.T_base_board, solution.T_Rb_board
     if given is None or found is None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.board_views import place_notes
+from legcal.board_views import board_notes
 from legcal.calibration import Calibration, judge
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.dataset.holdout import Split, check_fraction, dataset_at, split_images
@@ -131,15 +131,14 @@ def calibrate(
     unreached = found.part.reached.notes(found.part.measurements)
     notes = [*dataset.notes, *choices.notes, *left_open, *kept, *unreached]
     order = found.part.order
+    corners = None if found.corners is None else restore_corners(found.corners, work.order)
     calibration = judge(
         fitted,
         in_file_order(found.solution, order, fitted),
         found.steps.in_file_order(order),
-        (*notes, *place_notes(dataset, found.solution), *found.solution.notes),
+        (*notes, *board_notes(dataset, found.solution, corners), *found.solution.notes),
     )
-    if found.corners is not None:
-        corners = restore_corners(found.corners, work.order)
-        calibration = replace(calibration, corners=corners)
+    calibration = replace(calibration, corners=corners)
     if len(split.kept_aside):
         held_out = _compare_held_out(work, found, split)
         calibration = replace(calibration, held_out=held_out)

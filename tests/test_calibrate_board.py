@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ import yaml
 from scipy.spatial.transform import RigidTransform
 
 import legcal
-from legcal.board_views import BoardViews, base_of_board
+from legcal.board_views import BoardViews, base_of_board, board_notes
 from legcal.calibration import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.mechanism.parametrization import geometries, vector_of
@@ -100,7 +101,7 @@ def test_a_place_of_the_board_that_cannot_be_is_told(in_the_hand: Path, tmp_path
         right.solution.parameters.base_joints,
         atol=1e-8,
     )
-    assert not any("stands" in note for note in right.notes)
+    assert not any("calibration board" in note for note in right.notes)
 
 
 def test_a_board_and_cameras_that_contradict_each_other_are_refused() -> None:
@@ -152,3 +153,18 @@ def test_a_board_that_no_image_shows_is_refused_where_cameras_have_places(
     )
     with pytest.raises(NotVisible, match="found no image with 4 of its corners or more"):
         legcal.calibrate(dataset)
+
+
+def test_views_that_lost_the_board_are_named() -> None:
+    views = [SimpleNamespace(name=name) for name in ("c1", "c2", "c3")]
+    dataset: Any = SimpleNamespace(
+        measurements=SimpleNamespace(views=views, view=np.array([0, 1, 1])), T_base_board=None
+    )
+    corner = np.zeros(2, dtype=np.intp)
+    corners = found_corners(np.array([0, 1]), corner, np.zeros((2, 2)), np.ones(2))
+    solution: Any = SimpleNamespace(T_Rb_board=None)
+    assert board_notes(dataset, solution, corners) == ()
+    assert board_notes(dataset, solution, None) == ()
+    lost = replace(corners, used=np.array([True, False]))
+    (note,) = board_notes(dataset, solution, lost)
+    assert note.startswith("No image of c2 shows the calibration board")

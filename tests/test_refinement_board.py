@@ -152,8 +152,10 @@ def test_a_board_of_other_dimensions_is_refused(factor: float) -> None:
     measurements, outlines = session.noisy(7)
     seen, start = with_board(session, corners_of(session, seed=8))
     wrong = replace(seen, board=Board("chessboard", 7, 6, factor * BOARD.side))
-    with pytest.raises(DidNotConverge, match=r"board does not fit the readings .* measure the bo"):
+    with pytest.raises(DidNotConverge, match=r"board does not fit .* measure the bo") as refusal:
         refine(session.legs, measurements, outlines, start, board=wrong)
+    told = float(str(refusal.value).split("found that it is ")[1].split(" times")[0])
+    assert told == pytest.approx(1.0 / factor, rel=3e-3)
 
 
 def test_the_size_of_a_board_can_be_left_to_the_fit_or_known_or_fixed() -> None:
@@ -198,3 +200,14 @@ def test_rejected_corners_and_a_board_that_nobody_sees_are_left_out() -> None:
     assert (solution.T_Rb_board, solution.rms_corners_px) == (None, None)
     assert BOARD_SCALE not in solution.values
     assert corners.sigma_px[0] == SIGMA_PX
+
+
+def test_a_size_that_little_is_known_of_is_not_doubted() -> None:
+    """One view that shows the board says nothing of its size that its distance could not."""
+    session = machine_session("3-rpr")
+    measurements, outlines = session.noisy(13)
+    corners = corners_of(session, seed=14)
+    once = replace(corners, used=corners.used & (measurements.view[corners.row] == 0))
+    seen, start = with_board(session, once)
+    solution = refine(session.legs, measurements, outlines, start, board=seen)
+    assert solution.values[BOARD_SCALE] == pytest.approx(1.0, abs=5e-3)

@@ -8,7 +8,6 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.refinement.determinacy import of_values
-from legcal.refinement.known_parameters import BOARD_SCALE
 from legcal.refinement.normal import NormalEquations, inverse_on_range
 from legcal.refinement.priors import named_values
 from legcal.refinement.problem import FitProblem
@@ -52,7 +51,7 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
         return
     problems = []
     for i, mean, sigma in stated:
-        found = _without_prior(problem, state, normal, i, mean, sigma)
+        found = without_prior(problem, state, normal, i, mean, sigma)
         if found is not None and found.apart > _SIGNIFICANT:
             unit = problem.named_units[i]
             problems.append(
@@ -65,49 +64,18 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
         raise DidNotConverge(problems)
 
 
-def refuse_other_board(problem: FitProblem, state: State, normal: NormalEquations) -> None:
-    """Refuse a calibration board whose dimensions cannot be those that were given.
-
-    Encoders and radii carry the scale too; a board that was taken for larger than it is puts
-    cameras further away.
-
-    Parameters
-    ----------
-    problem, state, normal
-        As in :func:`refuse_contradicted_priors`.
-
-    Raises
-    ------
-    DidNotConverge
-        If its size contradicts what else was measured, and nobody stated a prior of it.
-    """
-    if BOARD_SCALE not in problem.named or BOARD_SCALE in problem.choices.priors:
-        return
-    place = problem.named.index(BOARD_SCALE)
-    for i in np.flatnonzero(problem.priors.position == place).tolist():
-        mean, sigma = float(problem.priors.mean[i]), float(problem.priors.sigma[i])
-        found = _without_prior(problem, state, normal, place, mean, sigma)
-        if found is not None and found.apart > _SIGNIFICANT:
-            raise DidNotConverge(
-                "The calibration board does not fit the readings and the legs: found that it is "
-                f"{found.value:.4g} times as large as the dataset says ({found.apart:.0f} standard "
-                f"deviations from 1), needed its dimensions to {1e2 * sigma:.2g} %; measure the "
-                "board and correct its dimensions in dataset.yaml, or let the fit find them "
-                f"(--free {BOARD_SCALE})."
-            )
-
-
 @dataclass(frozen=True)
-class _Opinion:
+class Opinion:
     """What everything but its own prior says of a parameter, and how far it is from the prior."""
 
     value: float
+    sigma: float
     apart: float  # standard deviations
 
 
-def _without_prior(
+def without_prior(
     problem: FitProblem, state: State, normal: NormalEquations, i: int, mean: float, sigma: float
-) -> _Opinion | None:
+) -> Opinion | None:
     """Return what measurements say of a named unknown by themselves; None if nothing."""
     S = of_values(problem, state, normal)
     others = np.delete(np.arange(len(S)), i)
@@ -117,4 +85,6 @@ def _without_prior(
         return None
     value = float(named_values(state, problem.layout, problem.legs)[i])
     away = (value - mean) * (1.0 + 1.0 / (known * sigma**2))
-    return _Opinion(mean + away, abs(away) / float(np.sqrt(sigma**2 + 1.0 / known)))
+    variance = 1.0 / known
+    apart = abs(away) / float(np.sqrt(sigma**2 + variance))
+    return Opinion(mean + away, float(np.sqrt(variance)), apart)

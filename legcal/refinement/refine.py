@@ -18,7 +18,7 @@ from legcal.refinement.assembly import assemble_solution, comparable_cost
 from legcal.refinement.build import build_fit
 from legcal.refinement.choices import NO_CHOICES, Choices
 from legcal.refinement.constraints import on_constraints
-from legcal.refinement.contradictions import refuse_contradicted_priors, refuse_other_board
+from legcal.refinement.contradictions import refuse_contradicted_priors
 from legcal.refinement.determinacy import held_at_nominal, open_directions, refuse_lost
 from legcal.refinement.fixed_values import refuse_contradicted_values
 from legcal.refinement.legs import FittedLegs
@@ -28,6 +28,7 @@ from legcal.refinement.minimise import Minimum
 from legcal.refinement.noise import NoiseModel, noise_of_the_median
 from legcal.refinement.normal import information
 from legcal.refinement.observed_board import SeenBoard
+from legcal.refinement.other_board import refuse_other_board
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.rounds import first_minimum, fit_in_rounds
 from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
@@ -203,7 +204,7 @@ def _refined(
     k = width_to_k(settings.loss_width)
     normal = information(problem, first.state, first.linear, k)
     held = open_directions(problem, first.state, normal)
-    refuse_other_board(problem, first.state, normal)
+    refuse_other_board(problem, first.state, normal, settings)
     free, state, iterations = problem, first.state, first.iterations
     try:
         if len(held.basis):
