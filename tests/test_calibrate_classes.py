@@ -20,7 +20,7 @@ from legcal.simulation.simulate import simulate
 Row = dict[str, str]
 
 
-@pytest.mark.parametrize("model", ["3-upu", "tricept"])
+@pytest.mark.parametrize("model", [pytest.param("3-upu", marks=pytest.mark.slow), "tricept"])
 def test_a_machine_of_any_class_comes_much_nearer_to_its_truth(model: str, tmp_path: Path) -> None:
     made = simulate(model, tmp_path / "set", settings(poses=8, views=3))
     found = calibrate(made.folder, output=tmp_path / "result")

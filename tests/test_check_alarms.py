@@ -55,7 +55,12 @@ def _moved(
 
 
 @pytest.mark.parametrize(
-    ("model", "known"), [("3-upu", 1e-3), ("3-upu-tilted", 2e-3), ("tricept", 2e-3)]
+    ("model", "known"),
+    [
+        pytest.param("3-upu", 1e-3, marks=pytest.mark.slow),
+        pytest.param("3-upu-tilted", 2e-3, marks=pytest.mark.slow),
+        ("tricept", 2e-3),
+    ],
 )
 def test_a_calibrated_machine_of_any_class_has_not_moved(
     model: str, known: float, tmp_path: Path
@@ -69,6 +74,7 @@ def test_a_calibrated_machine_of_any_class_has_not_moved(
     assert 1e-5 < found.at_platform.expected_displacement < known
 
 
+@pytest.mark.slow
 def test_errors_that_outlines_share_do_not_look_like_a_movement(tmp_path: Path) -> None:
     rng = np.random.default_rng(9)
     images = _with_errors(_simulated("hexapod", tmp_path / "set", 15, 3), rng, shared=0.05)

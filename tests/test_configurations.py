@@ -109,6 +109,7 @@ def test_a_travel_that_home_cannot_enter_is_refused_once(motors: str) -> None:
         random_configurations(mechanism, 3, 1)
 
 
+@pytest.mark.slow
 def test_poses_are_drawn_where_home_is_nearly_singular(tmp_path: Path) -> None:
     chance = np.random.default_rng(3)
     A, B = ring(list(np.arange(6) * 60.0), 0.3), ring(list(np.arange(6) * 60.0 + 6.0), 0.15)

@@ -41,9 +41,15 @@ def _stops_on_the_chain(mechanism: Mechanism, readings: Array) -> bool:
 
 @pytest.mark.parametrize("hung", ["base", "platform"])
 @pytest.mark.parametrize(
-    ("leg_type", "seed", "stops"), [("US", 1, True), ("US", 6, True), ("SU", 6, True),
-                                    ("SU", 1, False), ("SS", 2, False)]
-)  # fmt: skip
+    ("leg_type", "seed", "stops"),
+    [
+        pytest.param("US", 1, True, marks=pytest.mark.slow),
+        ("US", 6, True),
+        ("SU", 6, True),
+        pytest.param("SU", 1, False, marks=pytest.mark.slow),
+        ("SS", 2, False),
+    ],
+)
 def test_random_readings_give_the_same_poses_in_every_tree(
     leg_type: str, seed: int, stops: bool, hung: str, tmp_path: Path
 ) -> None:

@@ -153,6 +153,7 @@ def test_steps_as_printed_spoil_z_of_coplanar_joints_and_the_fit_is_near_the_bou
         assert rows["default", coplanar]["dX_mm"] > bound["dX_mm"]
 
 
+@pytest.mark.slow
 def test_one_fit_is_within_a_few_percent_of_the_bound() -> None:
     found = run_study(PaperStudy(estimators=("fit",)), 12)
     document = found.document()
