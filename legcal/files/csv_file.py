@@ -46,7 +46,12 @@ def read_lines(path: Path, what: str) -> list[Line]:
 
 
 def read_named_rows(
-    path: Path, what: str, columns: Sequence[str], remedy: str, problems: list[str]
+    path: Path,
+    what: str,
+    columns: Sequence[str],
+    remedy: str,
+    problems: list[str],
+    optional: Sequence[str] = (),
 ) -> list[tuple[str, dict[str, str]]]:
     """Return the rows of a CSV file by column name, each with its place for messages.
 
@@ -62,6 +67,8 @@ def read_named_rows(
         What to do about another header.
     problems : list of str
         Takes one sentence for each row that is not complete; such rows are left out.
+    optional : sequence of str
+        Names that the header may have besides.
 
     Raises
     ------
@@ -70,7 +77,8 @@ def read_named_rows(
     """
     lines = read_lines(path, what)
     header = lines[0][1] if lines else []
-    if sorted(header) != sorted(columns):
+    here = [name for name in optional if name in header]
+    if sorted(header) != sorted([*columns, *here]):
         raise DatasetError(
             f"{path}, header: the columns could not be used: found {','.join(header) or 'none'}, "
             f"needed {','.join(columns)}; {remedy}."
