@@ -173,13 +173,15 @@ def read_named_rows(
     columns: Sequence[str],
     remedy: str,
     problems: list[str],
+    *,
     needed: str = "",
+    optional: Sequence[str] = (),
 ) -> list[Row]:
     """Return the rows of a CSV file whose columns are fixed.
 
     Parameters
     ----------
-    path, what, needed
+    path, what
         As in :func:`read_table`.
     columns : sequence of str
         The names in its header, in any order.
@@ -187,6 +189,10 @@ def read_named_rows(
         What to do about another header.
     problems : list of str
         Takes one sentence for each row that is not complete; such rows are left out.
+    needed : str
+        As in :func:`read_table`.
+    optional : sequence of str
+        Names that the header may have besides.
 
     Raises
     ------
@@ -194,7 +200,8 @@ def read_named_rows(
         If :func:`read_table` refuses the file, or it has other columns.
     """
     table = read_table(path, what, needed)
-    if sorted(table.header) != sorted(columns):
+    here = [name for name in optional if name in table.header]
+    if sorted(table.header) != sorted([*columns, *here]):
         raise DatasetError(
             f"{path}, header: the columns could not be used: found "
             f"{','.join(table.header) or 'none'}, needed {','.join(columns)}; {remedy}."

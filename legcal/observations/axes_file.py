@@ -125,7 +125,9 @@ def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) 
     needed = (
         "the axes of the legs in every image; add them, or delete the file to have images searched"
     )
-    rows = read_named_rows(path, "table of axes", COLUMNS, "correct the header", problems, needed)
+    rows = read_named_rows(
+        path, "table of axes", COLUMNS, "correct the header", problems, needed=needed
+    )
     places = rows_by_name(measurements)
     first: dict[tuple[int, int], str] = {}
     numbers = []

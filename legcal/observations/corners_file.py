@@ -100,7 +100,7 @@ def read_corners(path: Path, board: Board, measurements: Measurements) -> Corner
         "searched"
     )
     rows = read_named_rows(
-        path, "table of corners", COLUMNS, "correct the header", problems, needed
+        path, "table of corners", COLUMNS, "correct the header", problems, needed=needed
     )
     places = rows_by_name(measurements)
     sizes = [(camera.width, camera.height) for camera in (v.camera for v in measurements.views)]
