@@ -166,6 +166,24 @@ def test_legs_behind_others_end_where_they_are_hidden() -> None:
     found = detect(cam, [front, behind], image.astype(np.uint8))
     assert np.all(found.used), found.reason
     assert np.abs(errors(cam, [front, behind], found)).max() < 0.2
+    gap = np.linalg.norm(np.diff(found.ends, axis=1)[:, 0], axis=1) - found.length
+    assert np.all(gap > -1.0)
+    assert np.all(gap[2:] > 20.0)  # the leg in front hides the middle
+
+
+def test_outlines_say_how_well_they_were_seen() -> None:
+    cam = camera()
+    bars = [bar(-0.09, 0.03, 150.0), bar(0.08, 0.03, 90.0), bar(0.9, 0.0, 150.0)]
+    flat = Light(ambient=1.0, diffuse=0.0)
+    image = render(cam, bars[:2], 30.0, flat, blur=0.5, noise=2.0, supersample=4)
+    found = detect(cam, bars, np.rint(image).astype(np.uint8))
+    np.testing.assert_allclose(found.contrast[:4], [120.0, 120.0, 60.0, 60.0], rtol=0.05)
+    seen = np.linalg.norm(found.ends[:4, 1] - found.ends[:4, 0], axis=1)
+    assert np.all(np.abs(found.length[:4] - seen) < 20.0)
+    assert np.all((found.residual[:4] > 0.0) & (found.residual[:4] < 0.1))
+    assert np.mean(found.residual[2:4]) > 1.2 * np.mean(found.residual[:2])
+    for values in (found.contrast, found.length, found.residual):
+        assert np.all(np.isnan(values[4:]))
 
 
 def test_a_leg_that_another_covers_is_left_out_by_its_name() -> None:

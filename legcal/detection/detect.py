@@ -262,4 +262,7 @@ def _table(rows: Sequence[int], found: Sequence[Sequence[PartOutlines]]) -> Outl
         used=np.array([part.reasons[edge] == "" for _, part, edge in pairs], dtype=np.bool_),
         reason=tuple(part.reasons[edge] for _, part, edge in pairs),
         source=("detected",) * len(pairs),
+        contrast=np.array([part.contrast[edge] for _, part, edge in pairs]),
+        length=np.array([part.length[edge] for _, part, edge in pairs]),
+        residual=np.array([part.residual[edge] for _, part, edge in pairs]),
     )
