@@ -284,6 +284,16 @@ def _equations(
     )
 
 
+def distances(picture: Picture, poses: Poses, found: Agreement) -> Array:
+    """Return how far pieces are from the bars that agree with them, (n_poses, n_targets) [m].
+
+    Sideways, at the ends of the bars and at the depth of the pieces.
+    """
+    _, _, residual, _ = _equations(picture, poses, found, 1.0)
+    X, _, _, _ = _in_picture(picture, poses)
+    return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
+
+
 def _moved(poses: Poses, xi: Array, shift: Array) -> Poses:
     """Return poses moved by rotation vectors and translations in the camera frame, (n, 6)."""
     angle = np.linalg.norm(xi[:, :3], axis=1)
