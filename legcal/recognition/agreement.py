@@ -6,7 +6,7 @@ piece counts. One Gauss-Newton step moves every pose towards the bars that agree
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -67,11 +67,16 @@ class Picture:
         Pieces of legs at its reading.
     corners : (2, 2) array
         Least and greatest x and y of the sensor plane that it shows.
+    R, t : (3, 3) and (3,) array
+        Its camera frame, where poses are those of another frame that is fixed to it:
+        X_camera = R X + t.
     """
 
     bars: Bars
     targets: Targets
     corners: Array
+    R: Array = field(default_factory=lambda: np.eye(3))
+    t: Array = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +127,8 @@ def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Ar
         at = targets.place[:, :, None]
         ends = ends + (1.0 - at) * of_leg[:, :, :1] + at * of_leg[:, :, 1:]
     n_ends = 2 * len(targets)
-    X = ends.reshape(-1, n_ends, 3) @ poses.R.swapaxes(1, 2) + poses.t[:, None, :]
+    R, t = _of_camera(picture, poses)
+    X = ends.reshape(-1, n_ends, 3) @ R.swapaxes(1, 2) + t[:, None, :]
     X = X.reshape(-1, len(targets), 2, 3)
     z = np.maximum(X[..., 2:], NEAREST)
     xy = X[..., :2] / z
@@ -131,6 +137,11 @@ def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Ar
     width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
     front = (X[..., 2] > NEAREST).all(axis=-1)
     return X, xy, width, np.where(front, _shown(xy, picture.corners), 0.0)
+
+
+def _of_camera(picture: Picture, poses: Poses) -> tuple[Array, Array]:
+    """Return the poses of the picture's own camera frame: rotations and translations."""
+    return picture.R @ poses.R, poses.t @ picture.R.T + picture.t
 
 
 def _shown(xy: Array, corners: Array) -> Array:
@@ -267,6 +278,8 @@ def _equations(
     D[:, :, :2] = parts[..., None] * g[:, :, None]
     D[:, :, 2, 0] = (1.0 - share)[..., None] * of_depth
     D[:, :, 2, 1] = share[..., None] * of_depth
+    D = D @ picture.R  # by the ends in the frame of the poses
+    X = (X - picture.t) @ picture.R
     turning = np.cross(X[:, :, None], D).sum(axis=3)
     J = np.concatenate([turning, D.sum(axis=3)], axis=-1)
     in_base = D @ poses.R[:, None, None]
@@ -295,7 +308,7 @@ def distances(picture: Picture, poses: Poses, found: Agreement) -> Array:
 
 
 def _moved(poses: Poses, xi: Array, shift: Array) -> Poses:
-    """Return poses moved by rotation vectors and translations in the camera frame, (n, 6)."""
+    """Return poses moved by rotation vectors and translations in their frame, (n, 6)."""
     angle = np.linalg.norm(xi[:, :3], axis=1)
     xi = xi * np.minimum(1.0, 0.5 / np.maximum(angle, 1e-12))[:, None]
     turn = _rotations(xi[:, :3])

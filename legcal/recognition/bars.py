@@ -110,7 +110,9 @@ def find_bars(segments: Segments, most: int = MOST) -> Bars:
     good &= (width.min(axis=0) >= NARROWEST * pixel) & (width.max(axis=0) <= WIDEST * pixel)
     good &= overlap >= SLENDER * width.mean(axis=0)
     merit = overlap * np.minimum(segments.covered[i], segments.covered[j])
-    merit = merit * np.where(cosine < 0.0, 1.0, SAME_WAY) * np.sqrt(np.maximum(overlap, 0.0) / longer)
+    merit = (
+        merit * np.where(cosine < 0.0, 1.0, SAME_WAY) * np.sqrt(np.maximum(overlap, 0.0) / longer)
+    )
     centre = 0.5 * (offsets[0] + offsets[1])  # (2, n) of the axis at both ends
     start, stop = (
         origin + t[:, None] * axis + v[:, None] * across

@@ -154,8 +154,8 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
     kept: list[int] = []
     for i in np.argsort(-support.sum(axis=1), kind="stable").tolist():
         mine = matches[i] >= 0
-        least = max(1, np.count_nonzero(mine))
-        common = [np.count_nonzero((matches[i] == matches[k]) & mine) / least for k in kept]
+        least = max(1, int(np.count_nonzero(mine)))
+        common = [int(np.count_nonzero((matches[i] == matches[k]) & mine)) / least for k in kept]
         if max(common, default=0.0) < SAME_MATCHES:
             kept.append(i)
     order = np.array(kept, dtype=np.intp)
@@ -205,9 +205,7 @@ def _refined(
     return poses
 
 
-def _support(
-    pictures: Sequence[Picture], poses: Poses, tolerance: float
-) -> tuple[Array, Array]:
+def _support(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
     """Return the support and the expected number of legs, both (n_poses, n_pictures)."""
     support, expected = [], []
     for picture in pictures:

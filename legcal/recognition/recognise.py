@@ -6,7 +6,7 @@ a pose that they agree on elsewhere is used and said.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -101,6 +101,7 @@ def recognise(
     search: Search,
     rows: IntArray,
     hints: Sequence[RigidTransform | None],
+    joined: Sequence[RigidTransform | None] | None = None,
     *,
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
@@ -115,6 +116,9 @@ def recognise(
         The images to use.
     hints : sequence of RigidTransform or None, for each view
         Rough camera poses T_base_camera.
+    joined : sequence of RigidTransform or None, for each view
+        T_x_camera of views that know how they stand to each other, by a calibration board x: they
+        are placed together.
     progress : callable, optional
         Called with the row of each image when it has been searched.
     run : callable
@@ -130,31 +134,85 @@ def recognise(
     NotVisible
         If no view could be placed: one sentence for each.
     """
-    view_of = search.measurements.view[rows]
-    by_view = {int(v): rows[view_of == v] for v in np.unique(view_of)}
-    near = [r for v, own in by_view.items() if hints[v] is not None for r in _some(own)]
-    far = [r for v, own in by_view.items() if hints[v] is None for r in own.tolist()]
+    groups = _groups(search, rows, hints, joined)
+    near = [r for group in groups if group.hint is not None for r in group.some]
+    far = [r for group in groups if group.hint is None for r in group.rows]
     pictures = _pictures(search, sorted([*near, *far]), progress, run)
-    poses: dict[int, Placed] = {}
-    for v in by_view:
-        hint = hints[v]
-        if hint is not None:
-            poses[v] = place_near([pictures[r] for r in _some(by_view[v])], hint, search.n_legs)
-    doubted = [v for v in by_view if v not in poses or not poses[v].is_convincing]
+    found: list[Placed | None] = [
+        None
+        if group.hint is None
+        else place_near(group.pictures(pictures, group.some), group.hint, search.n_legs)
+        for group in groups
+    ]
     # Views without a rough pose, and those whose images do not agree near it: all images, anywhere.
-    missing = [r for v in doubted for r in by_view[v].tolist() if r not in pictures]
+    doubted = [g for g, near in enumerate(found) if near is None or not near.is_clear]
+    missing = [r for g in doubted for r in groups[g].rows if r not in pictures]
     pictures |= _pictures(search, missing, progress, run)
-    groups = {v: [pictures[r] for r in by_view[v].tolist()] for v in doubted}
-    task = partial(_place, groups, search.n_legs)
-    for v, found in zip(doubted, run(task, doubted), strict=True):
-        poses[v] = found if v not in poses else _better(poses[v], found)
-    return _gathered(search, by_view, hints, poses)
+    everywhere = [groups[g].pictures(pictures, groups[g].rows) for g in doubted]
+    task = partial(_place, everywhere, search.n_legs)
+    for g, anywhere in zip(doubted, run(task, range(len(doubted))), strict=True):
+        found[g] = _better(found[g], anywhere)
+    return _gathered(search, groups, [placed for placed in found if placed is not None])
 
 
-def _some(rows: IntArray) -> list[int]:
-    """Return a few rows spread over all of a view."""
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Views whose cameras are placed together, since they know how they stand to each other.
+
+    Attributes
+    ----------
+    views : list of int
+    T_group_camera : dict of RigidTransform, by view
+    rows, some : list of int
+        All images to use, and a few of them.
+    view_of_row : dict of int
+    hint : RigidTransform or None
+        T_base_group, roughly.
+    """
+
+    views: list[int]
+    T_group_camera: dict[int, RigidTransform]
+    rows: list[int]
+    some: list[int]
+    view_of_row: dict[int, int]
+    hint: RigidTransform | None
+
+    def pictures(self, of_row: dict[int, Picture], rows: Sequence[int]) -> list[Picture]:
+        """Return the pictures of some rows, in the frame of the group."""
+        found = []
+        for row in rows:
+            T = self.T_group_camera[self.view_of_row[row]].inv()
+            found.append(replace(of_row[row], R=T.rotation.as_matrix(), t=T.translation))
+        return found
+
+
+def _groups(
+    search: Search,
+    rows: IntArray,
+    hints: Sequence[RigidTransform | None],
+    joined: Sequence[RigidTransform | None] | None,
+) -> list[_Group]:
+    """Return the views that stand alone, and those that are joined."""
+    view_of = {int(row): int(search.measurements.view[row]) for row in rows}
+    views = sorted(set(view_of.values()))
+    together = [v for v in views if joined is not None and joined[v] is not None]
+    groups = [[v] for v in views if v not in together] + ([together] if together else [])
+    found = []
+    for group in groups:
+        own = [row for row, v in view_of.items() if v in group]
+        T = {v: RigidTransform.identity() for v in group}
+        if joined is not None and group == together:
+            T = {v: joined_v for v in group if (joined_v := joined[v]) is not None}
+        given = [(hint, T[v]) for v in group if (hint := hints[v]) is not None]
+        hint = None if not given else given[0][0] * given[0][1].inv()
+        found.append(_Group(group, T, own, _some(own), view_of, hint))
+    return found
+
+
+def _some(rows: Sequence[int]) -> list[int]:
+    """Return a few rows spread over all of them."""
     chosen = np.linspace(0, len(rows) - 1, min(NEAR_IMAGES, len(rows)))
-    return [int(rows[int(k)]) for k in np.unique(np.rint(chosen).astype(int))]
+    return [rows[int(k)] for k in np.unique(np.rint(chosen).astype(int))]
 
 
 def _pictures(
@@ -168,13 +226,15 @@ def _pictures(
     return found
 
 
-def _place(groups: dict[int, list[Picture]], n_legs: int, view: int) -> Placed:
-    return place_camera(groups[view], n_legs)
+def _place(groups: Sequence[Sequence[Picture]], n_legs: int, group: int) -> Placed:
+    return place_camera(groups[group], n_legs)
 
 
-def _better(near: Placed, anywhere: Placed) -> Placed:
+def _better(near: Placed | None, anywhere: Placed) -> Placed:
     """Return the pose with the greater support, that near a rough pose if they are alike."""
-    if len(anywhere.poses) == 0 or not anywhere.is_clear:
+    if near is None:
+        return anywhere
+    if len(anywhere.poses) == 0 or not anywhere.is_convincing:
         return near
     if len(near.poses) == 0:
         return anywhere
@@ -182,35 +242,37 @@ def _better(near: Placed, anywhere: Placed) -> Placed:
     return anywhere if mean[1] > 1.1 * mean[0] else near
 
 
-def _gathered(
-    search: Search,
-    by_view: dict[int, IntArray],
-    hints: Sequence[RigidTransform | None],
-    poses: dict[int, Placed],
-) -> Recognised:
+def _gathered(search: Search, groups: Sequence[_Group], poses: Sequence[Placed]) -> Recognised:
     """Put the views together, with what is to be said of them."""
     views = search.measurements.views
     n_views, n_legs = len(views), search.n_legs
-    found: list[RigidTransform | None] = list(hints)
+    found: list[RigidTransform | None] = [None] * n_views
     shift = np.zeros((n_views, n_legs, 2, 3))
     error = np.full((n_views, n_legs), UNSEEN_ERROR)
     problems, notes = [], []
-    for v, placed in poses.items():
-        name, hint = views[v].name, hints[v]
+    for group, placed in zip(groups, poses, strict=True):
+        name = _named([views[v].name for v in group.views])
         if not placed.is_convincing:
-            found[v] = None
-            problems.append(_problem(name, placed, hint is not None))
+            problems.append(_problem(name, placed, group.hint is not None))
             continue
-        T = placed.pose()
-        found[v], shift[v] = T, placed.poses.shift[0]
-        of_leg = placed.leg_error
-        seen = np.isfinite(of_leg)
-        error[v, seen] = LEAST_ERROR + ERROR_REACH * of_leg[seen]
-        if hint is not None:
-            notes.extend(_wrong_hint(name, hint, T))
+        of_leg = np.where(
+            np.isfinite(placed.leg_error),
+            LEAST_ERROR + ERROR_REACH * placed.leg_error,
+            UNSEEN_ERROR,
+        )
+        for v in group.views:
+            found[v] = placed.pose() * group.T_group_camera[v]
+            shift[v], error[v] = placed.poses.shift[0], of_leg
+        if group.hint is not None:
+            notes.extend(_wrong_hint(name, group.hint, placed.pose()))
     if problems and len(problems) == len(poses):
         raise NotVisible(problems)
     return Recognised(found, shift, error, tuple(problems), tuple(notes))
+
+
+def _named(names: Sequence[str]) -> str:
+    """Return the name of a view, or of a group."""
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _problem(name: str, placed: Placed, hinted: bool) -> str:
@@ -259,7 +321,9 @@ def _wrong_hint(name: str, hint: RigidTransform, T: RigidTransform) -> list[str]
 def _corners(camera: Camera) -> Array:
     """Return the least and the greatest x and y (2, 2) of the sensor plane that an image shows."""
     x, y = camera.width - 1.0, camera.height - 1.0
-    border = np.array([[0, 0], [x, 0], [0, y], [x, y], [x / 2, 0], [0, y / 2], [x / 2, y], [x, y / 2]])
+    border = np.array(
+        [[0, 0], [x, 0], [0, y], [x, y], [x / 2, 0], [0, y / 2], [x / 2, y], [x, y / 2]]
+    )
     xy = camera.undistort(border)
     return np.array([xy.min(axis=0), xy.max(axis=0)])
 
@@ -267,4 +331,3 @@ def _corners(camera: Camera) -> Array:
 def shifted(found: Recognised, view: IntArray, A: Array, B: Array) -> tuple[Array, Array]:
     """Return joint centres (n_rows, n_legs, 3) where the view of each row sees them [m]."""
     return A + found.shift[view][:, :, 0], B + found.shift[view][:, :, 1]
-

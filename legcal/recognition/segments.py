@@ -118,7 +118,7 @@ def _join(ends: Array) -> tuple[Array, Array]:
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
     _, label = connected_components(graph, directed=False)
     lines, covered = [], []
-    for group in _groups(label):
+    for group in _groups(np.asarray(label, dtype=np.intp)):
         for line, share in _fitted(ends[group], length[group]):
             lines.append(line)
             covered.append(share)
