@@ -222,7 +222,9 @@ def test_other_columns_are_refused(tmp_path: Path, content: str) -> None:
 def test_rows_of_another_length_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path, outlines_of(11))
     path.write_text(path.read_text() + "right,i/2.png\n")
-    with pytest.raises(DatasetError, match="found 2 cells, needed 21; complete or remove"):
+    with pytest.raises(
+        DatasetError, match="found 2 cells, needed 21 as in the header; complete or remove"
+    ):
         read(path)
 
 

@@ -165,7 +165,9 @@ def read_observations(
     found: list[OutlineRow] = []
     first: dict[tuple[int, int, str, int], str] = {}
     remedy = "delete the file to have it written again"
-    rows = read_named_rows(path, "table of observations", COLUMNS, remedy, problems, QUALITY)
+    rows = read_named_rows(
+        path, "table of observations", COLUMNS, remedy, problems, optional=QUALITY
+    )
     for where, cells in rows:
         place, unknown = place_of(where, cells, places, legs)
         if unknown and skip_stale and cells["source"] == "detected":
