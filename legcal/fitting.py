@@ -108,7 +108,9 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
     if len(photographs.detect) == 0:
         return _fit(part, fitted, given_outlines(photographs), scene, board, progress)
     joined = None if board is None else board.T_board_camera
-    scene, notes = place(photographs, scene, progress, joined)
+    placement = place(photographs, scene, progress, joined)
+    placement.require_one()
+    scene, notes = placement.scene, placement.all_notes
     outlines = detect(photographs, scene, progress)
     found = replace(_fit(part, fitted, outlines, scene, board, progress), notes=notes)
     doubtful = doubtful_rows(photographs, found.judged)

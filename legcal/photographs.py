@@ -24,6 +24,7 @@ from legcal.detection.detect import (
     detect_outlines,
 )
 from legcal.detection.outline import OUTSIDE, outline_parts
+from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.leg import Cylinder
 from legcal.mechanism.model import Mechanism
@@ -166,32 +167,60 @@ def doubtful_rows(photographs: Photographs, outlines: Outlines) -> IntArray:
     return np.intersect1d(photographs.detect, outlines.row[unused])
 
 
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """What the images say of where everything is.
+
+    Attributes
+    ----------
+    scene : Scene
+        With the camera of every searched view where its images put it, and joint centres where
+        the view sees them.
+    unplaced : dict of str
+        Why views could not be placed, by name.
+    notes : tuple of str
+        What else a reader should know.
+    """
+
+    scene: Scene
+    unplaced: dict[str, str]
+    notes: tuple[str, ...]
+
+    def require_one(self) -> None:
+        """Refuse images of which no view could be placed.
+
+        Raises
+        ------
+        NotVisible
+            One sentence for each view.
+        """
+        if self.unplaced and all(T is None for T in self.scene.T_base_camera):
+            raise NotVisible(list(dict.fromkeys(self.unplaced.values())))
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """What a reader should know, with the views that could not be placed."""
+        return (*dict.fromkeys(self.unplaced.values()), *self.notes)
+
+
 def place(
     photographs: Photographs,
     scene: Scene,
     report: Report,
     joined: Sequence[RigidTransform | None] | None = None,
-) -> tuple[Scene, tuple[str, ...]]:
-    """Return the scene as the images show it, and what is to be said of it.
-
-    The camera of every searched view is placed by its images, near its rough pose if there is one;
-    joint centres are put where each view sees them.
+) -> Placement:
+    """Recognise the legs in the images, and place the cameras by them.
 
     Parameters
     ----------
     photographs : Photographs
         The images.
     scene : Scene
-        The model, and rough camera poses.
+        The model, and rough camera poses where there are any.
     report : callable
         Called as ``report(stage, done, total)``.
     joined : sequence of RigidTransform or None, for each view
         T_board_camera of the views that show a calibration board: they are placed together.
-
-    Raises
-    ------
-    NotVisible
-        If no view shows the legs where any camera pose would have them.
     """
     search = Search(
         photographs.load,
@@ -209,9 +238,15 @@ def place(
         run=photographs.run,
         progress=_counted(report, "Recognising legs", len(photographs.detect)),
     )
+    views = photographs.measurements.views
     A, B = shifted(found, photographs.measurements.view, scene.A_base, scene.B_base)
-    placed = Scene(A, B, tuple(found.T_base_camera), found.joint_error)
-    return placed, (*found.problems, *found.notes)
+    searched = set(photographs.measurements.view[photographs.detect].tolist())
+    cameras = tuple(
+        T if v in searched else rough
+        for v, (T, rough) in enumerate(zip(found.T_base_camera, scene.T_base_camera, strict=True))
+    )
+    unplaced = {views[v].name: why for v, why in found.unplaced.items()}
+    return Placement(Scene(A, B, cameras, found.joint_error), unplaced, found.notes)
 
 
 def detect(

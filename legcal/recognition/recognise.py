@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.detection.picture import to_grey
-from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements
@@ -44,8 +43,8 @@ class Recognised:
         Where each view sees A and B of the legs, against the model, in the base link [m].
     joint_error : (n_views, n_legs) array
         How far the legs may still be from there [m].
-    problems : tuple of str
-        One sentence for each view that could not be placed.
+    unplaced : dict of str
+        Why views could not be placed, by view: one sentence for each.
     notes : tuple of str
         What else a reader should know: rough poses that are wrong.
     """
@@ -53,7 +52,7 @@ class Recognised:
     T_base_camera: list[RigidTransform | None]
     shift: Array
     joint_error: Array
-    problems: tuple[str, ...]
+    unplaced: dict[int, str]
     notes: tuple[str, ...]
 
 
@@ -127,12 +126,7 @@ def recognise(
     Returns
     -------
     Recognised
-        Also where some views could not be placed.
-
-    Raises
-    ------
-    NotVisible
-        If no view could be placed: one sentence for each.
+        Also where views could not be placed.
     """
     groups = _groups(search, rows, hints, joined)
     near = [r for group in groups if group.hint is not None for r in group.some]
@@ -249,11 +243,13 @@ def _gathered(search: Search, groups: Sequence[_Group], poses: Sequence[Placed])
     found: list[RigidTransform | None] = [None] * n_views
     shift = np.zeros((n_views, n_legs, 2, 3))
     error = np.full((n_views, n_legs), UNSEEN_ERROR)
-    problems, notes = [], []
+    unplaced: dict[int, str] = {}
+    notes: list[str] = []
     for group, placed in zip(groups, poses, strict=True):
         name = _named([views[v].name for v in group.views])
         if not placed.is_convincing:
-            problems.append(_problem(name, placed, group.hint is not None))
+            sentence = _problem(name, placed, group.hint is not None)
+            unplaced |= dict.fromkeys(group.views, sentence)
             continue
         of_leg = np.where(
             np.isfinite(placed.leg_error),
@@ -265,9 +261,7 @@ def _gathered(search: Search, groups: Sequence[_Group], poses: Sequence[Placed])
             shift[v], error[v] = placed.poses.shift[0], of_leg
         if group.hint is not None:
             notes.extend(_wrong_hint(name, group.hint, placed.pose()))
-    if problems and len(problems) == len(poses):
-        raise NotVisible(problems)
-    return Recognised(found, shift, error, tuple(problems), tuple(notes))
+    return Recognised(found, shift, error, unplaced, tuple(notes))
 
 
 def _named(names: Sequence[str]) -> str:

@@ -115,7 +115,9 @@ def _search(
     poses = forward_kinematics_many(every.mechanism, q)
     scene = scene_at_poses(every.mechanism, measurements, poses)
     to_align = replace(every, detect=_rows_to_align(every, repeats))
-    scene, _ = place(to_align, scene, progress)
+    placement = place(to_align, scene, progress)
+    placement.require_one()
+    scene = placement.scene
     repeated = replace(every, detect=np.sort(np.concatenate([group.rows for group in repeats])))
     return {
         name: detect(repeated, scene, progress, method=method, stage=stage)
