@@ -114,7 +114,17 @@ def _observed(work: Workpiece, progress: Report) -> tuple[Outlines, Placement]:
         return given_outlines(photographs), Placement(scene, {}, ())
     joined = None if board is None else board.T_board_camera
     placement = place(photographs, scene, progress, joined)
-    return search(photographs, placement.scene, progress), placement
+    view = work.measurements.view[photographs.detect]
+    placed = np.array([placement.scene.T_base_camera[v] is not None for v in view.tolist()])
+    photographs = replace(photographs, detect=photographs.detect[placed])
+    found = search(photographs, placement.scene, progress)
+    # Legs of a view that could not be placed are drawn where its rough pose has them.
+    drawn = tuple(
+        T if T is not None else rough
+        for T, rough in zip(placement.scene.T_base_camera, scene.T_base_camera, strict=True)
+    )
+    scene = replace(placement.scene, T_base_camera=drawn)
+    return found, replace(placement, scene=scene)
 
 
 def _in_file_order(

@@ -110,6 +110,10 @@ def agreement(picture: Picture, poses: Poses, tolerance: float) -> Agreement:
     tolerance : float
         Distance of an axis from a bar at which they agree no longer, on the sensor plane.
     """
+    n, n_targets = len(poses), len(picture.targets)
+    if n == 0 or n_targets == 0 or len(picture.bars) == 0:
+        visible = _in_picture(picture, poses)[3] if n and n_targets else np.zeros((n, n_targets))
+        return Agreement(np.zeros((n, n_targets)), np.zeros((n, n_targets), np.intp), visible)
     parts = [
         _judge(picture, poses.take(np.arange(k, min(k + CHUNK, len(poses)))), tolerance)
         for k in range(0, len(poses), CHUNK)
@@ -216,6 +220,8 @@ def improved(
     H_leg, H_cross = np.zeros((n, n_legs, 6, 6)), np.zeros((n, n_legs, 6, 6))
     b_leg = np.zeros((n, n_legs, 6))
     for picture, found in zip(pictures, agreements, strict=True):
+        if len(picture.bars) == 0 or len(picture.targets) == 0:
+            continue
         J, J_leg, residual, weight = _equations(picture, poses, found, tolerance)
         weighted = J * weight[..., None]
         H += np.einsum("ntri,ntrj->nij", weighted, J)

@@ -168,6 +168,8 @@ def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
     n_legs = pose.shift.shape[1]
     square, count = np.zeros(n_legs), np.zeros(n_legs)
     for picture in pictures:
+        if len(picture.bars) == 0 or len(picture.targets) == 0:
+            continue
         found = agreement(picture, pose, TOLERANCES[-1])
         matched = _one_bar_each(found)[0] >= MATCHED
         distance = distances(picture, pose, found)[0]

@@ -48,9 +48,12 @@ def pose_starts(picture: Picture, n_legs: int) -> Poses:
         Number of legs of the machine.
     """
     bars, targets = picture.bars.take(np.arange(min(N_SECOND, len(picture.bars)))), picture.targets
+    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
+    if len(bars) < 2 or len(set(targets.leg.tolist())) < 2:
+        return nothing
     firsts = _firsts(bars, targets)
-    if len(firsts.u) == 0 or len(bars) < 2 or len(set(targets.leg.tolist())) < 2:
-        return Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
+    if len(firsts.u) == 0:
+        return nothing
     middle = targets.ends.mean(axis=1)
     piece = targets.ends[:, 1] - targets.ends[:, 0]
     length = np.linalg.norm(piece, axis=1)
