@@ -127,9 +127,17 @@ def calibrate(
             dataset, run, criteria, choices, use_cache=use_cache, transformation=transformation
         )
         found = observe_and_fit(work, split.fitted, progress)
-    kept = work.keep_outlines(found.outlines)
+    kept = [] if found.other_radii else work.keep_outlines(found.outlines, found.notes)
     unreached = found.part.reached.notes(found.part.measurements)
-    notes = [*dataset.notes, *found.notes, *choices.notes, *left_open, *kept, *unreached]
+    notes = [
+        *dataset.notes,
+        *found.notes,
+        *found.doubts,
+        *choices.notes,
+        *left_open,
+        *kept,
+        *unreached,
+    ]
     order = found.part.order
     corners = None if found.corners is None else restore_corners(found.corners, work.order)
     calibration = judge(
