@@ -19,6 +19,8 @@ from legcal.refinement.rejections import DISAGREES
 from legcal.refinement.solution import Solution
 
 MANY, SOME_LEGS = 0.34, 2  # of an image's outlines that the fit rejected, and legs altogether
+MOST = 0.67  # of them, if the readings suit the image
+SUITED = "its readings suit it, so check that nobody moved the camera"
 LEAST_OUTLINES, LEAST_LEGS = 6, 3  # by which a pose is known
 LEAST_NOISE = 5e-5  # of an outline at its leg [m]
 SURE = 5.0  # standard deviations
@@ -63,9 +65,12 @@ def disagreeing_images(
         view = measurements.views[int(measurements.view[row])]
         name = f"view {view.name}, image {measurements.image[row] or f'of row {row + 1}'}"
         found = _readings(measurements, mechanism, solution, row, judged)
+        explanation = _explanation(measurements, mechanism, row, found)
+        if not explanation and len(wrong) < MOST * len(judged):
+            continue  # what is wrong there is not of this image
         notes.append(
             f"{name}: {len(wrong)} of its {len(judged)} outlines disagree with the fit and were "
-            f"left out; {_explanation(measurements, mechanism, row, found)}."
+            f"left out; {explanation or SUITED}."
         )
     return tuple(notes)
 
@@ -117,7 +122,7 @@ def _readings(
 def _explanation(
     measurements: Measurements, mechanism: Mechanism, row: int, found: _Readings | None
 ) -> str:
-    """Return what is to be looked for."""
+    """Return what is to be looked for; nothing where the readings suit the image."""
     motors = list(mechanism.motors)
     if found is None or not motors:
         return "check its reading and that nobody moved camera or machine"
@@ -136,11 +141,11 @@ def _explanation(
     if len(wrong) and alike:
         nearest = min(alike, key=lambda k: float(np.abs(measurements.q[k, motors] - shown).max()))
         return (
-            f"it shows the reading given for image {measurements.image[nearest]}; check which image "
-            "belongs to which row"
+            f"it shows the reading given for image {measurements.image[nearest]}; check which "
+            "image belongs to which row"
         )
     if len(wrong) == 0:
-        return "the readings suit it, so check that nobody moved the camera"
+        return ""
     worst = 1e3 * float(np.abs(off[wrong]).max())
     if len(wrong) == 1:
         k = int(wrong[0])

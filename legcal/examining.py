@@ -26,6 +26,7 @@ from legcal.progress import Report
 from legcal.recognition.doubts import Explanation, explain, share_shown
 
 FEW, USUALLY = 0.5, 0.3  # found, against the others of its view, which must find as much at least
+GOOD = 75.0  # percentile of what images find, for what good ones do
 WITNESSES = 3  # good images of a view that tell how much of the legs they show
 SHOWN = 0.5  # share of a leg's length in each of them, from which on it is clearly visible
 NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
@@ -186,7 +187,7 @@ def _doubted(found: Mapping[int, _Count], view: IntArray) -> list[int]:
     for row, count in found.items():
         own = [other.share for r, other in found.items() if view[r] == view[row]]
         every = [other.share for other in found.values()]
-        usual = float(np.median(own if len(own) >= WITNESSES else every))
+        usual = float(np.percentile(own if len(own) >= WITNESSES else every, GOOD))
         if usual >= USUALLY and count.share < FEW * usual:
             doubted.append(row)
     return doubted
@@ -208,7 +209,8 @@ def _usual(
     views = np.unique(photographs.measurements.view[list(doubted)]).tolist() if doubted else []
     usual = {}
     for v in views:
-        rows = [row for row in _witnesses(photographs, found, v) if row not in doubted]
+        good = {row: count for row, count in found.items() if row not in doubted}
+        rows = _witnesses(photographs, good, v)
         task = partial(share_shown, placement.search, placement.recognised)
         usual[v] = float(np.median(list(photographs.run(task, rows)) or [0.0]))
     return usual
@@ -293,7 +295,8 @@ def _leg_notes(
                 f"outline that can be used ({why.most_common(1)[0][0]}); look at legcal detect, "
                 "or leave it out there."
             )
-        notes += _left_out_legs(photographs, placement, v, _witnesses(photographs, found, v))
+        good = {row: found[row] for row in rows}
+        notes += _left_out_legs(photographs, placement, v, _witnesses(photographs, good, v))
     return notes
 
 

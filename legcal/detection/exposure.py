@@ -19,9 +19,11 @@ REDUCTION = 8  # before the range is taken, so that noise does not count
 SCALES = (1.0, 2.5)  # at which slopes are compared, standard deviations [px]
 DIRECTIONS = 4  # of edges: what moves is blurred in one
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
-STRONG, FEWEST_EDGES = 95.0, 100  # percentile of the slopes from which on they count, places
+STRONG = 95.0  # percentile of the slopes from which on they count
+FEWEST_EDGES, FEWEST_PART = 100, 0.1  # places of a direction, and of all
 LARGEST_BLUR = 8.0  # that the scales can tell [px]
 MUCH_BLURRED = (2.0, 1.2)  # against the view: factor, and more [px]
+SHARP = 40.0  # percentile of the blurs of a view, for what is usual there
 FEWEST = 3  # images of a view, to be compared
 
 
@@ -80,15 +82,14 @@ def _blur(grey: Grey) -> float:
     angle = np.arctan2(coarse_y[edge], coarse_x[edge])
     fine, coarse = fine[edge], np.maximum(coarse[edge], 1e-3)
     direction = np.rint(angle / (np.pi / DIRECTIONS)).astype(np.intp) % DIRECTIONS
-    return max(
-        _blur_of(fine[own], coarse[own]) for d in range(DIRECTIONS) for own in [direction == d]
-    )
+    least = max(FEWEST_EDGES, int(FEWEST_PART * len(fine)))  # else they are corners of others
+    of_direction = [direction == d for d in range(DIRECTIONS)]
+    chosen = [own for own in of_direction if np.count_nonzero(own) >= least]
+    return max((_blur_of(fine[own], coarse[own]) for own in chosen), default=0.0)
 
 
 def _blur_of(fine: Grey, coarse: Grey) -> float:
     """Return the blur of the strongest of some edges by their slopes, fine and coarse."""
-    if len(coarse) < FEWEST_EDGES:
-        return 0.0
     strong = coarse >= np.partition(coarse, -FEWEST_EDGES)[-FEWEST_EDGES]
     strong |= coarse >= np.percentile(coarse, STRONG)
     ratio = float(np.median(fine[strong] / coarse[strong]))
@@ -120,7 +121,7 @@ def image_defects(exposures: Mapping[int, Exposure], view: Mapping[int, int]) ->
         rows = [row for row in exposures if view[row] == v and row not in found]
         if len(rows) < FEWEST:
             continue
-        usual = float(np.median([exposures[row].blur for row in rows]))
+        usual = float(np.percentile([exposures[row].blur for row in rows], SHARP))
         factor, more = MUCH_BLURRED
         for row in rows:
             blur = exposures[row].blur

@@ -19,11 +19,12 @@ from legcal.recognition.segments import find_segments
 from legcal.recognition.targets import targets_of
 
 TOLERANCE = 0.006  # of an axis from its bar, on the sensor plane
+UNPLACED = 0.015  # the same of a leg that nothing has moved from where the model has it
 CLEAR, BETTER = (
     0.35,
     (2.0, 0.15),
 )  # share of the legs that explain; against the reading's: factor, more
-AS_USUAL = 0.6  # of the share that the other images of the view reach
+AS_USUAL = 0.5  # of the share that the other images of the view reach
 ALIKE = 0.85  # of the best explanation: then another one is about as good
 MIRRORED = "the image is mirrored"  # reasons
 TURNED = "the image is upside down"
@@ -66,7 +67,8 @@ def share_shown(
         The legs to look for; by default those that the view is said to show.
     """
     view = int(search.measurements.view[row])
-    return _share(_picture(search, _bars(search, row, view), row, view, legs), found, view)
+    picture = _picture(search, _bars(search, row, view), row, view, legs)
+    return _share(picture, found, view, TOLERANCE if legs is None else UNPLACED)
 
 
 def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: int) -> Explanation:
@@ -106,7 +108,11 @@ def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: 
         there = [row, *(other for other in rows if measurements.view[other] == w)]
         readings = [(_share(_picture(search, seen, other, w), found, w), other) for other in there]
         for share, other in _best(readings):
-            at = "" if other == row else f" at the reading given for image {measurements.image[other]}"
+            at = (
+                ""
+                if other == row
+                else f" at the reading given for image {measurements.image[other]}"
+            )
             why = f"it was taken by the camera of view {other_view.name}{at}"
             tried.append((share, why, "check which image belongs to which row"))
     share, why, remedy = max(tried, key=lambda one: one[0])
@@ -156,14 +162,14 @@ def _picture(
     return Picture(bars, targets, corners_of(search.measurements.views[view].camera))
 
 
-def _share(picture: Picture, found: Recognised, view: int) -> float:
+def _share(picture: Picture, found: Recognised, view: int, tolerance: float = TOLERANCE) -> float:
     """Return the share of the visible length of the legs on which a picture has their bars."""
     T = found.T_base_camera[view]
     if T is None or len(picture.targets) == 0:
         return 0.0
     T = T.inv()
     pose = Poses(T.rotation.as_matrix()[None], T.translation[None], found.shift[view][None])
-    seen = agreement(picture, pose, TOLERANCE)
+    seen = agreement(picture, pose, tolerance)
     share = picture.targets.share
     visible = float((seen.visible @ share)[0])
     return float(one_bar_each(seen.value, seen.bar)[0] @ share) / visible if visible > 0.0 else 0.0

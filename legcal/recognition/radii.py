@@ -66,6 +66,13 @@ class OtherRadii:
                 return factor
         return self.common or 1.0
 
+    def of_the_same(self, step: "OtherRadii") -> "OtherRadii":
+        """Return what a step says of the parts whose radii this one has corrected."""
+        if self.common:
+            return step if step.common else NO_OTHER_RADII
+        mine = {(leg, r * factor) for (leg, r), factor in self.factor.items()}
+        return OtherRadii({part: f for part, f in step.factor.items() if part in mine}, step.sigma)
+
     def then(self, step: "OtherRadii") -> "OtherRadii":
         """Return both corrections, the second one of radii that the first had corrected."""
         if not self.factor:

@@ -21,7 +21,7 @@ from legcal.recognition.bars import find_bars
 from legcal.recognition.hints import hint_notes
 from legcal.recognition.mirror import mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
-from legcal.recognition.radii import LEFT, MOST_TURNS, NO_OTHER_RADII, OtherRadii, other_radii
+from legcal.recognition.radii import LEFT, MOST_TURNS, OtherRadii, other_radii
 from legcal.recognition.segments import find_segments
 from legcal.recognition.targets import Targets, targets_of
 from legcal.vision.camera import Camera
@@ -166,8 +166,7 @@ def recognise(
         search = replace(search, cylinders=radii.corrected(given))
         pictures = {row: search.retargeted(row, one) for row, one in pictures.items()}
         placed = _placed_again(search, groups, placed, pictures, run)
-        step = other_radii(_for_radii(groups, placed, pictures), LEFT)
-        step = step if radii.common == 0.0 or step.common != 0.0 else NO_OTHER_RADII
+        step = radii.of_the_same(other_radii(_for_radii(groups, placed, pictures), LEFT))
         radii = radii.then(step)
     return _gathered(search, groups, hints, placed, pictures, radii, run)
 
