@@ -172,7 +172,7 @@ def test_the_order_of_rows_columns_legs_and_views_does_not_matter(tmp_path: Path
     for name in ("given", "reordered"):
         folder = copy_of_the_example(tmp_path / name)
         header, *rows = _table(folder)
-        _write_table(folder, [header, *rows[0:4], *rows[15:19], *rows[30:34]])
+        _write_table(folder, [header, *rows[0:3], *rows[15:18], *rows[30:33]])
         if name == "reordered":
             _reordered(folder)
         results.append(calibrate(folder))
@@ -223,6 +223,8 @@ def test_what_the_steps_alone_leave_open_is_noted(example_run: Run, tmp_path: Pa
 
 def test_a_camera_pose_that_sees_no_leg_is_named(tmp_path: Path) -> None:
     folder = copy_of_the_example(tmp_path / "away")
+    header, *rows = _table(folder)
+    _write_table(folder, [header, *rows[0:2], *rows[15:17], *rows[30:32]])
     entry = _entry(folder)
     entry["views"]["c2"]["T_base_camera"]["quat_xyzw"] = [0.0, 0.0, 0.0, 1.0]
     _write_entry(folder, entry)
@@ -266,7 +268,7 @@ def test_a_view_without_images_is_noted_and_gets_no_pose(example_run: Run, tmp_p
     entry["views"]["spare"] = {"camera": "camera_info.yaml"}
     _write_entry(folder, entry)
     header, *rows = _table(folder)
-    _write_table(folder, [header, *rows[0:4], *rows[15:19], *rows[30:34]])  # searched again
+    _write_table(folder, [header, *rows[0:3], *rows[15:18], *rows[30:33]])  # searched again
     calibration = calibrate(folder, output=tmp_path / "out")
     assert any("view spare has no row" in note for note in calibration.notes)
     document = json.loads((tmp_path / "out/result.json").read_text())
