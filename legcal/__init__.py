@@ -28,6 +28,7 @@ from legcal.version import __version__
 if TYPE_CHECKING:
     from legcal.checking import check
     from legcal.dataset.folder import load_dataset
+    from legcal.detecting import detect
     from legcal.identify.analysis import identifiability
     from legcal.location.document import load_location, write_location
     from legcal.location.locate import locate
@@ -59,6 +60,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "check",
+    "detect",
     "evaluate",
     "forward_kinematics",
     "identifiability",
@@ -85,6 +87,7 @@ _HOME = {
     "ToolPoses": "legcal.location.tool_poses",
     "calibrate": "legcal.pipeline",
     "check": "legcal.checking",
+    "detect": "legcal.detecting",
     "evaluate": "legcal.report.accuracy",
     "forward_kinematics": "legcal.mechanism.kinematics",
     "identifiability": "legcal.identify.analysis",

@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from legcal.cli.calibrate import calibrate
+from legcal.cli.detect import detect
 from legcal.cli.evaluate import evaluate
 from legcal.cli.identify import identify
 from legcal.cli.inspect import inspect
@@ -59,7 +60,7 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-for command in (inspect, identify, calibrate, evaluate, locate, new, noise, simulate):
+for command in (inspect, identify, detect, calibrate, evaluate, locate, new, noise, simulate):
     app.command()(command)
 app.add_typer(study, name="study")
 
