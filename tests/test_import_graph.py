@@ -16,6 +16,7 @@ LAYERS = (
     "observations",
     "detection",
     "dataset",
+    "camera_calibration",
     "stages",
     "refinement",
     "identify",
