@@ -1,6 +1,6 @@
 """Detection without a fit: what the images of a dataset show, for people to look at.
 
-The cameras are aligned and the outlines measured as :func:`legcal.calibrate` does first. Nothing is
+The cameras are placed and the outlines measured as :func:`legcal.calibrate` does first. Nothing is
 written beside the dataset.
 """
 
@@ -11,19 +11,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from legcal.board_views import BoardViews, base_of_board, board_without_place, observe_board
+from legcal.board_views import base_of_board, observe_board
 from legcal.dataset.folder import Dataset, load_dataset
-from legcal.detection.observe import Scene, align, given_outlines, scene_at_poses
-from legcal.detection.observe import detect as search
-from legcal.errors import DatasetError, NotVisible
+from legcal.errors import DatasetError
 from legcal.geometry.types import IntArray
 from legcal.observations.canonical_order import inverse, restore_outlines
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import reject_unused_legs
 from legcal.overlays.detected import Detection
 from legcal.overlays.folder import DETECTION, check_detection_destination, write_detection
+from legcal.photographs import Placement, given_outlines, place, scene_at_poses
+from legcal.photographs import detect as search
 from legcal.progress import Report, no_progress
 from legcal.refinement.choices import Choices
 from legcal.report.destination import output_path
@@ -76,8 +75,8 @@ def detect(
     rows = _rows_with_image(dataset)
     with worker_pool(workers) as run:
         work = workpiece(dataset, run, None, Choices(), use_cache=False)
-        outlines, scene, unplaced = _observed(work, progress)
-        detection = _in_file_order(work, rows, outlines, scene, unplaced)
+        outlines, placement = _observed(work, progress)
+        detection = _in_file_order(work, rows, outlines, placement)
         if output is not None:
             write_detection(detection, Path(output), run, progress)
     return detection
@@ -101,60 +100,38 @@ def _rows_with_image(dataset: Dataset) -> IntArray:
     return np.array(rows, dtype=np.intp)
 
 
-def _observed(work: Workpiece, progress: Report) -> tuple[Outlines, Scene, dict[str, str]]:
-    """Return all outlines, the scene with aligned cameras, and views without one and why."""
+def _observed(work: Workpiece, progress: Report) -> tuple[Outlines, Placement]:
+    """Return all outlines, and where the images put the cameras."""
     photographs = work.photographs
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
     board = observe_board(work, progress)
     if board is not None:
-        place = base_of_board(work, board, scene.T_base_camera)
-        if place is None and len(photographs.detect):
-            raise board_without_place(work)
-        if place is not None:
-            scene = _with_cameras_of(board, scene, place)
+        T_base_board = base_of_board(work, board, scene.T_base_camera)
+        if T_base_board is not None:
+            cameras = board.cameras(T_base_board, scene.T_base_camera)
+            scene = replace(scene, T_base_camera=cameras)
     if len(photographs.detect) == 0:
-        return given_outlines(photographs), scene, {}
-    scene, unplaced = _aligned(work, scene, progress)
-    if board is not None and not unplaced:
-        place = board.placed(scene.T_base_camera)
-        scene = scene if place is None else _with_cameras_of(board, scene, place)
-    view_names = [view.name for view in work.measurements.views]
-    placed = [
-        view_names[v] not in unplaced for v in work.measurements.view[photographs.detect].tolist()
-    ]
-    photographs = replace(photographs, detect=photographs.detect[np.array(placed, dtype=np.bool_)])
-    return search(photographs, scene, progress), scene, unplaced
-
-
-def _with_cameras_of(board: BoardViews, scene: Scene, T_base_board: RigidTransform) -> Scene:
-    """Return a scene whose cameras stand to each other as the board shows them."""
-    return replace(scene, T_base_camera=board.cameras(T_base_board, scene.T_base_camera))
-
-
-def _aligned(work: Workpiece, scene: Scene, progress: Report) -> tuple[Scene, dict[str, str]]:
-    """Return the scene with aligned cameras; where that fails, of the views where it does not."""
-    photographs = work.photographs
-    try:
-        return align(photographs, scene, progress), {}
-    except NotVisible:
-        pass
-    unplaced = {}
+        return given_outlines(photographs), Placement(scene, {}, ())
+    joined = None if board is None else board.T_board_camera
+    placement = place(photographs, scene, progress, joined)
     view = work.measurements.view[photographs.detect]
-    for v in np.unique(view).tolist():
-        try:
-            scene = align(
-                replace(photographs, detect=photographs.detect[view == v]), scene, progress
-            )
-        except NotVisible as error:
-            unplaced[work.measurements.views[v].name] = " ".join(error.problems)
-    return scene, unplaced
+    placed = np.array([placement.scene.T_base_camera[v] is not None for v in view.tolist()])
+    photographs = replace(photographs, detect=photographs.detect[placed])
+    found = search(photographs, placement.scene, progress)
+    # Legs of a view that could not be placed are drawn where its rough pose has them.
+    drawn = tuple(
+        T if T is not None else rough
+        for T, rough in zip(placement.scene.T_base_camera, scene.T_base_camera, strict=True)
+    )
+    scene = replace(placement.scene, T_base_camera=drawn)
+    return found, replace(placement, scene=scene)
 
 
 def _in_file_order(
-    work: Workpiece, images: IntArray, outlines: Outlines, scene: Scene, unplaced: dict[str, str]
+    work: Workpiece, images: IntArray, outlines: Outlines, placement: Placement
 ) -> Detection:
     """Return what was found in the order of the files."""
-    dataset, order = work.dataset, work.order
+    dataset, order, scene = work.dataset, work.order, placement.scene
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
     restored = restore_outlines(outlines, order)
     names = dataset.mechanism.leg_names
@@ -165,6 +142,6 @@ def _in_file_order(
         B_base=scene.B_base[rows][:, legs],
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
-        unplaced=unplaced,
-        notes=(*dataset.notes, *work.reached.notes(work.measurements)),
+        unplaced=placement.unplaced,
+        notes=(*dataset.notes, *placement.notes, *work.reached.notes(work.measurements)),
     )

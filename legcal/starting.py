@@ -9,12 +9,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.board_views import BoardViews
 from legcal.calibration import Steps
-from legcal.detection.observe import Scene
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.mechanism.parametrization import geometries
 from legcal.observations.leg_axes import axes_from_outlines
 from legcal.observations.one_camera import in_one_camera
 from legcal.observations.outlines import Outlines
+from legcal.photographs import Scene
 from legcal.progress import Report
 from legcal.refinement.start import Start, start_from
 from legcal.stages.nominal import nominal_mechanism

@@ -15,6 +15,8 @@ LAYERS = (
     "vision",
     "observations",
     "detection",
+    "recognition",
+    "photographs",
     "dataset",
     "camera_calibration",
     "stages",

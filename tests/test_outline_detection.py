@@ -9,11 +9,12 @@ import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.detect import align_views, detect_outlines
+from legcal.detection.detect import detect_outlines
 from legcal.geometry.types import Array, Image
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
+from legcal.recognition.recognise import Search, recognise, shifted
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -286,11 +287,22 @@ def test_the_sample_is_detected_from_its_nominal_model() -> None:
     A = np.repeat(mechanism.A_base[None], len(rows), axis=0)
     B = np.array([forward_kinematics(mechanism, q).apply(mechanism.B_platform) for q in chosen.q])
     cylinders = [leg.cylinders for leg in mechanism.legs]
-    rough = [view.T_base_camera for view in chosen.views]
-    hints = [T for T in rough if T is not None]
-    poses = align_views(load, chosen, A, B, cylinders, hints)
     wanted = np.ones((3, 6), dtype=np.bool_)
-    found = detect_outlines(load, chosen, A, B, cylinders, poses, wanted, mechanism.leg_names)
+    placed = recognise(
+        Search(load, chosen, A, B, cylinders, wanted), np.arange(len(rows)), [None] * 3
+    )
+    A, B = shifted(placed, chosen.view, A, B)
+    found = detect_outlines(
+        load,
+        chosen,
+        A,
+        B,
+        cylinders,
+        placed.T_base_camera,
+        wanted,
+        mechanism.leg_names,
+        joint_error=placed.joint_error,
+    )
     truth = json.loads((ROOT / "tests/data/hexapod-truth/truth.json").read_text())
     legs = {image["file"]: image["legs"] for image in truth["images"]}
     middle, visible = np.full(len(found), np.nan), np.zeros(len(found))
