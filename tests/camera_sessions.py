@@ -21,7 +21,7 @@ BOARD = Board("chessboard", 9, 6, 0.03)
 NOISE_PX = 0.03
 _K = np.array([[560.0, 0.0, 312.4], [0.0, 563.0, 244.9], [0.0, 0.0, 1.0]])
 _WIDE = np.array([[260.0, 0.0, 318.0], [0.0, 261.0, 237.5], [0.0, 0.0, 1.0]])
-PINHOLE = Camera(_K, 640, 480, np.zeros(5))
+PINHOLE = Camera(np.diag([0.7, 0.7, 1.0]) @ _K, 448, 336, np.zeros(5))
 CAMERAS = {
     "plumb_bob": Camera(_K, 640, 480, np.array([-0.25, 0.1, 1e-3, -5e-4, -0.02])),
     "rational_polynomial": Camera(

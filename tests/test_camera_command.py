@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four pictures of a chessboard, and one that shows nothing."""
     path = tmp_path_factory.mktemp("boards")
     drawings(path, PINHOLE, N_IMAGES)
-    cv2.imwrite(str(path / "empty.png"), np.full((480, 640), 90, dtype=np.uint8))
+    cv2.imwrite(str(path / "empty.png"), np.full((336, 448), 90, dtype=np.uint8))
     return path
 
 
@@ -74,7 +74,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
 def test_pictures_give_the_camera_that_took_them(found: CameraCalibration) -> None:
     truth = intrinsic_values(PINHOLE)
     assert np.abs((found.values - truth) / found.sigma).max() < 3.0
-    assert found.sigma[0] < 0.5
+    assert found.sigma[0] < 1.0
     assert found.rms_px < 0.03
 
 
@@ -176,9 +176,9 @@ def test_too_few_images_are_refused(folder: Path) -> None:
 
 
 def test_images_of_another_size_are_refused_by_name(folder: Path, tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "turned.png"), np.zeros((640, 480), dtype=np.uint8))
+    cv2.imwrite(str(tmp_path / "turned.png"), np.zeros((448, 336), dtype=np.uint8))
     with pytest.raises(
-        DatasetError, match=r"640 x 480 px in b00.png, .*; 480 x 640 px in turned.png"
+        DatasetError, match=r"448 x 336 px in b00.png, .*; 336 x 448 px in turned.png"
     ):
         calibrate_camera([folder, tmp_path / "turned.png"], SPEC)
 
