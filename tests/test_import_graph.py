@@ -18,6 +18,7 @@ LAYERS = (
     "recognition",
     "photographs",
     "dataset",
+    "camera_calibration",
     "stages",
     "refinement",
     "identify",
