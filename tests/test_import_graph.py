@@ -19,6 +19,7 @@ LAYERS = (
     "photographs",
     "examining",
     "dataset",
+    "camera_calibration",
     "stages",
     "refinement",
     "identify",
