@@ -106,11 +106,14 @@ class Pool:
     def _round(self, at: Round, log_blur: float, sigma: float) -> Round:
         """Take one step."""
         normal, right, expected = self._blocks(at)
-        noise, weight = self._noise(at, normal, right, expected)
-        normal /= noise[self.edge][:, None, None]
-        right /= noise[self.edge][:, None]
+        normal /= at.noise[self.edge][:, None, None]
+        right /= at.noise[self.edge][:, None]
+        own = self._own_precision()
+        inverse = np.linalg.inv(normal + _diagonal(own))
+        fitted = (inverse @ (right + own * expected)[..., None])[..., 0]
+        noise, weight = self._noise(at, normal, right, fitted)
         # A block's own amplitudes are eliminated: what is left is known of the common ones.
-        eliminated = normal @ np.linalg.inv(normal + _diagonal(self._own_precision()))
+        eliminated = normal @ inverse
         normal = (normal - eliminated @ normal) * weight[:, None, None]
         right = (right - (eliminated @ right[..., None])[..., 0]) * weight[:, None]
         n = len(self.half_width)
@@ -162,15 +165,11 @@ class Pool:
         return normal, (design @ right[..., None])[..., 0], expected
 
     def _noise(
-        self, at: Round, normal: Array, right: Array, expected: Array
+        self, at: Round, normal: Array, right: Array, fitted: Array
     ) -> tuple[Array, Array]:
         """Return the noise of each edge, and how much each block counts by its own."""
-        own = self._own_precision()
-        noise = at.noise[self.edge][:, None]
-        matrix = normal / noise[..., None] + _diagonal(own)
-        fitted = np.linalg.solve(matrix, (right / noise + own * expected)[..., None])[..., 0]
-        explained = 2.0 * np.sum(fitted * right, axis=1)
-        explained -= np.einsum("ni,nij,nj->n", fitted, normal, fitted)
+        explained = 2.0 * right - (normal @ fitted[..., None])[..., 0]
+        explained = np.sum(fitted * explained, axis=1) * at.noise[self.edge]
         of_block = np.maximum(self.power - explained, 0.0) / np.maximum(self.n_samples - 5.0, 1.0)
         of_edge = np.ones(len(self.half_width))
         for k in np.flatnonzero(self.seen):
