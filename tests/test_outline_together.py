@@ -6,7 +6,6 @@ from scipy.integrate import quad
 
 from legcal.detection.blocks import Blocks
 from legcal.detection.limb import Samples
-from legcal.detection.pool import NEAR
 from legcal.detection.pooled import fit_together
 from legcal.detection.powers import (
     HALF,
@@ -141,5 +140,5 @@ def test_outlines_without_blocks_stay_where_they_are() -> None:
     blocks = outline(BRIGHT, (0.1, 0.1), 0.5)
     found = fit_together(blocks, np.zeros(40, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_array_equal(found.ends, np.zeros((1, 2)))
-    assert np.all(np.diag(found.covariance[0]) >= NEAR**2)
+    assert np.all(np.diag(found.covariance[0]) >= 1.0)
     assert found.blur == 0.5

@@ -25,7 +25,8 @@ __all__ = ["Edge", "MeasuredEdge", "measure_edges"]
 FIRST_BLUR = 1.0  # [px]
 LEAST_GAIN = 30  # in chi^2, by which a block shows an edge at all
 FIRST_STEP = 2
-FIRST_ROUNDS, LAST_ROUNDS = 2, 6  # at most
+FIRST_ROUNDS, LAST_ROUNDS = 2, 3  # at most
+TRIALS, SIMILAR = 3, 0.08  # of the blur, until its logarithm changes by less than this
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
 COMMON_BIAS, TILT_BIAS = 0.012, 0.02  # of both ends, of each end [px]
@@ -88,12 +89,16 @@ def measure_edges(
     blocks.settle(FIRST_BLUR, FIRST_ROUNDS, least_gain=-np.inf)
     blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
     v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
-    blocks = Blocks.read(grey, camera, edges, v, blur, step=1)
-    if len(blocks.moved) == 0:
-        return [None] * len(edges), blur
-    blocks.settle(blur, LAST_ROUNDS, least_gain=LEAST_GAIN)
-    together = fit_together(blocks, blocks.kept(), blur, depth_for_blur(blur))
-    blur = together.blur
+    for _ in range(TRIALS):
+        tried = blur
+        blocks = Blocks.read(grey, camera, edges, v, tried, step=1)
+        if len(blocks.moved) == 0:
+            return [None] * len(edges), tried
+        blocks.settle(tried, LAST_ROUNDS, least_gain=LEAST_GAIN)
+        together = fit_together(blocks, blocks.kept(), tried, depth_for_blur(tried))
+        blur = together.blur
+        if abs(np.log(blur / tried)) < SIMILAR:
+            break
     return [
         None
         if line is None

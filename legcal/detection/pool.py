@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.detection.blocks import Blocks
-from legcal.detection.powers import powers
+from legcal.detection.powers import N_POWERS, powers
 from legcal.detection.shading import N_AMPLITUDES, profile_functions
 from legcal.geometry.types import Array, BoolArray, IntArray
 
@@ -20,10 +20,11 @@ ALONG = np.array([1.0, 0.3, 1.0, 1.0, 1.0, 1.0, 1.0])
 OF_BLOCKS = np.array([2.0, 1.0, 0.3, 0.1, 0.1, 0.05, 0.05])
 N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
 ROUGH = 0.02  # displacement of single blocks [px]
-NEAR = 0.15  # standard deviation of the lines that it starts from [px]
+NEAR = (0.02, 0.35)  # standard deviation of the lines that it starts from: [px] and in blurs
 BLURS = (0.2, 4.0)  # [px]
 LEAST_SAMPLES = 30  # of a block
-LARGEST_STEP = (0.3, 0.4)  # of one round: of the line [px], of the logarithm of the blur
+LARGEST_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
+SETTLED = 0.01  # step of every line below which the rounds end [px]
 ODD = (1.5, 4.0)  # noise in that of a typical block from where on one counts less, and not at all
 LEAST_NOISE = 0.05  # [grey levels^2]
 
@@ -63,7 +64,7 @@ class Pool:
     @classmethod
     def of(cls, blocks: Blocks, kept: BoolArray, depth: float) -> "Pool":
         """Return what is needed of some blocks."""
-        d, grey, weight, half_width = (x.astype(np.float64) for x in blocks.samples(slice(None)))
+        d, grey, weight, half_width = blocks.samples(slice(None))
         bounds = blocks.bounds
         edge = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
         n_samples = np.count_nonzero(weight, axis=1)
@@ -98,9 +99,13 @@ class Pool:
         return at
 
     def rounds(self, at: Round, log_blur: float, sigma: float, n: int) -> Round:
-        """Take Gauss-Newton steps, with the blur of every edge known to ``sigma`` beforehand."""
+        """Take Gauss-Newton steps, ``n`` at most, the blur known to ``sigma`` beforehand."""
         for _ in range(n):
+            before = at
             at = self._round(at, log_blur, sigma)
+            steps = np.abs(at.line - before.line), np.abs(at.log_blur - before.log_blur)
+            if max(float(step.max()) for step in steps) < SETTLED:
+                break
         return at
 
     def _round(self, at: Round, log_blur: float, sigma: float) -> Round:
@@ -130,7 +135,8 @@ class Pool:
         whole = system.reshape(*shape, -1) + _diagonal(precision.reshape(shape))
         inverse = np.linalg.inv(whole)
         step = (inverse @ (target + pull).reshape(*shape, 1)).reshape(n, N_ALONG, N_UNKNOWNS)
-        move = np.clip(step[:, :2, SHIFT], -LARGEST_STEP[0], LARGEST_STEP[0])
+        largest = LARGEST_STEP[0] * np.exp(at.log_blur)[:, None]
+        move = np.clip(step[:, :2, SHIFT], -largest, largest)
         widen = np.clip(step[:, 0, BLUR], -LARGEST_STEP[1], LARGEST_STEP[1])
         least, most = np.log(BLURS).tolist()
         widened = np.clip(at.log_blur + widen, least, most)
@@ -145,10 +151,12 @@ class Pool:
     def _sums(self, at: Round) -> tuple[Array, Array]:
         """Return products of the powers of every block, and of them with its light."""
         moved = self.gain * np.sum(at.line[self.edge] * self.along[:, :2], axis=1)
-        U = powers((self.d - moved[:, None]) / np.exp(at.log_blur)[self.edge][:, None])
-        U *= self.weight[..., None]
-        transposed = U.swapaxes(1, 2)
-        return transposed @ U, (transposed @ self.light[..., None])[..., 0]
+        z = (self.d - moved[:, None]) / np.exp(at.log_blur)[self.edge][:, None]
+        U = np.empty((*z.shape, N_POWERS + 1))  # in double precision: sums nearly cancel
+        np.multiply(powers(z), self.weight[..., None], out=U[..., :-1])
+        U[..., -1] = self.light
+        products = U.swapaxes(1, 2) @ U
+        return products[:, :-1, :-1], products[:, :-1, -1]
 
     def _blocks(self, at: Round) -> tuple[Array, Array, Array]:
         """Return the normal equations of all blocks, and the unknowns that are expected."""
@@ -193,8 +201,9 @@ class Pool:
         contrast = self.contrast[:, None]
         precision[:, 0, :N_AMPLITUDES] = (COMMON * contrast) ** -2
         precision[:, 1:, :N_AMPLITUDES] = ((ALONG * contrast) ** -2)[:, None, :]
-        precision[:, :2, SHIFT] = NEAR**-2
-        pull[:, :2, SHIFT] = -at.line * NEAR**-2
+        near = (NEAR[0] + NEAR[1] * np.exp(log_blur)) ** -2
+        precision[:, :2, SHIFT] = near
+        pull[:, :2, SHIFT] = -at.line * near
         precision[:, 0, BLUR] = sigma**-2
         pull[:, 0, BLUR] = (log_blur - at.log_blur) * sigma**-2
         return precision, pull
