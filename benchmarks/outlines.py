@@ -302,7 +302,7 @@ def by_segments(scene: Photographed, grey: Grey, start: Array) -> Ends:
     segments = found.reshape(-1, 2, 2).astype(np.float64)
     steps = np.linspace(0.0, 1.0, 50)[:, None]
     points = segments[:, None, 0] + (segments[:, None, 1] - segments[:, None, 0]) * steps
-    t, v = scene.band.coordinates(scene.camera.undistort(points - 0.5))
+    t, v = scene.band.coordinates(scene.camera.undistort(points))
     t = t / scene.band.length
     ends: Ends = []
     for line, true in zip(start, scene.v, strict=True):

@@ -23,7 +23,7 @@ ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp pict
 ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on longer ones are made, so many times
 ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
 VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
-SETTLED = 0.01  # movement of every line below which the rounds end [px]
+SETTLED = 0.03  # movement of every line below which the rounds end [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +82,8 @@ class Blocks:
         reach = int(np.ceil(1.42 * outer))
         rows = ROWS * int(np.clip(np.rint(blur / ROWS_PER_BLUR), 1, 4)) if step == 1 else ROWS
         if step == 1 and edges:
-            free = min(edge.band.length * float(np.mean(~edge.hidden)) for edge in edges)
-            rows = max(rows, ROWS * int(np.clip(free / (ROWS * ENOUGH), 1, LONGEST)))
+            shortest = min(edge.band.length * float(np.mean(~edge.hidden)) for edge in edges)
+            rows = max(rows, ROWS * int(np.clip(shortest / (ROWS * ENOUGH), 1, LONGEST)))
         profiles = []
         for edge, at in zip(edges, v, strict=True):
             inner = min(outer, SHALLOWEST * edge.half_width)

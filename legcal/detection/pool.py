@@ -60,11 +60,14 @@ class Pool:
     contrast: Array  # (n_edges,)
     depth: float
     seen: BoolArray  # (n_edges,) edges with usable blocks
+    latest: tuple[Round | None, tuple[Array, Array]]  # sums, and where the unknowns were
 
     @classmethod
     def of(cls, blocks: Blocks, kept: BoolArray, depth: float) -> "Pool":
         """Return what is needed of some blocks."""
-        d, grey, weight, half_width = blocks.samples(slice(None))
+        d, grey, weight, half_width = (
+            np.asarray(x, dtype=np.float64) for x in blocks.samples(slice(None))
+        )
         bounds = blocks.bounds
         edge = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
         n_samples = np.count_nonzero(weight, axis=1)
@@ -85,6 +88,7 @@ class Pool:
         return cls(
             d, weight, light, np.sum(light**2, axis=1), n_samples, usable, blocks.gain, edge,
             bounds, along, half_width[first, 0], 2.0 * np.sqrt(spread) + 1.0, depth, seen,
+            (None, (np.empty(0), np.empty(0))),
         )  # fmt: skip
 
     def first_amplitudes(self, at: Round) -> Round:
@@ -150,13 +154,17 @@ class Pool:
 
     def _sums(self, at: Round) -> tuple[Array, Array]:
         """Return products of the powers of every block, and of them with its light."""
+        if at is self.latest[0]:
+            return self.latest[1]
         moved = self.gain * np.sum(at.line[self.edge] * self.along[:, :2], axis=1)
         z = (self.d - moved[:, None]) / np.exp(at.log_blur)[self.edge][:, None]
         U = np.empty((*z.shape, N_POWERS + 1))  # in double precision: sums nearly cancel
         np.multiply(powers(z), self.weight[..., None], out=U[..., :-1])
         U[..., -1] = self.light
         products = U.swapaxes(1, 2) @ U
-        return products[:, :-1, :-1], products[:, :-1, -1]
+        sums = products[:, :-1, :-1], products[:, :-1, -1]
+        self.latest = at, sums
+        return sums
 
     def _blocks(self, at: Round) -> tuple[Array, Array, Array]:
         """Return the normal equations of all blocks, and the unknowns that are expected."""
@@ -172,9 +180,7 @@ class Pool:
         normal = design @ gram @ design.swapaxes(1, 2)
         return normal, (design @ right[..., None])[..., 0], expected
 
-    def _noise(
-        self, at: Round, normal: Array, right: Array, fitted: Array
-    ) -> tuple[Array, Array]:
+    def _noise(self, at: Round, normal: Array, right: Array, fitted: Array) -> tuple[Array, Array]:
         """Return the noise of each edge, and how much each block counts by its own."""
         explained = 2.0 * right - (normal @ fitted[..., None])[..., 0]
         explained = np.sum(fitted * explained, axis=1) * at.noise[self.edge]
