@@ -17,12 +17,13 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.dataset.folder import load_dataset
-from legcal.detection.detect import align_views, detect_outlines
+from legcal.detection.detect import detect_outlines
 from legcal.geometry.types import Array, Image
 from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
+from legcal.recognition.recognise import Search, recognise, shifted
 from legcal.vision.cylinder import EPSILON
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -127,12 +128,18 @@ def main() -> None:
         return np.asarray(image)
 
     A, B = joint_centres(mechanism, measurements)
-    hints = [T for T in (view.T_base_camera for view in measurements.views) if T is not None]
+    rough = [view.T_base_camera for view in measurements.views]
+    search, rows = Search(load, measurements, A, B, cylinders, wanted), np.arange(len(A))
+    for words, hints in (("with", rough), ("without", [None] * len(rough))):
+        start = time.perf_counter()
+        placed = recognise(search, rows, hints)
+        print(f"recognition {words} rough camera poses: {time.perf_counter() - start:.2f} s")
+    A, B = shifted(placed, measurements.view, A, B)
+    T, error = placed.T_base_camera, placed.joint_error
     start = time.perf_counter()
-    poses = align_views(load, measurements, A, B, cylinders, hints)
-    print(f"alignment: {time.perf_counter() - start:.2f} s")
-    start = time.perf_counter()
-    first = detect_outlines(load, measurements, A, B, cylinders, poses, wanted, names)
+    first = detect_outlines(
+        load, measurements, A, B, cylinders, T, wanted, names, joint_error=error
+    )
     seconds = time.perf_counter() - start
     show("near the nominal model", first, *errors(truth, measurements, first), seconds)
     A, B, poses = true_scene(truth, measurements)

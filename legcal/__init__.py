@@ -26,8 +26,10 @@ from legcal.errors import LegcalError
 from legcal.version import __version__
 
 if TYPE_CHECKING:
+    from legcal.camera_calibration.calibrate import calibrate_camera
     from legcal.checking import check
     from legcal.dataset.folder import load_dataset
+    from legcal.detecting import detect
     from legcal.identify.analysis import identifiability
     from legcal.location.document import load_location, write_location
     from legcal.location.locate import locate
@@ -58,7 +60,9 @@ __all__ = [
     "ToolPoses",
     "__version__",
     "calibrate",
+    "calibrate_camera",
     "check",
+    "detect",
     "evaluate",
     "forward_kinematics",
     "identifiability",
@@ -84,7 +88,9 @@ _HOME = {
     "TableNoise": "legcal.simulation.table_noise",
     "ToolPoses": "legcal.location.tool_poses",
     "calibrate": "legcal.pipeline",
+    "calibrate_camera": "legcal.camera_calibration.calibrate",
     "check": "legcal.checking",
+    "detect": "legcal.detecting",
     "evaluate": "legcal.report.accuracy",
     "forward_kinematics": "legcal.mechanism.kinematics",
     "identifiability": "legcal.identify.analysis",

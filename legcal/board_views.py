@@ -165,15 +165,6 @@ def base_of_board(
     return given
 
 
-def board_without_place(work: Workpiece) -> DatasetError:
-    """Return the refusal of photographs in which nobody says where to look for legs."""
-    return DatasetError(
-        f"{work.dataset.yaml_path}: the images could not be searched for legs: found a calibration "
-        "board but neither its pose nor that of any camera that sees it, needed one of them to "
-        "about 2 cm and 2 degrees; add T_base_board to the block board, or T_base_camera to a view."
-    )
-
-
 def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -> tuple[str, ...]:
     """Return what is odd about the board: views without it, and a place that cannot be.
 

@@ -1,8 +1,8 @@
 """What is searched in the images of a dataset, and what is fitted to it.
 
 1. The nominal model and the readings say where each leg is (section 2).
-2. Each view's camera is aligned with what its images show, and the outlines of the legs are
-   measured near where they should be (section 3.1).
+2. The legs are recognised in the images and each view's camera is placed by them; the outlines of
+   the legs are measured near where that has them (section 3.1).
 3. The four steps give joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. One fit of everything, started from the nominal model and from the steps, ends the work.
 5. Photographs in which anything was left in doubt are searched again close to that fit, and 3
@@ -19,16 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.board_views import BoardViews, base_of_board, board_without_place, observe_board
+from legcal.board_views import BoardViews, base_of_board, observe_board
 from legcal.calibration import Steps
-from legcal.detection.observe import (
-    Scene,
-    align,
-    detect,
-    doubtful_rows,
-    given_outlines,
-    scene_at_poses,
-)
 from legcal.errors import NotVisible
 from legcal.geometry.types import IntArray
 from legcal.observations.canonical_order import inverse
@@ -36,6 +28,14 @@ from legcal.observations.corners import Corners
 from legcal.observations.outlines import Outlines
 from legcal.observations.parts import outlines_at
 from legcal.observations.sets import choose_outlines, join_outlines, reject_unused_legs
+from legcal.photographs import (
+    Scene,
+    detect,
+    doubtful_rows,
+    given_outlines,
+    place,
+    scene_at_poses,
+)
 from legcal.progress import Report
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
@@ -61,6 +61,8 @@ class Found:
         The fit, in the order of the part.
     corners : Corners or None
         Of the calibration board in all images, in the order of work; None without a board.
+    notes : tuple of str
+        What is to be said of the images.
     """
 
     outlines: Outlines
@@ -69,6 +71,7 @@ class Found:
     steps: Steps
     solution: Solution
     corners: Corners | None
+    notes: tuple[str, ...] = ()
 
     @property
     def judged(self) -> Outlines:
@@ -100,24 +103,23 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
     board = observe_board(work, progress)
     if board is not None:
-        place = base_of_board(work, board, scene.T_base_camera)
-        if place is None and len(photographs.detect):
-            raise board_without_place(work)
-        scene = _placed_by_board(scene, board, place)
+        T_base_board = base_of_board(work, board, scene.T_base_camera)
+        scene = _placed_by_board(scene, board, T_base_board)
     if len(photographs.detect) == 0:
         return _fit(part, fitted, given_outlines(photographs), scene, board, progress)
-    scene = align(photographs, scene, progress)
-    if board is not None:
-        scene = _placed_by_board(scene, board, board.placed(scene.T_base_camera))
+    joined = None if board is None else board.T_board_camera
+    placement = place(photographs, scene, progress, joined)
+    placement.require_one()
+    scene, notes = placement.scene, placement.all_notes
     outlines = detect(photographs, scene, progress)
-    found = _fit(part, fitted, outlines, scene, board, progress)
+    found = replace(_fit(part, fitted, outlines, scene, board, progress), notes=notes)
     doubtful = doubtful_rows(photographs, found.judged)
     if len(doubtful) == 0:
         return found
-    scene = _fitted_scene(work, found.solution)
+    scene = _fitted_scene(work, found.solution, scene)
     again = photographs.narrowed(doubtful, found.outlines)
     outlines = detect(again, scene, progress, near_fit=True)
-    return _fit(part, fitted, outlines, scene, board, progress)
+    return replace(_fit(part, fitted, outlines, scene, board, progress), notes=notes)
 
 
 def _placed_by_board(scene: Scene, board: BoardViews, T: RigidTransform | None) -> Scene:
@@ -181,12 +183,18 @@ def _refuse_unseen_legs(work: Workpiece, outlines: Outlines) -> None:
         )
 
 
-def _fitted_scene(work: Workpiece, solution: Solution) -> Scene:
-    """Return where a fit puts the legs; R_b is laid on the nominal R_b."""
+def _fitted_scene(work: Workpiece, solution: Solution, before: Scene) -> Scene:
+    """Return where a fit puts the legs; R_b is laid on the nominal R_b.
+
+    Views that had no camera pose before have none now.
+    """
     T_base_Rb = work.mechanism.T_base_Rb
     A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
     B = np.array([leg.B for leg in solution.legs])
     placed = np.array([(T_base_Rb * T).apply(B) for T in work.poses_by(solution.legs)])
     at_row = work.measurements.pose
-    cameras = tuple(T_base_Rb * T.inv() for T in solution.T_camera_Rb)
+    cameras = tuple(
+        None if known is None else T_base_Rb * T.inv()
+        for known, T in zip(before.T_base_camera, solution.T_camera_Rb, strict=True)
+    )
     return Scene(np.broadcast_to(A, placed.shape)[at_row], placed[at_row], cameras)

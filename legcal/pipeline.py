@@ -129,7 +129,7 @@ def calibrate(
         found = observe_and_fit(work, split.fitted, progress)
     kept = work.keep_outlines(found.outlines)
     unreached = found.part.reached.notes(found.part.measurements)
-    notes = [*dataset.notes, *choices.notes, *left_open, *kept, *unreached]
+    notes = [*dataset.notes, *found.notes, *choices.notes, *left_open, *kept, *unreached]
     order = found.part.order
     corners = None if found.corners is None else restore_corners(found.corners, work.order)
     calibration = judge(

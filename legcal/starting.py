@@ -9,16 +9,16 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.board_views import BoardViews
 from legcal.calibration import Steps
-from legcal.detection.observe import Scene
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.mechanism.parametrization import geometries
 from legcal.observations.leg_axes import axes_from_outlines
 from legcal.observations.one_camera import in_one_camera
 from legcal.observations.outlines import Outlines
+from legcal.photographs import Scene
 from legcal.progress import Report
 from legcal.refinement.start import Start, start_from
 from legcal.stages.nominal import nominal_mechanism
-from legcal.stages.run import place_cameras, run_steps
+from legcal.stages.run import run_base_steps, run_platform_steps
 from legcal.workpiece import Workpiece
 
 _NAMED = 5  # views, in a message
@@ -51,20 +51,22 @@ def _stepped(work: Workpiece, outlines: Outlines, board: BoardViews | None) -> S
     nominal, criteria = nominal_mechanism(work.mechanism), work.criteria or "default"
     legs, failure = None, ""
     diagnostics: tuple[str, ...] = ()
+    base = run_base_steps(nominal, axes, measurements, criteria=criteria)
     try:
-        found = run_steps(
+        found = run_platform_steps(
             nominal,
             axes,
             measurements,
+            base,
             criteria=criteria,
             transformation=work.transformation,
             free_twists=any(name.endswith(".twist") for name in work.choices.free),
         )
-        legs, cameras, diagnostics = found.legs, found.T_Rb_camera, found.diagnostics
+        legs, diagnostics = found.legs, found.diagnostics
     except (NotIdentifiable, DidNotConverge) as error:
         failure = str(error)
-        cameras = place_cameras(nominal, axes, measurements, criteria=criteria)
-    return Steps(legs, cameras if joined is None else joined.cameras(cameras), failure, diagnostics)
+    cameras = base.T_Rb_camera if joined is None else joined.cameras(base.T_Rb_camera)
+    return Steps(legs, cameras, failure, diagnostics)
 
 
 def starts_of_fit(

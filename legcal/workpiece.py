@@ -12,10 +12,6 @@ from scipy.spatial.transform import RigidTransform
 from legcal.dataset.cache import DetectionPlan, fingerprint, plan_dataset, store_outlines
 from legcal.dataset.folder import Dataset
 from legcal.dataset.holdout import dataset_at
-from legcal.detection.observe import (
-    Photographs,
-    detection_settings,
-)
 from legcal.geometry.types import IntArray
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.model import Mechanism
@@ -31,6 +27,10 @@ from legcal.observations.canonical_order import (
 from legcal.observations.leg_axes import LegAxes
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
+from legcal.photographs import (
+    Photographs,
+    detection_settings,
+)
 from legcal.refinement.choices import Choices
 from legcal.refinement.legs import FittedLegs, fitted_legs
 from legcal.refinement.nominal_poses import NominalPoses, nominal_poses

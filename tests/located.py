@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.location.pose_pairs import Frames, PosePairs, frames_of, predicted, turned
+from legcal.location.pose_pairs import Frames, PosePairs, predicted, turned
 from legcal.location.tool_poses import ToolPoses
 from legcal.mechanism.configurations import Configurations, random_configurations
 from legcal.mechanism.kinematics import inverse_kinematics
@@ -83,6 +83,12 @@ def located(
         numbers=np.arange(1, len(tools) + 1),
     )
     return Located(mechanism, BASE, TOOL, platform, poses)
+
+
+def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> Frames:
+    """Return two rigid motions as frames."""
+    base, tool = T_world_base.as_matrix(), T_platform_tool.as_matrix()
+    return Frames(base[:3, :3], base[:3, 3], tool[:3, :3], tool[:3, 3])
 
 
 def pairs_at(base: RigidTransform, tool: RigidTransform, n: int = 8, seed: int = 0) -> PosePairs:

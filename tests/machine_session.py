@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -139,7 +140,7 @@ def machine_session(
     return MachineSession(
         wrong,
         measurements,
-        _outlines(mechanism, legs, measurements, truth),
+        shown_outlines(fitted.radii, measurements, truth),
         truth,
         start_from(away, measurements, wrong, rough, home, "nominal"),
     )
@@ -185,25 +186,24 @@ def _cameras(
     return tuple(found)
 
 
-def _outlines(
-    mechanism: Mechanism, legs: tuple[LegGeometry, ...], m: Measurements, truth: Start
+def shown_outlines(
+    radii: Mapping[tuple[int, str], float], m: Measurements, truth: Start
 ) -> Outlines:
     """Return both outlines of every part of every leg in every image."""
     rows, of_leg, parts, hs, ends = [], [], [], [], []
     for row, (v, pose) in enumerate(zip(m.view, m.pose, strict=True)):
         T, platform = truth.T_camera_Rb[v], truth.T_Rb_Re[pose]
-        for j, leg in enumerate(legs):
-            A, B = T.apply(leg.A), T.apply(platform.apply(leg.B))
+        for (j, part), radius in radii.items():
+            A, B = T.apply(truth.legs[j].A), T.apply(platform.apply(truth.legs[j].B))
             along = float(np.linalg.norm(B - A))
             u = (B - A) / along
-            for part, radius in mechanism.legs[j].radius_of_part.items():
-                h, offset = silhouette(u, A, np.array(radius))
-                points = A + along * np.array([[0.15], [0.85]]) * u
-                rows += [row, row]
-                of_leg += [j, j]
-                parts += [part, part]
-                hs.append(h)
-                ends.append(m.views[v].camera.project(points + offset[:, None]))
+            h, offset = silhouette(u, A, np.array(radius))
+            points = A + along * np.array([[0.15], [0.85]]) * u
+            rows += [row, row]
+            of_leg += [j, j]
+            parts += [part, part]
+            hs.append(h)
+            ends.append(m.views[v].camera.project(points + offset[:, None]))
     n = len(rows)
     return Outlines(
         np.array(rows, dtype=np.intp),

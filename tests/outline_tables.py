@@ -7,7 +7,7 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import Cylinder, Leg, LegKind
 from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
+from legcal.observations.outlines import QUALITY, Outlines
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -87,7 +87,10 @@ def outlines_of(
     covariance[:, 1, 0] = covariance[:, 0, 1]
     used = rng.uniform(size=len(places)) > rejected
     lost = ~used & (rng.uniform(size=len(places)) < 0.5)
-    for numbers in (h, ends, covariance):
+    quality = rng.uniform(0.0, [100.0, 500.0, 1.0], size=(len(places), 3))
+    if source == "edited":
+        quality[:] = np.nan
+    for numbers in (h, ends, covariance, quality):
         numbers[lost] = np.nan
     return Outlines(
         row=row,
@@ -100,12 +103,15 @@ def outlines_of(
         used=used,
         reason=tuple("" if ok else 'hidden, by "another" leg' for ok in used),
         source=(source,) * len(places),
+        contrast=quality[:, 0],
+        length=quality[:, 1],
+        residual=quality[:, 2],
     )
 
 
 def assert_same(found: Outlines, expected: Outlines) -> None:
     """Fail unless both tables are the same to the last bit."""
-    for name in ("row", "leg", "edge", "h", "ends", "covariance", "used"):
+    for name in ("row", "leg", "edge", "h", "ends", "covariance", "used", *QUALITY):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
     assert found.part == expected.part
     assert found.reason == expected.reason

@@ -154,10 +154,10 @@ def test_another_header_is_refused(tmp_path: Path) -> None:
 def test_an_incomplete_row_is_refused(tmp_path: Path) -> None:
     path = _written(tmp_path)
     path.write_text(path.read_text() + "right,i/2.png\n")
-    assert "found 2 cells, needed 11; complete or remove the row" in _refusal(path)
+    assert "found 2 cells, needed 11 as in the header; complete or remove the row" in _refusal(path)
 
 
 def test_a_table_without_rows_is_refused(tmp_path: Path) -> None:
     path = _written(tmp_path)
     path.write_text(path.read_text().splitlines()[0] + "\n")
-    assert "found no row, needed the axes of the legs in every image" in _refusal(path)
+    assert "found a header and no row, needed the axes of the legs in every image" in _refusal(path)

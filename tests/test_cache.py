@@ -226,6 +226,45 @@ def test_every_change_of_the_dataset_changes_the_fingerprint(
     assert fingerprint(load_dataset(folder.path), SETTINGS) != before
 
 
+def add_board(folder: Folder) -> dict[str, Any]:
+    """Fix a board to the base, and return its block."""
+    pose = {"xyz": [0.1, 0.0, 0.0], "quat_xyzw": [0.0, 0.0, 0.0, 1.0]}
+    board = {"kind": "chessboard", "squares_x": 6, "squares_y": 9, "square": 0.03}
+    folder.entry["board"] = board | {"T_base_board": pose}
+    folder.write()
+    found: dict[str, Any] = folder.entry["board"]
+    return found
+
+
+def correct_square(board: dict[str, Any]) -> None:
+    board["square"] = 0.031
+
+
+def correct_pose_of_board(board: dict[str, Any]) -> None:
+    board["T_base_board"]["xyz"][2] += 1e-4
+
+
+def remove_pose_of_board(board: dict[str, Any]) -> None:
+    del board["T_base_board"]
+
+
+@pytest.mark.parametrize("change", [correct_square, correct_pose_of_board, remove_pose_of_board])
+def test_corrected_board_or_pose_of_it_detects_again(
+    folder: Folder, change: Callable[[dict[str, Any]], None]
+) -> None:
+    board = add_board(folder)
+    dataset = load_dataset(folder.path)
+    store_outlines(dataset, hexapod_outlines(), fingerprint(dataset, SETTINGS), NONE)
+    same = load_dataset(folder.path)
+    assert len(plan_dataset(same, fingerprint(same, SETTINGS)).detect) == 0
+    change(board)
+    folder.write()
+    other = load_dataset(folder.path)
+    plan = plan_dataset(other, fingerprint(other, SETTINGS))
+    assert plan.detect.tolist() == [0, 1, 2, 3]
+    assert len(plan.keep) == 0
+
+
 def test_settings_model_and_version_change_the_fingerprint(
     folder: Folder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -13,7 +13,7 @@ import yaml
 from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset, load_mechanism
-from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
+from legcal.errors import NotIdentifiable, UsageError
 from legcal.identify.check import check_identifiable
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
 
@@ -95,8 +95,8 @@ def test_the_written_model_is_the_one_that_was_computed(example_run: Run) -> Non
 def test_a_second_run_reads_the_outlines_and_gives_the_same_result(example_run: Run) -> None:
     stages: list[str] = []
     again = calibrate(example_run.folder, progress=lambda stage, done, total: stages.append(stage))
-    assert "Aligning cameras" in example_run.stages
-    assert not any("outlines" in stage or "Aligning" in stage for stage in stages)
+    assert "Recognising legs" in example_run.stages
+    assert not any("outlines" in stage or "Recognising" in stage for stage in stages)
     difference = (
         again.solution.parameters.base_joints
         - example_run.calibration.solution.parameters.base_joints
@@ -137,15 +137,16 @@ def test_an_edited_row_wins_and_is_kept(example_run: Run, tmp_path: Path) -> Non
     folder = Path(shutil.copytree(example_run.folder, tmp_path / "edited"))
     path = folder / "observations.csv"
     lines = path.read_text().splitlines()
-    k = next(i for i, line in enumerate(lines) if line.endswith(",used,,detected"))
+    k = next(i for i, line in enumerate(lines) if ",used,,detected," in line)
     lines[k] = lines[k].replace(",used,,detected", ",rejected,a reflection,edited")
+    assert not lines[k].endswith(",,,")  # how well it was seen
     path.write_text("\n".join(lines) + "\n")
     result = calibrate(folder, output=tmp_path / "out")
     key = ",".join(lines[k].split(",")[:5])
     for table in (path, tmp_path / "out/observations.csv"):
         kept = [line for line in table.read_text().splitlines() if line.startswith(key + ",")]
         assert len(kept) == 1
-        assert kept[0].endswith(",rejected,a reflection,edited")
+        assert ",rejected,a reflection,edited," in kept[0]
     assert (
         result.solution.outlines.used.sum() < example_run.calibration.solution.outlines.used.sum()
     )
@@ -172,7 +173,7 @@ def test_the_order_of_rows_columns_legs_and_views_does_not_matter(tmp_path: Path
     for name in ("given", "reordered"):
         folder = copy_of_the_example(tmp_path / name)
         header, *rows = _table(folder)
-        _write_table(folder, [header, *rows[0:4], *rows[15:19], *rows[30:34]])
+        _write_table(folder, [header, *rows[0:3], *rows[15:18], *rows[30:33]])
         if name == "reordered":
             _reordered(folder)
         results.append(calibrate(folder))
@@ -221,23 +222,21 @@ def test_what_the_steps_alone_leave_open_is_noted(example_run: Run, tmp_path: Pa
     )
 
 
-def test_a_camera_pose_that_sees_no_leg_is_named(tmp_path: Path) -> None:
-    folder = copy_of_the_example(tmp_path / "away")
-    entry = _entry(folder)
-    entry["views"]["c2"]["T_base_camera"]["quat_xyzw"] = [0.0, 0.0, 0.0, 1.0]
-    _write_entry(folder, entry)
-    with pytest.raises(NotVisible, match="c2"):
-        calibrate(folder, output=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_view_without_a_camera_pose_is_named(tmp_path: Path) -> None:
+@pytest.mark.slow  # test_recognise.py has the same in seconds
+def test_no_and_wrong_camera_poses_end_where_right_ones_do(
+    example_run: Run, tmp_path: Path
+) -> None:
     folder = copy_of_the_example(tmp_path / "unknown")
     entry = _entry(folder)
-    del entry["views"]["c3"]["T_base_camera"]
+    entry["views"]["c1"]["T_base_camera"]["quat_xyzw"] = [0.0, 0.0, 0.0, 1.0]
+    for name in ("c2", "c3"):
+        del entry["views"][name]["T_base_camera"]
     _write_entry(folder, entry)
-    with pytest.raises(DatasetError, match=r"c3.*T_base_camera"):
-        calibrate(folder)
+    found = calibrate(folder)
+    assert [note for note in found.notes if note.startswith("view c1: its T_base_camera is")]
+    right = example_run.calibration.solution
+    apart = [found.solution.values[name] - right.values[name] for name in right.names]
+    assert np.all(np.abs(apart) < right.sigma)
 
 
 def test_an_output_folder_with_other_files_is_left_alone(tmp_path: Path) -> None:
@@ -266,7 +265,7 @@ def test_a_view_without_images_is_noted_and_gets_no_pose(example_run: Run, tmp_p
     entry["views"]["spare"] = {"camera": "camera_info.yaml"}
     _write_entry(folder, entry)
     header, *rows = _table(folder)
-    _write_table(folder, [header, *rows[0:4], *rows[15:19], *rows[30:34]])  # searched again
+    _write_table(folder, [header, *rows[0:3], *rows[15:18], *rows[30:33]])  # searched again
     calibration = calibrate(folder, output=tmp_path / "out")
     assert any("view spare has no row" in note for note in calibration.notes)
     document = json.loads((tmp_path / "out/result.json").read_text())

@@ -135,5 +135,7 @@ def test_twice_the_same_corner_and_none_at_all_are_refused(tmp_path: Path) -> No
     line = "c2,a.png,3,1,2,0.1,used,,detected"
     with pytest.raises(DatasetError, match=r"row 2 .* the same image and corner in row 1"):
         _read(tmp_path, line, line)
-    with pytest.raises(DatasetError, match="found no row, needed the corners of the board"):
+    with pytest.raises(
+        DatasetError, match="found a header and no row, needed the corners of the board"
+    ):
         _read(tmp_path)

@@ -12,6 +12,7 @@ from located import (
     SIGMA_POSITION,
     TOOL,
     frame_errors,
+    frames_of,
     machine,
     noisy,
     pairs_at,
@@ -27,7 +28,6 @@ from legcal.location.noise import Noise
 from legcal.location.pose_pairs import (
     Frames,
     PosePairs,
-    frames_of,
     jacobian,
     predicted,
     residuals,

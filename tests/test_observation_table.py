@@ -12,7 +12,7 @@ from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
 from legcal.errors import DatasetError
 from legcal.observations.measurements import View
-from legcal.observations.outlines import Outlines
+from legcal.observations.outlines import QUALITY, Outlines
 from legcal.observations.row import COLUMNS
 from legcal.observations.sets import no_outlines, reject_unused_legs
 from legcal.observations.table import read_observations, row_names, write_observations
@@ -39,7 +39,7 @@ def edit(path: Path, row: int, **cells: str) -> Path:
     with path.open(newline="") as file:
         lines = list(csv.reader(file))
     for name, cell in cells.items():
-        lines[row][COLUMNS.index(name)] = cell
+        lines[row][lines[0].index(name)] = cell
     with path.open("w", newline="") as file:
         csv.writer(file).writerows(lines)
     return path
@@ -55,8 +55,36 @@ def test_outlines_are_read_exactly_as_they_were_written(tmp_path: Path, seed: in
 def test_header_is_that_of_the_contract(tmp_path: Path) -> None:
     header = written(tmp_path, no_outlines()).read_text().strip()
     assert header == (
-        "view,image,leg,part,edge,a,b,c,u0,v0,u1,v1,s00,s01,s11,verdict,reason,source"
+        "view,image,leg,part,edge,a,b,c,u0,v0,u1,v1,s00,s01,s11,verdict,reason,source,"
+        "contrast,length,residual"
     )
+
+
+def test_table_without_quality_is_read(tmp_path: Path) -> None:
+    outlines = outlines_of(3)
+    path = written(tmp_path, outlines)
+    with path.open(newline="") as file:
+        lines = [cells[: len(COLUMNS)] for cells in csv.reader(file)]
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(lines)
+    found = read(path)
+    for name in QUALITY:
+        assert np.isnan(getattr(found, name)).all()
+    unknown = np.full(len(outlines), np.nan)
+    assert_same(found, replace(outlines, contrast=unknown, length=unknown, residual=unknown))
+
+
+def test_edited_row_has_no_quality(tmp_path: Path) -> None:
+    found = read(edit(written(tmp_path, outlines_of(6, rejected=0.0)), 3, source="edited"))
+    assert np.isnan(found.contrast[2])
+    assert np.isfinite(found.contrast[[0, 1, 3]]).all()
+
+
+@pytest.mark.parametrize("cell", ["-1", "inf", "good"])
+def test_quality_that_is_no_number_is_refused(tmp_path: Path, cell: str) -> None:
+    path = edit(written(tmp_path, outlines_of(3, rejected=0.0)), 2, residual=cell)
+    with pytest.raises(DatasetError, match=f"row 2 .*, column residual: .*found '{cell}', needed"):
+        read(path)
 
 
 def test_empty_table_is_read_as_empty(tmp_path: Path) -> None:
@@ -194,7 +222,9 @@ def test_other_columns_are_refused(tmp_path: Path, content: str) -> None:
 def test_rows_of_another_length_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path, outlines_of(11))
     path.write_text(path.read_text() + "right,i/2.png\n")
-    with pytest.raises(DatasetError, match="found 2 cells, needed 18; complete or remove"):
+    with pytest.raises(
+        DatasetError, match="found 2 cells, needed 21 as in the header; complete or remove"
+    ):
         read(path)
 
 

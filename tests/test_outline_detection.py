@@ -9,11 +9,12 @@ import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.detect import align_views, detect_outlines
+from legcal.detection.detect import detect_outlines
 from legcal.geometry.types import Array, Image
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
+from legcal.recognition.recognise import Search, recognise, shifted
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -166,6 +167,24 @@ def test_legs_behind_others_end_where_they_are_hidden() -> None:
     found = detect(cam, [front, behind], image.astype(np.uint8))
     assert np.all(found.used), found.reason
     assert np.abs(errors(cam, [front, behind], found)).max() < 0.2
+    gap = np.linalg.norm(np.diff(found.ends, axis=1)[:, 0], axis=1) - found.length
+    assert np.all(gap > -1.0)
+    assert np.all(gap[2:] > 20.0)  # the leg in front hides the middle
+
+
+def test_outlines_say_how_well_they_were_seen() -> None:
+    cam = camera()
+    bars = [bar(-0.09, 0.03, 150.0), bar(0.08, 0.03, 90.0), bar(0.9, 0.0, 150.0)]
+    flat = Light(ambient=1.0, diffuse=0.0)
+    image = render(cam, bars[:2], 30.0, flat, blur=0.5, noise=2.0, supersample=4)
+    found = detect(cam, bars, np.rint(image).astype(np.uint8))
+    np.testing.assert_allclose(found.contrast[:4], [120.0, 120.0, 60.0, 60.0], rtol=0.05)
+    seen = np.linalg.norm(found.ends[:4, 1] - found.ends[:4, 0], axis=1)
+    assert np.all(np.abs(found.length[:4] - seen) < 20.0)
+    assert np.all((found.residual[:4] > 0.0) & (found.residual[:4] < 0.1))
+    assert np.mean(found.residual[2:4]) > 1.2 * np.mean(found.residual[:2])
+    for values in (found.contrast, found.length, found.residual):
+        assert np.all(np.isnan(values[4:]))
 
 
 def test_a_leg_that_another_covers_is_left_out_by_its_name() -> None:
@@ -268,11 +287,22 @@ def test_the_sample_is_detected_from_its_nominal_model() -> None:
     A = np.repeat(mechanism.A_base[None], len(rows), axis=0)
     B = np.array([forward_kinematics(mechanism, q).apply(mechanism.B_platform) for q in chosen.q])
     cylinders = [leg.cylinders for leg in mechanism.legs]
-    rough = [view.T_base_camera for view in chosen.views]
-    hints = [T for T in rough if T is not None]
-    poses = align_views(load, chosen, A, B, cylinders, hints)
     wanted = np.ones((3, 6), dtype=np.bool_)
-    found = detect_outlines(load, chosen, A, B, cylinders, poses, wanted, mechanism.leg_names)
+    placed = recognise(
+        Search(load, chosen, A, B, cylinders, wanted), np.arange(len(rows)), [None] * 3
+    )
+    A, B = shifted(placed, chosen.view, A, B)
+    found = detect_outlines(
+        load,
+        chosen,
+        A,
+        B,
+        cylinders,
+        placed.T_base_camera,
+        wanted,
+        mechanism.leg_names,
+        joint_error=placed.joint_error,
+    )
     truth = json.loads((ROOT / "tests/data/hexapod-truth/truth.json").read_text())
     legs = {image["file"]: image["legs"] for image in truth["images"]}
     middle, visible = np.full(len(found), np.nan), np.zeros(len(found))

@@ -300,7 +300,10 @@ HEAD = "leg1_prismatic,leg2_prismatic,leg3_prismatic\n"
         (HEAD.replace("leg2", "leg1") + "0,0,0\n", "'leg1_prismatic' 2 times"),
         (HEAD + "0,0,0\n0,0\n", r"row 2 \(line 3\): the row could not be used: found 2 cells"),
         (HEAD + "0,0,\n", r"row 1 \(line 2\), column leg3_prismatic: .* found an empty cell"),
-        (HEAD + "0,nan,0\n", r"column leg2_prismatic: .* found 'nan', needed a number in metres"),
+        (
+            HEAD + "0,nan,0\n",
+            r"column leg2_prismatic: .* found 'nan', needed a finite number in metres",
+        ),
         (HEAD + "0,0,1.0\n", "column leg3_prismatic: readings are outside the travel: found 1 m"),
         (HEAD + "10,20,60\n", "these look like millimetres"),
     ],

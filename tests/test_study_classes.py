@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machine_session import machine_session
+from machine_session import machine_session, shown_outlines
 from rich.console import Console
 from test_cli import run
 
@@ -20,13 +20,14 @@ from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.parametrization import vector_of
 from legcal.mechanism.platform import platform_in_base
 from legcal.refinement.solution import Solution
-from legcal.refinement.state import components
+from legcal.refinement.start import Start
+from legcal.refinement.state import components, motions
 from legcal.studies import classes
 from legcal.studies.bound import ERRORS
 from legcal.studies.classes import EXPERIMENT, ClassesJudge, errors_of_fit
 from legcal.studies.classes_record import FIT, FitErrors, fit_record
 from legcal.studies.classes_statistics import ClassStatistics, ClassTally
-from legcal.studies.outline_bound import bound_of, offsets_from
+from legcal.studies.outline_bound import bound_of
 from legcal.studies.outline_design import OutlineDesign
 from legcal.studies.outline_determined import Determined, as_stated, at_best
 from legcal.studies.outline_estimate import one_fit
@@ -107,11 +108,15 @@ def open_machine() -> tuple[OutlineDesign, OutlineSession, Solution]:
 def test_the_machine_that_stands_where_the_fit_holds_shows_the_same_as_the_true_one(
     open_machine: tuple[OutlineDesign, OutlineSession, Solution],
 ) -> None:
-    design, _, _ = open_machine
+    design, session, _ = open_machine
     there = standing_where_held(*open_machine)
     xi, truth = (vector_of(design.parametrization, d.legs, design.legs) for d in (there, design))
     assert np.abs(xi - truth).max() > 1e-3  # far off, in what nothing shows
-    assert np.abs(offsets_from(design, there)).max() < 1e-7  # [px]
+    cameras = tuple(T.inv() for T in there.T_Rb_camera)
+    stands = Start(there.legs, cameras, motions(there.R, there.t), "there")
+    shown = shown_outlines(there.radii, session.measurements, stands)
+    ends = design.camera.undistort(design.outlines.ends)
+    assert np.abs(design.camera.line_offset(shown.h[:, None], ends)).max() < 1e-7  # [px]
     length = np.linalg.norm(
         np.einsum("kij,lj->kli", there.R, [leg.B for leg in there.legs])
         + there.t[:, None]

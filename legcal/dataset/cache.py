@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from legcal.dataset.board_entry import board_document
 from legcal.dataset.folder import CACHE_NAME, OBSERVATIONS_NAME, Dataset
 from legcal.files.atomic import write_atomically
 from legcal.files.schema import FileSchema
@@ -127,8 +128,9 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
 def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:
     """Return a fingerprint of all that detected outlines depend on.
 
-    It covers the images, readings, views and cameras, the mechanism's files, the encoder
-    sigma, the settings of detection and the version of legcal; not the order of the rows.
+    It covers the images, readings, views and cameras, the board and its pose, the mechanism's
+    files, the encoder sigma, the settings of detection and the version of legcal; not the order
+    of the rows.
 
     Parameters
     ----------
@@ -145,7 +147,7 @@ def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:
 
 
 def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
-    """Return settings, views and readings as bytes that do not depend on the rows' order."""
+    """Return settings, views, readings and board as bytes that do not depend on the rows' order."""
     leg_names = dataset.mechanism.leg_names
     order = canonical_order(dataset.measurements, leg_names)
     measurements = reorder_measurements(dataset.measurements, order)
@@ -161,6 +163,10 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
     ]
     rows = [measurements.image, measurements.view.tolist(), measurements.pose.tolist()]
     document = [FORMAT, __version__, settings, views, rows, measurements.sigma_q]
+    if dataset.board is not None:  # it places the cameras near which outlines are looked for
+        T = dataset.T_base_board
+        document.append(board_document(dataset.board))
+        document.append(None if T is None else T.as_matrix().tolist())
     return [
         json.dumps(document, sort_keys=True).encode(),
         np.ascontiguousarray(measurements.q, dtype="<f8").tobytes(),

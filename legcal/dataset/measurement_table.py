@@ -6,16 +6,14 @@ and one reading (their mean); a row without a label is a pose of its own.
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from legcal.dataset.travel import check_travel
 from legcal.errors import DatasetError
-from legcal.files.csv_file import Line, read_lines
+from legcal.files.csv_file import Row, read_table
 from legcal.files.inside import path_problem
 from legcal.files.schema import closest, describe
 from legcal.geometry.types import Array, IntArray
@@ -24,16 +22,7 @@ from legcal.observations.measurements import Measurements, View
 
 SAME_READING = 10.0  # sigma by which rows of one pose may differ
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _FIXED_COLUMNS = ("view", "image", "pose")
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A row of the table: where it is, and its cells by column."""
-
-    where: str
-    cells: Mapping[str, str]
 
 
 def read_measurements(
@@ -66,15 +55,16 @@ def read_measurements(
         images exist is not looked at.
     """
     joints = [leg.prismatic or "" for leg in legs if leg.kind is LegKind.ACTUATED]
-    header, lines = _read_table(path)
-    problems = _header_problems(path, header, joints)
+    table = read_table(path, "table of measurements", "one row for each image; record measurements")
+    problems = _header_problems(path, table.header, joints)
     if problems:
         raise DatasetError(problems)
-    rows = _rows(path, header, lines, problems)
+    rows = table.rows(problems)
     view_index = {view.name: i for i, view in enumerate(views)}
     problems += _view_problems(rows, view_index) + _image_problems(rows, folder)
     readings = np.array(
-        [[_reading(row, joint, problems) for joint in joints] for row in rows], dtype=np.float64
+        [[row.number(joint, "reading", "metres", problems) for joint in joints] for row in rows],
+        dtype=np.float64,
     ).reshape(len(rows), len(joints))
     pose, labels = _poses(rows)
     actuated = [leg for leg in legs if leg.kind is LegKind.ACTUATED]
@@ -90,27 +80,14 @@ def read_measurements(
         pose=pose,
         q=_by_leg(legs, joints, readings),
         sigma_q=sigma_q,
-        pose_labels=labels if "pose" in header else (),
+        pose_labels=labels if "pose" in table.header else (),
     )
     return measurements, notes
-
-
-def _read_table(path: Path) -> tuple[list[str], list[Line]]:
-    """Return the header and the lines below it."""
-    lines = read_lines(path, "table of measurements")
-    if len(lines) < 2:
-        raise DatasetError(
-            f"{path}: the table could not be used: found {'no header' if not lines else 'a header'}"
-            " and no row, needed one row for each image; record measurements."
-        )
-    return lines[0][1], lines[1:]
 
 
 def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -> list[str]:
     """Return what is wrong with the columns."""
     start = f"{path}, header: the columns could not be used: found"
-    if len(header) == 1 and re.search(r"[;\t]", header[0]):
-        return [f"{start} '{header[0]}' in one column, needed commas between columns; save as CSV."]
     known = [*_FIXED_COLUMNS, *joints]
     problems = [
         f"{start} the column '{name}' {header.count(name)} times, needed it once; remove one."
@@ -132,27 +109,7 @@ def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -
     return problems
 
 
-def _rows(
-    path: Path, header: Sequence[str], lines: Sequence[Line], problems: list[str]
-) -> list[_Row]:
-    """Return the rows that have as many cells as the header."""
-    rows = []
-    for number, (line, cells) in enumerate(lines, start=1):
-        where = f"{path}, row {number} (line {line})"
-        if len(cells) == len(header):
-            rows.append(_Row(where, dict(zip(header, cells, strict=True))))
-        else:
-            kind, remedy = "short", "complete the row"
-            if len(cells) > len(header):
-                kind, remedy = "long", "remove what is too much, and write decimals with points"
-            problems.append(
-                f"{where}: the row is too {kind}: found {len(cells)} cells, needed {len(header)} "
-                f"as in the header; {remedy}."
-            )
-    return rows
-
-
-def _view_problems(rows: Sequence[_Row], view_index: Mapping[str, int]) -> list[str]:
+def _view_problems(rows: Sequence[Row], view_index: Mapping[str, int]) -> list[str]:
     """Return the rows whose view the dataset does not have."""
     return [
         f"{row.where}, column view: the row could not be used: found the unknown view "
@@ -163,7 +120,7 @@ def _view_problems(rows: Sequence[_Row], view_index: Mapping[str, int]) -> list[
     ]
 
 
-def _image_problems(rows: Sequence[_Row], folder: Path) -> list[str]:
+def _image_problems(rows: Sequence[Row], folder: Path) -> list[str]:
     """Return images that are named twice or lie outside the dataset folder."""
     problems = []
     first: dict[Path, str] = {}
@@ -187,21 +144,7 @@ def _image_problems(rows: Sequence[_Row], folder: Path) -> list[str]:
     return problems
 
 
-def _reading(row: _Row, joint: str, problems: list[str]) -> float:
-    """Return one reading, NaN if its cell holds none."""
-    text = row.cells[joint]
-    value = float(text) if _NUMBER.fullmatch(text) else math.nan
-    if math.isfinite(value):
-        return value
-    problems.append(
-        f"{row.where}, column {joint}: the reading could not be used: found "
-        f"{describe(text) if text else 'an empty cell'}, needed a finite number in metres; correct "
-        "it or remove the row."
-    )
-    return math.nan
-
-
-def _poses(rows: Sequence[_Row]) -> tuple[IntArray, tuple[str, ...]]:
+def _poses(rows: Sequence[Row]) -> tuple[IntArray, tuple[str, ...]]:
     """Return the pose of each row, numbered as they first appear, and the label of each pose."""
     labels: list[str] = []
     index: dict[str, int] = {}
@@ -216,7 +159,7 @@ def _poses(rows: Sequence[_Row]) -> tuple[IntArray, tuple[str, ...]]:
 
 
 def _shared_readings(
-    rows: Sequence[_Row],
+    rows: Sequence[Row],
     pose: IntArray,
     joints: Sequence[str],
     readings: Array,

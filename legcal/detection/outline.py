@@ -5,7 +5,7 @@ fitted to all outlines of the image together; the verdict on each part, with the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from legcal.detection.pairs import Pair, block_positions, find_pair
 from legcal.detection.picture import Grey
 from legcal.detection.pieces import Piece
 from legcal.detection.prediction import PredictedLeg, hidden_by
-from legcal.detection.verdict import LEAST_LENGTH, verdicts
+from legcal.detection.verdict import LEAST_LENGTH, qualities, verdicts
 from legcal.geometry.types import Array, BoolArray
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -24,6 +24,10 @@ OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one
 MARGIN = 4.0  # beside a leg in front [px]
 NARROWEST = 5.0  # [px]
+
+
+def _unknown() -> Array:
+    return np.full(2, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,9 @@ class PartOutlines:
         Of the normal offsets at these ends [px^2].
     reasons : tuple of two str
         Why each outline was rejected, "" if it is to be used.
+    contrast, length, residual : (2,) array
+        How well each was seen, as in :class:`legcal.observations.outlines.Outlines` [grey levels,
+        px, px]; NaN where nothing was found.
     """
 
     leg: int
@@ -52,6 +59,9 @@ class PartOutlines:
     ends: Array
     covariance: Array
     reasons: tuple[str, str]
+    contrast: Array = field(default_factory=_unknown)
+    length: Array = field(default_factory=_unknown)
+    residual: Array = field(default_factory=_unknown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +267,16 @@ def _judge(
         for edge in (one, two)
     ]
     reasons = verdicts(part.pair, part.width, part.band.length, (one, two))
-    return replace(part.outlines(camera, lines), reasons=reasons)
+    contrast, length, residual = np.transpose(
+        [qualities(edge, part.band.length) for edge in (one, two)]
+    )
+    return replace(
+        part.outlines(camera, lines),
+        reasons=reasons,
+        contrast=contrast,
+        length=length,
+        residual=residual,
+    )
 
 
 def _rejected(leg: PredictedLeg, piece: Piece, reason: str) -> PartOutlines:

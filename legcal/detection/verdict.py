@@ -1,4 +1,6 @@
-"""The verdict on both outlines of a part: whether to use them, or why not."""
+"""The verdict on both outlines of a part: how well they were seen, and whether to use them."""
+
+import math
 
 import numpy as np
 
@@ -61,6 +63,35 @@ def verdicts(
         for reason, partner, alone in zip(reasons, partners, stands, strict=True)
     )
     return first, second
+
+
+def qualities(edge: MeasuredEdge | None, length: float) -> tuple[float, float, float]:
+    """Return how well an edge was seen; NaN if it was not.
+
+    Parameters
+    ----------
+    edge : MeasuredEdge or None
+        The edge; None where no straight line fits.
+    length : float
+        Length of the band [px].
+
+    Returns
+    -------
+    contrast, length, residual : float
+        Median step [grey levels], how much of the edge lies on the line, without gaps [px], and
+        the robust standard deviation of its blocks about the line [px]; rounded to what says
+        something.
+    """
+    if edge is None:
+        return math.nan, math.nan, math.nan
+    line = edge.line
+    visible = (len(line.position) - 1) * _spacing(line.position) * length
+    return round(edge.contrast, 2), round(visible, 1), round(line.scatter, 4)
+
+
+def _spacing(position: Array) -> float:
+    """Return how far apart neighbouring blocks are; hidden and wrong ones leave gaps."""
+    return float(np.min(np.diff(np.sort(position))))
 
 
 def _reason(edge: MeasuredEdge | None, length: float, width: float) -> str:

@@ -12,15 +12,13 @@ from legcal.location.convention import covariance_with, hold_tool, is_resolved_b
 from legcal.location.fit import Fit, finished, frame_design, system
 from legcal.location.open_directions import (
     BLOCKS,
-    OpenPart,
     beyond_the_machine,
-    direction_words,
-    joined,
     needed_words,
     open_directions,
     open_parts,
     variety,
 )
+from legcal.location.open_part import OpenPart, direction_of, direction_words, joined
 from legcal.location.pose_pairs import N_FRAME, Frames, PosePairs, jacobian
 from legcal.location.problem import Problem
 from legcal.mechanism.configurations import random_configurations
@@ -197,16 +195,14 @@ def _weak(covariance: Array, found: Fit, pairs: PosePairs, *, oriented: bool) ->
     position, angle = found.noise.factor * np.sqrt((found.noise.sigma**2).mean(axis=0))
     one = max(float(position), float(angle) * pairs.length if oriented else 0.0)
     sentences = []
-    frames = ("base", "base", "tool", "tool")
-    kinds = ("position", "orientation", "position", "orientation")
-    for block, frame, kind in zip(BLOCKS, frames, kinds, strict=True):
+    for block, frame, kind in BLOCKS:
         values, vectors = np.linalg.eigh(covariance[block, block])
         sigma = float(np.sqrt(max(values[-1], 0.0)))
         limit = WEAK * (one if kind == "position" else one / pairs.length)
         if sigma <= limit:
             continue
         v = vectors[:, -1] if frame == "tool" else found.frames.R_base.T @ vectors[:, -1]
-        part = OpenPart(frame, kind, (tuple(v.tolist()),))
+        part = OpenPart(frame, kind, (direction_of(v),))
         known = f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
         sentences.append(
             f"Known badly is {part.words}: {known} (1 sigma); poses that differ more, above all in "

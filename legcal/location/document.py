@@ -15,7 +15,8 @@ from legcal.files.atomic import write_atomically
 from legcal.files.motion import MotionEntry
 from legcal.files.schema import FileSchema, Number, Version, parse_yaml, read_text, validate
 from legcal.geometry.frames import motion_to_xyz_quat
-from legcal.location.location import NAMES, Held, Location, MeasurementNoise, RowResidual
+from legcal.location.location import NAMES, Location, MeasurementNoise, RowResidual
+from legcal.location.open_part import OpenPart
 
 WHAT = "location file"
 KEY = "legcal_location"
@@ -268,7 +269,7 @@ def load_location(file: str | Path) -> Location:
         T_platform_tool=document.T_platform_tool.motion(),
         has_tool_orientation=determined.tool_orientation,
         covariance=_matrix(path, document.covariance),
-        held=tuple(Held(h.frame, h.kind, tuple(h.directions)) for h in determined.held),
+        held=tuple(OpenPart(h.frame, h.kind, tuple(h.directions)) for h in determined.held),
         held_at=determined.tool_position,
         held_words=determined.words,
         noise=MeasurementNoise(**document.noise.model_dump()),

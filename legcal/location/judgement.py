@@ -12,7 +12,7 @@ from legcal.geometry.types import Array
 from legcal.location.agreement import Agreement
 from legcal.location.determinacy import Determinacy
 from legcal.location.fit import Fit
-from legcal.location.location import Held, Location, MeasurementNoise, RowResidual, Status
+from legcal.location.location import Location, MeasurementNoise, RowResidual, Status
 from legcal.location.pose_pairs import jacobian, residuals
 from legcal.location.problem import Problem
 
@@ -65,7 +65,7 @@ def judge(
         T_platform_tool=tool,
         has_tool_orientation=problem.is_oriented,
         covariance=0.5 * (determined.covariance + determined.covariance.T),
-        held=tuple(_held(determined)),
+        held=determined.held,
         held_at=(float(at[0]), float(at[1]), float(at[2])),
         held_words=determined.words,
         noise=_noise(problem, found),
@@ -143,18 +143,6 @@ def _off(problem: Problem, agreement: Agreement, i: int) -> str:
         found += f" and {np.degrees(agreement.angle[i]):.3g} deg"
         scatter += f" and {np.degrees(sigma[1]):.2g} deg"
     return f"{found} from where the other rows foretell it, which scatter {scatter}"
-
-
-def _held(determined: Determinacy) -> list[Held]:
-    """Return what is held, as the result has it."""
-    return [
-        Held(
-            "base" if part.frame == "base" else "tool",
-            "position" if part.kind == "position" else "orientation",
-            tuple((v[0], v[1], v[2]) for v in part.directions),
-        )
-        for part in determined.held
-    ]
 
 
 def _at_the_tool(problem: Problem, determined: Determinacy) -> tuple[float, float | None]:

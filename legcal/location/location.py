@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry.types import Array
+from legcal.location.open_part import OpenPart
 
 Status = Literal["located", "located in part", "doubtful"]
 
@@ -45,25 +46,6 @@ class RowResidual:
     def used(self) -> bool:
         """Whether the frames rest on it."""
         return not self.reason
-
-
-@dataclass(frozen=True)
-class Held:
-    """A part of the frames that no pose of the machine tells, held by convention.
-
-    Attributes
-    ----------
-    frame : {"base", "tool"}
-        Whose.
-    kind : {"position", "orientation"}
-        Of what.
-    directions : tuple of tuple of float
-        Unit vectors in the base link, or in the platform link for the tool.
-    """
-
-    frame: Literal["base", "tool"]
-    kind: Literal["position", "orientation"]
-    directions: tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -110,7 +92,7 @@ class Location:
         Of ``NAMES``: displacements [m] and rotation vectors [rad] of the base about world axes and
         of the tool about platform axes, T_true = (exp r, t + x) applied from the left. What is
         held, and an orientation that is not known, counts as zero.
-    held : tuple of Held
+    held : tuple of OpenPart
         What the machine leaves open.
     held_at : tuple of float
         The tool position in the platform whose components are taken where it is open [m].
@@ -140,7 +122,7 @@ class Location:
     T_platform_tool: RigidTransform
     has_tool_orientation: bool
     covariance: Array
-    held: tuple[Held, ...]
+    held: tuple[OpenPart, ...]
     held_at: tuple[float, float, float]
     held_words: str
     noise: MeasurementNoise

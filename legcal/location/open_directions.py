@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from legcal.geometry.types import Array, BoolArray
 from legcal.location.fit import SINGULAR
+from legcal.location.open_part import Frame, Kind, OpenPart, direction_of, direction_words
 from legcal.location.pose_pairs import Frames
 
 OPEN = 0.1  # [rad], and of the length of the machine
@@ -22,7 +23,12 @@ HARDLY = 2e-3  # of the best seen direction: what no pose of a machine shows bet
 _PART = 0.03  # of a unit direction: what is less is not named
 _SAME_AXIS = 0.02  # of the largest rotations: what is less is about the same axis
 
-BLOCKS = (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12))  # base, its turn, tool, its turn
+BLOCKS: tuple[tuple[slice, Frame, Kind], ...] = (
+    (slice(0, 3), "base", "position"),
+    (slice(3, 6), "base", "orientation"),
+    (slice(6, 9), "tool", "position"),
+    (slice(9, 12), "tool", "orientation"),
+)  # of a step
 
 
 def open_directions(design: Array, *, oriented: bool) -> Array:
@@ -68,74 +74,18 @@ def _unseen(design: Array, oriented: bool, is_open: Callable[[Array], BoolArray]
     return basis
 
 
-@dataclass(frozen=True)
-class OpenPart:
-    """A part of the frames that is open.
-
-    Attributes
-    ----------
-    frame : {"base", "tool"}
-        Whose.
-    kind : {"position", "orientation"}
-        Of what.
-    directions : tuple of tuple of float
-        Unit vectors: of the base in the base link, of the tool in the platform link.
-    """
-
-    frame: str
-    kind: str
-    directions: tuple[tuple[float, ...], ...]
-
-    @property
-    def words(self) -> str:
-        """What is open, for people."""
-        whose = "the base in the world" if self.frame == "base" else "the tool in the platform"
-        link = "the base" if self.frame == "base" else "the platform"
-        start = f"the {self.kind} of {whose}"
-        if len(self.directions) == 3:
-            return start
-        if len(self.directions) == 2:
-            normal = np.cross(*np.array(self.directions))
-            return f"{start} across {direction_words(normal)} of {link}"
-        link = "its own axes" if self.frame == "base" else link
-        how = "along" if self.kind == "position" else "about"
-        return f"{start} {how} {direction_words(self.directions[0])} of {link}"
-
-
 def open_parts(basis: Array, frames: Frames) -> list[OpenPart]:
     """Return which parts of the frames some open directions (12, k) move."""
     parts = []
-    for block, frame, kind in zip(
-        BLOCKS,
-        ("base", "base", "tool", "tool"),
-        ("position", "orientation", "position", "orientation"),
-        strict=True,
-    ):
+    for block, frame, kind in BLOCKS:
         rows = basis[block]
         if frame == "base":
             rows = frames.R_base.T @ rows
         U, s, _ = np.linalg.svd(rows, full_matrices=False)
-        found = [tuple(_signed(u).tolist()) for u in U[:, s > _PART].T]
+        found = [direction_of(u) for u in U[:, s > _PART].T]
         if found:
             parts.append(OpenPart(frame, kind, tuple(found)))
     return parts
-
-
-def joined(parts: list[OpenPart]) -> str:
-    """Return parts in one phrase, the tool's first."""
-    words = [part.words for part in sorted(parts, key=lambda part: part.frame != "tool")]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-
-
-def direction_words(v: Array | tuple[float, ...]) -> str:
-    """Return a direction with two digits."""
-    v = _signed(np.asarray(v) / np.linalg.norm(v))
-    return "(" + ", ".join(f"{x:.3g}" for x in np.round(v, 2) + 0.0) + ")"
-
-
-def _signed(v: Array) -> Array:
-    """Return a direction with its largest component positive."""
-    return np.asarray(v if v[np.argmax(np.abs(v))] > 0.0 else -v)
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,12 +101,6 @@ class Frames:
         )
 
 
-def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> Frames:
-    """Return two rigid motions as frames."""
-    base, tool = T_world_base.as_matrix(), T_platform_tool.as_matrix()
-    return Frames(base[:3, :3], base[:3, 3], tool[:3, :3], tool[:3, 3])
-
-
 def stacked(several: list[Frames]) -> Frames:
     """Return several frames as one batch."""
     return Frames(

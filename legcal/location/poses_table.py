@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from legcal.dataset.travel import check_travel
 from legcal.errors import DatasetError
-from legcal.files.csv_file import read_lines
+from legcal.files.csv_file import Row, finite_number, read_table
 from legcal.files.motion import QUATERNION_TOLERANCE
-from legcal.files.schema import closest, describe
+from legcal.files.schema import closest
 from legcal.geometry.types import Array, BoolArray
 from legcal.location.noise import SMALLEST
 from legcal.location.tool_poses import ToolPoses
@@ -34,16 +33,7 @@ MOST = 1e6  # [m]; squares of far larger positions overflow
 LARGEST_ANGLE = 0.2  # [rad]; a larger standard deviation is none of a measured orientation
 _ROUNDED = 1e-5  # of the norm of a quaternion: not worth a note
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _ANGLES = re.compile(r"[rw][xyz]|[abc]|roll|pitch|yaw|phi|theta|psi", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A row of the table: where it is, and its cells by column."""
-
-    where: str
-    cells: Mapping[str, str]
 
 
 def read_tool_poses(path: Path, mechanism: Mechanism) -> ToolPoses:
@@ -63,17 +53,12 @@ def read_tool_poses(path: Path, mechanism: Mechanism) -> ToolPoses:
     """
     legs = [leg for leg in mechanism.legs if leg.kind is LegKind.ACTUATED]
     joints = [leg.prismatic or "" for leg in legs]
-    lines = read_lines(path, WHAT)
-    if len(lines) < 2:
-        raise DatasetError(
-            f"{path}: the {WHAT} could not be used: found {'a header' if lines else 'no header'} "
-            "and no row, needed a row for each pose; measure some."
-        )
-    header = lines[0][1]
+    table = read_table(path, WHAT, "a row for each pose; measure some")
+    header = table.header
     problems = _header_problems(path, header, joints)
     if problems:
         raise DatasetError(problems)
-    rows = _rows(path, header, lines[1:], problems)
+    rows = table.rows(problems)
     readings = _numbers(rows, joints, "reading", "metres", problems)
     outside, notes = check_travel(path, [row.where for row in rows], legs, readings)
     problems += outside
@@ -101,8 +86,6 @@ def read_tool_poses(path: Path, mechanism: Mechanism) -> ToolPoses:
 def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -> list[str]:
     """Return what is wrong with the columns."""
     start = f"{path}, header: the columns could not be used: found"
-    if len(header) == 1 and re.search(r"[;\t]", header[0]):
-        return [f"{start} '{header[0]}' in one column, needed commas between columns; save as CSV."]
     known = [*joints, *POSITION, *QUATERNION, *SIGMAS, "name"]
     problems = [
         f"{start} the column '{name}' {header.count(name)} times, needed it once; remove one."
@@ -133,49 +116,15 @@ def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -
     return problems
 
 
-def _rows(
-    path: Path,
-    header: Sequence[str],
-    lines: Sequence[tuple[int, list[str]]],
-    problems: list[str],
-) -> list[_Row]:
-    """Return the rows that have as many cells as the header."""
-    rows = []
-    for number, (line, cells) in enumerate(lines, start=1):
-        where = f"{path}, row {number} (line {line})"
-        if len(cells) == len(header):
-            rows.append(_Row(where, dict(zip(header, cells, strict=True))))
-        else:
-            problems.append(
-                f"{where}: the row could not be used: found {len(cells)} cells, needed "
-                f"{len(header)} as in the header; complete it, and write decimals with points."
-            )
-    return rows
-
-
 def _numbers(
-    rows: Sequence[_Row], columns: Sequence[str], what: str, unit: str, problems: list[str]
+    rows: Sequence[Row], columns: Sequence[str], what: str, unit: str, problems: list[str]
 ) -> Array:
     """Return some columns, NaN where a cell holds no finite number."""
-    found = [[_number(row, column, what, unit, problems) for column in columns] for row in rows]
+    found = [[row.number(column, what, unit, problems) for column in columns] for row in rows]
     return np.array(found, dtype=np.float64).reshape(len(rows), len(columns))
 
 
-def _number(row: _Row, column: str, what: str, unit: str, problems: list[str]) -> float:
-    """Return one cell, NaN if it holds no finite number."""
-    text = row.cells[column]
-    value = float(text) if _NUMBER.fullmatch(text) else math.nan
-    if math.isfinite(value):
-        return value
-    problems.append(
-        f"{row.where}, column {column}: the {what} could not be used: found "
-        f"{describe(text) if text else 'an empty cell'}, needed a finite number"
-        f"{f' in {unit}' if unit else ''}; correct it or remove the row."
-    )
-    return math.nan
-
-
-def _check_size(rows: Sequence[_Row], position: Array, problems: list[str]) -> None:
+def _check_size(rows: Sequence[Row], position: Array, problems: list[str]) -> None:
     """Refuse positions beyond reason."""
     problems += [
         f"{row.where}: the position could not be used: found {size:.3g} m, needed less than "
@@ -186,7 +135,7 @@ def _check_size(rows: Sequence[_Row], position: Array, problems: list[str]) -> N
 
 
 def _orientations(
-    path: Path, rows: Sequence[_Row], header: Sequence[str], problems: list[str]
+    path: Path, rows: Sequence[Row], header: Sequence[str], problems: list[str]
 ) -> tuple[Array, BoolArray, list[str]]:
     """Return orientations, where there are any, and a note if their quaternions were rounded."""
     rotation = np.tile(np.eye(3), (len(rows), 1, 1))
@@ -195,7 +144,7 @@ def _orientations(
     for i, row in enumerate(rows if "qx" in header else []):
         if not any(row.cells[c] for c in QUATERNION):
             continue
-        numbers = [_number(row, c, "quaternion", "", problems) for c in QUATERNION]
+        numbers = [row.number(c, "quaternion", "", problems) for c in QUATERNION]
         norm = math.hypot(*numbers)
         if not math.isfinite(norm):
             continue
@@ -217,7 +166,7 @@ def _orientations(
 
 
 def _sigma(
-    rows: Sequence[_Row],
+    rows: Sequence[Row],
     name: str,
     header: Sequence[str],
     oriented: BoolArray,
@@ -232,7 +181,7 @@ def _sigma(
     for i, row in enumerate(rows):
         if is_angle and not oriented[i]:
             continue
-        sigma[i] = _number(row, name, "standard deviation", unit, problems)
+        sigma[i] = row.number(name, "standard deviation", unit, problems)
         too_large = is_angle and sigma[i] > LARGEST_ANGLE
         if sigma[i] < SMALLEST or too_large:
             hint = "; it looks like degrees" if too_large else ""
@@ -244,12 +193,12 @@ def _sigma(
     return sigma
 
 
-def _check_twice(rows: Sequence[_Row], columns: Sequence[str], problems: list[str]) -> None:
+def _check_twice(rows: Sequence[Row], columns: Sequence[str], problems: list[str]) -> None:
     """Refuse a row that is there twice: one measurement would count as two."""
     first: dict[tuple[float | str, ...], str] = {}
     for row in rows:
         cells = [row.cells[c] for c in columns]
-        numbers = tuple(float(c) if _NUMBER.fullmatch(c) else c for c in cells)
+        numbers = tuple(c if math.isnan(x := finite_number(c)) else x for c in cells)
         earlier = first.setdefault(numbers, row.where)
         if earlier != row.where:
             problems.append(

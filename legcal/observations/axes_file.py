@@ -122,12 +122,12 @@ def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) 
         With one sentence for each thing that is wrong, naming row and column.
     """
     problems: list[str] = []
-    rows = read_named_rows(path, "table of axes", COLUMNS, "correct the header", problems)
-    if not problems and not rows:
-        problems.append(
-            f"{path}: the axes could not be used: found no row, needed the axes of the legs in "
-            "every image; add them, or delete the file to have images searched."
-        )
+    needed = (
+        "the axes of the legs in every image; add them, or delete the file to have images searched"
+    )
+    rows = read_named_rows(
+        path, "table of axes", COLUMNS, "correct the header", problems, needed=needed
+    )
     places = rows_by_name(measurements)
     first: dict[tuple[int, int], str] = {}
     numbers = []

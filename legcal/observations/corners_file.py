@@ -95,12 +95,13 @@ def read_corners(path: Path, board: Board, measurements: Measurements) -> Corner
         With one sentence for each thing that is wrong, naming row and column.
     """
     problems: list[str] = []
-    rows = read_named_rows(path, "table of corners", COLUMNS, "correct the header", problems)
-    if not problems and not rows:
-        problems.append(
-            f"{path}: the corners could not be used: found no row, needed the corners of the board "
-            "in the images; add them, or delete the file to have images searched."
-        )
+    needed = (
+        "the corners of the board in the images; add them, or delete the file to have images "
+        "searched"
+    )
+    rows = read_named_rows(
+        path, "table of corners", COLUMNS, "correct the header", problems, needed=needed
+    )
     places = rows_by_name(measurements)
     sizes = [(camera.width, camera.height) for camera in (v.camera for v in measurements.views)]
     found: dict[tuple[int, int, str], tuple[str, Mapping[str, str]]] = {}

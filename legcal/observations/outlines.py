@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from legcal.geometry.types import Array, BoolArray, IntArray
+
+QUALITY = ("contrast", "length", "residual")  # what tells how well an outline was seen
+
+
+def _unknown() -> Array:
+    return np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +44,13 @@ class Outlines:
         Why an outline was rejected; "" for used ones.
     source : tuple of str, length n
         ``detected`` or ``edited``.
+    contrast : (n,) array
+        Median step from the background to the leg [grey levels]. This and the next two are NaN
+        where nothing was found and for outlines that were given or edited; they may be left out.
+    length : (n,) array
+        How much of the used piece was seen on its line, without gaps [px].
+    residual : (n,) array
+        Robust standard deviation of its edge about the line [px].
     """
 
     row: IntArray
@@ -48,6 +63,14 @@ class Outlines:
     used: BoolArray
     reason: tuple[str, ...]
     source: tuple[str, ...]
+    contrast: Array = field(default_factory=_unknown)
+    length: Array = field(default_factory=_unknown)
+    residual: Array = field(default_factory=_unknown)
+
+    def __post_init__(self) -> None:
+        for name in QUALITY:
+            if len(getattr(self, name)) == 0:
+                object.__setattr__(self, name, np.full(len(self.row), np.nan))
 
     def __len__(self) -> int:
         return len(self.row)

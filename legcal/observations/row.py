@@ -8,7 +8,7 @@ import numpy as np
 
 from legcal.files.schema import closest, describe
 from legcal.mechanism.leg import Leg
-from legcal.observations.outlines import Outlines
+from legcal.observations.outlines import QUALITY, Outlines
 
 NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 COLUMNS = ("view", "image", "leg", "part", "edge", *NUMBERS, "verdict", "reason", "source")
@@ -32,6 +32,7 @@ class OutlineRow:
     used: bool
     reason: str
     source: str
+    quality: tuple[float, ...]  # as QUALITY, NaN where unknown
 
     @property
     def key(self) -> tuple[int, int, str, int]:
@@ -121,6 +122,15 @@ def parse_row(
     ]
     if not wrong and used:
         wrong = _number_problems(where, numbers)
+    quality = [number_in(cells.get(name, "")) for name in QUALITY]
+    wrong += [
+        f"{where}, column {name}: the outline could not be used: found {describe(cells[name])}, "
+        "needed a number from 0 on, or an empty cell; correct it or leave it empty."
+        for name, x in zip(QUALITY, quality, strict=True)
+        if cells.get(name) and not (math.isfinite(x) and x >= 0.0)
+    ]
+    if cells["source"] == "edited":  # they tell of what detection found
+        quality = [math.nan] * len(QUALITY)
     problems += wrong
     if wrong:
         return None
@@ -136,6 +146,7 @@ def parse_row(
         used,
         cells["reason"],
         cells["source"],
+        tuple(quality),
     )
 
 
@@ -175,6 +186,7 @@ def _number_problems(where: str, numbers: Sequence[float]) -> list[str]:
 def rows_to_outlines(found: Sequence[OutlineRow]) -> Outlines:
     """Return parsed rows as arrays."""
     numbers = np.array([o.numbers for o in found], dtype=np.float64).reshape(-1, len(NUMBERS))
+    quality = np.array([o.quality for o in found], dtype=np.float64).reshape(-1, len(QUALITY))
     return Outlines(
         row=np.array([o.row for o in found], dtype=np.intp),
         leg=np.array([o.leg for o in found], dtype=np.intp),
@@ -186,4 +198,7 @@ def rows_to_outlines(found: Sequence[OutlineRow]) -> Outlines:
         used=np.array([o.used for o in found], dtype=np.bool_),
         reason=tuple(o.reason for o in found),
         source=tuple(o.source for o in found),
+        contrast=quality[:, 0],
+        length=quality[:, 1],
+        residual=quality[:, 2],
     )

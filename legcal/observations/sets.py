@@ -64,6 +64,9 @@ def choose_outlines(outlines: Outlines, chosen: BoolArray | IntArray) -> Outline
         used=outlines.used[index],
         reason=tuple(outlines.reason[i] for i in index.tolist()),
         source=tuple(outlines.source[i] for i in index.tolist()),
+        contrast=outlines.contrast[index],
+        length=outlines.length[index],
+        residual=outlines.residual[index],
     )
 
 
@@ -81,6 +84,9 @@ def join_outlines(tables: Sequence[Outlines]) -> Outlines:
         used=np.concatenate([t.used for t in tables]),
         reason=tuple(reason for t in tables for reason in t.reason),
         source=tuple(source for t in tables for source in t.source),
+        contrast=np.concatenate([t.contrast for t in tables]),
+        length=np.concatenate([t.length for t in tables]),
+        residual=np.concatenate([t.residual for t in tables]),
     )
     return sort_outlines(joined)
 

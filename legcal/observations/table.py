@@ -20,7 +20,7 @@ from legcal.files.csv_file import read_named_rows
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import Leg
 from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import Outlines
+from legcal.observations.outlines import QUALITY, Outlines
 from legcal.observations.row import (
     COLUMNS,
     VERDICTS,
@@ -95,9 +95,10 @@ def format_observations(
     names = row_names(measurements)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow([*COLUMNS, *QUALITY])
     for i in range(len(outlines)):
         row, covariance = outlines.row[i], outlines.covariance[i]
+        quality = [float(getattr(outlines, name)[i]) for name in QUALITY]
         numbers = [
             *outlines.h[i].tolist(),
             *outlines.ends[i].ravel().tolist(),
@@ -110,13 +111,19 @@ def format_observations(
                 leg_names[outlines.leg[i]],
                 outlines.part[i],
                 int(outlines.edge[i]),
-                *("" if math.isnan(x) else repr(x) for x in numbers),
+                *map(_cell, numbers),
                 VERDICTS[0 if outlines.used[i] else 1],
                 outlines.reason[i],
                 outlines.source[i],
+                *map(_cell, quality),
             ]
         )
     return text.getvalue()
+
+
+def _cell(number: float) -> str:
+    """Return a number as it is read back, nothing for NaN."""
+    return "" if math.isnan(number) else repr(number)
 
 
 def read_observations(
@@ -158,7 +165,10 @@ def read_observations(
     found: list[OutlineRow] = []
     first: dict[tuple[int, int, str, int], str] = {}
     remedy = "delete the file to have it written again"
-    for where, cells in read_named_rows(path, "table of observations", COLUMNS, remedy, problems):
+    rows = read_named_rows(
+        path, "table of observations", COLUMNS, remedy, problems, optional=QUALITY
+    )
+    for where, cells in rows:
         place, unknown = place_of(where, cells, places, legs)
         if unknown and skip_stale and cells["source"] == "detected":
             continue

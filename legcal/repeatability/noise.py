@@ -18,7 +18,6 @@ import numpy as np
 
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.detection.detect import Method
-from legcal.detection.observe import Photographs, align, detect, scene_at_poses
 from legcal.detection.outline import outline_parts
 from legcal.errors import NotVisible
 from legcal.geometry.types import IntArray
@@ -27,6 +26,7 @@ from legcal.mechanism.model import Mechanism
 from legcal.observations.canonical_order import canonical_order, reorder_measurements
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import no_outlines
+from legcal.photographs import Photographs, detect, place, scene_at_poses
 from legcal.progress import Report, no_progress
 from legcal.repeatability.canny import canny_parts
 from legcal.repeatability.difference import outline_differences
@@ -115,7 +115,9 @@ def _search(
     poses = forward_kinematics_many(every.mechanism, q)
     scene = scene_at_poses(every.mechanism, measurements, poses)
     to_align = replace(every, detect=_rows_to_align(every, repeats))
-    scene = align(to_align, scene, progress)
+    placement = place(to_align, scene, progress)
+    placement.require_one()
+    scene = placement.scene
     repeated = replace(every, detect=np.sort(np.concatenate([group.rows for group in repeats])))
     return {
         name: detect(repeated, scene, progress, method=method, stage=stage)

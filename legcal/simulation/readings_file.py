@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,10 @@ import numpy as np
 
 from legcal.dataset.travel import check_travel
 from legcal.errors import DatasetError
-from legcal.files.csv_file import Line, read_lines
+from legcal.files.csv_file import read_table
 from legcal.files.schema import closest, describe
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
-from legcal.mechanism.urdf_checks import number_list
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +53,18 @@ def read_readings(path: Path, mechanism: Mechanism) -> GivenReadings:
     """
     motors = [mechanism.legs[j] for j in mechanism.motors]
     joints = [str(leg.prismatic) for leg in motors]
-    lines = read_lines(path, "file of poses")
-    if len(lines) < 2:
-        raise DatasetError(
-            f"{path}: the poses could not be used: found {'no header' if not lines else 'a header'}"
-            " and no row, needed one row for each pose; write the readings of the motors."
-        )
-    header = lines[0][1]
-    problems = _header_problems(path, header, joints)
+    table = read_table(
+        path, "file of poses", "one row for each pose; write the readings of the motors"
+    )
+    problems = _header_problems(path, table.header, joints)
     if problems:
         raise DatasetError(problems)
-    where = [f"{path}, row {i} (line {line})" for i, (line, _) in enumerate(lines[1:], start=1)]
-    columns = [header.index(joint) for joint in joints]
-    rows = [_row(w, line, header, problems) for w, line in zip(where, lines[1:], strict=True)]
-    readings = np.array(rows)[:, columns]
+    rows = table.rows(problems)
+    where = [row.where for row in rows]
+    readings = np.array(
+        [[row.number(joint, "reading", "metres", problems) for joint in joints] for row in rows],
+        dtype=np.float64,
+    ).reshape(len(rows), len(joints))
     problems += check_travel(path, where, motors, readings)[0]
     if problems:
         raise DatasetError(problems)
@@ -78,8 +74,6 @@ def read_readings(path: Path, mechanism: Mechanism) -> GivenReadings:
 def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -> list[str]:
     """Return what is wrong with the columns."""
     start = f"{path}, header: the columns could not be used: found"
-    if len(header) == 1 and re.search(r"[;\t]", header[0]):
-        return [f"{start} '{header[0]}' in one column, needed commas between columns; save as CSV."]
     problems = []
     for name in dict.fromkeys([*header, *joints]):
         count = header.count(name)
@@ -94,25 +88,3 @@ def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -
                 "once; correct the header."
             )
     return problems
-
-
-def _row(where: str, line: Line, header: Sequence[str], problems: list[str]) -> list[float]:
-    """Return the numbers of a row, NaN where there is none."""
-    _, cells = line
-    if len(cells) != len(header):
-        problems.append(
-            f"{where}: the row could not be used: found {len(cells)} cells, needed {len(header)} "
-            "as in the header; correct it."
-        )
-        return [np.nan] * len(header)
-    row = []
-    for name, text in zip(header, cells, strict=True):
-        found = number_list(text, 1)
-        if found is None:
-            problems.append(
-                f"{where}, column {name}: the reading could not be used: found "
-                f"{describe(text) if text else 'an empty cell'}, needed a number in metres; "
-                "correct it or remove the row."
-            )
-        row.append(np.nan if found is None else found[0])
-    return row

@@ -62,12 +62,8 @@ def weighted_joints(
 
     Parameters
     ----------
-    axes : LegAxes
-        Axes in the camera frames.
-    bundles : Bundles
-        Which of them are legs of one joint.
-    pool : (n,) array of int
-        Bundles with the same number, 0 and so on, share v.
+    axes, bundles, pool
+        As in :func:`plain_axes`.
     A, v : (n, 3) array
         Points [m] and unit vectors to start from, v the same in a pool.
 

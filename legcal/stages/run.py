@@ -27,6 +27,25 @@ from legcal.stages.platform_pose import Transformation
 
 
 @dataclass(frozen=True, eq=False)
+class BaseSteps:
+    """What steps 1 and 2 give: the base as the cameras see it, and where they stood.
+
+    Attributes
+    ----------
+    joints_in_camera, joints_in_base
+        The results of steps 1 and 2.
+    """
+
+    joints_in_camera: JointsInCamera
+    joints_in_base: JointsInBase
+
+    @property
+    def T_Rb_camera(self) -> tuple[RigidTransform | None, ...]:
+        """Where each camera stood; None for a view that locates fewer than three base joints."""
+        return self.joints_in_base.T_Rb_camera
+
+
+@dataclass(frozen=True, eq=False)
 class StagedResult:
     """What the four steps give.
 
@@ -96,8 +115,48 @@ def run_steps(
     DidNotConverge
         If a step does not converge.
     """
+    return run_platform_steps(
+        mechanism,
+        axes,
+        measurements,
+        run_base_steps(mechanism, axes, measurements, criteria=criteria),
+        criteria=criteria,
+        transformation=transformation,
+        free_twists=free_twists,
+    )
+
+
+def run_base_steps(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    measurements: Measurements,
+    *,
+    criteria: Criteria = "default",
+) -> BaseSteps:
+    """Locate base joints and cameras by steps 1 and 2 (3.2 and 3.3).
+
+    Parameters and errors are those of :func:`run_steps`.
+    """
     joints = locate_joints_in_cameras(mechanism, axes, measurements, criteria=criteria)
-    base = locate_joints_in_base(mechanism, joints, criteria=criteria)
+    return BaseSteps(joints, locate_joints_in_base(mechanism, joints, criteria=criteria))
+
+
+def run_platform_steps(
+    mechanism: NominalMechanism,
+    axes: LegAxes,
+    measurements: Measurements,
+    base_steps: BaseSteps,
+    *,
+    criteria: Criteria = "default",
+    transformation: Transformation | None = None,
+    free_twists: bool = False,
+) -> StagedResult:
+    """Identify the rest by steps 3 and 4 (3.4 and 3.5).
+
+    Parameters and errors are those of :func:`run_steps`; ``base_steps`` is what
+    :func:`run_base_steps` found by the same axes and criteria.
+    """
+    joints, base = base_steps.joints_in_camera, base_steps.joints_in_base
     diagnostics = joints.diagnostics
     if criteria == "default":
         wrong = find_misses(axes, measurements, joints, base)
@@ -129,18 +188,6 @@ def run_steps(
         platform_joints=platform,
         diagnostics=diagnostics + platform.diagnostics,
     )
-
-
-def place_cameras(
-    mechanism: NominalMechanism,
-    axes: LegAxes,
-    measurements: Measurements,
-    *,
-    criteria: Criteria = "default",
-) -> tuple[RigidTransform | None, ...]:
-    """Return T_Rb_camera of every view by steps 1 and 2 alone, as :func:`run_steps` does first."""
-    joints = locate_joints_in_cameras(mechanism, axes, measurements, criteria=criteria)
-    return locate_joints_in_base(mechanism, joints, criteria=criteria).T_Rb_camera
 
 
 def _describe_misses(

@@ -115,20 +115,7 @@ def build_closure(
 ) -> LeastSquares:
     """Build the closure of all legs without an S joint, unweighted: sin(angle - twist) = 0.
 
-    All are divided by one number.
-
-    Parameters
-    ----------
-    unknowns : PlatformUnknowns
-        Where turns of axes and twists stand; those of :func:`closure_unknowns` are looked for.
-    legs : tuple of LegGeometry
-        Legs with the axes that are known: revolute ones, and directions in the platform.
-    directions : LegDirections
-        Legs of each pose.
-    poses : PlatformPoses
-        Poses of the platform.
-    in_base : (n,) array of bool
-        Which legs stand in R_b.
+    All are divided by one number. The parameters are those of :func:`close_legs`.
 
     Returns
     -------

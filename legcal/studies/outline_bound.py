@@ -132,7 +132,7 @@ def _outline_rows(design: OutlineDesign) -> tuple[Array, Array]:
 
     The others are six motions of each camera, then the kinematic parameters, then the radii.
     """
-    truth = _numbers(design)
+    truth = _Numbers(design.legs, design.R, design.t, design.T_Rb_camera, design.radii)
     motions, unit = np.eye(6), np.eye(len(design.parametrization))
     of_poses = [partial(_with_poses, truth, motion) for motion in motions]
     of_others = [
@@ -162,16 +162,6 @@ class _Numbers:
     t: Array
     T_Rb_camera: Sequence[RigidTransform]
     radii: Mapping[tuple[int, str], float]
-
-
-def offsets_from(design: OutlineDesign, other: OutlineDesign) -> Array:
-    """Return how far (n, 2) [px] the ends of a design's outlines are from those of another."""
-    ends = design.camera.undistort(design.outlines.ends)
-    return _offsets(design, ends, _numbers(other))
-
-
-def _numbers(design: OutlineDesign) -> _Numbers:
-    return _Numbers(design.legs, design.R, design.t, design.T_Rb_camera, design.radii)
 
 
 def _with_poses(truth: _Numbers, motion: Array, size: float) -> _Numbers:

@@ -1,8 +1,8 @@
 """The images of a dataset as one table of outlines: detected, cached, given or edited.
 
-Detection has two passes: first the camera of every view is aligned on all of its images and
-the legs are searched in wide windows; once a fit has told where everything is, images that
-left doubts are searched again close to it.
+First the legs are recognised and the camera of every view is placed by its images, then outlines
+are measured near where that has them; once a fit has told where everything is, images that left
+doubts are searched again close to it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from legcal.detection.detect import (
     PIXEL_ERROR,
     Load,
     Method,
-    align_views,
     detect_outlines,
 )
 from legcal.detection.outline import OUTSIDE, outline_parts
-from legcal.errors import DatasetError
+from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.leg import Cylinder
 from legcal.mechanism.model import Mechanism
@@ -39,6 +38,7 @@ from legcal.observations.sets import (
     no_outlines,
 )
 from legcal.progress import Report
+from legcal.recognition.recognise import Search, recognise, shifted
 from legcal.workers import Run
 
 NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
@@ -47,7 +47,7 @@ NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 def detection_settings() -> dict[str, object]:
     """Return what detected outlines depend on besides the dataset: windows, and the code itself."""
     digest = hashlib.sha256()
-    for package in ("detection", "vision", "geometry"):
+    for package in ("recognition", "detection", "vision", "geometry"):
         for source in sorted(files(f"legcal.{package}").iterdir(), key=lambda source: source.name):
             if source.name.endswith(".py"):
                 digest.update(source.read_bytes())
@@ -64,11 +64,14 @@ class Scene:
         Joint centres at every row [m].
     T_base_camera : tuple of RigidTransform or None
         The camera of every view; None where nothing is known.
+    joint_error : float or (n_views, n_legs) array
+        How far joint centres may be off in the images of a view [m].
     """
 
     A_base: Array
     B_base: Array
     T_base_camera: tuple[RigidTransform | None, ...]
+    joint_error: float | Array = JOINT_ERROR
 
 
 def scene_at_poses(
@@ -164,33 +167,86 @@ def doubtful_rows(photographs: Photographs, outlines: Outlines) -> IntArray:
     return np.intersect1d(photographs.detect, outlines.row[unused])
 
 
-def align(photographs: Photographs, scene: Scene, report: Report) -> Scene:
-    """Return the scene with the camera of every searched view aligned on its images.
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """What the images say of where everything is.
 
-    Raises
-    ------
-    DatasetError
-        If a view that must be searched has no rough camera pose.
-    NotVisible
-        If the images of a view do not show the legs where they should be.
+    Attributes
+    ----------
+    scene : Scene
+        With the camera of every searched view where its images put it, and joint centres where
+        the view sees them.
+    unplaced : dict of str
+        Why views could not be placed, by name.
+    notes : tuple of str
+        What else a reader should know.
     """
-    hints = _hints(photographs, scene)
-    poses = align_views(
+
+    scene: Scene
+    unplaced: dict[str, str]
+    notes: tuple[str, ...]
+
+    def require_one(self) -> None:
+        """Refuse images of which no view could be placed.
+
+        Raises
+        ------
+        NotVisible
+            One sentence for each view.
+        """
+        if self.unplaced and all(T is None for T in self.scene.T_base_camera):
+            raise NotVisible(list(dict.fromkeys(self.unplaced.values())))
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """What a reader should know, with the views that could not be placed."""
+        return (*dict.fromkeys(self.unplaced.values()), *self.notes)
+
+
+def place(
+    photographs: Photographs,
+    scene: Scene,
+    report: Report,
+    joined: Sequence[RigidTransform | None] | None = None,
+) -> Placement:
+    """Recognise the legs in the images, and place the cameras by them.
+
+    Parameters
+    ----------
+    photographs : Photographs
+        The images.
+    scene : Scene
+        The model, and rough camera poses where there are any.
+    report : callable
+        Called as ``report(stage, done, total)``.
+    joined : sequence of RigidTransform or None, for each view
+        T_board_camera of the views that show a calibration board: they are placed together.
+    """
+    search = Search(
         photographs.load,
-        photographs.searched,
+        photographs.measurements,
         scene.A_base,
         scene.B_base,
         photographs.cylinders,
-        hints,
         photographs.wanted,
-        run=photographs.run,
-        progress=_counted(report, "Aligning cameras", len(photographs.detect)),
     )
-    known = [
-        aligned if hint is not None else None
-        for aligned, hint in zip(poses, scene.T_base_camera, strict=True)
-    ]
-    return replace(scene, T_base_camera=tuple(known))
+    found = recognise(
+        search,
+        photographs.detect,
+        scene.T_base_camera,
+        joined,
+        run=photographs.run,
+        progress=_counted(report, "Recognising legs", len(photographs.detect)),
+    )
+    views = photographs.measurements.views
+    A, B = shifted(found, photographs.measurements.view, scene.A_base, scene.B_base)
+    searched = set(photographs.measurements.view[photographs.detect].tolist())
+    cameras = tuple(
+        T if v in searched else rough
+        for v, (T, rough) in enumerate(zip(found.T_base_camera, scene.T_base_camera, strict=True))
+    )
+    unplaced = {views[v].name: why for v, why in found.unplaced.items()}
+    return Placement(Scene(A, B, cameras, found.joint_error), unplaced, found.notes)
 
 
 def detect(
@@ -210,13 +266,13 @@ def detect(
         scene.A_base,
         scene.B_base,
         photographs.cylinders,
-        _hints(photographs, scene),
+        scene.T_base_camera,
         photographs.wanted,
         photographs.mechanism.leg_names,
         run=photographs.run,
         method=method,
         progress=_counted(report, stage, len(photographs.detect)),
-        joint_error=0.0 if near_fit else JOINT_ERROR,
+        joint_error=0.0 if near_fit else scene.joint_error,
         pixel_error=NEAR_FIT_PX if near_fit else PIXEL_ERROR,
     )
     return given_outlines(photographs, found)
@@ -229,22 +285,8 @@ def given_outlines(photographs: Photographs, found: Outlines | None = None) -> O
     return join_outlines([merge_edited(detected, kept), choose_outlines(kept, ~is_edited(kept))])
 
 
-def _hints(photographs: Photographs, scene: Scene) -> list[RigidTransform]:
-    """Return a camera pose for every view; only views that are not searched may lack one."""
-    searched = set(photographs.measurements.view[photographs.detect].tolist())
-    problems = [
-        f"view {view.name}: its images could not be searched: found no T_base_camera, needed the "
-        "camera pose in the base link to about 2 cm and 2 degrees; add it to dataset.yaml."
-        for v, view in enumerate(photographs.measurements.views)
-        if v in searched and scene.T_base_camera[v] is None
-    ]
-    if problems:
-        raise DatasetError(problems)
-    return [T if T is not None else RigidTransform.identity() for T in scene.T_base_camera]
-
-
 def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:
-    """Return a callback that counts images."""
+    """Return a callback that counts images, up to a total that may not be reached."""
     done = itertools.count(1)
     report(stage, 0, total)
-    return lambda row: report(stage, next(done), total)
+    return lambda row: report(stage, min(next(done), total), total)

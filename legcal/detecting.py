@@ -1,0 +1,147 @@
+"""Detection without a fit: what the images of a dataset show, for people to look at.
+
+The cameras are placed and the outlines measured as :func:`legcal.calibrate` does first. Nothing is
+written beside the dataset.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from legcal.board_views import base_of_board, observe_board
+from legcal.dataset.folder import Dataset, load_dataset
+from legcal.errors import DatasetError
+from legcal.geometry.types import IntArray
+from legcal.observations.canonical_order import inverse, restore_outlines
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import reject_unused_legs
+from legcal.overlays.detected import Detection
+from legcal.overlays.folder import DETECTION, check_detection_destination, write_detection
+from legcal.photographs import Placement, given_outlines, place, scene_at_poses
+from legcal.photographs import detect as search
+from legcal.progress import Report, no_progress
+from legcal.refinement.choices import Choices
+from legcal.report.destination import output_path
+from legcal.workers import worker_pool
+from legcal.workpiece import Workpiece, workpiece
+
+
+def detect(
+    source: str | Path | Dataset,
+    *,
+    output: str | Path | None = None,
+    progress: Report = no_progress,
+    workers: int = 1,
+) -> Detection:
+    """Find and measure the outlines of the legs in all images, without a fit.
+
+    Parameters
+    ----------
+    source : path or Dataset
+        The dataset folder, or what :func:`legcal.load_dataset` returned. Outlines that were given
+        or edited are taken as they are; those that an earlier run left beside it are not.
+    output : path, optional
+        Write a folder there: ``observations.csv``, ``index.html`` and each image with what was
+        found in it.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+    workers : int
+        Search and draw the images in that many processes, as :func:`legcal.calibrate` does.
+
+    Returns
+    -------
+    Detection
+        With views in ``unplaced`` whose images do not show the legs where they should be.
+
+    Raises
+    ------
+    DatasetError, ModelError, OutOfClass
+        If the input is malformed or not covered, or has no images.
+    NotVisible
+        If the images do not show the calibration board that they should.
+    NotIdentifiable
+        If the motors do not determine where the legs are.
+    UsageError
+        If ``output`` holds something else, or a table of an earlier detection that was corrected.
+    """
+    if output is not None:
+        folder = source.folder if isinstance(source, Dataset) else _folder(Path(source))
+        check_detection_destination(output_path(output, DETECTION), folder)
+    dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    rows = _rows_with_image(dataset)
+    with worker_pool(workers) as run:
+        work = workpiece(dataset, run, None, Choices(), use_cache=False)
+        outlines, placement = _observed(work, progress)
+        detection = _in_file_order(work, rows, outlines, placement)
+        if output is not None:
+            write_detection(detection, Path(output), run, progress)
+    return detection
+
+
+def _folder(path: Path) -> Path:
+    """Return the folder of a dataset that is named by it or by its ``dataset.yaml``."""
+    return path if path.is_dir() else path.parent
+
+
+def _rows_with_image(dataset: Dataset) -> IntArray:
+    """Return the rows that have an image file; refuse a dataset without any."""
+    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
+    rows = [row for row, path in enumerate(paths) if path is not None and os.path.exists(path)]
+    if dataset.axes is not None or not rows:
+        found = "a table of axes" if dataset.axes is not None else "no image"
+        raise DatasetError(
+            f"{dataset.table_path}: the images could not be searched: found {found}, needed images "
+            "of the legs; name them in the table of measurements."
+        )
+    return np.array(rows, dtype=np.intp)
+
+
+def _observed(work: Workpiece, progress: Report) -> tuple[Outlines, Placement]:
+    """Return all outlines, and where the images put the cameras."""
+    photographs = work.photographs
+    scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
+    board = observe_board(work, progress)
+    if board is not None:
+        T_base_board = base_of_board(work, board, scene.T_base_camera)
+        if T_base_board is not None:
+            cameras = board.cameras(T_base_board, scene.T_base_camera)
+            scene = replace(scene, T_base_camera=cameras)
+    if len(photographs.detect) == 0:
+        return given_outlines(photographs), Placement(scene, {}, ())
+    joined = None if board is None else board.T_board_camera
+    placement = place(photographs, scene, progress, joined)
+    view = work.measurements.view[photographs.detect]
+    placed = np.array([placement.scene.T_base_camera[v] is not None for v in view.tolist()])
+    photographs = replace(photographs, detect=photographs.detect[placed])
+    found = search(photographs, placement.scene, progress)
+    # Legs of a view that could not be placed are drawn where its rough pose has them.
+    drawn = tuple(
+        T if T is not None else rough
+        for T, rough in zip(placement.scene.T_base_camera, scene.T_base_camera, strict=True)
+    )
+    scene = replace(placement.scene, T_base_camera=drawn)
+    return found, replace(placement, scene=scene)
+
+
+def _in_file_order(
+    work: Workpiece, images: IntArray, outlines: Outlines, placement: Placement
+) -> Detection:
+    """Return what was found in the order of the files."""
+    dataset, order, scene = work.dataset, work.order, placement.scene
+    rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
+    restored = restore_outlines(outlines, order)
+    names = dataset.mechanism.leg_names
+    return Detection(
+        dataset=dataset,
+        outlines=reject_unused_legs(restored, dataset.measurements, names),
+        A_base=scene.A_base[rows][:, legs],
+        B_base=scene.B_base[rows][:, legs],
+        T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
+        rows=images,
+        unplaced=placement.unplaced,
+        notes=(*dataset.notes, *placement.notes, *work.reached.notes(work.measurements)),
+    )

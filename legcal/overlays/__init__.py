@@ -1,0 +1,1 @@
+"""What detection found, drawn over the images and summed up, for people."""

@@ -1,0 +1,332 @@
+"""How well camera poses agree with the bars of a picture, and the step that improves them.
+
+Thousands of poses are judged at once. A piece of a leg agrees with a bar that lies along its
+predicted axis, is as wide as its radius and distance demand, and covers it; the best bar of each
+piece counts. One Gauss-Newton step moves every pose towards the bars that agree with it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from legcal.geometry.types import Array, IntArray
+from legcal.recognition.bars import Bars
+from legcal.recognition.targets import Targets
+
+NEAREST = 0.02  # depth of the nearest point of a leg [m]
+WIDTH_ERROR = 0.08  # of a bar and of what is predicted: relative, one standard deviation
+WIDTH_PIXELS = 1.0  # and of a bar in its pixels
+WIDTH_REACH = 2.5  # standard deviations
+INSIDE = 0.8  # share of a bar that should lie along the leg
+CHUNK = 128  # poses judged together
+DAMPING = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])  # precision that a step is given
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Camera poses T_camera_base.
+
+    Attributes
+    ----------
+    R : (n, 3, 3) array
+        Rotations.
+    t : (n, 3) array
+        Translations [m].
+    shift : (n, n_legs, 2, 3) array
+        Where A and B of each leg are, against where the model has them, in the base link [m].
+    """
+
+    R: Array
+    t: Array
+    shift: Array
+
+    @classmethod
+    def rigid(cls, R: Array, t: Array, n_legs: int) -> "Poses":
+        """Return poses at which all legs are where the model has them."""
+        return cls(R, t, np.zeros((len(R), n_legs, 2, 3)))
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.R)
+
+    def take(self, chosen: IntArray) -> "Poses":
+        """Return some of the poses."""
+        return Poses(self.R[chosen], self.t[chosen], self.shift[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What is known of a picture: its bars, and the legs that it may show.
+
+    Attributes
+    ----------
+    bars : Bars
+        Candidate cylinders.
+    targets : Targets
+        Pieces of legs at its reading.
+    corners : (2, 2) array
+        Least and greatest x and y of the sensor plane that it shows.
+    R, t : (3, 3) and (3,) array
+        Its camera frame, where poses are those of another frame that is fixed to it:
+        X_camera = R X + t.
+    """
+
+    bars: Bars
+    targets: Targets
+    corners: Array
+    R: Array = field(default_factory=lambda: np.eye(3))
+    t: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How poses agree with a picture.
+
+    Attributes
+    ----------
+    value : (n_poses, n_targets) array
+        Agreement of each piece, 0 to 1: how well, times how much of its visible length.
+    bar : (n_poses, n_targets) array of int
+        The bar that agrees best.
+    visible : (n_poses, n_targets) array
+        Share of each piece that is inside the picture.
+    """
+
+    value: Array
+    bar: IntArray
+    visible: Array
+
+
+def agreement(picture: Picture, poses: Poses, tolerance: float) -> Agreement:
+    """Judge poses by a picture.
+
+    Parameters
+    ----------
+    picture : Picture
+        Its bars and targets.
+    poses : Poses
+        Camera poses.
+    tolerance : float
+        Distance of an axis from a bar at which they agree no longer, on the sensor plane.
+    """
+    n, n_targets = len(poses), len(picture.targets)
+    if n == 0 or n_targets == 0 or len(picture.bars) == 0:
+        visible = _in_picture(picture, poses)[3] if n and n_targets else np.zeros((n, n_targets))
+        return Agreement(np.zeros((n, n_targets)), np.zeros((n, n_targets), np.intp), visible)
+    parts = [
+        _judge(picture, poses.take(np.arange(k, min(k + CHUNK, len(poses)))), tolerance)
+        for k in range(0, len(poses), CHUNK)
+    ]
+    value, bar, visible = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return Agreement(value, bar, visible)
+
+
+def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Array]:
+    """Return ends X (n, T, 2, 3) [m], points (n, T, 2, 2), widths (n, T, 2), and what is shown."""
+    targets = picture.targets
+    ends = np.broadcast_to(targets.ends, (len(poses), *targets.ends.shape))
+    if np.any(poses.shift):
+        of_leg = poses.shift[:, targets.leg]  # (n, T, 2, 3)
+        at = targets.place[:, :, None]
+        ends = ends + (1.0 - at) * of_leg[:, :, :1] + at * of_leg[:, :, 1:]
+    n_ends = 2 * len(targets)
+    R, t = _of_camera(picture, poses)
+    X = ends.reshape(-1, n_ends, 3) @ R.swapaxes(1, 2) + t[:, None, :]
+    X = X.reshape(-1, len(targets), 2, 3)
+    z = np.maximum(X[..., 2:], NEAREST)
+    xy = X[..., :2] / z
+    normal = np.cross(X[:, :, 0], X[:, :, 1])
+    flat = np.linalg.norm(normal[..., :2], axis=-1) / (np.linalg.norm(normal, axis=-1) + 1e-12)
+    width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
+    front = (X[..., 2] > NEAREST).all(axis=-1)
+    return X, xy, width, np.where(front, _shown(xy, picture.corners), 0.0)
+
+
+def _of_camera(picture: Picture, poses: Poses) -> tuple[Array, Array]:
+    """Return the poses of the picture's own camera frame: rotations and translations."""
+    return picture.R @ poses.R, poses.t @ picture.R.T + picture.t
+
+
+def _shown(xy: Array, corners: Array) -> Array:
+    """Return the share of segments xy (..., 2, 2) that lies within a rectangle, (...)."""
+    start, step = xy[..., 0, :], xy[..., 1, :] - xy[..., 0, :]
+    safe = np.where(np.abs(step) > 1e-9, step, 1e-9)
+    one, two = (corners[0] - start) / safe, (corners[1] - start) / safe
+    enter = np.minimum(one, two).max(axis=-1)
+    leave = np.maximum(one, two).min(axis=-1)
+    return np.asarray(np.clip(np.minimum(leave, 1.0) - np.maximum(enter, 0.0), 0.0, 1.0))
+
+
+def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, IntArray, Array]:
+    """Return value, bar and visible of :class:`Agreement`."""
+    bars = picture.bars
+    _, xy, width, visible = _in_picture(picture, poses)
+    xy, width = xy.astype(np.float32), width.astype(np.float32)
+    frame = np.concatenate([bars.along, bars.normal]).T.astype(np.float32)  # (2, 2 n_bars)
+    own = np.concatenate(
+        [np.sum(bars.middle * bars.along, axis=1), np.sum(bars.middle * bars.normal, axis=1)]
+    ).astype(np.float32)
+    place = xy @ frame - own
+    n = len(bars)
+    a0, a1 = place[:, :, 0, :n], place[:, :, 1, :n]
+    o0, o1 = place[:, :, 0, n:], place[:, :, 1, n:]
+    half = bars.half_length.astype(np.float32)
+    run = a1 - a0
+    run = np.where(np.abs(run) < 1e-6, np.float32(1e-6), run)
+    slope = (o1 - o0) / run
+    gap = np.abs(o0 - slope * a0) + np.abs(slope) * half
+    value = np.maximum(1.0 - (gap / np.float32(tolerance)) ** 2, 0.0)
+    w0, w1 = width[:, :, 0, None], width[:, :, 1, None]
+    expected = np.maximum(w0 - (w1 - w0) * a0 / run, np.float32(1e-6))
+    seen = bars.width.mean(axis=1).astype(np.float32)
+    sigma = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen).astype(np.float32)
+    pull = np.log(expected / seen) / (np.float32(WIDTH_REACH) * sigma)
+    value *= np.maximum(1.0 - pull**2, 0.0)
+    overlap = np.minimum(half, np.maximum(a0, a1)) - np.maximum(-half, np.minimum(a0, a1))
+    overlap = np.maximum(overlap, 0.0)
+    value *= np.minimum(overlap / (np.float32(2.0 * INSIDE) * half), 1.0)
+    length = np.abs(run) * np.maximum(visible, 0.05)[..., None].astype(np.float32)
+    value *= np.minimum(overlap / length, 1.0)
+    best = np.argmax(value, axis=2)
+    found = np.take_along_axis(value, best[..., None], axis=2)[..., 0]
+    return np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible
+
+
+def improved(
+    pictures: Sequence[Picture],
+    poses: Poses,
+    agreements: Sequence[Agreement],
+    tolerance: float,
+    joint_error: float = 0.0,
+) -> Poses:
+    """Return poses after one Gauss-Newton step towards the bars that agree with them.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        Some pictures of one camera.
+    poses : Poses
+        Camera poses.
+    agreements : sequence of Agreement
+        Of these poses with each picture.
+    tolerance : float
+        As for :func:`agreement`.
+    joint_error : float
+        Standard deviation of the joint centres of the model [m]; 0 to leave them in place.
+    """
+    n, n_legs = poses.shift.shape[:2]
+    H, b = np.tile(np.diag(DAMPING), (n, 1, 1)), np.zeros((n, 6))
+    H_leg, H_cross = np.zeros((n, n_legs, 6, 6)), np.zeros((n, n_legs, 6, 6))
+    b_leg = np.zeros((n, n_legs, 6))
+    for picture, found in zip(pictures, agreements, strict=True):
+        if len(picture.bars) == 0 or len(picture.targets) == 0:
+            continue
+        J, J_leg, residual, weight = _equations(picture, poses, found, tolerance)
+        weighted = J * weight[..., None]
+        H += np.einsum("ntri,ntrj->nij", weighted, J)
+        b -= np.einsum("ntri,ntr->ni", weighted, residual)
+        if joint_error > 0.0:
+            weighted_leg = J_leg * weight[..., None]
+            of_leg = np.eye(n_legs)[picture.targets.leg]  # (T, n_legs)
+            H_leg += np.einsum("ntri,ntrj,tl->nlij", weighted_leg, J_leg, of_leg, optimize=True)
+            H_cross += np.einsum("ntri,ntrj,tl->nlij", weighted, J_leg, of_leg, optimize=True)
+            b_leg -= np.einsum("ntri,ntr,tl->nli", weighted_leg, residual, of_leg, optimize=True)
+    if joint_error == 0.0:
+        return _moved(poses, np.linalg.solve(H, b[..., None])[..., 0], poses.shift)
+    H_leg += np.eye(6) / joint_error**2
+    b_leg -= poses.shift.reshape(n, n_legs, 6) / joint_error**2
+    back = np.linalg.solve(H_leg, np.concatenate([H_cross.swapaxes(2, 3), b_leg[..., None]], -1))
+    H -= np.einsum("nlij,nljk->nik", H_cross, back[..., :6])
+    b -= np.einsum("nlij,nlj->ni", H_cross, back[..., 6])
+    xi = np.linalg.solve(H, b[..., None])[..., 0]
+    change = back[..., 6] - np.einsum("nlij,nj->nli", back[..., :6], xi)
+    return _moved(poses, xi, poses.shift + change.reshape(poses.shift.shape))
+
+
+def _equations(
+    picture: Picture, poses: Poses, found: Agreement, tolerance: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return what each piece demands: three equations, two of its line and one of its width.
+
+    Derivatives (n, T, 3, 6) by the motion of the camera, and by shifts of A and B of the leg;
+    residuals and weights (n, T, 3).
+    """
+    bars, place = picture.bars, picture.targets.place
+    X, xy, width, _ = _in_picture(picture, poses)
+    along, across = bars.along[found.bar], bars.normal[found.bar]
+    to_ends = xy - bars.middle[found.bar][:, :, None, :]
+    a = np.einsum("ntkx,ntx->ntk", to_ends, along)
+    o = np.einsum("ntkx,ntx->ntk", to_ends, across)
+    run = a[..., 1] - a[..., 0]
+    run = np.where(np.abs(run) < 1e-6, 1e-6, run)
+    half = bars.half_length[found.bar]
+    z = np.maximum(X[..., 2], NEAREST)
+    g = np.concatenate(
+        [
+            np.broadcast_to(across[:, :, None, :], xy.shape),
+            -np.einsum("ntkx,ntx->ntk", xy, across)[..., None],
+        ],
+        axis=-1,
+    )
+    g = g / z[..., None]  # derivative of the offset of each end, (n, T, 2, 3)
+    shares = np.stack([(-half - a[..., 0]) / run, (half - a[..., 0]) / run], axis=-1)
+    parts = np.stack([1.0 - shares, shares], axis=-1)  # (n, T, 2 places, 2 ends)
+    residual = np.einsum("ntpe,nte->ntp", parts, o)
+    share = -a[..., 0] / run
+    expected = np.maximum(width[..., 0] + (width[..., 1] - width[..., 0]) * share, 1e-6)
+    seen = bars.width.mean(axis=1)[found.bar]
+    P = (1.0 - share)[..., None] * X[:, :, 0] + share[..., None] * X[:, :, 1]
+    of_depth = np.zeros_like(P)
+    of_depth[..., 2] = -1.0 / np.maximum(P[..., 2], NEAREST)
+    # Derivatives (n, T, 3, 2, 3) of the three residuals by the two ends in the camera frame.
+    D = np.empty((*P.shape[:2], 3, 2, 3))
+    D[:, :, :2] = parts[..., None] * g[:, :, None]
+    D[:, :, 2, 0] = (1.0 - share)[..., None] * of_depth
+    D[:, :, 2, 1] = share[..., None] * of_depth
+    D = D @ picture.R  # by the ends in the frame of the poses
+    X = (X - picture.t) @ picture.R
+    turning = np.cross(X[:, :, None], D).sum(axis=3)
+    J = np.concatenate([turning, D.sum(axis=3)], axis=-1)
+    in_base = D @ poses.R[:, None, None]
+    at = place[:, None, :, None]  # (T, 1, 2, 1)
+    J_leg = np.concatenate(
+        [((1.0 - at) * in_base).sum(axis=3), (at * in_base).sum(axis=3)], axis=-1
+    )
+    sigma_width = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen)
+    line = found.value / (tolerance / 3.0) ** 2
+    return (
+        J,
+        J_leg,
+        np.concatenate([residual, np.log(expected / seen)[..., None]], axis=-1),
+        np.stack([line, line, found.value / sigma_width**2], axis=-1),
+    )
+
+
+def distances(picture: Picture, poses: Poses, found: Agreement) -> Array:
+    """Return how far pieces are from the bars that agree with them, (n_poses, n_targets) [m].
+
+    Sideways, at the ends of the bars and at the depth of the pieces.
+    """
+    _, _, residual, _ = _equations(picture, poses, found, 1.0)
+    X, _, _, _ = _in_picture(picture, poses)
+    return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
+
+
+def _moved(poses: Poses, xi: Array, shift: Array) -> Poses:
+    """Return poses moved by rotation vectors and translations in their frame, (n, 6)."""
+    angle = np.linalg.norm(xi[:, :3], axis=1)
+    xi = xi * np.minimum(1.0, 0.5 / np.maximum(angle, 1e-12))[:, None]
+    turn = _rotations(xi[:, :3])
+    t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]
+    return Poses(turn @ poses.R, t, shift)
+
+
+def _rotations(vectors: Array) -> Array:
+    """Return the rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    x, y, z = (vectors / np.maximum(angle, 1e-12)[:, None]).T
+    zero = np.zeros_like(x)
+    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
+    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.asarray(np.eye(3) + s * K + (1.0 - c) * (K @ K))

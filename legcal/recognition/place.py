@@ -1,0 +1,245 @@
+"""The camera pose on which all pictures of a view agree, and what comes close to it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry.types import Array, IntArray
+from legcal.recognition.agreement import Agreement, Picture, Poses, agreement, distances, improved
+from legcal.recognition.starts import joined, pose_starts
+
+TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis, on the sensor plane
+JOINT_ERROR = 0.01  # standard deviation of the joint centres of the nominal model [m]
+START_PICTURES, MOST_START_PICTURES = 2, 8  # whose bars suggest poses: at once, at most
+KEPT = (500, 40, 10)  # of the starts of a picture, of its refined ones, of all
+SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
+SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
+MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
+CLEAR_SUPPORT, CLEAR_LEAD = 0.35, 1.6  # share of the expected legs, against the next pose: no doubt
+ENOUGH_SUPPORT, ENOUGH_LEAD = 0.2, 1.25  # the same, to be believed at all
+LEAST_SUPPORT = 1.6  # legs in all images together
+NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
+FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Poses of a camera, best first, each with other legs on other bars than the better ones.
+
+    Attributes
+    ----------
+    poses : Poses
+        T_camera_base.
+    support : (n, n_pictures) array
+        How many legs agree in each picture, weighted by how well and how much of them.
+    expected : (n, n_pictures) array
+        How many legs each picture would show.
+    leg_error : (n_legs,) array
+        Root mean square distance of the legs from their bars at the first pose [m]; infinite for
+        legs without any.
+    hinted : bool
+        Whether the pose was searched for near a rough one only.
+    """
+
+    poses: Poses
+    support: Array
+    expected: Array
+    leg_error: Array
+    hinted: bool = False
+
+    @property
+    def needed(self) -> float:
+        """How many legs must agree in a picture on average for a pose to be believed."""
+        n = self.support.shape[1]
+        return float(max(ENOUGH_SUPPORT * self.expected[0].mean(), LEAST_SUPPORT / n))
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether enough legs agree with the first pose."""
+        return len(self.poses) > 0 and float(self.support[0].mean()) >= self.needed
+
+    @property
+    def lead(self) -> float:
+        """Support of the first pose against that of the second one."""
+        if len(self.poses) < 2:
+            return float("inf")
+        return float(self.support[0].sum() / max(self.support[1].sum(), 1e-9))
+
+    @property
+    def is_convincing(self) -> bool:
+        """Whether the first pose is to be believed."""
+        return self.is_enough and (self.hinted or self.lead >= ENOUGH_LEAD)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the first pose leaves no doubt, so that no further search is needed."""
+        if not self.is_enough:
+            return False
+        share = float(self.support[0].sum() / self.expected[0].sum())
+        return share >= CLEAR_SUPPORT and (self.hinted or self.lead >= CLEAR_LEAD)
+
+    def pose(self, i: int = 0) -> RigidTransform:
+        """Return T_base_camera of a pose."""
+        R = Rotation.from_matrix(self.poses.R[i])
+        return RigidTransform.from_components(self.poses.t[i], R).inv()
+
+
+def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
+    """Return the camera poses on which most legs of all pictures of a view agree.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        Of one camera pose, at different readings.
+    n_legs : int
+        Number of legs of the machine.
+    """
+    order = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
+    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
+    best = _judged(pictures, nothing)
+    for first in range(0, min(len(order), MOST_START_PICTURES), START_PICTURES):
+        starts = [_starts(pictures[k], n_legs) for k in order[first : first + START_PICTURES]]
+        poses = joined([best.poses, *starts])
+        if len(poses) == 0:
+            continue
+        few = [pictures[k] for k in order[: first + START_PICTURES]]
+        poses = _refined(few, poses, TOLERANCES[2:4], JOINT_ERROR)
+        score = _support(pictures, poses, TOLERANCES[3])[0].sum(axis=1)
+        poses = poses.take(_distinct(poses, score, KEPT[2]))
+        poses = _refined(pictures, poses, (*TOLERANCES[3:], *TOLERANCES[-2:]), JOINT_ERROR)
+        best = _judged(pictures, poses)
+        if best.is_clear:
+            break
+    return best
+
+
+def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int) -> Placed:
+    """Return the camera pose near a rough one on which the pictures of a view agree.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        Of one camera pose, at different readings.
+    T_base_camera : RigidTransform
+        The rough pose.
+    n_legs : int
+        Number of legs of the machine.
+    """
+    T = T_base_camera.inv()
+    turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
+    poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
+    poses = _refined(pictures, poses, TOLERANCES[:3])
+    poses = _refined(pictures, poses, (*TOLERANCES[2:], *TOLERANCES[-2:]), JOINT_ERROR)
+    found = _judged(pictures, poses)
+    return replace(found, hinted=True)
+
+
+def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
+    """Return poses with their support, best first, without those that say the same."""
+    n_legs = poses.shift.shape[1]
+    if len(poses) == 0:
+        empty = np.zeros((0, len(pictures)))
+        return Placed(poses, empty, empty, np.full(n_legs, np.inf))
+    found = [agreement(picture, poses, TOLERANCES[-1]) for picture in pictures]
+    values = [_one_bar_each(one) for one in found]
+    shares = [picture.targets.share for picture in pictures]
+    support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
+    expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
+    matches = np.concatenate(
+        [np.where(v >= MATCHED, f.bar, -1) for v, f in zip(values, found, strict=True)], axis=1
+    )
+    kept: list[int] = []
+    for i in np.argsort(-support.sum(axis=1), kind="stable").tolist():
+        mine = matches[i] >= 0
+        least = max(1, int(np.count_nonzero(mine)))
+        common = [int(np.count_nonzero((matches[i] == matches[k]) & mine)) / least for k in kept]
+        if max(common, default=0.0) < SAME_MATCHES:
+            kept.append(i)
+    order = np.array(kept, dtype=np.intp)
+    best = poses.take(order[:1])
+    return Placed(poses.take(order), support[order], expected[order], _leg_error(pictures, best))
+
+
+def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
+    """Return the root mean square distance (n_legs,) of legs from their bars [m]."""
+    n_legs = pose.shift.shape[1]
+    square, count = np.zeros(n_legs), np.zeros(n_legs)
+    for picture in pictures:
+        if len(picture.bars) == 0 or len(picture.targets) == 0:
+            continue
+        found = agreement(picture, pose, TOLERANCES[-1])
+        matched = _one_bar_each(found)[0] >= MATCHED
+        distance = distances(picture, pose, found)[0]
+        np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
+        np.add.at(count, picture.targets.leg[matched], 1.0)
+    error = np.sqrt(square / np.maximum(count, 1.0))
+    error = np.where(count < FEW_MATCHES, np.maximum(error, FEW_ERROR), error)
+    return np.where(count > 0, error, np.inf)
+
+
+def _starts(picture: Picture, n_legs: int) -> Poses:
+    """Return the poses that suit a picture best, among those that two of its bars suggest."""
+    poses = pose_starts(picture, n_legs)
+    if len(poses) == 0:
+        return poses
+    poses = poses.take(_best(_support([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
+    poses = _refined([picture], poses, TOLERANCES[:3])
+    score = _support([picture], poses, TOLERANCES[2])[0].sum(axis=1)
+    return poses.take(_distinct(poses, score, KEPT[1]))
+
+
+def _merit(picture: Picture) -> float:
+    return float(picture.bars.merit[:8].sum()) if len(picture.bars) else 0.0
+
+
+def _refined(
+    pictures: Sequence[Picture],
+    poses: Poses,
+    tolerances: Sequence[float],
+    joint_error: float = 0.0,
+) -> Poses:
+    for tolerance in tolerances:
+        found = [agreement(picture, poses, tolerance) for picture in pictures]
+        poses = improved(pictures, poses, found, tolerance, joint_error)
+    return poses
+
+
+def _support(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
+    """Return the support and the expected number of legs, both (n_poses, n_pictures)."""
+    support, expected = [], []
+    for picture in pictures:
+        found = agreement(picture, poses, tolerance)
+        support.append(_one_bar_each(found) @ picture.targets.share)
+        expected.append(found.visible @ picture.targets.share)
+    return np.stack(support, axis=1), np.stack(expected, axis=1)
+
+
+def _one_bar_each(found: Agreement) -> Array:
+    """Return the agreement of pieces, where a bar counts for the piece that it suits best."""
+    same = found.bar[:, :, None] == found.bar[:, None, :]
+    better = found.value[:, None, :] > found.value[:, :, None]
+    return np.where(np.any(same & better, axis=2), 0.0, found.value)
+
+
+def _best(score: Array, n: int) -> IntArray:
+    return np.argsort(-score, kind="stable")[:n]
+
+
+def _distinct(poses: Poses, score: Array, n: int) -> IntArray:
+    """Return the best poses that differ from better ones."""
+    kept: list[int] = []
+    distance = np.linalg.norm(poses.t, axis=1)
+    for i in np.argsort(-score, kind="stable").tolist():
+        if len(kept) == n:
+            break
+        if kept:
+            trace = np.einsum("kij,ij->k", poses.R[kept], poses.R[i])
+            turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+            apart = np.linalg.norm(poses.t[kept] - poses.t[i], axis=1)
+            if np.any((turn < SAME_TURN) & (apart < SAME_PLACE * distance[i])):
+                continue
+        kept.append(i)
+    return np.array(kept, dtype=np.intp)

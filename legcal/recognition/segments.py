@@ -1,0 +1,150 @@
+"""Straight edges of a picture on the sensor plane, those of one line joined.
+
+OpenCV's line segment detector finds pieces of straight edges. A leg that another one crosses, a
+highlight or noise cut an edge into several; pieces that continue each other are joined here. Ends
+are taken to the undistorted sensor plane before, where edges of legs are straight.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from legcal.detection.picture import Grey, reduce
+from legcal.geometry.types import Array, IntArray
+from legcal.vision.camera import Camera
+
+LONG_SIDE = 480  # of the reduced picture at least [px]
+LARGEST_FACTOR = 4  # by which a picture is reduced: legs are 12 px wide and more
+SHORTEST = 7.0  # of a piece [reduced px]
+LEAST_LENGTH = 14.0  # of a joined edge [reduced px]
+ASIDE = 1.6  # of the ends of a piece from the line that it continues [reduced px]
+TURN = np.deg2rad(4.0)  # between pieces of one edge
+GAP = 3.0  # between them, in lengths of the shorter one
+DARK = 1.0 / 30.0  # part of the brightest light
+MOST = 400  # pieces of a picture, longest first
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Straight edges.
+
+    Attributes
+    ----------
+    ends : (n, 2, 2) array
+        Both ends on the sensor plane. On the way from the first to the second the picture is
+        brighter on the left-hand side, as one sees it: in the direction (dy, -dx).
+    covered : (n,) array
+        Share of the length on which the edge was seen.
+    pixel : float
+        Size of a pixel of the reduced picture on the sensor plane.
+    """
+
+    ends: Array
+    covered: Array
+    pixel: float
+
+    def __len__(self) -> int:
+        """Return the number of edges."""
+        return len(self.ends)
+
+
+def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> Segments:
+    """Return the straight edges of a picture.
+
+    Parameters
+    ----------
+    grey : Grey
+        The picture.
+    camera : Camera
+        Its camera.
+    long_side : int
+        The picture is reduced by the largest whole factor that leaves its longer side this long.
+    """
+    factor = int(np.clip(max(grey.shape) // long_side, 1, LARGEST_FACTOR))
+    pieces = _pieces(reduce(grey, factor))
+    focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
+    pixel = factor / focal
+    if len(pieces) == 0:
+        return Segments(np.zeros((0, 2, 2)), np.zeros(0), pixel)
+    ends = camera.undistort((pieces.reshape(-1, 2) + 0.5) * factor - 0.5).reshape(-1, 2, 2)
+    ends, covered = _join(ends / pixel)
+    return Segments(ends * pixel, covered, pixel)
+
+
+def _pieces(small: Grey) -> Array:
+    """Return pieces of edges (n, 2, 2) in a reduced picture [px]."""
+    levels = _stretched(small)
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, 1.0)  # reduced enough already
+    lines = detector.detect(levels)[0]
+    if lines is None:
+        return np.zeros((0, 2, 2))
+    pieces = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 2) - 0.5
+    length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
+    order = np.argsort(-length, kind="stable")[:MOST]
+    return np.asarray(pieces[order[length[order] >= SHORTEST]])
+
+
+def _stretched(small: Grey) -> NDArray[np.uint8]:
+    """Return about the logarithm of the light: a dark leg's edges count as much as a bright one's.
+
+    What is darker than ``DARK`` of the brightest is mostly noise and keeps its distances.
+    """
+    top = max(float(np.percentile(small[::4, ::4], 99.5)), 1.0)
+    levels = np.log1p(np.clip(small / top, 0.0, 1.0) / DARK) / np.log1p(1.0 / DARK)
+    return np.asarray(255.0 * levels, dtype=np.uint8)
+
+
+def _join(ends: Array) -> tuple[Array, Array]:
+    """Join pieces that continue each other; return the edges and how much of them was seen."""
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    along = along / length[:, None]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    middle = ends.mean(axis=1)
+    # Piece j against the line of piece i, the longer one (pieces come longest first).
+    to_ends = ends[None, :, :, :] - middle[:, None, None, :]
+    aside = np.abs(np.einsum("ijkx,ix->ijk", to_ends, normal)).max(axis=2)
+    place = np.einsum("ijkx,ix->ijk", to_ends, along)
+    gap = np.maximum(place.min(axis=2), -place.max(axis=2)) - 0.5 * length[:, None]
+    near = gap <= GAP * np.minimum(length[:, None], length[None, :])
+    # A long way ahead a line is known less well.
+    allowed = ASIDE * (1.0 + 0.5 * np.maximum(gap, 0.0) / length[:, None])
+    parallel = along @ along.T >= np.cos(TURN)
+    i, j = np.nonzero(np.triu(near & parallel & (aside <= np.minimum(allowed, 2 * ASIDE)), 1))
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
+    _, label = connected_components(graph, directed=False)
+    lines, covered = [], []
+    for group in _groups(np.asarray(label, dtype=np.intp)):
+        for line, share in _fitted(ends[group], length[group]):
+            lines.append(line)
+            covered.append(share)
+    found = np.array(lines).reshape(-1, 2, 2)
+    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= LEAST_LENGTH
+    return found[long], np.array(covered)[long]
+
+
+def _groups(label: IntArray) -> list[IntArray]:
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _fitted(pieces: Array, length: Array) -> list[tuple[Array, float]]:
+    """Return one line through pieces, or the pieces as they are if they bend."""
+    if len(pieces) == 1:
+        return [(pieces[0], 1.0)]
+    weight = np.repeat(length, 2)
+    points = pieces.reshape(-1, 2)
+    centre = np.average(points, axis=0, weights=weight)
+    spread = (points - centre) * np.sqrt(weight)[:, None]
+    direction = np.linalg.svd(spread, full_matrices=False)[2][0]
+    direction = direction * np.sign(direction @ (pieces[0, 1] - pieces[0, 0]))
+    place = (points - centre) @ direction
+    aside = (points - centre) @ np.array([-direction[1], direction[0]])
+    if np.abs(aside).max() > 1.5 * ASIDE:
+        return [(piece, 1.0) for piece in pieces]
+    line = centre + np.array([[place.min()], [place.max()]]) * direction
+    return [(line, float(min(1.0, length.sum() / (place.max() - place.min()))))]

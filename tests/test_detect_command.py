@@ -1,0 +1,232 @@
+"""``legcal detect``: the folder that people look at, and that nothing of theirs is lost."""
+
+import csv
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from axes_dataset import write_axes_dataset
+from outline_tables import assert_same
+from repeated_images import SIZE, RepeatedImages, repeated_images
+
+from legcal import cli, detect, load_dataset
+from legcal.errors import DatasetError, UsageError
+from legcal.observations.outlines import QUALITY
+from legcal.observations.table import read_observations
+from legcal.overlays.detected import Detection
+from legcal.overlays.folder import picture_names
+
+BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> RepeatedImages:
+    """A hexapod in two poses; one picture shows nothing, and another view only shows grey."""
+    made = repeated_images(tmp_path_factory.mktemp("detect") / "hexapod", n_images=2)
+    made.pictures[BLANK] = np.full_like(made.pictures[BLANK], 90.0)
+    made.pictures[ASIDE] = made.pictures[BLANK]
+    made.entry["views"]["c2"] = dict(made.entry["views"]["c1"])
+    made.rows.append({**made.rows[0], "view": "c2", "image": ASIDE})
+    made.write()
+    return made
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("out") / "found"
+
+
+@pytest.fixture(scope="module")
+def found(rendered: RepeatedImages, folder: Path) -> Detection:
+    return detect(rendered.path, output=folder)
+
+
+@pytest.fixture
+def one_image(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
+    """The same view with two images, to be changed."""
+    entry = json.loads(json.dumps(rendered.entry))
+    del entry["views"]["c2"]
+    rows = [dict(row) for row in rendered.rows[:2]]
+    pictures = {row["image"]: rendered.pictures[row["image"]] for row in rows}
+    made = RepeatedImages(tmp_path / "set", rendered.mechanism, entry, rows, pictures)
+    made.write()
+    return made
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
+    """Run the command in this process and return its exit code."""
+    command = ["legcal", "detect", *map(str, words), "--workers", "1"]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert isinstance(stop.value.code, int)
+    return stop.value.code
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_table(path: Path, rows: list[dict[str, str]]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def test_folder_json_and_summary_tell_the_same(
+    rendered: RepeatedImages,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    before = sorted(rendered.path.rglob("*"))
+    out = tmp_path / "out"
+    assert run(monkeypatch, rendered.path, "-o", out, "--json") == 1  # c2 shows no leg
+    document = json.loads(capsys.readouterr().out)
+    assert sorted(rendered.path.rglob("*")) == before
+    rows = table(out / "observations.csv")
+    assert document["outlines"] == len(rows)
+    assert document["used"] == sum(row["verdict"] == "used" for row in rows) > 20
+    assert list(document["views"]) == ["c1", "c2"]
+    view = document["views"]["c1"]
+    assert (view["images"], view["legs_found"]) == (4, view["legs_visible"] - 6)
+    contrast = [float(row["contrast"]) for row in rows if row["verdict"] == "used"]
+    assert view["contrast"] == pytest.approx(np.median(contrast))
+    assert sum(view["rejected"].values()) == view["outlines"] - view["used"]
+    assert "c2" in document["views"]["c2"]["problem"]
+    files = [entry["file"] for entry in document["overlays"]]
+    assert len(files) == len(set(files)) == document["images"] == 5
+    page = (out / "index.html").read_text()
+    for file in files:
+        picture = cv2.imread(str(out / file))
+        assert picture is not None
+        assert picture.shape[0] > 3 * SIZE[1]  # enlarged, with a legend
+        assert f'href="{file}"' in page
+    assert "http" not in page
+    kept = json.loads((out / "detection.json").read_text())
+    assert {key: kept[key] for key in document} == document
+
+
+def test_views_without_a_camera_pose_are_told_and_drawn_where_they_were_expected(
+    found: Detection,
+) -> None:
+    assert list(found.unplaced) == ["c2"]
+    assert {found.view_of(row) for row in found.outlines.row.tolist()} == {"c1"}
+    assert len(found.predicted(4)) == 6
+
+
+def test_the_written_table_is_read_as_what_was_found(
+    rendered: RepeatedImages, found: Detection, folder: Path
+) -> None:
+    dataset = load_dataset(rendered.path)
+    path, legs = folder / "observations.csv", dataset.mechanism.legs
+    assert_same(read_observations(path, legs, dataset.measurements), found.outlines)
+    for name in QUALITY:
+        assert np.all(np.isfinite(getattr(found.outlines, name)[found.outlines.used]))
+
+
+def test_people_read_a_table_of_views(
+    one_image: RepeatedImages,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run(monkeypatch, one_image.path, "-o", tmp_path / "out") == 0
+    printed = capsys.readouterr()
+    assert "outlines used in 2 images" in printed.out
+    assert "12/12" in printed.out
+    assert f"Look at {tmp_path}/out/index.html" in printed.out.replace("\n", "")
+    assert "Drawing overlays: 2/2" in printed.err
+
+
+def test_an_edited_table_is_never_written_over_and_wins_in_the_dataset(
+    one_image: RepeatedImages, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    detect(one_image.path, output=out)
+    detect(one_image.path, output=out)  # replaces its own files
+    rows = table(out / "observations.csv")
+    rows[3] |= {"verdict": "rejected", "reason": "a cable", "source": "edited"}
+    write_table(out / "observations.csv", rows)
+    edited = (out / "observations.csv").read_bytes()
+    with pytest.raises(UsageError, match=r"found a table that was changed since .* copy it into"):
+        detect(one_image.path, output=out)
+    assert (out / "observations.csv").read_bytes() == edited
+    (one_image.path / "observations.csv").write_bytes(edited)
+    found = detect(one_image.path, output=out)
+    assert found.outlines.reason[3] == "a cable"
+    assert found.outlines.source.count("edited") == 1
+    kept = table(out / "observations.csv")[3]
+    assert (kept["verdict"], kept["source"], kept["contrast"]) == ("rejected", "edited", "")
+
+
+def test_an_earlier_detection_is_replaced_and_other_files_are_kept(
+    one_image: RepeatedImages, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    detect(one_image.path, output=out)
+    (out / "overlays" / "mine.txt").write_text("mine")
+    del one_image.rows[1]
+    one_image.write()
+    detect(one_image.path, output=out)
+    assert [path.name for path in (out / "overlays" / "c1").iterdir()] == ["p0_0.jpg"]
+    assert (out / "overlays" / "mine.txt").read_text() == "mine"
+    one_image.rows[0]["image"] = "images/p0_1.png"
+    one_image.write()
+    (out / "overlays" / "c1" / "p0_1.jpg").write_text("of somebody else")
+    with pytest.raises(UsageError, match=r"overlays/c1/p0_1.jpg, which legcal did not write"):
+        detect(one_image.path, output=out)
+    assert (out / "overlays" / "c1" / "p0_0.jpg").exists()
+
+
+def test_images_of_the_same_name_have_pictures_of_their_own(found: Detection) -> None:
+    measurements = found.dataset.measurements
+    views = (replace(measurements.views[0], name="../left cam"), *measurements.views[1:])
+    images = ("images/a.png", "more/A.png", "b/c.png", "b/d.png", "images/a.png")
+    renamed = replace(measurements, views=views, image=images)
+    pictures = picture_names(replace(found, dataset=replace(found.dataset, measurements=renamed)))
+    assert list(pictures.values()) == [
+        "overlays/_left_cam/images_a.png.jpg",
+        "overlays/_left_cam/more_A.png.jpg",
+        "overlays/_left_cam/b_c.png.jpg",
+        "overlays/_left_cam/b_d.png.jpg",
+        "overlays/c2/a.jpg",
+    ]
+
+
+def test_a_folder_with_other_files_is_refused_before_any_work(
+    rendered: RepeatedImages, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, rendered.path, "-o", rendered.path, "--json") == 2
+    error: dict[str, Any] = json.loads(capsys.readouterr().out)["error"]
+    assert "found a folder with other files and no detection.json of legcal" in error["message"]
+
+
+def test_a_dataset_without_images_is_refused(tmp_path: Path) -> None:
+    write_axes_dataset(tmp_path / "axes", n_poses=2)
+    with pytest.raises(DatasetError, match="found a table of axes, needed images of the legs"):
+        detect(tmp_path / "axes", output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_images_that_cannot_be_read_are_refused_and_nothing_is_written(
+    one_image: RepeatedImages,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = one_image.path / one_image.rows[1]["image"]
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert run(monkeypatch, one_image.path, "-o", tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert "p0_1.png" in said
+    assert len(said.strip().splitlines()) <= 2
+    assert not (tmp_path / "out").exists()
