@@ -115,7 +115,7 @@ def legs_in_image(
     skins = [_skin(leg.cylinders, float(L), samples) for leg, L in zip(legs, length, strict=True)]
     s, radius = (np.array([getattr(skin, x) for skin in skins]) for x in ("s", "radius"))
     T_camera_base = T_base_camera.inv()
-    u_camera = np.asarray(T_camera_base.rotation.apply(u))
+    u_camera = u @ T_camera_base.as_matrix()[:3, :3].T
     A_camera = np.asarray(T_camera_base.apply(machine.A))
     axis = A_camera[:, None] + s[..., None] * u_camera[:, None]
     from_axis = np.linalg.norm(np.cross(u_camera, A_camera), axis=-1)
