@@ -40,6 +40,7 @@ from legcal.photographs import (
     scene_at_poses,
 )
 from legcal.progress import Report
+from legcal.recognition.hints import hint_notes
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
 from legcal.starting import four_steps, starts_of_fit
@@ -141,8 +142,16 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
 
 def _noted(found: Found, notes: tuple[str, ...]) -> Found:
     """Return what was found with what is to be said of the images, by themselves and by the fit."""
-    doubts = disagreeing_images(found.part.measurements, found.part.mechanism, found.solution)
-    return replace(found, notes=notes, doubts=doubts)
+    part, solution = found.part, found.solution
+    doubts = disagreeing_images(part.measurements, part.mechanism, solution)
+    shown = set(part.measurements.view[solution.outlines.row[solution.outlines.used]].tolist())
+    views = part.measurements.views
+    cameras = [
+        part.mechanism.T_base_Rb * T.inv() if v in shown else None
+        for v, T in enumerate(solution.T_camera_Rb)
+    ]
+    hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
+    return replace(found, notes=notes, doubts=(*hints, *doubts))
 
 
 def _refuse_too_few(work: Workpiece, fitted: IntArray, observed: Observed) -> None:

@@ -5,7 +5,7 @@ its view begins; if the images do not agree near it, the view is searched as if 
 a pose that they agree on elsewhere is used and said.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,10 +18,16 @@ from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import find_bars
-from legcal.recognition.hints import hint_notes
 from legcal.recognition.mirror import mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
-from legcal.recognition.radii import LEFT, MOST_TURNS, OtherRadii, other_radii
+from legcal.recognition.radii import (
+    LEFT,
+    MOST_TURNS,
+    NO_OTHER_RADII,
+    OtherRadii,
+    Part,
+    other_radii,
+)
 from legcal.recognition.segments import find_segments
 from legcal.recognition.targets import Targets, targets_of
 from legcal.vision.camera import Camera
@@ -48,8 +54,6 @@ class Recognised:
         How far the legs may still be from there [m].
     unplaced : dict of str
         Why views could not be placed, by view: one sentence for each.
-    notes : tuple of str
-        What else a reader should know: rough poses that are wrong.
     radii : OtherRadii
         Radii that the images contradict: the cameras were placed with those that they show.
     """
@@ -58,7 +62,6 @@ class Recognised:
     shift: Array
     joint_error: Array
     unplaced: dict[int, str]
-    notes: tuple[str, ...]
     radii: OtherRadii
 
 
@@ -115,6 +118,7 @@ def recognise(
     hints: Sequence[RigidTransform | None],
     joined: Sequence[RigidTransform | None] | None = None,
     *,
+    doubtful: Collection[Part] = (),
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
 ) -> Recognised:
@@ -131,6 +135,9 @@ def recognise(
     joined : sequence of RigidTransform or None, for each view
         T_x_camera of views that know how they stand to each other, by a calibration board x: they
         are placed together.
+    doubtful : collection of (int, float)
+        Parts, by leg and radius [m], whose outlines were not found with the radii of the model:
+        they may have others.
     progress : callable, optional
         Called with the row of each image when it has been searched.
     run : callable
@@ -158,7 +165,9 @@ def recognise(
     for g, anywhere in zip(doubted, _anywhere(groups, doubted, pictures, search, run), strict=True):
         found[g] = _better(found[g], anywhere)
     placed = [one for one in found if one is not None]
-    radii = _radii(search, groups, placed, pictures, run)
+    radii = NO_OTHER_RADII
+    if doubtful:
+        radii = _radii(search, groups, placed, pictures, run).only(doubtful)
     given, step = search.cylinders, radii
     for _ in range(MOST_TURNS):
         if not step.factor:
@@ -168,7 +177,7 @@ def recognise(
         placed = _placed_again(search, groups, placed, pictures, run)
         step = radii.of_the_same(other_radii(_for_radii(groups, placed, pictures), LEFT))
         radii = radii.then(step)
-    return _gathered(search, groups, hints, placed, pictures, radii, run)
+    return _gathered(search, groups, placed, pictures, radii, run)
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,7 +332,6 @@ def _better(near: Placed | None, anywhere: Placed) -> Placed:
 def _gathered(
     search: Search,
     groups: Sequence[_Group],
-    hints: Sequence[RigidTransform | None],
     poses: Sequence[Placed],
     pictures: dict[int, Picture],
     radii: OtherRadii,
@@ -354,8 +362,7 @@ def _gathered(
         for v in group.views:
             found[v] = placed.pose() * group.T_group_camera[v]
             shift[v], error[v] = placed.poses.shift[0], of_leg
-    notes = tuple(hint_notes([view.name for view in views], hints, found))
-    return Recognised(found, shift, error, unplaced, notes, radii)
+    return Recognised(found, shift, error, unplaced, radii)
 
 
 def _flipped(group: _Group, pictures: dict[int, Picture]) -> dict[int, Picture]:
