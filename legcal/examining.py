@@ -14,9 +14,9 @@ from functools import partial
 
 import numpy as np
 
-from legcal.detection.detect import NOT_PLACED, Load
+from legcal.detection.detect import NOT_PLACED, Load, Method
 from legcal.detection.exposure import Exposure, expose, image_defects
-from legcal.detection.outline import HIDDEN, OUTSIDE
+from legcal.detection.outline import HIDDEN, OUTSIDE, outline_parts
 from legcal.detection.picture import to_grey
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.observations.outlines import Outlines
@@ -55,7 +55,11 @@ class Observed:
 
 
 def observe(
-    photographs: Photographs, scene: Scene, report: Report, joined: Joined = None
+    photographs: Photographs,
+    scene: Scene,
+    report: Report,
+    joined: Joined = None,
+    method: Method = outline_parts,
 ) -> Observed:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
@@ -69,6 +73,8 @@ def observe(
         Called as ``report(stage, done, total)``.
     joined : sequence of RigidTransform or None, for each view
         As :func:`legcal.photographs.place` has it.
+    method : callable
+        How outlines are measured.
     """
     defects = _defects(photographs, report)
     rows = photographs.detect
@@ -77,7 +83,7 @@ def observe(
     placement = _without_images(photographs, placement, usable, defects)
     mechanism = photographs.mechanism.with_cylinders(placement.search.cylinders)
     photographs = replace(photographs, mechanism=mechanism)
-    outlines = detect(photographs, placement.scene, report)
+    outlines = detect(photographs, placement.scene, report, method=method)
     view = photographs.measurements.view
     placed = [row for row in rows.tolist() if placement.scene.T_base_camera[view[row]] is not None]
     found = _found(outlines, [row for row in placed if row not in defects])
