@@ -14,9 +14,9 @@ from functools import partial
 
 import numpy as np
 
-from legcal.detection.detect import NOT_PLACED, Load
+from legcal.detection.detect import NOT_PLACED, Load, Method
 from legcal.detection.exposure import Exposure, expose, image_defects
-from legcal.detection.outline import HIDDEN, OUTSIDE
+from legcal.detection.outline import HIDDEN, OUTSIDE, outline_parts
 from legcal.detection.picture import to_grey
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.observations.outlines import Outlines
@@ -57,7 +57,11 @@ class Observed:
 
 
 def observe(
-    photographs: Photographs, scene: Scene, report: Report, joined: Joined = None
+    photographs: Photographs,
+    scene: Scene,
+    report: Report,
+    joined: Joined = None,
+    method: Method = outline_parts,
 ) -> Observed:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
@@ -71,20 +75,22 @@ def observe(
         Called as ``report(stage, done, total)``.
     joined : sequence of RigidTransform or None, for each view
         As :func:`legcal.photographs.place` has it.
+    method : callable
+        How outlines are measured.
     """
     defects = _defects(photographs, report)
     rows = photographs.detect
     usable = np.array([row for row in rows.tolist() if row not in defects], dtype=np.intp)
     searched = replace(photographs, detect=usable)
     placement = place(searched, scene, report, joined)
-    outlines = detect(photographs, placement.scene, report)
+    outlines = detect(photographs, placement.scene, report, method=method)
     doubtful = _parts_not_found(photographs, outlines)
     if doubtful:
         other = place(searched, scene, report, joined, doubtful)
         if other.recognised.radii.factor:
             mechanism = photographs.mechanism.with_cylinders(other.search.cylinders)
             corrected = replace(photographs, mechanism=mechanism)
-            again = detect(corrected, other.scene, report)
+            again = detect(corrected, other.scene, report, method=method)
             if again.used.sum() > outlines.used.sum():
                 photographs, placement, outlines = corrected, other, again
     placement = _without_images(photographs, placement, usable, defects)

@@ -23,7 +23,7 @@ from legcal.detection.detect import (
     Method,
     detect_outlines,
 )
-from legcal.detection.outline import OUTSIDE, outline_parts
+from legcal.detection.outline import outline_parts
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.leg import Cylinder
@@ -152,21 +152,6 @@ class Photographs:
         """Return the search of some rows again; edited and other rows' outlines are kept."""
         kept = ~np.isin(outlines.row, rows) | is_edited(outlines)
         return replace(self, detect=rows, keep=choose_outlines(outlines, kept))
-
-
-def doubtful_rows(photographs: Photographs, outlines: Outlines) -> IntArray:
-    """Return the searched rows in which an outline was not found, or rejected by the fit.
-
-    Parameters
-    ----------
-    photographs : Photographs
-        The images.
-    outlines : Outlines
-        All outlines after a fit, with what it rejected.
-    """
-    unused = ~outlines.used & ~is_edited(outlines)
-    unused &= np.array([reason != OUTSIDE for reason in outlines.reason], dtype=np.bool_)
-    return np.intersect1d(photographs.detect, outlines.row[unused])
 
 
 @dataclass(frozen=True, eq=False)
