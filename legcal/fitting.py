@@ -48,7 +48,6 @@ from legcal.refinement.solution import Solution
 from legcal.starting import four_steps, starts_of_fit
 from legcal.workpiece import Workpiece
 
-
 LOST = 0.5  # of the outlines of an image: fewer were found
 
 
