@@ -176,7 +176,8 @@ def recognise(
         search = replace(search, cylinders=radii.corrected(given))
         pictures = {row: search.retargeted(row, one) for row, one in pictures.items()}
         placed = _placed_again(search, groups, placed, pictures, run)
-        step = radii.of_the_same(other_radii(_for_radii(groups, placed, pictures), LEFT))
+        few = _for_radii(groups, placed, pictures)
+        step = radii.of_the_same(other_radii(few, LEFT, alone=not radii.common))
         radii = radii.then(step)
     return _gathered(search, groups, placed, pictures, radii, run)
 
