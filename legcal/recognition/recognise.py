@@ -22,7 +22,13 @@ from legcal.recognition.groups import Group, group_views
 from legcal.recognition.hints import hint_notes
 from legcal.recognition.mirror import mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
-from legcal.recognition.radii import LEFT, MOST_TURNS, OtherRadii, other_radii
+from legcal.recognition.radii import (
+    LEFT,
+    MOST_TURNS,
+    NO_OTHER_RADII,
+    OtherRadii,
+    other_radii,
+)
 from legcal.recognition.segments import find_segments
 from legcal.recognition.sentences import named, placing_problem
 from legcal.recognition.targets import Targets, targets_of
@@ -30,6 +36,7 @@ from legcal.vision.camera import Camera
 from legcal.workers import Run, in_turn
 
 Load = Callable[[int], Image]
+RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
@@ -160,7 +167,7 @@ def recognise(
         found[g] = _better(found[g], anywhere)
     placed = [one for one in found if one is not None]
     radii = _radii(search, groups, placed, pictures, run)
-    given, step = search.cylinders, radii
+    given, step, as_given = search.cylinders, radii, (search, placed, pictures)
     for _ in range(MOST_TURNS):
         if not step.factor:
             break
@@ -169,6 +176,8 @@ def recognise(
         placed = _placed_again(search, groups, placed, pictures, run)
         step = radii.of_the_same(other_radii(_for_radii(groups, placed, pictures), LEFT))
         radii = radii.then(step)
+    if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[1]):
+        (search, placed, pictures), radii = as_given, NO_OTHER_RADII  # the scale is not known well
     return _gathered(search, groups, hints, placed, pictures, radii, run)
 
 
@@ -227,6 +236,11 @@ def _for_radii(
     for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
         if one.is_convincing:
             yield g, group.pictures(pictures, group.some), one.poses
+
+
+def _mean_support(placed: Sequence[Placed]) -> float:
+    """Return how many legs agree in a picture, over all groups that were placed."""
+    return sum(float(one.support[0].mean()) for one in placed if one.is_convincing)
 
 
 def _placed_again(
