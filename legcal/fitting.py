@@ -42,10 +42,13 @@ from legcal.photographs import (
     scene_at_poses,
 )
 from legcal.progress import Report
+from legcal.recognition.hints import hint_notes
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
 from legcal.starting import four_steps, starts_of_fit
 from legcal.workpiece import Workpiece
+
+LOST = 0.5  # of the outlines of an image: fewer were found
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +136,24 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
     found = _fit(part, fitted, outlines, scene, board, progress)
     shown = np.setdiff1d(_placed_rows(photographs, scene), list(observed.left_out))
     if len(shown):
+        first = disagreeing_images(part.measurements, part.mechanism, found.solution)
         scene = _fitted_scene(work, found.solution, scene)
         again = observed.photographs.narrowed(shown, found.outlines)
         outlines = detect(again, scene, progress, near_fit=True)
         found = _fit(part, fitted, outlines, scene, board, progress)
+        notes = (*notes, *_lost(found, first))
     return replace(_noted(found, notes), other_radii=other_radii)
+
+
+def _lost(found: Found, first: dict[int, str]) -> list[str]:
+    """Return what a first fit said of images in which hardly anything is found near it."""
+    part, o = found.part, found.solution.outlines
+    last = disagreeing_images(part.measurements, part.mechanism, found.solution)
+    return [
+        note
+        for row, note in first.items()
+        if row not in last and o.used[o.row == row].mean() < LOST
+    ]
 
 
 def _placed_rows(photographs: Photographs, scene: Scene) -> IntArray:
@@ -149,8 +165,16 @@ def _placed_rows(photographs: Photographs, scene: Scene) -> IntArray:
 
 def _noted(found: Found, notes: tuple[str, ...]) -> Found:
     """Return what was found with what is to be said of the images, by themselves and by the fit."""
-    doubts = disagreeing_images(found.part.measurements, found.part.mechanism, found.solution)
-    return replace(found, notes=notes, doubts=doubts)
+    part, solution = found.part, found.solution
+    doubts = disagreeing_images(part.measurements, part.mechanism, solution)
+    shown = set(part.measurements.view[solution.outlines.row[solution.outlines.used]].tolist())
+    views = part.measurements.views
+    cameras = [
+        part.mechanism.T_base_Rb * T.inv() if v in shown else None
+        for v, T in enumerate(solution.T_camera_Rb)
+    ]
+    hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
+    return replace(found, notes=notes, doubts=(*hints, *doubts.values()))
 
 
 def _refuse_too_few(work: Workpiece, fitted: IntArray, observed: Observed) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 
@@ -38,7 +38,7 @@ from legcal.observations.sets import (
     no_outlines,
 )
 from legcal.progress import Report
-from legcal.recognition.radii import radius_notes
+from legcal.recognition.radii import Part, radius_notes
 from legcal.recognition.recognise import Recognised, Search, recognise, shifted
 from legcal.workers import Run
 
@@ -201,6 +201,7 @@ def place(
     scene: Scene,
     report: Report,
     joined: Joined = None,
+    doubtful: Collection[Part] = (),
 ) -> Placement:
     """Recognise the legs in the images, and place the cameras by them.
 
@@ -214,6 +215,8 @@ def place(
         Called as ``report(stage, done, total)``.
     joined : sequence of RigidTransform or None, for each view
         T_board_camera of the views that show a calibration board: they are placed together.
+    doubtful : collection of (int, float)
+        Parts that may have other radii, as :func:`legcal.recognition.recognise.recognise` has it.
     """
     search = Search(
         photographs.load,
@@ -228,6 +231,7 @@ def place(
         photographs.detect,
         scene.T_base_camera,
         joined,
+        doubtful=doubtful,
         run=photographs.run,
         progress=counted(report, "Recognising legs", len(photographs.detect)),
     )
@@ -239,7 +243,7 @@ def place(
         for v, (T, rough) in enumerate(zip(found.T_base_camera, scene.T_base_camera, strict=True))
     )
     unplaced = {views[v].name: why for v, why in found.unplaced.items()}
-    notes = (*found.notes, *radius_notes(found.radii, photographs.mechanism.leg_names))
+    notes = tuple(radius_notes(found.radii, photographs.mechanism.leg_names))
     search = replace(search, cylinders=found.radii.corrected(search.cylinders))
     return Placement(Scene(A, B, cameras, found.joint_error), unplaced, notes, search, found)
 

@@ -5,7 +5,7 @@ its view begins; if the images do not agree near it, the view is searched as if 
 a pose that they agree on elsewhere is used and said.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,7 +19,6 @@ from legcal.observations.measurements import Measurements
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import find_bars
 from legcal.recognition.groups import Group, group_views
-from legcal.recognition.hints import hint_notes
 from legcal.recognition.mirror import mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
 from legcal.recognition.radii import (
@@ -27,6 +26,7 @@ from legcal.recognition.radii import (
     MOST_TURNS,
     NO_OTHER_RADII,
     OtherRadii,
+    Part,
     other_radii,
 )
 from legcal.recognition.segments import find_segments
@@ -56,8 +56,6 @@ class Recognised:
         How far the legs may still be from there [m].
     unplaced : dict of str
         Why views could not be placed, by view: one sentence for each.
-    notes : tuple of str
-        What else a reader should know: rough poses that are wrong.
     radii : OtherRadii
         Radii that the images contradict: the cameras were placed with those that they show.
     """
@@ -66,7 +64,6 @@ class Recognised:
     shift: Array
     joint_error: Array
     unplaced: dict[int, str]
-    notes: tuple[str, ...]
     radii: OtherRadii
 
 
@@ -123,6 +120,7 @@ def recognise(
     hints: Sequence[RigidTransform | None],
     joined: Sequence[RigidTransform | None] | None = None,
     *,
+    doubtful: Collection[Part] = (),
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
 ) -> Recognised:
@@ -139,6 +137,9 @@ def recognise(
     joined : sequence of RigidTransform or None, for each view
         T_x_camera of views that know how they stand to each other, by a calibration board x: they
         are placed together.
+    doubtful : collection of (int, float)
+        Parts, by leg and radius [m], whose outlines were not found with the radii of the model:
+        they may have others.
     progress : callable, optional
         Called with the row of each image when it has been searched.
     run : callable
@@ -166,7 +167,9 @@ def recognise(
     for g, anywhere in zip(doubted, _anywhere(groups, doubted, pictures, search, run), strict=True):
         found[g] = _better(found[g], anywhere)
     placed = [one for one in found if one is not None]
-    radii = _radii(search, groups, placed, pictures, run)
+    radii = NO_OTHER_RADII
+    if doubtful:
+        radii = _radii(search, groups, placed, pictures, run).only(doubtful)
     given, step, as_given = search.cylinders, radii, (search, placed, pictures)
     for _ in range(MOST_TURNS):
         if not step.factor:
@@ -178,7 +181,7 @@ def recognise(
         radii = radii.then(step)
     if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[1]):
         (search, placed, pictures), radii = as_given, NO_OTHER_RADII  # the scale is not known well
-    return _gathered(search, groups, hints, placed, pictures, radii, run)
+    return _gathered(search, groups, placed, pictures, radii, run)
 
 
 def _pictures(
@@ -278,7 +281,6 @@ def _better(near: Placed | None, anywhere: Placed) -> Placed:
 def _gathered(
     search: Search,
     groups: Sequence[Group],
-    hints: Sequence[RigidTransform | None],
     poses: Sequence[Placed],
     pictures: dict[int, Picture],
     radii: OtherRadii,
@@ -311,8 +313,7 @@ def _gathered(
         for v in group.views:
             found[v] = placed.pose() * group.T_group_camera[v]
             shift[v], error[v] = placed.poses.shift[0], of_leg
-    notes = tuple(hint_notes([view.name for view in views], hints, found))
-    return Recognised(found, shift, error, unplaced, notes, radii)
+    return Recognised(found, shift, error, unplaced, radii)
 
 
 def _flipped(group: Group, pictures: dict[int, Picture]) -> dict[int, Picture]:
