@@ -161,6 +161,7 @@ def _measured(
     bias = _shading_bias(contrast, blur)
     to_piece = np.array([[1.0 - place, place] for place in (line.first, line.last)])
     covariance = WIDENING**2 * to_piece @ spread @ to_piece.T
+    covariance = 0.5 * (covariance + covariance.T)
     covariance += COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2) + bias**2
     return MeasuredEdge(v + epsilon * ends, line, contrast, is_step, blur, covariance)
 

@@ -36,6 +36,7 @@ from legcal.vision.camera import Camera
 from legcal.workers import Run, in_turn
 
 Load = Callable[[int], Image]
+RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
@@ -169,7 +170,7 @@ def recognise(
     radii = NO_OTHER_RADII
     if doubtful:
         radii = _radii(search, groups, placed, pictures, run).only(doubtful)
-    given, step = search.cylinders, radii
+    given, step, as_given = search.cylinders, radii, (search, placed, pictures)
     for _ in range(MOST_TURNS):
         if not step.factor:
             break
@@ -179,6 +180,8 @@ def recognise(
         few = _for_radii(groups, placed, pictures)
         step = radii.of_the_same(other_radii(few, LEFT, alone=not radii.common))
         radii = radii.then(step)
+    if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[1]):
+        (search, placed, pictures), radii = as_given, NO_OTHER_RADII  # the scale is not known well
     return _gathered(search, groups, placed, pictures, radii, run)
 
 
@@ -237,6 +240,11 @@ def _for_radii(
     for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
         if one.is_convincing:
             yield g, group.pictures(pictures, group.some), one.poses
+
+
+def _mean_support(placed: Sequence[Placed]) -> float:
+    """Return how many legs agree in a picture, over all groups that were placed."""
+    return sum(float(one.support[0].mean()) for one in placed if one.is_convincing)
 
 
 def _placed_again(

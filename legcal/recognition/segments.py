@@ -19,7 +19,6 @@ from legcal.vision.camera import Camera
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
 LARGEST_FACTOR = 4  # by which a picture is reduced: legs are 12 px wide and more
-STAIRS = 0.6  # blur of a picture that is not reduced [px]
 SHORTEST = 7.0  # of a piece [reduced px]
 LEAST_LENGTH = 14.0  # of a joined edge [reduced px]
 ASIDE = 1.6  # of the ends of a piece from the line that it continues [reduced px]
@@ -66,10 +65,7 @@ def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> Seg
         The picture is reduced by the largest whole factor that leaves its longer side this long.
     """
     factor = int(np.clip(max(grey.shape) // long_side, 1, LARGEST_FACTOR))
-    small = reduce(grey, factor)
-    if factor == 1:  # stairs of a sharp picture are no edges
-        small = np.asarray(cv2.GaussianBlur(small, (0, 0), STAIRS), dtype=np.float32)
-    pieces = _pieces(small)
+    pieces = _pieces(reduce(grey, factor))
     focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
     pixel = factor / focal
     if len(pieces) == 0:
