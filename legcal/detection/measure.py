@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.detection.blocks import Blocks, Edge
+from legcal.detection.blocks import Blocks
 from legcal.detection.fit import depth_for_blur, estimate_blur
 from legcal.detection.picture import Grey
 from legcal.detection.pooled import fit_together
+from legcal.detection.profiles import Edge
 from legcal.detection.straight import StraightFit
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
@@ -89,7 +90,7 @@ def measure_edges(
     blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=FIRST_STEP)
     if len(blocks.moved) == 0:
         return [None] * len(edges), FIRST_BLUR
-    blocks.settle(FIRST_BLUR, FIRST_ROUNDS, least_gain=-np.inf)
+    blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
     blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
     v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     for _ in range(TRIALS):
@@ -97,7 +98,7 @@ def measure_edges(
         blocks = Blocks.read(grey, camera, edges, v, tried, step=1)
         if len(blocks.moved) == 0:
             return [None] * len(edges), tried
-        blocks.settle(tried, LAST_ROUNDS, least_gain=LEAST_GAIN)
+        blocks.settle(tried, LAST_ROUNDS)
         if not together:
             return _roughly(edges, v, blocks, tried), tried
         joint = fit_together(blocks, blocks.kept(), tried, depth_for_blur(tried))
