@@ -213,7 +213,7 @@ def _nodes(camera: Camera, edges: Sequence[Edge], v: Array) -> _Nodes:
     order = np.argsort(pixels[..., 1], axis=1, kind="stable")
     offset, along_px = (np.take_along_axis(pixels[..., k], order, axis=1) for k in (0, 1))
     inwards, besides = (np.take_along_axis(across[..., k], order, axis=1) for k in (0, 1))
-    slope = np.array([np.gradient(x, y) for x, y in zip(offset, along_px, strict=True)])
+    slope = _slopes(offset, along_px)
     epsilon = np.array([[edge.epsilon] for edge in edges])
     return _Nodes(
         flat,
@@ -224,6 +224,15 @@ def _nodes(camera: Camera, edges: Sequence[Edge], v: Array) -> _Nodes:
         epsilon * inwards,
         inwards - besides * slope,
     )
+
+
+def _slopes(y: Array, x: Array) -> Array:
+    """Return dy/dx at the points of curves (n, m) with rising x, to second order inside."""
+    rise = np.diff(y, axis=1) / np.maximum(np.diff(x, axis=1), 1e-9)
+    apart = np.diff(x, axis=1)
+    part = apart[:, :-1] / np.maximum(apart[:, :-1] + apart[:, 1:], 1e-9)
+    inner = rise[:, :-1] + (rise[:, 1:] - rise[:, :-1]) * part
+    return np.concatenate([rise[:, :1], inner, rise[:, -1:]], axis=1)
 
 
 def _unsaturated(d: Samples, grey: Grey, inside: BoolArray) -> BoolArray:
