@@ -193,7 +193,7 @@ def _lines(votes: Array, half: int) -> tuple[Array, Array]:
     shifts, scores = [], []
     for _ in range(KEPT):
         i, j = divmod(int(np.argmax(score)), score.shape[1])
-        if score[i, j] < LEAST_SCORE:
+        if score[i, j] <= 0.0:
             break
         shifts.append((j - half - 0.5 * differences[i], j - half + 0.5 * differences[i]))
         scores.append(float(score[i, j]))
