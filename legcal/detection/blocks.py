@@ -22,7 +22,7 @@ ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp pict
 ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on longer ones are made, so many times
 ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
 VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
-SETTLED = 0.03  # movement of every line below which the rounds end [px]
+SETTLED = 0.1  # movement of every line below which the rounds end [px]
 
 
 @dataclass(eq=False)
@@ -49,17 +49,18 @@ class Blocks:
         edges: Sequence[Edge],
         v: Sequence[Array],
         blur: float,
-        step: int,
+        most: int | None = None,
     ) -> "Blocks":
-        """Read every ``step``-th unhidden block of all edges."""
+        """Read the unhidden blocks of all edges; about ``most`` short ones of each, if given."""
         outer = depth_for_blur(blur)
-        rows = ROWS * int(np.clip(np.rint(blur / ROWS_PER_BLUR), 1, 4)) if step == 1 else ROWS
-        if step == 1:
+        rows = ROWS
+        if most is None:
+            rows *= int(np.clip(np.rint(blur / ROWS_PER_BLUR), 1, 4))
             shortest = min(edge.band.length * float(np.mean(~edge.hidden)) for edge in edges)
             rows = max(rows, ROWS * int(np.clip(shortest / (ROWS * ENOUGH), 1, LONGEST)))
         half_width = np.array([edge.half_width for edge in edges])
         depths = outer, np.minimum(outer, SHALLOWEST * half_width)
-        read = read_profiles(grey, camera, edges, v, depths, rows, step)
+        read = read_profiles(grey, camera, edges, v, depths, rows, most)
         light, weight = to_light(read.grey, read.inside, camera.gamma)
         n = len(read.position)
         return cls(

@@ -15,7 +15,7 @@ from legcal.detection.limb import N_BASIS, Samples, basis
 from legcal.geometry.types import Array
 
 BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
-BLUR_BLOCKS = 24
+BLUR_BLOCKS = 16
 BLUR_ROUNDS = 2
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 # Prior precision of the amplitudes, in units of the contrast of a block.

@@ -25,9 +25,9 @@ __all__ = ["Edge", "MeasuredEdge", "measure_edges"]
 
 FIRST_BLUR = 1.0  # [px]
 LEAST_GAIN = 30  # in chi^2, by which a block shows an edge at all
-FIRST_STEP = 2
+FIRST_BLOCKS = 12  # of an outline
 FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # at most
-TRIALS, SIMILAR = 3, 0.12  # of the blur, until its logarithm changes by less than this
+TRIALS, SIMILAR = 3, 0.25  # of the blur, until its logarithm changes by less than this
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
 COMMON_BIAS, TILT_BIAS = 0.012, 0.02  # of both ends, of each end [px]
@@ -87,7 +87,7 @@ def measure_edges(
         Standard deviation of the blur of the image [px].
     """
     v = [edge.v for edge in edges]
-    blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=FIRST_STEP)
+    blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, FIRST_BLOCKS)
     if len(blocks.moved) == 0:
         return [None] * len(edges), FIRST_BLUR
     blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
@@ -95,7 +95,7 @@ def measure_edges(
     v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     for _ in range(TRIALS):
         tried = blur
-        blocks = Blocks.read(grey, camera, edges, v, tried, step=1)
+        blocks = Blocks.read(grey, camera, edges, v, tried)
         if len(blocks.moved) == 0:
             return [None] * len(edges), tried
         blocks.settle(tried, LAST_ROUNDS)

@@ -81,7 +81,7 @@ def read_profiles(
     v: Sequence[Array],
     depths: tuple[float, Array],
     n_rows: int,
-    step: int = 1,
+    most: int | None = None,
 ) -> Profiles:
     """Read the pixels beside outlines, where nothing hides them.
 
@@ -99,16 +99,19 @@ def read_profiles(
         Distances from the outlines that are read, outside and inside of each [px].
     n_rows : int
         Rows of a block.
-    step : int
-        Every ``step``-th block of an outline is read.
+    most : int, optional
+        About how many blocks of each outline are read, at even distances; all of them by default.
     """
     nodes = _nodes(camera, edges, np.array(v))
     rows = nodes.rows(n_rows)
     # Blocks that are read: a few consecutive rows of one edge.
     position = nodes.at(rows, nodes.position).reshape(-1, n_rows).mean(axis=1)
     edge = rows.edge[::n_rows]
-    number = np.arange(len(edge)) - np.searchsorted(edge, edge)
-    free = number % step == 0
+    free = np.ones(len(edge), dtype=np.bool_)
+    if most is not None:
+        first = np.searchsorted(edge, np.arange(len(edges) + 1))
+        step = np.maximum(np.diff(first) // most, 1)
+        free = (np.arange(len(edge)) - first[edge]) % step[edge] == 0
     for k, one in enumerate(edges):
         if np.any(one.hidden):
             n, own = len(one.hidden), slice(*np.searchsorted(edge, [k, k + 1]))
