@@ -31,7 +31,9 @@ def numbered(axis: int) -> Samples:
     return np.asarray(np.indices((300, 400))[1 - axis], dtype=np.float32)
 
 
-def read(edges: list[Edge], axis: int = 0, inner: float = DEEP, most: int | None = None) -> Profiles:
+def read(
+    edges: list[Edge], axis: int = 0, inner: float = DEEP, most: int | None = None
+) -> Profiles:
     depths = DEEP, np.full(len(edges), inner)
     return read_profiles(numbered(axis), CAMERA, edges, [e.v for e in edges], depths, 8, most)
 

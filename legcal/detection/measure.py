@@ -1,6 +1,6 @@
 """Sub-pixel lines of all outlines of an image, from edges known to about a pixel.
 
-A first round with a wide blur and every second block pulls the lines in; then the blur of the
+A first round with a wide blur and a few blocks pulls the lines in; then the blur of the
 image is estimated from its best blocks, and lines settle robustly on blocks that are fitted apart.
 At last all blocks of an outline that lie on its line are fitted together, and the blur to all
 outlines. Pixels are used as far as the blurred outline reaches and little farther, since the
