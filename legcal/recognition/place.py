@@ -105,10 +105,10 @@ def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
         if len(poses) == 0:
             continue
         few = [pictures[k] for k in order[: first + START_PICTURES]]
-        poses = _refined(few, poses, TOLERANCES[2:4], JOINT_ERROR)
-        score = _support(pictures, poses, TOLERANCES[3])[0].sum(axis=1)
+        poses = refined(few, poses, TOLERANCES[2:4], JOINT_ERROR)
+        score = supports(pictures, poses, TOLERANCES[3])[0].sum(axis=1)
         poses = poses.take(_distinct(poses, score, KEPT[2]))
-        poses = _refined(pictures, poses, (*TOLERANCES[3:], *TOLERANCES[-2:]), JOINT_ERROR)
+        poses = refined(pictures, poses, (*TOLERANCES[3:], *TOLERANCES[-2:]), JOINT_ERROR)
         best = _judged(pictures, poses)
         if best.is_clear:
             break
@@ -131,8 +131,8 @@ def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_leg
     turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
-    poses = _refined(pictures, poses, TOLERANCES[:3])
-    poses = _refined(pictures, poses, (*TOLERANCES[2:], *TOLERANCES[-2:]), JOINT_ERROR)
+    poses = refined(pictures, poses, TOLERANCES[:3])
+    poses = refined(pictures, poses, (*TOLERANCES[2:], *TOLERANCES[-2:]), JOINT_ERROR)
     found = _judged(pictures, poses)
     return replace(found, hinted=True)
 
@@ -185,9 +185,9 @@ def _starts(picture: Picture, n_legs: int) -> Poses:
     poses = pose_starts(picture, n_legs)
     if len(poses) == 0:
         return poses
-    poses = poses.take(_best(_support([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
-    poses = _refined([picture], poses, TOLERANCES[:3])
-    score = _support([picture], poses, TOLERANCES[2])[0].sum(axis=1)
+    poses = poses.take(_best(supports([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
+    poses = refined([picture], poses, TOLERANCES[:3])
+    score = supports([picture], poses, TOLERANCES[2])[0].sum(axis=1)
     return poses.take(_distinct(poses, score, KEPT[1]))
 
 
@@ -195,19 +195,20 @@ def _merit(picture: Picture) -> float:
     return float(picture.bars.merit[:8].sum()) if len(picture.bars) else 0.0
 
 
-def _refined(
+def refined(
     pictures: Sequence[Picture],
     poses: Poses,
     tolerances: Sequence[float],
     joint_error: float = 0.0,
 ) -> Poses:
+    """Return poses after a step towards the bars for each of some tolerances."""
     for tolerance in tolerances:
         found = [agreement(picture, poses, tolerance) for picture in pictures]
         poses = improved(pictures, poses, found, tolerance, joint_error)
     return poses
 
 
-def _support(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
+def supports(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
     """Return the support and the expected number of legs, both (n_poses, n_pictures)."""
     support, expected = [], []
     for picture in pictures:
