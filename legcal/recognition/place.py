@@ -10,7 +10,7 @@ from legcal.geometry.types import Array, IntArray
 from legcal.recognition.agreement import Agreement, Picture, Poses, agreement, distances, improved
 from legcal.recognition.starts import joined, pose_starts
 
-TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis, on the sensor plane
+TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
 JOINT_ERROR = 0.01  # standard deviation of the joint centres of the nominal model [m]
 START_PICTURES, MOST_START_PICTURES = 2, 8  # whose bars suggest poses: at once, at most
 KEPT = (500, 40, 10)  # of the starts of a picture, of its refined ones, of all
