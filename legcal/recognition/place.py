@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.recognition.agreement import Agreement, Picture, Poses, agreement, distances, improved
+from legcal.recognition.bars import Bars
 from legcal.recognition.starts import joined, pose_starts
 
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
@@ -16,10 +17,15 @@ START_PICTURES, MOST_START_PICTURES = 2, 8  # whose bars suggest poses: at once,
 KEPT = (500, 40, 10)  # of the starts of a picture, of its refined ones, of all
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
 SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
+SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
 MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
-CLEAR_SUPPORT, CLEAR_LEAD = 0.35, 1.6  # share of the expected legs, against the next pose: no doubt
-ENOUGH_SUPPORT, ENOUGH_LEAD = 0.2, 1.25  # the same, to be believed at all
-LEAST_SUPPORT = 1.6  # legs in all images together
+JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
+SHIFT_COST = 0.15  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
+# Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
+# lead over the next pose in legs of all images together, and as a part.
+CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
+ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.12, 0.45, 0.07
+LEAST_SUPPORT = 1.4  # legs in all images together
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
 
@@ -36,6 +42,8 @@ class Placed:
         How many legs agree in each picture, weighted by how well and how much of them.
     expected : (n, n_pictures) array
         How many legs each picture would show.
+    score : (n,) array
+        The support in all pictures together, less what the shifts of the joints cost: legs.
     leg_error : (n_legs,) array
         Root mean square distance of the legs from their bars at the first pose [m]; infinite for
         legs without any.
@@ -46,6 +54,7 @@ class Placed:
     poses: Poses
     support: Array
     expected: Array
+    score: Array
     leg_error: Array
     hinted: bool = False
 
@@ -62,15 +71,15 @@ class Placed:
 
     @property
     def lead(self) -> float:
-        """Support of the first pose against that of the second one."""
+        """Score of the first pose beyond that of the second one, in legs."""
         if len(self.poses) < 2:
             return float("inf")
-        return float(self.support[0].sum() / max(self.support[1].sum(), 1e-9))
+        return float(self.score[0] - self.score[1])
 
     @property
     def is_convincing(self) -> bool:
         """Whether the first pose is to be believed."""
-        return self.is_enough and (self.hinted or self.lead >= ENOUGH_LEAD)
+        return self.is_enough and (self.hinted or self._leads(ENOUGH_LEAD, ENOUGH_PART))
 
     @property
     def is_clear(self) -> bool:
@@ -78,7 +87,11 @@ class Placed:
         if not self.is_enough:
             return False
         share = float(self.support[0].sum() / self.expected[0].sum())
-        return share >= CLEAR_SUPPORT and (self.hinted or self.lead >= CLEAR_LEAD)
+        return share >= CLEAR_SUPPORT and (self.hinted or self._leads(CLEAR_LEAD, CLEAR_PART))
+
+    def _leads(self, legs: float, part: float) -> bool:
+        """Say whether the first pose leads by so many legs and such a part of its score."""
+        return self.lead >= max(legs, part * float(self.score[0]))
 
     def pose(self, i: int = 0) -> RigidTransform:
         """Return T_base_camera of a pose."""
@@ -142,25 +155,48 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
-        return Placed(poses, empty, empty, np.full(n_legs, np.inf))
-    found = [agreement(picture, poses, TOLERANCES[-1]) for picture in pictures]
+        return Placed(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
+    found = [agreement(picture, poses, JUDGED) for picture in pictures]
     values = [_one_bar_each(one) for one in found]
     shares = [picture.targets.share for picture in pictures]
     support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
     expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
-    matches = np.concatenate(
-        [np.where(v >= MATCHED, f.bar, -1) for v, f in zip(values, found, strict=True)], axis=1
-    )
-    kept: list[int] = []
-    for i in np.argsort(-support.sum(axis=1), kind="stable").tolist():
-        mine = matches[i] >= 0
-        least = max(1, int(np.count_nonzero(mine)))
-        common = [int(np.count_nonzero((matches[i] == matches[k]) & mine)) / least for k in kept]
-        if max(common, default=0.0) < SAME_MATCHES:
-            kept.append(i)
-    order = np.array(kept, dtype=np.intp)
+    cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / JOINT_ERROR**2
+    score = support.sum(axis=1) - SHIFT_COST * cost
+    order = _different(pictures, found, [v >= MATCHED for v in values], score)
     best = poses.take(order[:1])
-    return Placed(poses.take(order), support[order], expected[order], _leg_error(pictures, best))
+    error = _leg_error(pictures, best)
+    return Placed(poses.take(order), support[order], expected[order], score[order], error)
+
+
+def _different(
+    pictures: Sequence[Picture],
+    found: Sequence[Agreement],
+    matched: Sequence[BoolArray],
+    score: Array,
+) -> IntArray:
+    """Return the poses, best first, that put other legs on other bars than better ones do."""
+    common = np.zeros((len(score), len(score)))
+    for picture, agreed, match in zip(pictures, found, matched, strict=True):
+        if len(picture.bars) == 0:
+            continue
+        same = _one_leg(picture.bars)
+        for j in range(len(picture.targets)):
+            bar, has = agreed.bar[:, j], match[:, j]
+            common += same[np.ix_(bar, bar)] & has[:, None] & has[None, :]
+    least = np.maximum(np.diag(common), 1.0)
+    kept: list[int] = []
+    for i in np.argsort(-score, kind="stable").tolist():
+        if np.max(common[i, kept] / least[i], initial=0.0) < SAME_MATCHES:
+            kept.append(i)
+    return np.array(kept, dtype=np.intp)
+
+
+def _one_leg(bars: Bars) -> BoolArray:
+    """Return which bars (n, n) may be of one leg: they continue each other or overlap."""
+    apart = np.abs(np.einsum("ijx,ix->ij", bars.middle[None] - bars.middle[:, None], bars.normal))
+    near = np.maximum(apart, apart.T) <= SAME_BAR[1] * bars.width.mean(axis=1)[:, None]
+    return np.asarray(near & (np.abs(bars.along @ bars.along.T) >= np.cos(SAME_BAR[0])))
 
 
 def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
