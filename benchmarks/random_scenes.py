@@ -137,8 +137,10 @@ def draw(seed: int) -> Scene:
     cylinders = tuple(leg.cylinders for leg in truth.legs)
     width = _widths(camera, T, A_true, B_true, cylinders)
     settings: dict[str, float | int | str] = {
-        "images": n, "errors": "10 mm" if coarse else "2 mm", "size": f"{camera.width}x{camera.height}",
-        "lens": round(float(camera.distortion[0]), 2), "focal": round(float(camera.K[0, 0]) / camera.width, 2),
+        "images": n, "errors": "10 mm" if coarse else "2 mm",
+        "size": f"{camera.width}x{camera.height}",
+        "lens": round(float(camera.distortion[0]), 2),
+        "focal": round(float(camera.K[0, 0]) / camera.width, 2),
         "width": round(float(np.median(width)), 1), "clutter": appearance.clutter,
         "occluders": len(occluders), "blur": round(appearance.blur, 2), "bits": appearance.bits,
         "gamma": appearance.gamma, "light": len(appearance.lights),

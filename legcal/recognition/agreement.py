@@ -252,13 +252,14 @@ def improved(
             H_cross += np.einsum("ntri,ntrj,tl->nlij", weighted, J_leg, of_leg, optimize=True)
             b_leg -= np.einsum("ntri,ntr,tl->nli", weighted_leg, residual, of_leg, optimize=True)
     if joint_error == 0.0:
-        return _moved(poses, np.linalg.solve(H, b[..., None])[..., 0], poses.shift, centre)
+        xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
+        return _moved(poses, xi, poses.shift, centre)
     H_leg += np.eye(6) / joint_error**2
     b_leg -= poses.shift.reshape(n, n_legs, 6) / joint_error**2
     back = np.linalg.solve(H_leg, np.concatenate([H_cross.swapaxes(2, 3), b_leg[..., None]], -1))
     H -= np.einsum("nlij,nljk->nik", H_cross, back[..., :6])
     b -= np.einsum("nlij,nlj->ni", H_cross, back[..., 6])
-    xi = np.linalg.solve(H, b[..., None])[..., 0]
+    xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
     change = back[..., 6] - np.einsum("nlij,nj->nli", back[..., :6], xi)
     return _moved(poses, xi, poses.shift + change.reshape(poses.shift.shape), centre)
 
@@ -324,6 +325,7 @@ def _equations(
     J_leg = np.concatenate(
         [((1.0 - at) * in_base).sum(axis=3), (at * in_base).sum(axis=3)], axis=-1
     )
+    J_leg[:, :, 2:] = 0.0  # too vague to tell where joints are
     sigma_width = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen)
     sigma = max(LINE_ERROR, LINE_PART * tolerance) / depth
     line = found.value / (sigma**2 + (LINE_PIXELS * bars.pixel) ** 2)

@@ -12,6 +12,7 @@ from legcal.recognition.bars import Bars
 from legcal.recognition.starts import joined, pose_starts
 
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
+LAST = (0.008, 0.005, 0.004, 0.003)  # with the joints known better
 JOINT_ERROR = 0.01  # standard deviation of the joint centres of the nominal model [m]
 START_PICTURES, MOST_START_PICTURES = 2, 8  # whose bars suggest poses: at once, at most
 KEPT = (500, 40, 10)  # of the starts of a picture, of its refined ones, of all
@@ -121,7 +122,7 @@ def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
         poses = refined(few, poses, TOLERANCES[2:4], JOINT_ERROR)
         score = supports(pictures, poses, TOLERANCES[3])[0].sum(axis=1)
         poses = poses.take(_distinct(poses, score, KEPT[2]))
-        poses = refined(pictures, poses, (*TOLERANCES[3:], *TOLERANCES[-2:]), JOINT_ERROR)
+        poses = refined(pictures, poses, (*TOLERANCES[3:], *LAST), JOINT_ERROR)
         best = _judged(pictures, poses)
         if best.is_clear:
             break
@@ -145,7 +146,7 @@ def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_leg
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     poses = refined(pictures, poses, TOLERANCES[:3])
-    poses = refined(pictures, poses, (*TOLERANCES[2:], *TOLERANCES[-2:]), JOINT_ERROR)
+    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST), JOINT_ERROR)
     found = _judged(pictures, poses)
     return replace(found, hinted=True)
 
@@ -206,7 +207,7 @@ def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
     for picture in pictures:
         if len(picture.bars) == 0 or len(picture.targets) == 0:
             continue
-        found = agreement(picture, pose, TOLERANCES[-1])
+        found = agreement(picture, pose, JUDGED)
         matched = _one_bar_each(found)[0] >= MATCHED
         distance = distances(picture, pose, found)[0]
         np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
