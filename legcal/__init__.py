@@ -26,6 +26,7 @@ from legcal.errors import LegcalError
 from legcal.version import __version__
 
 if TYPE_CHECKING:
+    from legcal.camera_calibration.calibrate import calibrate_camera
     from legcal.checking import check
     from legcal.dataset.folder import load_dataset
     from legcal.detecting import detect
@@ -59,6 +60,7 @@ __all__ = [
     "ToolPoses",
     "__version__",
     "calibrate",
+    "calibrate_camera",
     "check",
     "detect",
     "evaluate",
@@ -86,6 +88,7 @@ _HOME = {
     "TableNoise": "legcal.simulation.table_noise",
     "ToolPoses": "legcal.location.tool_poses",
     "calibrate": "legcal.pipeline",
+    "calibrate_camera": "legcal.camera_calibration.calibrate",
     "check": "legcal.checking",
     "detect": "legcal.detecting",
     "evaluate": "legcal.report.accuracy",

@@ -15,14 +15,14 @@ import numpy as np
 from legcal.board_views import base_of_board, observe_board
 from legcal.dataset.folder import Dataset, load_dataset
 from legcal.errors import DatasetError
+from legcal.examining import observe
 from legcal.geometry.types import IntArray
 from legcal.observations.canonical_order import inverse, restore_outlines
 from legcal.observations.outlines import Outlines
-from legcal.observations.sets import reject_unused_legs
+from legcal.observations.sets import choose_outlines, reject_unused_legs
 from legcal.overlays.detected import Detection
 from legcal.overlays.folder import DETECTION, check_detection_destination, write_detection
-from legcal.photographs import Placement, given_outlines, place, scene_at_poses
-from legcal.photographs import detect as search
+from legcal.photographs import Scene, given_outlines, scene_at_poses
 from legcal.progress import Report, no_progress
 from legcal.refinement.choices import Choices
 from legcal.report.destination import output_path
@@ -75,8 +75,7 @@ def detect(
     rows = _rows_with_image(dataset)
     with worker_pool(workers) as run:
         work = workpiece(dataset, run, None, Choices(), use_cache=False)
-        outlines, placement = _observed(work, progress)
-        detection = _in_file_order(work, rows, outlines, placement)
+        detection = _in_file_order(work, rows, *_observed(work, progress))
         if output is not None:
             write_detection(detection, Path(output), run, progress)
     return detection
@@ -100,8 +99,10 @@ def _rows_with_image(dataset: Dataset) -> IntArray:
     return np.array(rows, dtype=np.intp)
 
 
-def _observed(work: Workpiece, progress: Report) -> tuple[Outlines, Placement]:
-    """Return all outlines, and where the images put the cameras."""
+def _observed(
+    work: Workpiece, progress: Report
+) -> tuple[Outlines, Scene, dict[str, str], tuple[str, ...]]:
+    """Return all outlines, where the images put everything, unplaced views, and notes."""
     photographs = work.photographs
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
     board = observe_board(work, progress)
@@ -111,27 +112,33 @@ def _observed(work: Workpiece, progress: Report) -> tuple[Outlines, Placement]:
             cameras = board.cameras(T_base_board, scene.T_base_camera)
             scene = replace(scene, T_base_camera=cameras)
     if len(photographs.detect) == 0:
-        return given_outlines(photographs), Placement(scene, {}, ())
+        return given_outlines(photographs), scene, {}, ()
     joined = None if board is None else board.T_board_camera
-    placement = place(photographs, scene, progress, joined)
-    view = work.measurements.view[photographs.detect]
-    placed = np.array([placement.scene.T_base_camera[v] is not None for v in view.tolist()])
-    photographs = replace(photographs, detect=photographs.detect[placed])
-    found = search(photographs, placement.scene, progress)
+    observed = observe(photographs, scene, progress, joined)
+    placement = observed.placement
     # Legs of a view that could not be placed are drawn where its rough pose has them.
     drawn = tuple(
         T if T is not None else rough
         for T, rough in zip(placement.scene.T_base_camera, scene.T_base_camera, strict=True)
     )
     scene = replace(placement.scene, T_base_camera=drawn)
-    return found, replace(placement, scene=scene)
+    placed = np.array([T is not None for T in placement.scene.T_base_camera])
+    searched = placed[work.measurements.view[observed.outlines.row]]
+    kept = searched | ~np.isin(observed.outlines.row, photographs.detect)
+    found = choose_outlines(observed.outlines, kept)
+    return found, scene, placement.unplaced, placement.notes
 
 
 def _in_file_order(
-    work: Workpiece, images: IntArray, outlines: Outlines, placement: Placement
+    work: Workpiece,
+    images: IntArray,
+    outlines: Outlines,
+    scene: Scene,
+    unplaced: dict[str, str],
+    notes: tuple[str, ...],
 ) -> Detection:
     """Return what was found in the order of the files."""
-    dataset, order, scene = work.dataset, work.order, placement.scene
+    dataset, order = work.dataset, work.order
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
     restored = restore_outlines(outlines, order)
     names = dataset.mechanism.leg_names
@@ -142,6 +149,6 @@ def _in_file_order(
         B_base=scene.B_base[rows][:, legs],
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
-        unplaced=placement.unplaced,
-        notes=(*dataset.notes, *placement.notes, *work.reached.notes(work.measurements)),
+        unplaced=unplaced,
+        notes=(*dataset.notes, *notes, *work.reached.notes(work.measurements)),
     )

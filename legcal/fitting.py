@@ -21,8 +21,12 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.board_views import BoardViews, base_of_board, observe_board
 from legcal.calibration import Steps
-from legcal.errors import NotVisible
+from legcal.dataset.holdout import dataset_at
+from legcal.disagreeing import disagreeing_images
+from legcal.errors import NotIdentifiable, NotVisible
+from legcal.examining import Observed, observe
 from legcal.geometry.types import IntArray
+from legcal.identify.check import check_identifiable
 from legcal.observations.canonical_order import inverse
 from legcal.observations.corners import Corners
 from legcal.observations.outlines import Outlines
@@ -33,7 +37,6 @@ from legcal.photographs import (
     detect,
     doubtful_rows,
     given_outlines,
-    place,
     scene_at_poses,
 )
 from legcal.progress import Report
@@ -62,7 +65,11 @@ class Found:
     corners : Corners or None
         Of the calibration board in all images, in the order of work; None without a board.
     notes : tuple of str
-        What is to be said of the images.
+        What is to be said of the images by themselves.
+    doubts : tuple of str
+        What is to be said of them by the fit.
+    other_radii : bool
+        Whether the radii of the model were replaced by those that the images show.
     """
 
     outlines: Outlines
@@ -72,6 +79,8 @@ class Found:
     solution: Solution
     corners: Corners | None
     notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    other_radii: bool = False
 
     @property
     def judged(self) -> Outlines:
@@ -106,20 +115,51 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
         T_base_board = base_of_board(work, board, scene.T_base_camera)
         scene = _placed_by_board(scene, board, T_base_board)
     if len(photographs.detect) == 0:
-        return _fit(part, fitted, given_outlines(photographs), scene, board, progress)
+        outlines = given_outlines(photographs)
+        return _noted(_fit(part, fitted, outlines, scene, board, progress), work.plan.notes)
     joined = None if board is None else board.T_board_camera
-    placement = place(photographs, scene, progress, joined)
+    observed = observe(photographs, scene, progress, joined)
+    placement = observed.placement
     placement.require_one()
-    scene, notes = placement.scene, placement.all_notes
-    outlines = detect(photographs, scene, progress)
-    found = replace(_fit(part, fitted, outlines, scene, board, progress), notes=notes)
-    doubtful = doubtful_rows(photographs, found.judged)
-    if len(doubtful) == 0:
-        return found
-    scene = _fitted_scene(work, found.solution, scene)
-    again = photographs.narrowed(doubtful, found.outlines)
-    outlines = detect(again, scene, progress, near_fit=True)
-    return replace(_fit(part, fitted, outlines, scene, board, progress), notes=notes)
+    other_radii = bool(placement.recognised.radii.factor)
+    if other_radii:
+        work = replace(work, mechanism=observed.photographs.mechanism)
+        part = replace(part, mechanism=observed.photographs.mechanism)
+    scene, outlines, notes = placement.scene, observed.outlines, placement.all_notes
+    if part.every_leg and (observed.left_out or placement.unplaced):
+        _refuse_too_few(work, fitted, observed)
+    found = _fit(part, fitted, outlines, scene, board, progress)
+    left_out = list(observed.left_out)
+    doubtful = np.setdiff1d(doubtful_rows(observed.photographs, found.judged), left_out)
+    if len(doubtful):
+        scene = _fitted_scene(work, found.solution, scene)
+        again = observed.photographs.narrowed(doubtful, found.outlines)
+        outlines = detect(again, scene, progress, near_fit=True)
+        found = _fit(part, fitted, outlines, scene, board, progress)
+    return replace(_noted(found, notes), other_radii=other_radii)
+
+
+def _noted(found: Found, notes: tuple[str, ...]) -> Found:
+    """Return what was found with what is to be said of the images, by themselves and by the fit."""
+    doubts = disagreeing_images(found.part.measurements, found.part.mechanism, found.solution)
+    return replace(found, notes=notes, doubts=doubts)
+
+
+def _refuse_too_few(work: Workpiece, fitted: IntArray, observed: Observed) -> None:
+    """Raise NotIdentifiable if the images that are left do not determine the parameters."""
+    measurements, cameras = work.measurements, observed.placement.scene.T_base_camera
+    left = [
+        row
+        for row in fitted.tolist()
+        if row not in observed.left_out and cameras[measurements.view[row]] is not None
+    ]
+    notes = observed.placement.all_notes
+    if not left:
+        raise NotVisible(list(notes))
+    try:
+        check_identifiable(dataset_at(work.dataset, np.sort(work.order.rows[left])), work.choices)
+    except NotIdentifiable as failure:
+        raise NotIdentifiable([*failure.problems, *notes]) from None
 
 
 def _placed_by_board(scene: Scene, board: BoardViews, T: RigidTransform | None) -> Scene:

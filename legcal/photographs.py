@@ -38,9 +38,11 @@ from legcal.observations.sets import (
     no_outlines,
 )
 from legcal.progress import Report
-from legcal.recognition.recognise import Search, recognise, shifted
+from legcal.recognition.radii import radius_notes
+from legcal.recognition.recognise import Recognised, Search, recognise, shifted
 from legcal.workers import Run
 
+Joined = Sequence[RigidTransform | None] | None
 NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 
 
@@ -180,11 +182,17 @@ class Placement:
         Why views could not be placed, by name.
     notes : tuple of str
         What else a reader should know.
+    search : Search
+        The images and the model, with the radii that the images show.
+    recognised : Recognised
+        What was made of them.
     """
 
     scene: Scene
     unplaced: dict[str, str]
     notes: tuple[str, ...]
+    search: Search
+    recognised: Recognised
 
     def require_one(self) -> None:
         """Refuse images of which no view could be placed.
@@ -207,7 +215,7 @@ def place(
     photographs: Photographs,
     scene: Scene,
     report: Report,
-    joined: Sequence[RigidTransform | None] | None = None,
+    joined: Joined = None,
 ) -> Placement:
     """Recognise the legs in the images, and place the cameras by them.
 
@@ -236,7 +244,7 @@ def place(
         scene.T_base_camera,
         joined,
         run=photographs.run,
-        progress=_counted(report, "Recognising legs", len(photographs.detect)),
+        progress=counted(report, "Recognising legs", len(photographs.detect)),
     )
     views = photographs.measurements.views
     A, B = shifted(found, photographs.measurements.view, scene.A_base, scene.B_base)
@@ -246,7 +254,9 @@ def place(
         for v, (T, rough) in enumerate(zip(found.T_base_camera, scene.T_base_camera, strict=True))
     )
     unplaced = {views[v].name: why for v, why in found.unplaced.items()}
-    return Placement(Scene(A, B, cameras, found.joint_error), unplaced, found.notes)
+    notes = (*found.notes, *radius_notes(found.radii, photographs.mechanism.leg_names))
+    search = replace(search, cylinders=found.radii.corrected(search.cylinders))
+    return Placement(Scene(A, B, cameras, found.joint_error), unplaced, notes, search, found)
 
 
 def detect(
@@ -271,7 +281,7 @@ def detect(
         photographs.mechanism.leg_names,
         run=photographs.run,
         method=method,
-        progress=_counted(report, stage, len(photographs.detect)),
+        progress=counted(report, stage, len(photographs.detect)),
         joint_error=0.0 if near_fit else scene.joint_error,
         pixel_error=NEAR_FIT_PX if near_fit else PIXEL_ERROR,
     )
@@ -285,7 +295,7 @@ def given_outlines(photographs: Photographs, found: Outlines | None = None) -> O
     return join_outlines([merge_edited(detected, kept), choose_outlines(kept, ~is_edited(kept))])
 
 
-def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:
+def counted(report: Report, stage: str, total: int) -> Callable[[int], None]:
     """Return a callback that counts images, up to a total that may not be reached."""
     done = itertools.count(1)
     report(stage, 0, total)

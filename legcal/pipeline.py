@@ -30,6 +30,7 @@ from legcal.refinement.held_out import HeldOut, compare_held_out
 from legcal.refinement.known_parameters import known_parameters
 from legcal.refinement.resolution import resolve
 from legcal.refinement.settings import DEFAULT_SETTINGS
+from legcal.refinement.solution import Solution
 from legcal.report.destination import check_destination, output_path
 from legcal.report.result import write_result
 from legcal.stages.nominal import Criteria
@@ -127,16 +128,29 @@ def calibrate(
             dataset, run, criteria, choices, use_cache=use_cache, transformation=transformation
         )
         found = observe_and_fit(work, split.fitted, progress)
-    kept = work.keep_outlines(found.outlines)
+    kept = [] if found.other_radii else work.keep_outlines(found.outlines, found.notes)
     unreached = found.part.reached.notes(found.part.measurements)
-    notes = [*dataset.notes, *found.notes, *choices.notes, *left_open, *kept, *unreached]
+    notes = [
+        *dataset.notes,
+        *found.notes,
+        *found.doubts,
+        *choices.notes,
+        *left_open,
+        *kept,
+        *unreached,
+    ]
     order = found.part.order
     corners = None if found.corners is None else restore_corners(found.corners, work.order)
     calibration = judge(
         fitted,
         in_file_order(found.solution, order, fitted),
         found.steps.in_file_order(order),
-        (*notes, *board_notes(dataset, found.solution, corners), *found.solution.notes),
+        (
+            *notes,
+            *board_notes(dataset, found.solution, corners),
+            *found.solution.notes,
+            *_camera_notes(dataset, found.solution),
+        ),
     )
     calibration = replace(calibration, corners=corners)
     if len(split.kept_aside):
@@ -165,6 +179,16 @@ def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
     }
     twists = {name: prior for name, prior in twists.items() if name not in choices.fixed}
     return replace(choices, priors={**twists, **choices.priors})
+
+
+def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return which files hold the focal lengths that the measurements contradict."""
+    names = [view.name for view in dataset.measurements.views]
+    return [
+        f"The focal length of {view} that does not agree is that of "
+        f"{dataset.camera_paths[names.index(view)]}."
+        for view in solution.doubtful_cameras
+    ]
 
 
 def _compare_held_out(work: Workpiece, found: Found, split: Split) -> HeldOut:

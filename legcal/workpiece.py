@@ -128,12 +128,15 @@ class Workpiece:
             axes=None if dataset.axes is None else reorder_axes(dataset.axes, order),
         )
 
-    def keep_outlines(self, outlines: Outlines) -> list[str]:
-        """Leave the outlines beside the dataset for the next run; return a note if that fails."""
+    def keep_outlines(self, outlines: Outlines, notes: Sequence[str]) -> list[str]:
+        """Leave the outlines and what is to be said of the images beside the dataset.
+
+        Returns a note if that fails.
+        """
         if len(self.plan.detect) == 0:
             return []
         restored = restore_outlines(outlines, self.order)
-        note = store_outlines(self.dataset, restored, self.fingerprint, self.plan.given)
+        note = store_outlines(self.dataset, restored, self.fingerprint, self.plan.given, notes)
         return [note] if note else []
 
 

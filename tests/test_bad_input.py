@@ -97,8 +97,9 @@ def test_a_result_on_a_full_disk_is_refused_and_leaves_nothing(tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("stdout", ["/dev/full", None])
-@pytest.mark.parametrize("words", [[], ["--json"]])
+@pytest.mark.parametrize(
+    ("words", "stdout"), [([], "/dev/full"), (["--json"], "/dev/full"), (["--json"], None)]
+)
 def test_output_that_cannot_be_printed_is_said_on_stderr(
     words: list[str], stdout: str | None
 ) -> None:

@@ -332,12 +332,15 @@ def test_fingerprint_that_cannot_be_read_matches_nothing(folder: Folder, content
 
 def test_fingerprint_file_is_as_documented(folder: Folder) -> None:
     dataset = load_dataset(folder.path)
-    store_outlines(dataset, hexapod_outlines(), "abc", row_mask(0))
+    store_outlines(dataset, hexapod_outlines(), "abc", row_mask(0), ["view c1: a note."])
     assert json.loads((folder.path / CACHE_NAME).read_text()) == {
         "format": 1,
         "fingerprint": "abc",
         "given": [["c1", "images/c1_1.png"]],
+        "notes": ["view c1: a note."],
     }
+    assert plan_dataset(load_dataset(folder.path), "abc").notes == ("view c1: a note.",)
+    assert plan_dataset(load_dataset(folder.path), "abcd").notes == ()
 
 
 def test_folder_that_cannot_be_written_to_is_a_note(

@@ -57,9 +57,17 @@ def of_sigma(calibration: Calibration, dataset: Path) -> np.ndarray[Any, Any]:
     return np.asarray(error[sigma > 0.0] / sigma[sigma > 0.0])
 
 
-def test_cameras_in_the_hand_need_no_places_of_theirs(in_the_hand: Path, tmp_path: Path) -> None:
-    output = tmp_path / "result"
-    calibration = legcal.calibrate(in_the_hand, output=output)
+@pytest.fixture(scope="module")
+def of_the_hand(in_the_hand: Path) -> tuple[Calibration, Path]:
+    """Return the calibration with those images, and where it was written."""
+    output = in_the_hand.parent / "result"
+    return legcal.calibrate(in_the_hand, output=output), output
+
+
+def test_cameras_in_the_hand_need_no_places_of_theirs(
+    in_the_hand: Path, of_the_hand: tuple[Calibration, Path]
+) -> None:
+    calibration, output = of_the_hand
     assert len(calibration.solution.T_camera_Rb) == 15
     assert np.sqrt(np.mean(of_sigma(calibration, in_the_hand) ** 2)) < 1.8
     assert calibration.verdict.trustworthy
@@ -82,8 +90,10 @@ def test_a_board_joins_views_that_share_no_leg(in_the_hand: Path, tmp_path: Path
     assert np.sqrt(np.mean(of_sigma(calibration, in_the_hand) ** 2)) < 2.0
 
 
-def test_a_place_of_the_board_that_cannot_be_is_told(in_the_hand: Path, tmp_path: Path) -> None:
-    right = legcal.calibrate(in_the_hand)
+def test_a_place_of_the_board_that_cannot_be_is_told(
+    in_the_hand: Path, of_the_hand: tuple[Calibration, Path], tmp_path: Path
+) -> None:
+    right = of_the_hand[0]
     T_Rb_board = right.solution.T_Rb_board
     assert T_Rb_board is not None
     found = right.dataset.mechanism.T_base_Rb * T_Rb_board
@@ -137,15 +147,22 @@ def test_a_board_of_other_squares_is_refused(in_the_hand: Path, tmp_path: Path) 
     assert abs(free.solution.values[BOARD_SCALE] - 1.0 / 0.95) < 5e-3
 
 
-@pytest.mark.parametrize("rejected", [True, False], ids=["all rejected", "two left"])
-def test_a_board_that_no_image_shows_is_refused_where_cameras_have_places(
-    tmp_path: Path, rejected: bool
-) -> None:
-    dataset = tmp_path / "placed"
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of a board and of cameras that have places."""
+    folder = tmp_path_factory.mktemp("board") / "placed"
     settings = legcal.SimulationSettings(
         level=Level.OUTLINES, board="charuco", views=2, poses=2, seed=1
     )
-    legcal.simulate("hexapod", dataset, settings)
+    legcal.simulate("hexapod", folder, settings)
+    return folder
+
+
+@pytest.mark.parametrize("rejected", [True, False], ids=["all rejected", "two left"])
+def test_a_board_that_no_image_shows_is_refused_where_cameras_have_places(
+    placed: Path, tmp_path: Path, rejected: bool
+) -> None:
+    dataset = changed(placed, tmp_path / "placed", lambda document: None)
     table = dataset / "corners.csv"
     text = table.read_text()
     table.write_text(

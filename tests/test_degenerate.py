@@ -2,6 +2,7 @@
 
 import csv
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -170,10 +171,16 @@ def test_a_3_upu_not_far_from_its_constraint_singularity_is_calibrated(tmp_path:
 
 
 @pytest.fixture(scope="module")
-def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def two_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Outlines of a hexapod in two views."""
+    folder = tmp_path_factory.mktemp("two") / "set"
+    return simulate("hexapod", folder, settings(poses=12, views=2, seed=1)).folder
+
+
+@pytest.fixture(scope="module")
+def halves(two_views: Path) -> Path:
     """Outlines of a hexapod of which two cameras see three legs each, and no leg in common."""
-    folder = tmp_path_factory.mktemp("halves") / "set"
-    simulate("hexapod", folder, settings(poses=12, views=2, seed=1))
+    folder = Path(shutil.copytree(two_views, two_views.parent / "halves"))
     text = (folder / "dataset.yaml").read_text()
     for view, legs in (("c1", "leg1, leg2, leg3"), ("c2", "leg4, leg5, leg6")):
         text = re.sub(
@@ -193,9 +200,11 @@ def test_views_that_share_no_leg_are_joined_by_the_readings(halves: Path, tmp_pa
     assert "The four steps alone leave open" in said(calibration)
 
 
-def test_a_leg_that_no_view_shows_is_found_from_its_readings(tmp_path: Path) -> None:
+def test_a_leg_that_no_view_shows_is_found_from_its_readings(
+    two_views: Path, tmp_path: Path
+) -> None:
     """Legs 1 to 5 are named in the views, leg 6 in none: its encoder says where it is."""
-    folder = simulate("hexapod", tmp_path / "set", settings(poses=12, views=2, seed=1)).folder
+    folder = Path(shutil.copytree(two_views, tmp_path / "set"))
     observations = folder / "observations.csv"
     with observations.open(newline="") as file:
         header, *rows = csv.reader(file)

@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from legcal.errors import DatasetError, UsageError
 from legcal.observations.outlines import QUALITY
 from legcal.observations.table import read_observations
 from legcal.overlays.detected import Detection
+from legcal.overlays.folder import picture_names
 
 BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
 
@@ -185,24 +187,18 @@ def test_an_earlier_detection_is_replaced_and_other_files_are_kept(
     assert (out / "overlays" / "c1" / "p0_0.jpg").exists()
 
 
-def test_images_of_the_same_name_have_pictures_of_their_own(
-    one_image: RepeatedImages, tmp_path: Path
-) -> None:
-    picture = one_image.pictures.pop("images/p0_1.png")
-    (one_image.path / "images" / "more").mkdir()
-    one_image.pictures["images/more/P0_0.png"] = picture
-    one_image.rows[1]["image"] = "images/more/P0_0.png"
-    one_image.entry["views"] = {"../left cam": one_image.entry["views"]["c1"]}
-    for row in one_image.rows:
-        row["view"] = "../left cam"
-    one_image.write()
-    detect(one_image.path, output=tmp_path / "out")
-    written = sorted(
-        path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.jpg")
-    )
-    assert written == [
-        "overlays/_left_cam/images_more_P0_0.png.jpg",
-        "overlays/_left_cam/images_p0_0.png.jpg",
+def test_images_of_the_same_name_have_pictures_of_their_own(found: Detection) -> None:
+    measurements = found.dataset.measurements
+    views = (replace(measurements.views[0], name="../left cam"), *measurements.views[1:])
+    images = ("images/a.png", "more/A.png", "b/c.png", "b/d.png", "images/a.png")
+    renamed = replace(measurements, views=views, image=images)
+    pictures = picture_names(replace(found, dataset=replace(found.dataset, measurements=renamed)))
+    assert list(pictures.values()) == [
+        "overlays/_left_cam/images_a.png.jpg",
+        "overlays/_left_cam/more_A.png.jpg",
+        "overlays/_left_cam/b_c.png.jpg",
+        "overlays/_left_cam/b_d.png.jpg",
+        "overlays/c2/a.jpg",
     ]
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from machine_session import MachineSession, machine_session, shifted
+from thinned import thinned
 
 from legcal.errors import DidNotConverge
 from legcal.refinement import Solution, refine
@@ -68,7 +69,7 @@ def test_a_wrong_fixed_intrinsic_is_refused(session: MachineSession) -> None:
         fitted(session, fixed_at({"c1.fx": 1303.0}))
 
 
-@pytest.mark.parametrize("scale", [1.0, 4.0])
+@pytest.mark.parametrize("scale", thinned([1.0, 4.0], [4.0]))
 @pytest.mark.parametrize("part", ["offset", "base", "platform", "radius"])
 def test_right_fixed_values_are_believed_whatever_outlines_claim(part: str, scale: float) -> None:
     exact = machine_session("hexapod", n_poses=16)

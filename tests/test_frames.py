@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.frames import frame_on_points, motion_from_xyz_quat, motion_to_xyz_quat
+from legcal.geometry.frames import (
+    frame_on_points,
+    motion_from_xyz_quat,
+    motion_of,
+    motion_to_xyz_quat,
+    product,
+)
 from legcal.geometry.types import Array
 
 FAST = settings(deadline=None, max_examples=50)
@@ -23,6 +29,25 @@ def points(seed: int) -> Array:
     return np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.1, 0.3, 0.0]]) + rng.normal(
         scale=0.03, size=(3, 3)
     )
+
+
+@FAST
+@given(SEEDS)
+def test_quick_products_are_those_of_scipy(seed: int) -> None:
+    one, two, three = motion(seed), motion(seed + 1), motion(seed + 2)
+    expected = (one * two * three).as_matrix()
+    np.testing.assert_allclose(product(one, two, three).as_matrix(), expected, atol=1e-14)
+
+
+@FAST
+@given(SEEDS)
+def test_rounding_of_a_rotation_matrix_is_corrected(seed: int) -> None:
+    T = motion(seed)
+    R = T.rotation.as_matrix() + 1e-9 * np.random.default_rng(seed).normal(size=(3, 3))
+    found = motion_of(R, T.translation).as_matrix()
+    np.testing.assert_allclose(found[:3, :3].T @ found[:3, :3], np.eye(3), atol=1e-15)
+    expected = RigidTransform.from_components(T.translation, Rotation.from_matrix(R)).as_matrix()
+    np.testing.assert_allclose(found, expected, atol=1e-15)
 
 
 @FAST

@@ -213,9 +213,17 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
     ("name", "choices"),
     [
         ("hexapod", Choices(free=frozenset({"c1.fx", "c1.cx"}), fixed=frozenset({"leg2.offset"}))),
-        ("3-rps", Choices(priors={"leg2.base_axis.1": Prior(0.0, 1e-3)})),
+        pytest.param(
+            "3-rps",
+            Choices(priors={"leg2.base_axis.1": Prior(0.0, 1e-3)}),
+            marks=pytest.mark.slow,
+        ),
         ("tricept", Choices(free=frozenset({"leg1.radius.leg1_rod"}))),
-        ("hexapod-rod", Choices(priors={"leg6.length": Prior(0.4, 1e-4)})),
+        pytest.param(
+            "hexapod-rod",
+            Choices(priors={"leg6.length": Prior(0.4, 1e-4)}),
+            marks=pytest.mark.slow,
+        ),
         ("3-rpr", Choices()),
     ],
 )

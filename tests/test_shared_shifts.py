@@ -171,7 +171,7 @@ def shared_errors(
 def test_shared_errors_are_found_and_weighed(session: Session) -> None:
     start = disturbed_start(session)
     normalised, sizes = [], []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         measurements = noisy_readings(session, rng)
         outlines = shared_errors(session, rng, 0.06, 0.03)

@@ -115,7 +115,10 @@ def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: boo
     assert (np.abs(error).max() < np.sqrt(3.0) + 1e-6) == uniform
 
 
-def test_a_machine_that_reaches_no_pose_of_its_travel_is_refused() -> None:
+def test_a_machine_that_reaches_no_pose_of_its_travel_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("legcal.simulation.poses._ROUNDS", 20)
     machine = replace(hexapod(), travel=np.tile([[0.1, 0.1], [0.9, 0.9]], (3, 1)))
     with pytest.raises(DidNotConverge, match="Only 0 of 2 random poses"):
         extreme_poses(machine, 2, np.random.default_rng(0))

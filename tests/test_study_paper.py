@@ -30,7 +30,7 @@ from legcal.studies.session import SimulatedSession
 from legcal.studies.truths import coplanar_hexapod, noncoplanar_hexapod
 from legcal.studies.workers import child_seed
 
-N_RUNS = 3
+N_RUNS = 2
 
 
 @pytest.fixture(scope="module")

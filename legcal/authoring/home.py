@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.authoring.machine import Description, Home
 from legcal.errors import ModelError
-from legcal.geometry.frames import motion_to_xyz_quat
+from legcal.geometry.frames import motion_of, motion_to_xyz_quat
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import LegKind
 
@@ -152,7 +152,7 @@ def _search(closure: _Closure, *, turning: bool) -> Home | None:
 
     def pose(x: Array) -> RigidTransform:
         turn = np.zeros(3) if n_free == 3 else x[3:]
-        return RigidTransform.from_components(closure.size * x[:3], Rotation.from_rotvec(turn))
+        return motion_of(Rotation.from_rotvec(turn).as_matrix(), closure.size * x[:3])
 
     def misfit(x: Array) -> Array:
         return closure.residual(pose(x))
@@ -188,7 +188,7 @@ def _jacobian(closure: _Closure, T: RigidTransform) -> Array:
 def _moved(T: RigidTransform, step: Array, size: float) -> RigidTransform:
     """Return a pose moved by parts of a size and turned by a rotation vector [rad]."""
     turn = Rotation.from_rotvec(step[3:])
-    return RigidTransform.from_components(T.translation + size * step[:3], turn * T.rotation)
+    return motion_of((turn * T.rotation).as_matrix(), T.translation + size * step[:3])
 
 
 def _written(T: RigidTransform) -> Home:

@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from legcal.cli.calibrate import calibrate
+from legcal.cli.camera import camera
 from legcal.cli.detect import detect
 from legcal.cli.evaluate import evaluate
 from legcal.cli.identify import identify
@@ -60,7 +61,18 @@ def _root(
     """Calibrate parallel robots from photographs of their legs."""
 
 
-for command in (inspect, identify, detect, calibrate, evaluate, locate, new, noise, simulate):
+for command in (
+    inspect,
+    camera,
+    identify,
+    detect,
+    calibrate,
+    evaluate,
+    locate,
+    new,
+    noise,
+    simulate,
+):
     app.command()(command)
 app.add_typer(study, name="study")
 

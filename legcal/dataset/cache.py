@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,11 +38,14 @@ class CacheEntry(FileSchema):
         Of all that the detected outlines in the table came from.
     given : list of (view, image)
         The images whose outlines the user gave; they are never detected.
+    notes : tuple of str
+        What was to be said of the images.
     """
 
     format: int
     fingerprint: str
     given: list[tuple[str, str]]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +60,14 @@ class DetectionPlan:
         Outlines to use as they are; its edited rows win over those that detection finds.
     given : (n_rows,) array of bool
         Rows whose outlines the user gave.
+    notes : tuple of str
+        What was to be said of the images when they were searched, if none is searched again.
     """
 
     detect: IntArray
     keep: Outlines
     given: BoolArray
+    notes: tuple[str, ...] = ()
 
 
 def plan_detection(
@@ -122,7 +128,10 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     given_names = set(entry.given) if entry else set()
     given = np.array([name in given_names for name in _places(dataset)], dtype=np.bool_)
     recorded = entry.fingerprint if entry else None  # the format is part of the fingerprint
-    return plan_detection(dataset.observations, has_image, recorded, current, given)
+    plan = plan_detection(dataset.observations, has_image, recorded, current, given)
+    if entry is None or recorded != current or len(plan.detect):
+        return plan
+    return replace(plan, notes=entry.notes)
 
 
 def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:
@@ -190,7 +199,11 @@ def _digest(path: Path) -> bytes:
 
 
 def store_outlines(
-    dataset: Dataset, outlines: Outlines, current: str, given: BoolArray
+    dataset: Dataset,
+    outlines: Outlines,
+    current: str,
+    given: BoolArray,
+    notes: Sequence[str] = (),
 ) -> str | None:
     """Write outlines and the fingerprint of what they came from beside the dataset.
 
@@ -204,6 +217,8 @@ def store_outlines(
         Its :func:`fingerprint`.
     given : (n_rows,) array of bool
         ``DetectionPlan.given``.
+    notes : sequence of str
+        What is to be said of the images.
 
     Returns
     -------
@@ -214,7 +229,12 @@ def store_outlines(
     places = [
         list(name) for name, is_given in zip(_places(dataset), given, strict=True) if is_given
     ]
-    entry = {"format": FORMAT, "fingerprint": current, "given": sorted(places)}
+    entry = {
+        "format": FORMAT,
+        "fingerprint": current,
+        "given": sorted(places),
+        "notes": list(notes),
+    }
     path = dataset.folder / OBSERVATIONS_NAME
     try:
         write_observations(path, outlines, dataset.measurements, dataset.mechanism.leg_names)

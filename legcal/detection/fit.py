@@ -14,9 +14,9 @@ import numpy as np
 from legcal.detection.limb import N_BASIS, Samples, basis
 from legcal.geometry.types import Array
 
-BLURS = (0.3, 2.7, 7)  # first trials, least to greatest [px]
-BLUR_BLOCKS = 40
-BLUR_ROUNDS = 3
+BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
+BLUR_BLOCKS = 24
+BLUR_ROUNDS = 2
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 # Prior precision of the amplitudes, in units of the contrast of a block.
 RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
@@ -134,16 +134,12 @@ def estimate_blur(
     best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
     d, grey, weight, half_width = d[best], grey[best], weight[best], half_width[best]
     blurs = np.geomspace(*BLURS)
-    rough = blurs[int(np.argmin(_misfits(d, grey, weight, half_width, blurs)))]
-    near = np.abs(d) <= depth_for_blur(float(rough))
-    ratio = np.sqrt(blurs[1] / blurs[0])
-    fine = rough * ratio ** np.arange(-2.0, 3.0)
-    misfit = _misfits(d, grey, weight * near, half_width, fine)
-    i = int(np.clip(np.argmin(misfit), 1, len(fine) - 2))
+    misfit = _misfits(d, grey, weight, half_width, blurs)
+    i = int(np.clip(np.argmin(misfit), 1, len(blurs) - 2))
     left, middle, right = misfit[i - 1 : i + 2]
     bend = left - 2.0 * middle + right
     offset = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
-    return float(fine[i] * ratio**offset)
+    return float(blurs[i] * (blurs[1] / blurs[0]) ** offset)
 
 
 def depth_for_blur(blur: float) -> float:

@@ -1,8 +1,10 @@
 """Sub-pixel lines of all outlines of an image, from edges known to about a pixel.
 
 A first round with a wide blur and every second block pulls the lines in; then the blur of the
-image is estimated from its best blocks; the last rounds use the pixels that the blurred outline
-reaches and little more, since the further inside, the less the shading is that of a limb.
+image is estimated from its best blocks, and lines settle robustly on blocks that are fitted apart.
+At last all blocks of an outline that lie on its line are fitted together, and the blur to all
+outlines. Pixels are used as far as the blurred outline reaches and little farther, since the
+further inside, the less the shading is that of a limb.
 """
 
 from collections.abc import Sequence
@@ -10,51 +12,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.detection.band import Band
-from legcal.detection.fit import depth_for_blur, estimate_blur, fit_blocks
-from legcal.detection.limb import Samples
+from legcal.detection.blocks import Blocks, Edge
+from legcal.detection.fit import depth_for_blur, estimate_blur
 from legcal.detection.picture import Grey
-from legcal.detection.profiles import read_profiles
-from legcal.detection.response import to_light
-from legcal.detection.straight import StraightFit, fit_straight
-from legcal.geometry.types import Array, BoolArray, IntArray
+from legcal.detection.pooled import fit_together
+from legcal.detection.straight import StraightFit
+from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
 
+__all__ = ["Edge", "MeasuredEdge", "measure_edges"]
+
 FIRST_BLUR = 1.0  # [px]
-SHALLOWEST = 0.8  # largest used depth, in half-widths
-ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
-ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
-VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
 LEAST_GAIN = 30  # in chi^2, by which a block shows an edge at all
 FIRST_STEP = 2
-FIRST_ROUNDS, LAST_ROUNDS = 2, 6  # at most
-SHADING = 0.8  # that the limb model leaves out [grey levels]
-SETTLED = 0.01  # movement of every line below which the rounds end [px]
-
-
-@dataclass(frozen=True, eq=False)
-class Edge:
-    """An outline that is known to about a pixel.
-
-    Attributes
-    ----------
-    band : Band
-        The frame of its part.
-    v : (2,) array
-        Offsets at both ends of the band [px].
-    epsilon : float
-        +1 for edge 1, -1 for edge 2.
-    half_width : float
-        Half of the width of the part in the image [px].
-    hidden : (n,) array of bool
-        Which of n equal stretches of the band other legs hide.
-    """
-
-    band: Band
-    v: Array
-    epsilon: float
-    half_width: float
-    hidden: BoolArray
+FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # at most
+TRIALS, SIMILAR = 3, 0.12  # of the blur, until its logarithm changes by less than this
+SHADING = 0.5  # that the model leaves out [grey levels]
+WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
+COMMON_BIAS, TILT_BIAS = 0.012, 0.02  # of both ends, of each end [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,141 +83,59 @@ def measure_edges(
         Standard deviation of the blur of the image [px].
     """
     v = [edge.v for edge in edges]
-    blocks = _Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=FIRST_STEP)
+    blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=FIRST_STEP)
     if len(blocks.moved) == 0:
         return [None] * len(edges), FIRST_BLUR
     blocks.settle(FIRST_BLUR, FIRST_ROUNDS, least_gain=-np.inf)
     blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
     v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
-    blocks = _Blocks.read(grey, camera, edges, v, blur, step=1)
-    if len(blocks.moved) == 0:
-        return [None] * len(edges), blur
-    blocks.settle(blur, LAST_ROUNDS, least_gain=LEAST_GAIN)
+    for _ in range(TRIALS):
+        tried = blur
+        blocks = Blocks.read(grey, camera, edges, v, tried, step=1)
+        if len(blocks.moved) == 0:
+            return [None] * len(edges), tried
+        blocks.settle(tried, LAST_ROUNDS, least_gain=LEAST_GAIN)
+        together = fit_together(blocks, blocks.kept(), tried, depth_for_blur(tried))
+        blur = together.blur
+        if abs(np.log(blur / tried)) < SIMILAR:
+            break
     return [
-        None if line is None else _measured(_moved(edge, at, line), line, step, sharp, blur)
-        for edge, at, line, step, sharp in zip(
-            edges, v, blocks.lines, blocks.contrasts(), blocks.sharpness(), strict=True
+        None
+        if line is None
+        else _measured(_moved(edge, at, line), edge.epsilon, line, step, sharp, blur, ends, spread)
+        for edge, at, line, step, sharp, ends, spread in zip(
+            edges,
+            v,
+            blocks.lines,
+            blocks.contrasts(),
+            blocks.sharpness(),
+            together.ends,
+            together.covariance,
+            strict=True,
         )
     ], blur
 
 
 def _measured(
-    v: Array, line: StraightFit, contrasts: Array, sharp: Array, blur: float
+    v: Array,
+    epsilon: float,
+    line: StraightFit,
+    contrasts: Array,
+    sharp: Array,
+    blur: float,
+    ends: Array,
+    spread: Array,
 ) -> MeasuredEdge:
     """Return a measured edge; shading moves it by its grey levels over the slope of the step."""
     contrast = float(np.median(contrasts[line.kept]))
     is_step = float(np.median(sharp[line.kept])) > LEAST_GAIN
     bias = SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3)
-    return MeasuredEdge(v, line, contrast, is_step, blur, line.covariance + bias**2)
+    to_piece = np.array([[1.0 - place, place] for place in (line.first, line.last)])
+    covariance = WIDENING**2 * to_piece @ spread @ to_piece.T
+    covariance += COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2) + bias**2
+    return MeasuredEdge(v + epsilon * ends, line, contrast, is_step, blur, covariance)
 
 
 def _moved(edge: Edge, v: Array, line: StraightFit | None) -> Array:
     """Return the offsets of an edge moved by a line of shifts towards the inside."""
     return v if line is None else np.asarray(v + edge.epsilon * line.ends)
-
-
-@dataclass(eq=False)
-class _Blocks:
-    """The blocks of all edges of an image, and how far their lines have moved."""
-
-    d: Samples  # (n, m) from the lines at which they were read
-    grey: Samples  # (n, m) proportional to light
-    weight: Samples  # (n, m)
-    gain: Array  # (n,)
-    bounds: IntArray  # (n_edges + 1,) first block of each edge
-    position: Array  # (n,) as fractions of the bands
-    half_width: Samples  # (n, 1)
-    moved: Array  # (n,) [px]
-    contrast: Array  # (n,) [grey levels]
-    sharp: Array  # (n,) chi^2
-    lines: list[StraightFit | None]
-
-    @classmethod
-    def read(
-        cls,
-        grey: Grey,
-        camera: Camera,
-        edges: Sequence[Edge],
-        v: Sequence[Array],
-        blur: float,
-        step: int,
-    ) -> "_Blocks":
-        """Read every ``step``-th unhidden block of all edges."""
-        outer = depth_for_blur(blur)
-        reach = int(np.ceil(1.42 * outer))
-        rows = ROWS if step > 1 else ROWS * int(np.clip(np.rint(blur / ROWS_PER_BLUR), 1, 4))
-        profiles = []
-        for edge, at in zip(edges, v, strict=True):
-            inner = min(outer, SHALLOWEST * edge.half_width)
-            depths = (-outer, inner)
-            read = read_profiles(grey, camera, edge.band, at, edge.epsilon, depths, reach, rows)
-            n = len(edge.hidden)
-            stretch = np.clip((read.t / edge.band.length * n).astype(np.intp), 0, n - 1)
-            free = ~edge.hidden[stretch]
-            free[np.arange(len(free)) % step != 0] = False
-            profiles.append(read.take(free))
-        counts = [len(p.t) for p in profiles]
-        half_width = np.repeat([edge.half_width for edge in edges], counts)
-        inside = np.concatenate([p.inside for p in profiles])
-        light, weight = to_light(np.concatenate([p.grey for p in profiles]), inside, camera.gamma)
-        return cls(
-            np.concatenate([p.d for p in profiles]),
-            light,
-            weight,
-            np.concatenate([p.gain for p in profiles]),
-            np.cumsum([0, *counts]),
-            np.concatenate(
-                [p.t / edge.band.length for p, edge in zip(profiles, edges, strict=True)]
-            ),
-            half_width.astype(np.float32)[:, None],
-            np.zeros(sum(counts)),
-            np.zeros(sum(counts)),
-            np.zeros(sum(counts)),
-            [None] * len(edges),
-        )
-
-    def samples(self, blocks: slice | BoolArray) -> tuple[Samples, Samples, Samples, Samples]:
-        """Return distances from the current lines, grey levels, weights, half-widths."""
-        d = self.d[blocks] - self.moved[blocks, None].astype(np.float32)
-        return d, self.grey[blocks], self.weight[blocks], self.half_width[blocks]
-
-    def contrasts(self) -> list[Array]:
-        """Return the contrasts of the blocks of each edge, without sign."""
-        return np.split(np.abs(self.contrast), self.bounds[1:-1])
-
-    def sharpness(self) -> list[Array]:
-        """Return how clearly the blocks of each edge show a step and not a bend [chi^2]."""
-        return np.split(self.sharp, self.bounds[1:-1])
-
-    def settle(self, blur: float, n_rounds: int, least_gain: float) -> None:
-        """Fit the blocks and a line to each edge in turn, until no line moves any more."""
-        active = np.ones(len(self.lines), dtype=np.bool_)
-        counts = np.diff(self.bounds)
-        for turn in range(n_rounds):
-            least = least_gain if turn > 1 else -np.inf  # a line that is off shows bad fits
-            chosen = np.repeat(active, counts)
-            fit = fit_blocks(*self.samples(chosen), blur)
-            self.contrast[chosen], self.sharp[chosen] = fit.contrast, fit.sharp
-            shift, variance = np.zeros(len(chosen)), np.full(len(chosen), np.inf)
-            shift[chosen] = fit.shift
-            variance[chosen] = np.where(fit.gain > least, fit.variance, np.inf)
-            for i in np.flatnonzero(active):
-                block = slice(self.bounds[i], self.bounds[i + 1])
-                movement = self._fit_line(
-                    int(i), shift[block], variance[block], min(VAGUE[0] * blur, VAGUE[1]) ** 2
-                )
-                active[i] = movement > SETTLED
-            if not np.any(active):
-                break
-
-    def _fit_line(self, i: int, shift: Array, variance: Array, largest: float) -> float:
-        """Fit the line of an edge, which holds the whole shift; return its movement [px]."""
-        block = slice(self.bounds[i], self.bounds[i + 1])
-        gain, position, before = self.gain[block], self.position[block], self.moved[block].copy()
-        line = fit_straight(position, (before + shift) / gain, variance / gain**2, largest)
-        self.lines[i] = line
-        if line is None:
-            return 0.0
-        along = line.ends[0] + (line.ends[1] - line.ends[0]) * position
-        self.moved[block] = along * gain
-        return float(np.abs(along * gain - before).max())

@@ -16,7 +16,7 @@ from legcal.vision.camera import Camera
 
 SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
 FEW = 4  # such pixels of a block that may be noise
-MAX_BLOCKS = 64  # along one outline
+MAX_ROWS = 512  # along one outline
 NODE_SPACING = 16.0  # between points at which the lens distortion is computed [px]
 
 
@@ -98,7 +98,7 @@ def read_profiles(
     along, offset = nodes[order, 1], nodes[order, 0]
     first, last = np.ceil(along[0]), np.floor(along[-1])
     available = max(0, int(last - first) + 1)
-    stride = max(1, int(np.ceil(available / (n_rows * MAX_BLOCKS))))
+    stride = max(1, int(np.ceil(available / MAX_ROWS)))
     n_blocks = available // (n_rows * stride)
     rows = first + stride * np.arange(n_blocks * n_rows)
     centre = np.interp(rows, along, offset)

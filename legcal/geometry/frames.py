@@ -13,6 +13,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 
+_ONE = np.eye(3)
+
 
 def frame_on_points(points: Array, normal: Array | None = None) -> RigidTransform:
     """Return the frame that three points define: origin, x axis, xy plane (z completes).
@@ -50,13 +52,40 @@ def frame_on_points(points: Array, normal: Array | None = None) -> RigidTransfor
         raise ValueError("the points that should define a frame coincide or are collinear")
     x = x / np.linalg.norm(x)
     z = z / np.linalg.norm(z)
-    rotation = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
-    return RigidTransform.from_components(points[0], rotation)
+    return motion_of(np.column_stack([x, np.cross(z, x), z]), points[0])
+
+
+def motion_of(R: Array, t: Array) -> RigidTransform:
+    """Return the rigid motion of a rotation matrix and a translation.
+
+    Quick: ``RigidTransform.from_components`` decomposes every matrix anew, which is most of the
+    time of reading a model.
+
+    Parameters
+    ----------
+    R : (..., 3, 3) array
+        Rotation matrix, orthogonal but for rounding, which is corrected.
+    t : (..., 3) array
+        Translation [m].
+    """
+    matrix = np.zeros((*R.shape[:-2], 4, 4))
+    matrix[..., :3, :3] = R @ (1.5 * _ONE - 0.5 * (np.swapaxes(R, -1, -2) @ R))
+    matrix[..., :3, 3] = t
+    matrix[..., 3, 3] = 1.0
+    return RigidTransform(matrix, normalize=False, copy=False)
+
+
+def product(*motions: RigidTransform) -> RigidTransform:
+    """Return the product of motions, as ``*`` does, quickly; see :func:`motion_of`."""
+    matrix = motions[0].as_matrix()
+    for motion in motions[1:]:
+        matrix = matrix @ motion.as_matrix()
+    return motion_of(matrix[..., :3, :3], matrix[..., :3, 3])
 
 
 def motion_from_xyz_quat(xyz: Sequence[float], quat_xyzw: Sequence[float]) -> RigidTransform:
     """Return the rigid motion written as ``{xyz: [m], quat_xyzw: [-]}`` in the files."""
-    return RigidTransform.from_components(np.asarray(xyz), Rotation.from_quat(quat_xyzw))
+    return motion_of(Rotation.from_quat(quat_xyzw).as_matrix(), np.asarray(xyz))
 
 
 def motion_to_xyz_quat(T: RigidTransform) -> dict[str, list[float]]:

@@ -9,6 +9,8 @@ import numpy as np
 
 from legcal.geometry.types import Array
 
+_COORDINATE_AXES = np.eye(3)
+
 
 def moment(u: Array, M: Array) -> Array:
     """Return the moment h = u x M of oriented lines, eq (1).
@@ -80,8 +82,11 @@ def normal_basis(u: Array) -> Array:
     (..., 2, 3) array
         e1 and e2, with e1 x e2 = u.
     """
-    axis = np.eye(3)[np.argmin(np.round(np.abs(u), 9), axis=-1)]  # ties are not left to rounding
-    e1 = axis - u * np.sum(u * axis, axis=-1, keepdims=True)
-    e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
-    e2 = u[..., [1, 2, 0]] * e1[..., [2, 0, 1]] - u[..., [2, 0, 1]] * e1[..., [1, 2, 0]]
-    return np.stack([e1, e2], axis=-2)  # np.cross is slow on single vectors
+    axis = _COORDINATE_AXES[np.abs(u).round(9).argmin(axis=-1)]  # ties are not left to rounding
+    basis = np.empty((*u.shape[:-1], 2, 3))
+    e1, e2 = basis[..., 0, :], basis[..., 1, :]
+    np.subtract(axis, u * (u * axis).sum(axis=-1, keepdims=True), out=e1)
+    e1 /= np.sqrt((e1 * e1).sum(axis=-1, keepdims=True))
+    ahead, behind = [1, 2, 0], [2, 0, 1]  # np.cross is slow on single vectors
+    e2[...] = u[..., ahead] * e1[..., behind] - u[..., behind] * e1[..., ahead]
+    return basis

@@ -120,7 +120,10 @@ class _Closing:
         count = rank - self.rank(R, t)
         if count < len(motors):
             size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
-            rows = [demanded(self.legs[j], R, t).by_pose[0, 0, self.columns] for j in motors]
+            rows = [
+                demanded(self.legs[j], R, t, by_local=False).by_pose[0, 0, self.columns]
+                for j in motors
+            ]
             held = self.system(R, t, None)[1][0] / size
             left = np.eye(len(size)) - np.linalg.pinv(held, rcond=_RANK) @ held
             order = qr((np.array(rows) / size @ left).T, mode="r", pivoting=True)[1]
@@ -149,7 +152,7 @@ class _Closing:
         """Return residuals (k, m), derivatives (k, m, f); without lengths motors are free."""
         values, slopes = [np.zeros((len(t), 0))], [np.zeros((len(t), 0, 6))]
         for j, leg in enumerate(self.legs):
-            found = demanded(leg, R, t)
+            found = demanded(leg, R, t, by_local=False)
             value, slope = found.values, found.by_pose
             if leg.kind is LegKind.ACTUATED and j in self.driven and wanted is not None:
                 value[:, 0] += leg.q0 - wanted[:, j]

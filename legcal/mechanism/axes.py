@@ -46,8 +46,8 @@ class Step:
 
     def line(self, side: int) -> tuple[Array, Array]:
         """Return a point [m] and the direction of the axis in the body of one side."""
-        T = self.connection.T_body_joint[side]
-        return np.asarray(T.translation), np.asarray(T.rotation.apply(self.axis))
+        matrix = self.connection.T_body_joint[side].as_matrix()
+        return matrix[:3, 3], matrix[:3, :3] @ self.axis
 
     def point(self, side: int, along: float) -> Array:
         """Return the point of the axis at a distance from the joint frame's origin [m]."""

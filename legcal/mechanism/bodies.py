@@ -12,6 +12,7 @@ from typing import Literal
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
+from legcal.geometry.frames import product
 from legcal.mechanism.chain import Closure
 from legcal.mechanism.urdf import Urdf
 
@@ -89,7 +90,7 @@ def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | 
         Connection(
             "prismatic" if joint.type == "prismatic" else "revolute",
             (body_of[joint.parent], body_of[joint.child]),
-            (T_body_link[joint.parent] * joint.T_parent_origin, T_body_link[joint.child]),
+            (product(T_body_link[joint.parent], joint.T_parent_origin), T_body_link[joint.child]),
             joint.name,
             None,
         )
@@ -119,8 +120,8 @@ def _merge(
 ) -> None:
     """Make the body of one link part of the body of another."""
     into, gone = body_of[keep], body_of[join]
-    T_into_gone = T_body_link[keep] * T_keep_join * T_body_link[join].inv()
+    T_into_gone = product(T_body_link[keep], T_keep_join, T_body_link[join].inv())
     for link, body in body_of.items():
         if body == gone:
             body_of[link] = into
-            T_body_link[link] = T_into_gone * T_body_link[link]
+            T_body_link[link] = product(T_into_gone, T_body_link[link])

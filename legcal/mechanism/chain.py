@@ -14,6 +14,7 @@ import pinocchio as pin
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import ModelError
+from legcal.geometry.frames import motion_of
 from legcal.geometry.types import Array, IntArray
 
 
@@ -143,11 +144,17 @@ class ClosedChain:
         M = self._placement(base).actInv(self._placement(frame))
         return M.rotation, M.translation
 
+    def turns(self, configuration: Array, base: str, frames: Sequence[str]) -> Array:
+        """Return the rotations (n, 3, 3) of frames in another one at a configuration."""
+        pin.forwardKinematics(self._model, self._data, configuration)
+        R = self._placement(base).rotation.T
+        return np.array([R @ self._placement(frame).rotation for frame in frames])
+
     def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
         """Return T_base_frame between two frames at a configuration."""
         pin.forwardKinematics(self._model, self._data, configuration)
         M = self._placement(base).actInv(self._placement(frame))
-        return RigidTransform.from_matrix(M.homogeneous)
+        return motion_of(M.rotation, M.translation)
 
     def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
         """Return residual and Jacobian of holding a frame at a pose, at the last linearisation.

@@ -46,7 +46,7 @@ def check_equations(mechanism: Mechanism) -> None:
         T = platform_pose(mechanism, configuration)
         R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
         for j, leg in enumerate(mechanism.legs):
-            equations = linearize(geometry_of(leg), R, t)
+            equations = linearize(geometry_of(leg), R, t, by_local=False)
             values = equations.values[0].copy()
             if leg.kind is not LegKind.CONSTANT:
                 values[0] -= leg.sign * configuration[slider_columns(mechanism, (j,))[0][0]]

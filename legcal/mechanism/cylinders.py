@@ -9,6 +9,7 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
+from legcal.geometry.frames import product
 from legcal.geometry.types import Array
 from legcal.mechanism.axes import Step
 from legcal.mechanism.bodies import Bodies
@@ -62,7 +63,7 @@ def with_cylinders(
 
 def ends_in_body(cylinder: VisualCylinder, bodies: Bodies) -> Array:
     """Return both ends of a cylinder's axis in the body that it is on, (2, 3) [m]."""
-    T = bodies.T_body_link[cylinder.link] * cylinder.T_link_cylinder
+    T = product(bodies.T_body_link[cylinder.link], cylinder.T_link_cylinder)
     half = np.array([0.0, 0.0, 0.5 * cylinder.length])
     return np.asarray(T.apply(np.stack([-half, half])))
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.frames import motion_of
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.equations import demanded
@@ -94,7 +95,7 @@ def demands_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Demands
     rows: list[Array] = []
     measured: list[bool] = []
     for leg in mechanism.legs:
-        at = demanded(geometry_of(leg), R, t)
+        at = demanded(geometry_of(leg), R, t, by_local=False)
         for demand, value, by_pose in zip(at.demands, at.values[0], at.by_pose[0], strict=True):
             found.append((f"leg '{leg.name}'", _WORDS[demand]))
             values.append(float(value))
@@ -144,17 +145,14 @@ def leg_scale(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
 def moved(T_base_platform: RigidTransform, step: Sequence[float] | Array) -> RigidTransform:
     """Return a pose after a rotation [rad] and a displacement [m] as :class:`Demands` has them."""
     change = np.asarray(step, dtype=np.float64)
-    return RigidTransform.from_components(
-        T_base_platform.translation + change[3:],
-        Rotation.from_rotvec(change[:3]) * T_base_platform.rotation,
-    )
+    matrix, turn = T_base_platform.as_matrix(), Rotation.from_rotvec(change[:3])
+    return motion_of(turn.as_matrix() @ matrix[:3, :3], matrix[:3, 3] + change[3:])
 
 
 def _plane(mechanism: Mechanism, matrix: Array) -> list[tuple[float, Array]]:
     """Return the three equations that keep a platform in its plane, tilts at a mean leg's end."""
-    across = np.array([0.0, 0.0, 1.0])
-    normal = np.asarray(mechanism.T_base_Rb.rotation.apply(across))
-    carried = matrix[:3, :3] @ mechanism.T_platform_Re.rotation.apply(across)
+    normal = mechanism.T_base_Rb.as_matrix()[:3, 2]
+    carried = matrix[:3, :3] @ mechanism.T_platform_Re.as_matrix()[:3, 2]
     arms = mechanism.B_platform @ matrix[:3, :3].T
     vectors = arms + matrix[:3, 3] - mechanism.A_base
     scale = float(np.linalg.norm(vectors, axis=1).mean())

@@ -50,7 +50,7 @@ class Linearization:
     by_local: Array
 
 
-def linearize(leg: LegGeometry, R: Array, t: Array) -> Linearization:
+def linearize(leg: LegGeometry, R: Array, t: Array, *, by_local: bool = True) -> Linearization:
     """Return a leg's equations and their derivatives at poses of the platform.
 
     Parameters
@@ -59,12 +59,15 @@ def linearize(leg: LegGeometry, R: Array, t: Array) -> Linearization:
         The leg.
     R, t : (k, 3, 3) and (k, 3) array
         Rotation and position [m] of the platform's frame in that of the base.
+    by_local : bool
+        Whether derivatives by the leg's numbers are wanted too; without them they are
+        (k, m, 0), in two thirds of the time.
 
     Returns
     -------
     Linearization
     """
-    state = _State(leg, R, t)
+    state = _State(leg, R, t, by_local)
     rows = [_ROWS[demand](state) for demand in leg.demands]
     return Linearization(
         leg.demands,
@@ -74,13 +77,13 @@ def linearize(leg: LegGeometry, R: Array, t: Array) -> Linearization:
     )
 
 
-def demanded(leg: LegGeometry, R: Array, t: Array) -> Linearization:
+def demanded(leg: LegGeometry, R: Array, t: Array, *, by_local: bool = True) -> Linearization:
     """Return what a leg really demands at poses: a passive one nothing of its length.
 
     All rows are lengths [m]: those without a unit are counted at the far end of the leg. For the
     rest see :func:`linearize`.
     """
-    found = linearize(leg, R, t)
+    found = linearize(leg, R, t, by_local=by_local)
     rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
     is_length = np.array([d is Demand.LENGTH for d in found.demands[rows]], dtype=np.bool_)
     arm = np.where(is_length, 1.0, found.values[:, :1] + leg.q0)
@@ -95,8 +98,8 @@ def demanded(leg: LegGeometry, R: Array, t: Array) -> Linearization:
 class _State:
     """A leg at poses: its direction, and its axes turned into the frame of the base."""
 
-    def __init__(self, leg: LegGeometry, R: Array, t: Array) -> None:
-        self.leg, self.R = leg, R
+    def __init__(self, leg: LegGeometry, R: Array, t: Array, by_local: bool) -> None:
+        self.leg, self.R, self.by_local = leg, R, by_local
         self.arm = R @ leg.B
         vector = self.arm + t - leg.A
         self.length = np.linalg.norm(vector, axis=1)
@@ -113,14 +116,15 @@ class _Row:
     def __init__(self, state: _State, value: Array) -> None:
         self.state, self.value = state, value
         self.by_pose = np.zeros((len(value), 6))
-        self.by_local = np.zeros((len(value), N_LOCAL))
+        self.by_local = np.zeros((len(value), N_LOCAL if state.by_local else 0))
 
     def depends_on_leg(self, gradient: Array) -> None:
         """Add the dependence on the vector from A to B."""
         self.by_pose[:, :3] += _cross(self.state.arm, gradient)
         self.by_pose[:, 3:] += gradient
-        self.by_local[:, :3] -= gradient
-        self.by_local[:, 3:6] += _back(self.state.R, gradient)
+        if self.state.by_local:
+            self.by_local[:, :3] -= gradient
+            self.by_local[:, 3:6] += _back(self.state.R, gradient)
 
     def depends_on_u(self, gradient: Array) -> None:
         """Add the dependence on the leg's direction."""
@@ -130,6 +134,8 @@ class _Row:
 
     def depends_on_base_axis(self, gradient: Array) -> None:
         """Add the dependence on the axis at the base."""
+        if not self.state.by_local:
+            return
         e1, e2 = _basis(_given(self.state.leg.base_axis))
         self.by_local[:, 7] -= gradient @ e2
         self.by_local[:, 8] += gradient @ e1
@@ -138,6 +144,8 @@ class _Row:
         """Add the dependence on a direction that is tied to the platform and to its axis."""
         axis = _given(self.state.leg.platform_axis)
         self.by_pose[:, :3] += _cross(self.state.turned(vector), gradient)
+        if not self.state.by_local:
+            return
         inside = _back(self.state.R, gradient)
         for column, e in zip((9, 10), _basis(axis), strict=True):
             self.by_local[:, column] += inside @ _cross(e, vector)
@@ -147,7 +155,7 @@ def _length(state: _State) -> _Row:
     """Return |AB| - q0."""
     row = _Row(state, state.length - state.leg.q0)
     row.depends_on_leg(state.u)
-    row.by_local[:, 6] = -1.0
+    row.by_local[:, 6:7] = -1.0
     return row
 
 
@@ -203,7 +211,8 @@ def _twist(state: _State) -> _Row:
         row.depends_on_u(_cross(by_w, state.turned(outer)) / far_reach)
         by_w = _cross(u, by_w) / far_reach
     row.depends_on_platform_vector(outer, by_w)
-    row.by_local[:, 11] = -(s * _dot(u, _cross(p, w)) + c * _dot(p, w))
+    if state.by_local:
+        row.by_local[:, 11] = -(s * _dot(u, _cross(p, w)) + c * _dot(p, w))
     return row
 
 
@@ -253,4 +262,4 @@ def _dot(a: Array, b: Array) -> Array:
 
 def _back(R: Array, vectors: Array) -> Array:
     """Return directions of the base's frame in that of the platform, (k, 3)."""
-    return np.asarray(np.einsum("kji,kj->ki", R, vectors))
+    return np.asarray((vectors[:, None] @ R)[:, 0])

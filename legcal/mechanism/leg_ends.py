@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass
+from legcal.geometry.frames import product
 from legcal.geometry.types import Array
 from legcal.mechanism.axes import PERPENDICULAR, Axis, Pivot, Step, off_square
 
@@ -32,11 +33,11 @@ class LegAtZero:
         self.axes: list[Axis] = []
         for step in steps:
             T_near, T_far = (step.connection.T_body_joint[side] for side in (step.near, step.far))
-            T = self.poses[-1] * T_near
+            T = product(self.poses[-1], T_near)
             turns = step.connection.type != "sphere"
-            direction = np.asarray(T.rotation.apply(step.axis)) if turns else None
-            self.axes.append(Axis(step.name, np.asarray(T.translation), direction))
-            self.poses.append(T * T_far.inv())
+            direction = T.as_matrix()[:3, :3] @ step.axis if turns else None
+            self.axes.append(Axis(step.name, T.as_matrix()[:3, 3], direction))
+            self.poses.append(product(T, T_far.inv()))
         self.platform_origin = np.asarray(self.poses[-1].apply(platform_origin))
         self.leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
 

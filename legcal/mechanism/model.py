@@ -12,7 +12,7 @@ from legcal.errors import UsageError
 from legcal.geometry.frames import frame_on_points
 from legcal.geometry.types import Array
 from legcal.mechanism.chain import ClosedChain
-from legcal.mechanism.leg import Leg, LegKind
+from legcal.mechanism.leg import Cylinder, Leg, LegKind
 from legcal.mechanism.leg_chain import LegChain
 from legcal.mechanism.parameters import KinematicParameters
 from legcal.mechanism.urdf import Urdf
@@ -137,6 +137,14 @@ class Mechanism:
             platform[leg, rank:n_d] = 0.0
         passive = [leg.kind is LegKind.PASSIVE for leg in self.legs]
         return KinematicParameters(base, platform, np.where(passive, np.nan, self.q0))
+
+    def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Mechanism":
+        """Return the mechanism with other visible cylinders of its legs."""
+        legs = tuple(
+            replace(leg, cylinders=tuple(of_leg))
+            for leg, of_leg in zip(self.legs, cylinders, strict=True)
+        )
+        return replace(self, legs=legs)
 
     def with_leg_order(self, names: Sequence[str]) -> "Mechanism":
         """Return the same mechanism with its legs in another order.

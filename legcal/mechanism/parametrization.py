@@ -224,10 +224,29 @@ def _turn(axis: Array | None, nominal: Array | None) -> Array:
         return np.zeros(2)
     if axis @ nominal < 0.0:
         axis = -axis
-    turn = np.cross(nominal, axis)
-    sine = float(np.linalg.norm(turn))
+    turn = _cross(nominal, axis)
+    sine = float(np.sqrt(turn @ turn))
     scale = 1.0 if sine == 0.0 else float(np.arctan2(sine, axis @ nominal)) / sine
     return np.asarray(normal_basis(nominal) @ (scale * turn))
+
+
+def turn_slope(axis: Array | None, nominal: Array | None) -> Array:
+    """Return the derivative (2, 2) of the angles of an axis from the nominal one by its turns.
+
+    Turns are about the :func:`normal_basis` of the axis where it is now.
+    """
+    if axis is None or nominal is None:
+        return np.eye(2)
+    seen = -axis if axis @ nominal < 0.0 else axis
+    by_turn = _cross(normal_basis(axis), seen)
+    turn, d_turn = _cross(nominal, seen), _cross(nominal, by_turn)
+    sine, cosine = float(np.sqrt(turn @ turn)), float(nominal @ seen)
+    if sine == 0.0:
+        return np.asarray(normal_basis(nominal) @ d_turn.T)
+    scale = float(np.arctan2(sine, cosine)) / sine
+    d_sine = d_turn @ turn / sine
+    d_scale = (cosine * d_sine - sine * (by_turn @ nominal) - scale * d_sine) / sine
+    return np.asarray(normal_basis(nominal) @ (scale * d_turn + np.outer(d_scale, turn)).T)
 
 
 def tied_twist(leg: LegGeometry, nominal: LegGeometry, twist: float) -> float | None:
@@ -263,6 +282,12 @@ def _twist(leg: LegGeometry, nominal: LegGeometry) -> float:
     if twist is None or nominal.twist is None:
         return 0.0
     return float(twist - np.pi * np.round((twist - nominal.twist) / np.pi))
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return vector products along the last axis; np.cross is slow."""
+    here, there = [1, 2, 0], [2, 0, 1]
+    return np.asarray(a[..., here] * b[..., there] - a[..., there] * b[..., here])
 
 
 def turn_between(nominal: Array | None, axis: Array | None) -> Rotation:

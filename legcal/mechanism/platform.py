@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.frames import product
 from legcal.geometry.types import Array
 from legcal.mechanism.model import Mechanism
 
 
 def platform_in_base(mechanism: Mechanism, T_base_platform: RigidTransform) -> RigidTransform:
     """Return T_Rb_Re, the pose of the frame on the platform joints, from that of the links."""
-    return mechanism.T_base_Rb.inv() * T_base_platform * mechanism.T_platform_Re
+    return product(mechanism.T_base_Rb.inv(), T_base_platform, mechanism.T_platform_Re)
 
 
 def pose_differences(

@@ -56,7 +56,7 @@ def dimensionless(mechanism: Mechanism, T_base_platform: RigidTransform) -> Arra
         return _lines(mechanism, T_base_platform)
     demands = demands_at(mechanism, T_base_platform)
     scale = leg_scale(mechanism, T_base_platform)
-    centre = T_base_platform.rotation.apply(mechanism.B_platform.mean(axis=0))
+    centre = T_base_platform.as_matrix()[:3, :3] @ mechanism.B_platform.mean(axis=0)
     gradient, moment = demands.jacobian[:, 3:], demands.jacobian[:, :3]
     return np.hstack([(moment - np.cross(centre, gradient)) / scale, gradient])
 

@@ -77,7 +77,7 @@ def _chain(zero: LegAtZero, n_lower: int, slider: Step | None, ends: Ends) -> Le
                 end.letter,
                 np.asarray(near.inv().apply(centre)),
                 np.asarray(far.inv().apply(centre)),
-                None if outer is None else np.asarray(own.rotation.inv().apply(outer)),
+                None if outer is None else outer @ own.as_matrix()[:3, :3],
                 inner,
             )
         )
@@ -88,8 +88,8 @@ def _chain(zero: LegAtZero, n_lower: int, slider: Step | None, ends: Ends) -> Le
         base=groups[0],
         platform=groups[1],
         slider=slider,
-        u_lower=np.asarray(lower.rotation.inv().apply(ends.u)),
-        u_upper=np.asarray(upper.rotation.inv().apply(ends.u)),
+        u_lower=ends.u @ lower.as_matrix()[:3, :3],
+        u_upper=ends.u @ upper.as_matrix()[:3, :3],
         reach=float((ends.B - ends.A) @ ends.u),
         u_zero=ends.u,
         T_zero=last,

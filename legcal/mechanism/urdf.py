@@ -12,6 +12,7 @@ import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.frames import motion_of
 from legcal.geometry.types import Array
 from legcal.mechanism.files import read_file
 from legcal.mechanism.robot_xml import parse_robot
@@ -197,7 +198,7 @@ def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> 
         type=cast("JointType", kind),
         parent=parent,
         child=child,
-        T_parent_origin=RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy)),
+        T_parent_origin=motion_of(Rotation.from_euler("xyz", rpy).as_matrix(), xyz),
         axis=axis,
         limits=limits,
         line=cast("int", element.sourceline),

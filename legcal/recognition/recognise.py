@@ -5,7 +5,7 @@ its view begins; if the images do not agree near it, the view is searched as if 
 a pose that they agree on elsewhere is used and said.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,17 +16,20 @@ from legcal.detection.picture import to_grey
 from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements
-from legcal.recognition.agreement import Picture
+from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import find_bars
+from legcal.recognition.hints import hint_notes
+from legcal.recognition.mirror import mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
+from legcal.recognition.radii import LEFT, MOST_TURNS, OtherRadii, other_radii
 from legcal.recognition.segments import find_segments
-from legcal.recognition.targets import targets_of
+from legcal.recognition.targets import Targets, targets_of
 from legcal.vision.camera import Camera
 from legcal.workers import Run, in_turn
 
 Load = Callable[[int], Image]
 NEAR_IMAGES = 6  # of a view that are searched where a rough pose is given, at first
-FAR_OFF = (0.10, np.deg2rad(8.0))  # of a rough pose: part of the distance, angle
+SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
 
@@ -47,6 +50,8 @@ class Recognised:
         Why views could not be placed, by view: one sentence for each.
     notes : tuple of str
         What else a reader should know: rough poses that are wrong.
+    radii : OtherRadii
+        Radii that the images contradict: the cameras were placed with those that they show.
     """
 
     T_base_camera: list[RigidTransform | None]
@@ -54,6 +59,7 @@ class Recognised:
     joint_error: Array
     unplaced: dict[int, str]
     notes: tuple[str, ...]
+    radii: OtherRadii
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +97,16 @@ class Search:
         view = int(self.measurements.view[row])
         camera = self.measurements.views[view].camera
         bars = find_bars(find_segments(to_grey(self.load(row)), camera))
+        return Picture(bars, self.targets(row, view), corners_of(camera))
+
+    def targets(self, row: int, view: int) -> Targets:
+        """Return the legs at the reading of a row that a view is said to show."""
         legs = np.flatnonzero(self.wanted[view])
-        targets = targets_of(self.A_base[row], self.B_base[row], self.cylinders, legs)
-        return Picture(bars, targets, _corners(camera))
+        return targets_of(self.A_base[row], self.B_base[row], self.cylinders, legs)
+
+    def retargeted(self, row: int, picture: Picture) -> Picture:
+        """Return what an image shows with what it should show by other cylinders."""
+        return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
 
 
 def recognise(
@@ -142,11 +155,20 @@ def recognise(
     doubted = [g for g, near in enumerate(found) if near is None or not near.is_clear]
     missing = [r for g in doubted for r in groups[g].rows if r not in pictures]
     pictures |= _pictures(search, missing, progress, run)
-    everywhere = [groups[g].pictures(pictures, groups[g].rows) for g in doubted]
-    task = partial(_place, everywhere, search.n_legs)
-    for g, anywhere in zip(doubted, run(task, range(len(doubted))), strict=True):
+    for g, anywhere in zip(doubted, _anywhere(groups, doubted, pictures, search, run), strict=True):
         found[g] = _better(found[g], anywhere)
-    return _gathered(search, groups, [placed for placed in found if placed is not None])
+    placed = [one for one in found if one is not None]
+    radii = _radii(search, groups, placed, pictures, run)
+    given, step = search.cylinders, radii
+    for _ in range(MOST_TURNS):
+        if not step.factor:
+            break
+        search = replace(search, cylinders=radii.corrected(given))
+        pictures = {row: search.retargeted(row, one) for row, one in pictures.items()}
+        placed = _placed_again(search, groups, placed, pictures, run)
+        step = radii.of_the_same(other_radii(_for_radii(groups, placed, pictures), LEFT))
+        radii = radii.then(step)
+    return _gathered(search, groups, hints, placed, pictures, radii, run)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +242,70 @@ def _pictures(
     return found
 
 
+def _anywhere(
+    groups: Sequence[_Group],
+    chosen: Sequence[int],
+    pictures: dict[int, Picture],
+    search: Search,
+    run: Run,
+) -> list[Placed]:
+    """Return the cameras of some groups by all of their images, searched for anywhere."""
+    of_group = [groups[g].pictures(pictures, groups[g].rows) for g in chosen]
+    return list(run(partial(_place, of_group, search.n_legs), range(len(chosen))))
+
+
 def _place(groups: Sequence[Sequence[Picture]], n_legs: int, group: int) -> Placed:
     return place_camera(groups[group], n_legs)
+
+
+def _radii(
+    search: Search,
+    groups: Sequence[_Group],
+    placed: Sequence[Placed],
+    pictures: dict[int, Picture],
+    run: Run,
+) -> OtherRadii:
+    """Return the radii that the images contradict, as far as the views can be placed."""
+    if not any(one.is_convincing for one in placed):
+        for factor in SCALED:
+            cylinders = [
+                [replace(c, radius=factor * c.radius) for c in leg] for leg in search.cylinders
+            ]
+            scaled = replace(search, cylinders=cylinders)
+            others = {row: scaled.retargeted(row, one) for row, one in pictures.items()}
+            placed = _anywhere(groups, range(len(groups)), others, scaled, run)
+            if any(one.is_clear for one in placed):
+                break
+    return other_radii(_for_radii(groups, placed, pictures))
+
+
+def _for_radii(
+    groups: Sequence[_Group], placed: Sequence[Placed], pictures: dict[int, Picture]
+) -> Iterator[tuple[int, list[Picture], Poses]]:
+    """Return a few pictures of each group that was placed."""
+    for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
+        if one.is_convincing:
+            yield g, group.pictures(pictures, group.some), one.poses
+
+
+def _placed_again(
+    search: Search,
+    groups: Sequence[_Group],
+    placed: Sequence[Placed],
+    pictures: dict[int, Picture],
+    run: Run,
+) -> list[Placed]:
+    """Return the cameras by other radii: near where they were, or anywhere if they were not."""
+    found = list(placed)
+    lost = [g for g, one in enumerate(placed) if not one.is_convincing]
+    for g, one in zip(lost, _anywhere(groups, lost, pictures, search, run), strict=True):
+        found[g] = one
+    for g, one in enumerate(placed):
+        if one.is_convincing:
+            some = groups[g].pictures(pictures, groups[g].some)
+            near = place_near(some, one.pose(), search.n_legs)
+            found[g] = near if near.is_convincing else one
+    return found
 
 
 def _better(near: Placed | None, anywhere: Placed) -> Placed:
@@ -236,7 +320,15 @@ def _better(near: Placed | None, anywhere: Placed) -> Placed:
     return anywhere if mean[1] > 1.1 * mean[0] else near
 
 
-def _gathered(search: Search, groups: Sequence[_Group], poses: Sequence[Placed]) -> Recognised:
+def _gathered(
+    search: Search,
+    groups: Sequence[_Group],
+    hints: Sequence[RigidTransform | None],
+    poses: Sequence[Placed],
+    pictures: dict[int, Picture],
+    radii: OtherRadii,
+    run: Run,
+) -> Recognised:
     """Put the views together, with what is to be said of them."""
     views = search.measurements.views
     n_views, n_legs = len(views), search.n_legs
@@ -244,11 +336,14 @@ def _gathered(search: Search, groups: Sequence[_Group], poses: Sequence[Placed])
     shift = np.zeros((n_views, n_legs, 2, 3))
     error = np.full((n_views, n_legs), UNSEEN_ERROR)
     unplaced: dict[int, str] = {}
-    notes: list[str] = []
-    for group, placed in zip(groups, poses, strict=True):
+    lost = [g for g, placed in enumerate(poses) if not placed.is_convincing]
+    flipped = {row: one for g in lost for row, one in _flipped(groups[g], pictures).items()}
+    mirrors = dict(zip(lost, _anywhere(groups, lost, flipped, search, run), strict=True))
+    for g, (group, placed) in enumerate(zip(groups, poses, strict=True)):
         name = _named([views[v].name for v in group.views])
         if not placed.is_convincing:
-            sentence = _problem(name, placed, group.hint is not None)
+            is_mirrored = mirrors[g].is_clear
+            sentence = _problem(name, placed, group.hint is not None, is_mirrored=is_mirrored)
             unplaced |= dict.fromkeys(group.views, sentence)
             continue
         of_leg = np.where(
@@ -259,9 +354,14 @@ def _gathered(search: Search, groups: Sequence[_Group], poses: Sequence[Placed])
         for v in group.views:
             found[v] = placed.pose() * group.T_group_camera[v]
             shift[v], error[v] = placed.poses.shift[0], of_leg
-        if group.hint is not None:
-            notes.extend(_wrong_hint(name, group.hint, placed.pose()))
-    return Recognised(found, shift, error, unplaced, tuple(notes))
+    notes = tuple(hint_notes([view.name for view in views], hints, found))
+    return Recognised(found, shift, error, unplaced, notes, radii)
+
+
+def _flipped(group: _Group, pictures: dict[int, Picture]) -> dict[int, Picture]:
+    """Return the pictures of a group with left and right exchanged."""
+    found = mirrored([pictures[row] for row in group.rows])
+    return dict(zip(group.rows, found, strict=True))
 
 
 def _named(names: Sequence[str]) -> str:
@@ -269,8 +369,14 @@ def _named(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
-def _problem(name: str, placed: Placed, hinted: bool) -> str:
+def _problem(name: str, placed: Placed, hinted: bool, *, is_mirrored: bool) -> str:
     """Say why a view could not be placed."""
+    if is_mirrored:
+        return (
+            f"view {name}: its camera could not be placed: found that its images show the legs if "
+            "left and right are exchanged, needed photographs as the camera took them; replace "
+            "the mirrored images by the originals."
+        )
     where = "near its T_base_camera or anywhere else" if hinted else "anywhere"
     if len(placed.poses) == 0:
         return (
@@ -297,22 +403,7 @@ def _problem(name: str, placed: Placed, hinted: bool) -> str:
     )
 
 
-def _wrong_hint(name: str, hint: RigidTransform, T: RigidTransform) -> list[str]:
-    """Return a note if a rough pose is far from where the images put the camera."""
-    off = hint.inv() * T
-    distance = float(np.linalg.norm(T.translation))
-    apart, angle = float(np.linalg.norm(off.translation)), float(off.rotation.magnitude())
-    if apart <= FAR_OFF[0] * distance and angle <= FAR_OFF[1]:
-        return []
-    x, y, z = T.translation
-    return [
-        f"view {name}: its T_base_camera is {1e3 * apart:.0f} mm and {np.degrees(angle):.0f} deg "
-        f"from where its images put the camera (xyz: [{x:.3f}, {y:.3f}, {z:.3f}]); it was not "
-        "used; correct it in dataset.yaml."
-    ]
-
-
-def _corners(camera: Camera) -> Array:
+def corners_of(camera: Camera) -> Array:
     """Return the least and the greatest x and y (2, 2) of the sensor plane that an image shows."""
     x, y = camera.width - 1.0, camera.height - 1.0
     border = np.array(

@@ -109,6 +109,7 @@ def assemble_solution(
         iterations=fit.iterations,
         posterior=Posterior(problem, state, fit.shifts, fit.noise, kept),
         focal_doubt=max((abs(f.change) for f in doubtful), default=0.0),
+        doubtful_cameras=tuple(f.view for f in doubtful),
         notes=(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),

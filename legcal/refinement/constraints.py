@@ -82,9 +82,14 @@ class Tangent:
     Q: Array
 
 
-def pose_rows(legs: Sequence[LegGeometry], R: Array, t: Array) -> PoseRows:
-    """Return what all legs demand at poses R (k, 3, 3), t (k, 3) of R_e in R_b."""
-    found = [demanded(leg, R, t) for leg in legs]
+def pose_rows(
+    legs: Sequence[LegGeometry], R: Array, t: Array, *, by_local: bool = True
+) -> PoseRows:
+    """Return what all legs demand at poses R (k, 3, 3), t (k, 3) of R_e in R_b.
+
+    Without *by_local* these derivatives have no columns.
+    """
+    found = [demanded(leg, R, t, by_local=by_local) for leg in legs]
     counts = [len(part.demands) for part in found]
     measured = [
         leg.kind is LegKind.ACTUATED and demand is Demand.LENGTH
@@ -120,7 +125,7 @@ def on_constraints(state: State, frame_legs: Sequence[int]) -> State:
     free = list(freedoms(frame_legs))
     R, t, size = state.R_pose, state.t_pose, np.inf
     for _ in range(_MAX_STEPS):
-        rows = _binding(state.legs, R, t)
+        rows = _binding(state.legs, R, t, by_local=False)
         step = np.zeros((len(t), 6))
         inverse = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
         step[:, free] = -np.einsum("kij,kj->ki", inverse, rows.values)
@@ -184,7 +189,7 @@ def n_bonds(leg: LegGeometry) -> int:
     return len(leg.demands) - (leg.kind is not LegKind.CONSTANT)
 
 
-def _binding(legs: Sequence[LegGeometry], R: Array, t: Array) -> PoseRows:
+def _binding(legs: Sequence[LegGeometry], R: Array, t: Array, *, by_local: bool = True) -> PoseRows:
     """Return the rows that hold without a reading."""
-    rows = pose_rows(legs, R, t)
+    rows = pose_rows(legs, R, t, by_local=by_local)
     return rows.of(~rows.measured)

@@ -41,6 +41,8 @@ class KnownParameter:
         What it belongs to.
     least, most : float
         Between these a stated value is believed [unit].
+    sigma : float or None
+        What its camera file says of its uncertainty, one standard deviation [unit].
     """
 
     nominal: float
@@ -48,6 +50,7 @@ class KnownParameter:
     kind: Kind
     least: float
     most: float
+    sigma: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +160,8 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
                 "fy": (nominal / _FOCAL_RATIO, nominal * _FOCAL_RATIO),
             }.get(name, (-_COEFFICIENT, _COEFFICIENT))
             unit = intrinsic_unit(name)
-            known[f"{owner}.{name}"] = KnownParameter(nominal, unit, "intrinsic", *limits)
+            sigma = camera.sigma.get(name) or None
+            known[f"{owner}.{name}"] = KnownParameter(nominal, unit, "intrinsic", *limits, sigma)
     return known, synonyms
 
 

@@ -8,21 +8,20 @@ unknowns are turns of where it is now.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.leg_steps import moved_legs
-from legcal.mechanism.parametrization import vector_of
+from legcal.mechanism.parametrization import tied_twist_slope, turn_slope
 from legcal.refinement.layout import Layout
 from legcal.refinement.legs import FittedLegs
 from legcal.refinement.residuals import prior_residual
 from legcal.refinement.state import State, intrinsic_of
 
-_STEP = 1e-6  # [rad], of central differences
-_AXES, _ANGLES = slice(7, 11), slice(7, 12)  # among the numbers of a leg
+_BASE_AXIS, _PLATFORM_AXIS, _TWIST = slice(7, 9), slice(9, 11), 11  # among the numbers of a leg
+_ANGLES = slice(7, 12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,18 +75,20 @@ def named_jacobian(state: State, layout: Layout, legs: FittedLegs) -> Array:
     """
     J = np.eye(layout.n_named)
     free = layout.kinematic < layout.size
-    for j, leg in enumerate(state.legs):
-        place, nominal = layout.place[[j]], legs.nominal[j : j + 1]
-        own = replace(legs.parametrization, place=legs.parametrization.place[[j]])
-        for x in place[0, _AXES]:
-            if x < layout.size:
-                step = np.zeros(layout.size)
-                step[x] = _STEP
-                ahead, behind = (
-                    vector_of(own, moved_legs((leg,), place, sign * step), nominal)
-                    for sign in (1.0, -1.0)
-                )
-                J[: layout.n_kinematic, x] = ((ahead - behind) / (2.0 * _STEP))[free]
+    for leg, nominal, place, number in zip(
+        state.legs, legs.nominal, layout.place, legs.parametrization.place, strict=True
+    ):
+        both = (leg.base_axis, nominal.base_axis), (leg.platform_axis, nominal.platform_axis)
+        for columns, axes in zip((_BASE_AXIS, _PLATFORM_AXIS), both, strict=True):
+            if np.all(place[columns] >= layout.size):
+                continue
+            by = np.zeros((len(free), 2))
+            by[number[columns]] = turn_slope(*axes)
+            if columns is _PLATFORM_AXIS and number[_TWIST] >= 0:
+                by[number[_TWIST]] = -tied_twist_slope(leg, nominal)
+            for x, column in zip(place[columns], by.T, strict=True):
+                if x < layout.size:
+                    J[: layout.n_kinematic, x] = column[free]
     J.flags.writeable = False
     return J
 

@@ -12,6 +12,7 @@ from legcal.refinement.problem import FitProblem
 from legcal.refinement.state import State
 from legcal.vision.cylinder import EPSILON
 
+DISAGREES = "disagrees with the fit"  # the beginning of a reason
 _ON_AN_EDGE = 1.5  # [px] at both ends
 _MUCH_NEARER = 0.25  # of the distance from the outline that it was taken for
 
@@ -32,7 +33,7 @@ def rejection_reasons(
         How far both ends of all outlines are from where the fit puts them [px].
     """
     away = np.abs(offsets[rejected]).max(axis=1, initial=0.0)
-    reasons = [f"disagrees with the fit by {distance:.1f} px" for distance in away.tolist()]
+    reasons = [f"{DISAGREES} by {distance:.1f} px" for distance in away.tolist()]
     names, from_edges = _distances_from_edges(problem, state, rejected)
     for i, distances in enumerate(from_edges):
         nearest = int(np.argmin(distances))

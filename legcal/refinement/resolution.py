@@ -44,7 +44,8 @@ def resolve(wishes: Sequence[Wish], known: KnownParameters) -> Choices:
     if its_problems:
         raise DatasetError(its_problems)
     given_way = [name for name in in_file if asked.get(name, in_file[name]) != in_file[name]]
-    choices = _choices(in_file | asked, given_way)
+    decisions = {name: _known(d, known.by_name[name]) for name, d in (in_file | asked).items()}
+    choices = _choices(decisions, given_way)
     _refuse_all_fixed(choices, known)
     return choices
 
@@ -56,6 +57,13 @@ class _Decision:
     action: Action
     value: float | None = None
     sigma: float | None = None
+
+
+def _known(decision: _Decision, parameter: KnownParameter) -> _Decision:
+    """Return what a decision comes to where the camera file says how uncertain a number is."""
+    if decision.action != "free" or parameter.sigma is None:
+        return decision
+    return _Decision("prior", parameter.nominal, parameter.sigma)
 
 
 def _choices(decisions: Mapping[str, _Decision], given_way: Sequence[str]) -> Choices:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -89,8 +90,12 @@ class Places:
         Positions in x; ``n_kept`` or more for what is no unknown.
     pose : (n,) array of int
     n_kept, n_poses : int
-    groups : tuple of (array of int, array of int)
-        Measurements that depend on the same unknowns, and these.
+    order : (n,) array of int
+        Measurements that depend on the same unknowns one after the other: they are a group.
+    bounds : tuple of (int, int)
+        Where each group begins and ends in that order.
+    columns : (n_groups, m) array of int
+        The unknowns of each group.
     to_kept : sparse ((n_kept + 1) n_poses, n m) array
         Sums what couples unknowns to poses.
     to_pose : sparse (n_poses, n) array
@@ -101,21 +106,25 @@ class Places:
     pose: IntArray
     n_kept: int
     n_poses: int
-    groups: tuple[tuple[IntArray, IntArray], ...]
+    order: IntArray
+    bounds: tuple[tuple[int, int], ...]
+    columns: IntArray
     to_kept: csr_array
     to_pose: csr_array
+
+    @property
+    def groups(self) -> list[tuple[IntArray, IntArray]]:
+        """The measurements of each group and its unknowns."""
+        members = [self.order[start:end] for start, end in self.bounds]
+        return list(zip(members, self.columns, strict=True))
 
 
 def places(index: IntArray, pose: IntArray, n_kept: int, n_poses: int) -> Places:
     """Return the places of measurements that depend on unknowns at *index* and on poses."""
     index = np.minimum(index, n_kept)
     n, m = index.shape
-    if n:
-        columns, group = np.unique(index, axis=0, return_inverse=True)
-        order = np.argsort(group.ravel(), kind="stable")
-        members = np.split(order, np.cumsum(np.bincount(group.ravel()))[:-1])
-    else:
-        columns, members = index, []
+    columns, group = np.unique(index, axis=0, return_inverse=True) if n else (index, pose)
+    ends = np.cumsum(np.bincount(group.ravel())).tolist()
     row = (index * n_poses + pose[:, None]).ravel()
     ones = np.ones(n * m)
     return Places(
@@ -123,7 +132,9 @@ def places(index: IntArray, pose: IntArray, n_kept: int, n_poses: int) -> Places
         pose,
         n_kept,
         n_poses,
-        tuple(zip(members, columns, strict=True)),
+        np.argsort(group.ravel(), kind="stable"),
+        tuple(pairwise([0, *ends])),
+        columns,
         csr_array((ones, (row, np.arange(n * m))), shape=((n_kept + 1) * n_poses, n * m)),
         csr_array((ones[:n], (pose, np.arange(n))), shape=(n_poses, n)),
     )
@@ -154,13 +165,17 @@ def summed(kinds: list[tuple[Places, Rows]], n_kept: int, n_poses: int) -> Sums:
     W = np.zeros(((n_kept + 1) * n_poses, 6))
     V, g_pose = np.zeros((n_poses, 36)), np.zeros((n_poses, 6))
     for where, rows in kinds:
-        n, _, m = rows.J.shape
+        n, q, m = rows.J.shape
         if n == 0:
             continue
-        for member, column in where.groups:
-            J = rows.J[member].reshape(-1, m)
-            U[np.ix_(column, column)] += J.T @ J
-            g_kept[column] += J.T @ rows.r[member].ravel()
+        J, r = rows.J[where.order].reshape(n * q, m), rows.r[where.order].ravel()
+        squares, products = np.empty((len(where.bounds), m, m)), np.empty((len(where.bounds), m))
+        for group, (start, end) in enumerate(where.bounds):
+            of_group = slice(q * start, q * end)
+            squares[group] = J[of_group].T @ J[of_group]
+            products[group] = r[of_group] @ J[of_group]
+        np.add.at(U, (where.columns[:, :, None], where.columns[:, None, :]), squares)
+        np.add.at(g_kept, where.columns, products)
         J_pose = rows.J_pose
         W += where.to_kept @ (np.swapaxes(rows.J, 1, 2) @ J_pose).reshape(n * m, 6)
         V += where.to_pose @ (np.swapaxes(J_pose, 1, 2) @ J_pose).reshape(n, 36)

@@ -131,6 +131,8 @@ class Solution:
         What else a reader should know, one sentence each.
     focal_doubt : float
         By what part of itself a focal length is wrong, if measurements contradict one; 0 otherwise.
+    doubtful_cameras : tuple of str
+        Views that stand for the cameras whose focal lengths the measurements contradict.
     """
 
     legs: tuple[LegGeometry, ...]
@@ -169,6 +171,7 @@ class Solution:
     posterior: Posterior
     notes: tuple[str, ...] = ()
     focal_doubt: float = 0.0
+    doubtful_cameras: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> KinematicParameters:

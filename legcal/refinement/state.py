@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
+from legcal.geometry.frames import motion_of
 from legcal.geometry.types import Array
 from legcal.mechanism.leg_geometry import LegGeometry
 from legcal.mechanism.leg_steps import moved_legs
@@ -146,8 +147,7 @@ def motions(R: Array, t: Array) -> tuple[RigidTransform, ...]:
     """Return rigid motions of rotation matrices (n, 3, 3) and translations (n, 3) [m]."""
     if len(R) == 0:
         return ()
-    together = RigidTransform.from_components(t, Rotation.from_matrix(R))
-    return tuple(together)
+    return tuple(motion_of(R, t))
 
 
 def components(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:

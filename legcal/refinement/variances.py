@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from legcal.geometry.types import Array, BoolArray, IntArray
 
@@ -49,19 +50,28 @@ class Effects:
 
     def log_likelihood(self, variances: Array) -> float:
         """Return the logarithm of the likelihood of variances (n_kinds,), 0 for none."""
-        root = np.sqrt(variances[self.kind])
-        L = np.linalg.cholesky(np.eye(len(root)) + root[:, None] * self.K * root)
-        y = np.linalg.solve(L, root * self.z)
+        some, root, L = self._factor(variances)
+        y = solve_triangular(L, root * self.z[some], lower=True, check_finite=False)
         return float(0.5 * y @ y - np.log(np.diagonal(L)).sum())
 
     def slope(self, variances: Array) -> tuple[Array, Array]:
         """Return its derivatives (n_kinds,) and their covariance (n_kinds, n_kinds)."""
-        spread = np.eye(len(self.z)) + self.K * variances[self.kind]
-        found = np.linalg.solve(spread, np.column_stack([self.K, self.z]))
+        some, root, L = self._factor(variances)
+        seen = root[:, None] * np.column_stack([self.K[some], self.z[some]])
+        seen = solve_triangular(L, seen, lower=True, check_finite=False)
+        found = np.column_stack([self.K, self.z]) - seen[:, :-1].T @ seen
         left, y = found[:, :-1], found[:, -1]
         of_kind = (self.kind == np.arange(self.n_kinds)[:, None]).astype(np.float64)
         slope = 0.5 * of_kind @ (y**2 - np.diagonal(left))
         return slope, np.asarray(0.5 * of_kind @ left**2 @ of_kind.T)
+
+    def _factor(self, variances: Array) -> tuple[IntArray, Array, Array]:
+        """Return the effects with a variance, its root, and L L^T = 1 + D^(1/2) K D^(1/2)."""
+        some = np.flatnonzero(variances[self.kind] > 0.0)
+        root = np.asarray(np.sqrt(variances[self.kind[some]]))
+        spread = root[:, None] * self.K[np.ix_(some, some)] * root
+        L = np.asarray(np.linalg.cholesky(np.eye(len(some)) + spread), dtype=np.float64)
+        return np.asarray(some), root, L
 
 
 def estimate_variances(effects: Effects, least_gain: float) -> tuple[Array, float]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.frames import motion_of
 from legcal.geometry.types import Array
 from legcal.simulation.machine import Machine
 from legcal.vision.camera import Camera
@@ -115,5 +116,5 @@ def look_at(
     z = (target - position) / np.linalg.norm(target - position)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
-    upright = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
-    return RigidTransform.from_components(position, upright * Rotation.from_euler("z", roll))
+    upright = np.column_stack([x, np.cross(z, x), z])
+    return motion_of(upright @ Rotation.from_euler("z", roll).as_matrix(), position)

@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.geometry.frames import product
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array
 from legcal.mechanism.cylinders import COAXIAL
@@ -154,7 +155,7 @@ def link_poses(mechanism: Mechanism, configuration: Array) -> dict[str, RigidTra
 def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tuple[PlacedSolid, ...]:
     """Return solids where the poses of their links, T_base_link, put them."""
     return tuple(
-        PlacedSolid(s, s.T_link_solid if s.link is None else poses[s.link] * s.T_link_solid)
+        PlacedSolid(s, s.T_link_solid if s.link is None else product(poses[s.link], s.T_link_solid))
         for s in solids
     )
 

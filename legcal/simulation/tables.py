@@ -132,7 +132,7 @@ def _axis(
     u = along / np.linalg.norm(along)
     T_camera_base = T_base_camera.inv()
     ends = A + np.array([[stretch.start], [stretch.end]]) * u
-    return T_camera_base.rotation.apply(u), T_camera_base.apply(ends), stretch.radius
+    return T_camera_base.as_matrix()[:3, :3] @ u, T_camera_base.apply(ends), stretch.radius
 
 
 def _exact(camera: Camera, u: Array, axis_ends: Array, radius: float) -> tuple[Array, Array]:

@@ -115,7 +115,7 @@ def legs_in_image(
     skins = [_skin(leg.cylinders, float(L), samples) for leg, L in zip(legs, length, strict=True)]
     s, radius = (np.array([getattr(skin, x) for skin in skins]) for x in ("s", "radius"))
     T_camera_base = T_base_camera.inv()
-    u_camera = np.asarray(T_camera_base.rotation.apply(u))
+    u_camera = u @ T_camera_base.as_matrix()[:3, :3].T
     A_camera = np.asarray(T_camera_base.apply(machine.A))
     axis = A_camera[:, None] + s[..., None] * u_camera[:, None]
     from_axis = np.linalg.norm(np.cross(u_camera, A_camera), axis=-1)
@@ -212,6 +212,7 @@ def pixels_in_image(camera: Camera, points: Array) -> tuple[Array, BoolArray]:
     return pixels, near & np.all((pixels >= _BORDER_PX) & (pixels <= limit), axis=-1)
 
 
+@lru_cache(maxsize=64)  # a camera is asked for the same at every place that it might stand at
 def field_of_view(camera: Camera) -> tuple[Array, Array]:
     """Return the least and the largest (x, y) of the sensor plane on the image's border."""
     x, y = camera.width - 1.0, camera.height - 1.0
@@ -219,4 +220,6 @@ def field_of_view(camera: Camera) -> tuple[Array, Array]:
     corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y], [0.0, 0.0]])
     border = np.concatenate([a + t * (b - a) for a, b in pairwise(corners)])
     xy = camera.undistort(border)
-    return xy.min(axis=0), xy.max(axis=0)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    low.flags.writeable = high.flags.writeable = False
+    return low, high

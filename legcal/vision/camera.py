@@ -5,6 +5,7 @@ undistorted plane z = 1: a point of it is (x, y, 1), without unit. Pixel (0, 0) 
 of the top-left pixel.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -37,6 +38,10 @@ class Camera:
     gamma : float
         Grey levels are light to the power 1 / gamma; 1 for a camera whose levels are proportional
         to light.
+    sigma : mapping
+        Standard deviations of its numbers, by the names of
+        :func:`legcal.vision.intrinsics.intrinsic_names` [px; distortion without unit]; those that
+        nobody stated are missing.
     """
 
     K: Array
@@ -45,6 +50,7 @@ class Camera:
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     model: DistortionModel = "plumb_bob"
     gamma: float = 1.0
+    sigma: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def has_distortion(self) -> bool:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from legcal.files.schema import parse_yaml, read_text, validate
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera, DistortionModel
 from legcal.vision.camera_schema import KalibrEntry, MatrixEntry, OpenCVEntry, RosEntry
+from legcal.vision.intrinsics import intrinsic_names
 from legcal.vision.quiet import quiet_opencv
 
 _COUNTS: Mapping[DistortionModel, tuple[int, ...]] = {
@@ -77,13 +79,24 @@ def _is_kalibr(value: object) -> bool:
 def _from_ros(found: Mapping[str, Any], path: Path) -> Camera:
     """Return the camera of a ROS camera_info file."""
     entry = validate(RosEntry, found, path)
-    return _checked(
+    camera = _checked(
         path,
         _matrix(entry.camera_matrix),
         (entry.image_width, entry.image_height),
         entry.distortion_model,
         entry.distortion_coefficients.data,
     )
+    if entry.legcal_camera is None:
+        return camera
+    sigma = entry.legcal_camera.sigma
+    unknown = [name for name in sigma if name not in intrinsic_names(camera)]
+    if unknown:
+        raise DatasetError(
+            f"{path}: legcal_camera.sigma could not be used: found {', '.join(unknown)}, needed "
+            f"names of {camera.model}: {', '.join(intrinsic_names(camera))}; calibrate the camera "
+            "again."
+        )
+    return replace(camera, sigma=sigma)
 
 
 def _from_opencv(found: Mapping[str, Any], path: Path) -> Camera:

@@ -7,6 +7,8 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from legcal.files.schema import FileSchema
 
 Pixels = Annotated[int, Field(gt=0)]
+Sigma = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+CALIBRATED = "legcal_camera"  # the key under which legcal camera says what it found
 
 
 class _OpenSchema(FileSchema):
@@ -45,6 +47,13 @@ def _is_3x3(matrix: MatrixEntry) -> MatrixEntry:
 CameraMatrix = Annotated[MatrixEntry, AfterValidator(_is_3x3)]
 
 
+class CalibratedEntry(_OpenSchema):
+    """What legcal adds to a camera that it calibrated: standard deviations by name."""
+
+    version: Literal[1]
+    sigma: dict[str, Sigma]
+
+
 class RosEntry(_OpenSchema):
     """A ROS camera_info file."""
 
@@ -53,6 +62,7 @@ class RosEntry(_OpenSchema):
     camera_matrix: CameraMatrix
     distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
     distortion_coefficients: MatrixEntry
+    legcal_camera: CalibratedEntry | None = None
 
 
 class OpenCVEntry(_OpenSchema):

@@ -91,7 +91,7 @@ def undistort_derivatives(camera: Camera, pixels: Array, names: Sequence[str]) -
     if len(flat) == 0:  # OpenCV refuses to project nothing
         return np.zeros((*pixels.shape, len(names)))
     xy = camera.undistort(flat)
-    moved = _distort_derivatives(camera, xy, names)
+    moved = distort_derivatives(camera, xy, names)
     found = -np.linalg.solve(camera.pixels_per_unit(xy), moved)
     return np.asarray(found.reshape(*pixels.shape, len(names)))
 
@@ -139,7 +139,7 @@ def _padded(camera: Camera) -> Array:
     return distortion
 
 
-def _distort_derivatives(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
+def distort_derivatives(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
     """Return the derivative of pixels of points (n, 2) by a camera's numbers, (n, 2, n_names)."""
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
     zero, distortion = np.zeros(3), _padded(camera)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.geometry.frames import motion_of
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
 
@@ -143,9 +144,8 @@ def _evaluated(
 
 def _moved(T: RigidTransform, step: Array) -> RigidTransform:
     """Return a pose shifted [m] and turned [rad] about its own origin, in the camera frame."""
-    return RigidTransform.from_components(
-        T.translation + step[:3], Rotation.from_rotvec(step[3:]) * T.rotation
-    )
+    turn = Rotation.from_rotvec(step[3:]).as_matrix()
+    return motion_of(turn @ T.as_matrix()[:3, :3], T.translation + step[:3])
 
 
 def _cross(v: Array) -> Array:

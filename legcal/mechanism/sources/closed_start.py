@@ -4,7 +4,7 @@ It gives home where the file has none: the assembly mode is then that of the dra
 the readings about which a travel is assumed where none is written.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -86,25 +86,22 @@ def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array
         return start
     rng = np.random.default_rng(1965)
     best: tuple[float, Array] | None = None
+    drawn = chain.turns(start, links[0], links)
     for trial in range(TRIALS):
         away = chain.integrate(start, _SPREAD * trial * rng.normal(size=chain.nv))
         found = _close(chain, away)
         if found is None:
             continue
-        turned = sum(float(R.magnitude()) for R in _turns(chain, links, start, found))
+        turned = _turned(drawn, chain.turns(found, links[0], links))
         if best is None or turned < best[0] - 1e-6:
             best = turned, found
     return None if best is None else best[1]
 
 
-def _turns(
-    chain: ClosedChain, links: Sequence[str], start: Array, end: Array
-) -> Iterator[Rotation]:
-    """Give how the links have turned from one configuration to another."""
-    before = [chain.pose(start, links[0], link).rotation for link in links]
-    after = [chain.pose(end, links[0], link).rotation for link in links]
-    for one, two in zip(before, after, strict=True):
-        yield one.inv() * two
+def _turned(before: Array, after: Array) -> float:
+    """Return by how much rotations (n, 3, 3) differ, all together [rad]."""
+    apart = np.swapaxes(before, 1, 2) @ after
+    return float(Rotation.from_matrix(apart).magnitude().sum())
 
 
 def _close(chain: ClosedChain, configuration: Array) -> Array | None:

@@ -1,0 +1,1 @@
+"""A camera calibrated from photographs of a flat board."""

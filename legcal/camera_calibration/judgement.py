@@ -1,0 +1,166 @@
+"""Whether photographs determine a camera: refusals, and warnings with the figures behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from legcal.camera_calibration.adjustment import adjust
+from legcal.camera_calibration.rounds import Agreed
+from legcal.errors import NotIdentifiable
+from legcal.geometry.types import Array
+from legcal.vision.camera import Camera
+from legcal.vision.intrinsics import intrinsic_names
+
+FEWEST_IMAGES, FEW_IMAGES = 3, 10
+LARGEST_FOCAL_SIGMA, WEAK_FOCAL_SIGMA = 0.05, 0.003  # as parts of the focal length
+LEAST_TILT, LEAST_SPREAD = np.radians(15.0), np.radians(20.0)
+LEAST_COVERAGE = 0.5
+LARGE_RESIDUAL_PX = 1.0
+MANY_LEFT_OUT = 0.05  # of all corners
+_OVERFIT = 0.01  # probability from which on the gain of more coefficients may be chance
+_FOLDED_PX = 0.1
+
+
+def tilts(found: Agreed) -> Array:
+    """Return the angle of each board out of the image plane, (n_images,) [rad]."""
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
+    return np.asarray(np.arccos(np.clip(np.abs(normal[:, 2]), 0.0, 1.0)))
+
+
+def spread(found: Agreed) -> float:
+    """Return the largest angle between two boards' planes [rad]."""
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
+    return float(np.arccos(np.clip(np.abs(normal @ normal.T), 0.0, 1.0).min()))
+
+
+def coverage(found: Agreed) -> float:
+    """Return the share of the image inside the convex hull of all corners."""
+    hull = cv2.convexHull(found.seen.px.astype(np.float32))
+    camera = found.adjusted.camera
+    return float(cv2.contourArea(hull)) / (camera.width * camera.height)
+
+
+def refuse_undetermined(found: Agreed, names: Sequence[str]) -> None:
+    """Raise NotIdentifiable if the images do not determine the camera.
+
+    Parameters
+    ----------
+    found : Agreed
+        What the images gave.
+    names : sequence of str
+        The images that were used.
+    """
+    n = len(found.images)
+    if n < FEWEST_IMAGES:
+        raise too_few_images(n, names)
+    camera = found.adjusted.camera
+    f = float(camera.K[0, 0])
+    sigma = float(np.sqrt(found.adjusted.covariance[0, 0] * found.scale))
+    if not sigma <= LARGEST_FOCAL_SIGMA * f:
+        raise NotIdentifiable(
+            f"The camera could not be calibrated: found boards tilted by at most "
+            f"{np.degrees(tilts(found).max()):.0f} deg out of the image plane and at most "
+            f"{np.degrees(spread(found)):.0f} deg to each other, which leave the focal length open "
+            f"(fx {f:.0f} px, known to {sigma:.2g} px), needed views from several sides; tilt the "
+            "board by 30 deg and more to the left, the right, up and down."
+        )
+    centre = camera.K[:2, 2]
+    if not np.all((centre > 0.0) & (centre < [camera.width - 1.0, camera.height - 1.0])):
+        raise NotIdentifiable(
+            f"The camera could not be calibrated: found the principal point at ({centre[0]:.0f}, "
+            f"{centre[1]:.0f}) px, outside the image, needed one inside; see that the images are "
+            "not cropped, that the model fits the lens, and tilt the board more."
+        )
+
+
+def too_few_images(n: int, names: Sequence[str]) -> NotIdentifiable:
+    """Return the refusal of so few images with the board."""
+    found = f"{n} images" if n != 1 else "1 image"
+    which = f" ({', '.join(names)})" if names else ""
+    return NotIdentifiable(
+        f"The camera could not be calibrated: found {found} with the board{which}, needed "
+        f"{FEWEST_IMAGES} at least and better {FEW_IMAGES}; take more, with the board tilted to "
+        "all sides."
+    )
+
+
+def warnings(found: Agreed) -> list[str]:
+    """Return what is wrong with a camera that can be used, one sentence each."""
+    n, camera = len(found.images), found.adjusted.camera
+    sigma = np.sqrt(np.diag(found.adjusted.covariance) * found.scale)
+    told = []
+    if n < FEW_IMAGES:
+        told.append(
+            f"{n} images are few: the standard deviations themselves are uncertain; take "
+            f"{FEW_IMAGES} or more."
+        )
+    tilt, apart = float(tilts(found).max()), spread(found)
+    focal = float(sigma[0] / camera.K[0, 0])
+    if tilt < LEAST_TILT or apart < LEAST_SPREAD or focal > WEAK_FOCAL_SIGMA:
+        told.append(
+            f"The focal length is weakly determined, to {100.0 * focal:.2g} % ({sigma[0]:.2g} px): "
+            f"the boards are tilted by at most {np.degrees(tilt):.0f} deg out of the image plane "
+            f"and {np.degrees(apart):.0f} deg to each other; tilt them by 30 deg and more."
+        )
+    covered = coverage(found)
+    if covered < LEAST_COVERAGE:
+        told.append(
+            f"Corners cover {100.0 * covered:.0f} % of the image: what the lens does outside is "
+            "extrapolated; bring the board near every edge and corner of the image."
+        )
+    told += _folding(camera)
+    told += _overfit(found)
+    rms = float(np.sqrt(np.mean(np.sum(found.adjusted.residual**2, axis=1))))
+    if rms > LARGE_RESIDUAL_PX:
+        told.append(
+            f"The residuals are large, {rms:.2f} px (rms): the board is bent, its dimensions are "
+            "wrong, or the model of the lens does not fit."
+        )
+    n_all = found.n_left_out + len(found.seen.px)
+    if found.n_left_out > MANY_LEFT_OUT * n_all:
+        told.append(
+            f"{found.n_left_out} of {n_all} corners disagree with the others and were left out; "
+            "see that the board is flat, sharp and evenly lit."
+        )
+    return told
+
+
+def _folding(camera: Camera) -> list[str]:
+    """Return a warning if the lens model maps two directions to one pixel inside the image."""
+    w, h = camera.width - 1.0, camera.height - 1.0
+    corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
+    back = camera.distort(camera.undistort(corners))
+    off = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
+    if off < _FOLDED_PX:
+        return []
+    return [
+        "The lens model folds back before the corners of the image, where no board was seen: "
+        "pixels there cannot be used; bring the board into the corners, or take a simpler --model."
+    ]
+
+
+def _overfit(found: Agreed) -> list[str]:
+    """Return a warning if the three more coefficients of the rational model gain nothing."""
+    full = found.adjusted
+    if full.camera.model != "rational_polynomial":
+        return []
+    simple = [name for name in intrinsic_names(full.camera) if name not in ("k4", "k5", "k6")]
+    zeroed = full.camera.distortion.copy()
+    zeroed[5:] = 0.0
+    start = Camera(full.camera.K, full.camera.width, full.camera.height, zeroed, full.camera.model)
+    plain = adjust(start, full.T_camera_board, found.seen, simple)
+    if plain is None:
+        return []
+    dof = 2 * len(found.seen.px) - len(full.covariance) - 6 * len(found.images)
+    gain = (plain.cost - full.cost) / 3.0 / max(full.cost / max(dof, 1), 1e-30)
+    if gain > 0.0 and f_distribution.sf(gain, 3, max(dof, 1)) < _OVERFIT:
+        return []
+    rms = [float(np.sqrt(np.mean(np.sum(a.residual**2, axis=1)))) for a in (full, plain)]
+    return [
+        f"The model overfits: with rational_polynomial corners are {rms[0]:.4f} px off (rms), "
+        f"with plumb_bob {rms[1]:.4f} px, which is no better than chance; take --model plumb_bob."
+    ]

@@ -1,0 +1,132 @@
+"""Whether an image can show anything: black, overexposed, featureless, or blurred.
+
+The blur is that of the sharpest edges. An edge of blur sigma that is blurred by s besides has a
+slope proportional to (sigma^2 + s^2)^(-1/2); slopes after two such s give sigma, whatever the step.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from legcal.detection.picture import Grey, reduce
+
+BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
+NEARLY_ALL = 0.5  # percent of an image that may be otherwise
+LEAST_RANGE = 10.0  # of an image in which something can be seen [grey levels]
+REDUCTION = 8  # before the range is taken, so that noise does not count
+SCALES = (1.0, 2.5)  # at which slopes are compared, standard deviations [px]
+DIRECTIONS = 4  # of edges: what moves is blurred in one
+WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
+STRONG = 95.0  # percentile of the slopes from which on they count
+FEWEST_EDGES, FEWEST_PART = 100, 0.1  # places of a direction, and of all
+LARGEST_BLUR = 8.0  # that the scales can tell [px]
+MUCH_BLURRED = (2.0, 1.2)  # against the view: factor, and more [px]
+SHARP = 40.0  # percentile of the blurs of a view, for what is usual there
+FEWEST = 3  # images of a view, to be compared
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How an image was exposed.
+
+    Attributes
+    ----------
+    dark, bright : float
+        What nearly all of the image is brighter and darker than [grey levels].
+    range : float
+        Between the darkest and the brightest places [grey levels].
+    blur : float
+        Standard deviation of the blur of its sharp edges [px].
+    """
+
+    dark: float
+    bright: float
+    range: float
+    blur: float
+
+    @property
+    def defect(self) -> str:
+        """Why nothing can be seen in the image, "" if something may."""
+        if self.bright < BLACK:
+            return f"the image is black, at most {self.bright:.0f} of 255 grey levels"
+        if self.dark > WHITE:
+            return f"the image is overexposed, at least {self.dark:.0f} of 255 grey levels"
+        if self.range < LEAST_RANGE:
+            return f"the image shows nothing, all of it within {self.range:.0f} of 255 grey levels"
+        return ""
+
+
+def expose(grey: Grey) -> Exposure:
+    """Return how an image was exposed.
+
+    Parameters
+    ----------
+    grey : Grey
+        The image.
+    """
+    small = reduce(grey, max(1, min(REDUCTION, min(grey.shape) // 16)))
+    low, high = np.percentile(small, [NEARLY_ALL, 100.0 - NEARLY_ALL])
+    dark, bright = np.percentile(grey[::4, ::4], [NEARLY_ALL, 100.0 - NEARLY_ALL])
+    return Exposure(float(dark), float(bright), float(high - low), _blur(grey))
+
+
+def _blur(grey: Grey) -> float:
+    """Return the blur of sharp edges [px], in the direction in which it is greatest."""
+    (x, y), (coarse_x, coarse_y) = (_slopes(grey, s) for s in SCALES)
+    fine, coarse = cv2.magnitude(x, y), cv2.magnitude(coarse_x, coarse_y)
+    # The middle of an edge: beside it the ratio says nothing.
+    edge = fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))
+    edge &= coarse >= np.percentile(coarse[::4, ::4], WEAK)
+    angle = np.arctan2(coarse_y[edge], coarse_x[edge])
+    fine, coarse = fine[edge], np.maximum(coarse[edge], 1e-3)
+    direction = np.rint(angle / (np.pi / DIRECTIONS)).astype(np.intp) % DIRECTIONS
+    least = max(FEWEST_EDGES, int(FEWEST_PART * len(fine)))  # else they are corners of others
+    of_direction = [direction == d for d in range(DIRECTIONS)]
+    chosen = [own for own in of_direction if np.count_nonzero(own) >= least]
+    return max((_blur_of(fine[own], coarse[own]) for own in chosen), default=0.0)
+
+
+def _blur_of(fine: Grey, coarse: Grey) -> float:
+    """Return the blur of the strongest of some edges by their slopes, fine and coarse."""
+    strong = coarse >= np.partition(coarse, -FEWEST_EDGES)[-FEWEST_EDGES]
+    strong |= coarse >= np.percentile(coarse, STRONG)
+    ratio = float(np.median(fine[strong] / coarse[strong]))
+    one, two = (s**2 for s in SCALES)
+    # ratio^2 = (sigma^2 + s2^2) / (sigma^2 + s1^2)
+    squared = (two - ratio**2 * one) / max(ratio**2 - 1.0, 1e-3)
+    return float(np.sqrt(np.clip(squared, 0.0, LARGEST_BLUR**2)))
+
+
+def _slopes(grey: Grey, sigma: float) -> tuple[Grey, Grey]:
+    """Return both slopes of an image that is blurred besides."""
+    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma), dtype=np.float32)
+    x, y = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)
+
+
+def image_defects(exposures: Mapping[int, Exposure], view: Mapping[int, int]) -> dict[int, str]:
+    """Return why images cannot be used: by themselves, or beside the others of their view.
+
+    Parameters
+    ----------
+    exposures : mapping
+        Of each row.
+    view : mapping
+        The view of each row: its images show about the same through the same lens.
+    """
+    found = {row: why for row, exposure in exposures.items() if (why := exposure.defect)}
+    for v in sorted(set(view.values())):
+        rows = [row for row in exposures if view[row] == v and row not in found]
+        if len(rows) < FEWEST:
+            continue
+        usual = float(np.percentile([exposures[row].blur for row in rows], SHARP))
+        factor, more = MUCH_BLURRED
+        for row in rows:
+            blur = exposures[row].blur
+            if blur > max(factor * usual, usual + more):
+                found[row] = (
+                    f"the image is blurred by {blur:.1f} px, the others of its view by {usual:.1f}"
+                )
+    return found

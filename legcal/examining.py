@@ -1,0 +1,323 @@
+"""Photographs observed with doubt: what each shows, against its reading and the others of its view.
+
+Images that are black, overexposed, empty or blurred are found before anything else; images in which
+few legs were found where the others of their view show theirs are judged once more by all that they
+may show instead. Whatever is wrong is left out with a reason, and said once.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from legcal.detection.detect import NOT_PLACED, Load
+from legcal.detection.exposure import Exposure, expose, image_defects
+from legcal.detection.outline import HIDDEN, OUTSIDE
+from legcal.detection.picture import to_grey
+from legcal.geometry.types import BoolArray, IntArray
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import is_edited
+from legcal.photographs import Joined, Photographs, Placement, Scene, counted, detect, place
+from legcal.progress import Report
+from legcal.recognition.doubts import Explanation, explain, share_shown
+
+FEW, USUALLY = 0.5, 0.3  # found, against the others of its view, which must find as much at least
+GOOD = 75.0  # percentile of what images find, for what good ones do
+WITNESSES = 3  # good images of a view that tell how much of the legs they show
+SHOWN = 0.5  # share of a leg's length in each of them, from which on it is clearly visible
+NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What the images show.
+
+    Attributes
+    ----------
+    photographs : Photographs
+        The images, and the mechanism with the radii that they show.
+    placement : Placement
+        The scene, views that could not be placed, and notes on views and images.
+    outlines : Outlines
+        Of all images; those of images that are left out are rejected.
+    left_out : dict of str
+        Why images were left out, by row.
+    """
+
+    photographs: Photographs
+    placement: Placement
+    outlines: Outlines
+    left_out: dict[int, str]
+
+
+def observe(
+    photographs: Photographs, scene: Scene, report: Report, joined: Joined = None
+) -> Observed:
+    """Place the cameras, measure the outlines, and leave out the images that are wrong.
+
+    Parameters
+    ----------
+    photographs : Photographs
+        The images.
+    scene : Scene
+        The model, and rough camera poses where there are any.
+    report : callable
+        Called as ``report(stage, done, total)``.
+    joined : sequence of RigidTransform or None, for each view
+        As :func:`legcal.photographs.place` has it.
+    """
+    defects = _defects(photographs, report)
+    rows = photographs.detect
+    usable = np.array([row for row in rows.tolist() if row not in defects], dtype=np.intp)
+    placement = place(replace(photographs, detect=usable), scene, report, joined)
+    placement = _without_images(photographs, placement, usable, defects)
+    mechanism = photographs.mechanism.with_cylinders(placement.search.cylinders)
+    photographs = replace(photographs, mechanism=mechanism)
+    outlines = detect(photographs, placement.scene, report)
+    view = photographs.measurements.view
+    placed = [row for row in rows.tolist() if placement.scene.T_base_camera[view[row]] is not None]
+    found = _found(outlines, [row for row in placed if row not in defects])
+    doubted = _doubted(found, view)
+    usual = _usual(photographs, placement, found, doubted)
+    explained = _explained(photographs, placement, usual, doubted)
+    reasons = {row: why for row, why in defects.items() if row in placed}
+    notes = []
+    for row, explanation in explained.items():
+        reason, note = _judged(photographs, row, explanation, usual, found)
+        notes.append(note)
+        if reason:
+            reasons[row] = reason
+    notes = [*_defect_notes(photographs, {r: w for r, w in defects.items() if r in placed}), *notes]
+    notes += _leg_notes(photographs, placement, outlines, found, reasons)
+    placement = replace(placement, notes=(*placement.notes, *notes))
+    return Observed(photographs, placement, rejected(outlines, reasons), reasons)
+
+
+def rejected(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
+    """Return outlines with those of some images rejected; edited ones stay."""
+    out = np.isin(outlines.row, list(reasons)) & ~is_edited(outlines)
+    reason = tuple(
+        reasons[row] if is_out else why
+        for row, is_out, why in zip(
+            outlines.row.tolist(), out.tolist(), outlines.reason, strict=True
+        )
+    )
+    return replace(outlines, used=outlines.used & ~out, reason=reason)
+
+
+def _expose(load: Load, row: int) -> Exposure:
+    return expose(to_grey(load(row)))
+
+
+def _defects(photographs: Photographs, report: Report) -> dict[int, str]:
+    """Return why images show nothing, by row."""
+    rows = photographs.detect.tolist()
+    count = counted(report, "Looking at images", len(rows))
+    exposures = {}
+    for row, exposure in zip(
+        rows, photographs.run(partial(_expose, photographs.load), rows), strict=True
+    ):
+        exposures[row] = exposure
+        count(row)
+    view = photographs.measurements.view
+    return image_defects(exposures, {row: int(view[row]) for row in rows})
+
+
+def _without_images(
+    photographs: Photographs, placement: Placement, usable: IntArray, defects: Mapping[int, str]
+) -> Placement:
+    """Return the placement with views unplaced all of whose images show nothing."""
+    measurements = photographs.measurements
+    lost = set(measurements.view[photographs.detect].tolist())
+    lost -= set(measurements.view[usable].tolist())
+    cameras = list(placement.scene.T_base_camera)
+    unplaced = dict(placement.unplaced)
+    for v in sorted(lost):
+        name = measurements.views[v].name
+        own = [row for row in defects if measurements.view[row] == v]
+        cameras[v] = None
+        unplaced[name] = (
+            f"view {name}: its camera could not be placed: found nothing to see in its "
+            f"{len(own)} images ({measurements.image[own[0]]}: {defects[own[0]]}), needed "
+            "photographs of the legs; take them again."
+        )
+    scene = replace(placement.scene, T_base_camera=tuple(cameras))
+    return replace(placement, scene=scene, unplaced=unplaced)
+
+
+@dataclass(frozen=True)
+class _Count:
+    """How many outlines of an image were found, of those that it should show."""
+
+    used: int
+    visible: int
+
+    @property
+    def share(self) -> float:
+        """Their ratio."""
+        return self.used / self.visible
+
+
+def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, _Count]:
+    """Return how many outlines were found in images that should show any, by row."""
+    visible = visible_outlines(outlines)
+    counts = {}
+    for row in rows:
+        own = (outlines.row == row) & visible
+        if own.any():
+            counts[row] = _Count(int(outlines.used[own].sum()), int(own.sum()))
+    return counts
+
+
+def visible_outlines(outlines: Outlines) -> BoolArray:
+    """Return which outlines an image should show."""
+    return np.array(
+        [not why.startswith((OUTSIDE, HIDDEN, NOT_PLACED)) for why in outlines.reason],
+        dtype=np.bool_,
+    )
+
+
+def _doubted(found: Mapping[int, _Count], view: IntArray) -> list[int]:
+    """Return the images in which far fewer outlines were found than in others of their view."""
+    doubted = []
+    for row, count in found.items():
+        own = [other.share for r, other in found.items() if view[r] == view[row]]
+        every = [other.share for other in found.values()]
+        usual = float(np.percentile(own if len(own) >= WITNESSES else every, GOOD))
+        if usual >= USUALLY and count.share < FEW * usual:
+            doubted.append(row)
+    return doubted
+
+
+def _witnesses(photographs: Photographs, found: Mapping[int, _Count], view: int) -> list[int]:
+    """Return the images of a view in which most was found."""
+    own = [row for row in found if photographs.measurements.view[row] == view]
+    return sorted(own, key=lambda row: -found[row].share)[:WITNESSES]
+
+
+def _usual(
+    photographs: Photographs,
+    placement: Placement,
+    found: Mapping[int, _Count],
+    doubted: Sequence[int],
+) -> dict[int, float]:
+    """Return how much of the legs good images show, for views with images in doubt."""
+    views = np.unique(photographs.measurements.view[list(doubted)]).tolist() if doubted else []
+    usual = {}
+    for v in views:
+        good = {row: count for row, count in found.items() if row not in doubted}
+        rows = _witnesses(photographs, good, v)
+        task = partial(share_shown, placement.search, placement.recognised)
+        usual[v] = float(np.median(list(photographs.run(task, rows)) or [0.0]))
+    return usual
+
+
+def _explained(
+    photographs: Photographs,
+    placement: Placement,
+    usual: Mapping[int, float],
+    rows: Sequence[int],
+) -> dict[int, Explanation]:
+    """Return what images show, by row."""
+    task = partial(explain, placement.search, placement.recognised, dict(usual))
+    return dict(zip(rows, photographs.run(task, rows), strict=True))
+
+
+def image_name(photographs: Photographs, row: int) -> str:
+    """Return what an image is called in notes."""
+    measurements = photographs.measurements
+    view = measurements.views[int(measurements.view[row])]
+    return f"view {view.name}, image {measurements.image[row]}"
+
+
+def _judged(
+    photographs: Photographs,
+    row: int,
+    explanation: Explanation,
+    usual: Mapping[int, float],
+    found: Mapping[int, _Count],
+) -> tuple[str, str]:
+    """Return why an image is left out, "" if it is not, and the sentence that says so."""
+    name, count = image_name(photographs, row), found[row]
+    much = f"{count.used} of {count.visible} outlines where its reading has the legs"
+    if explanation.reason:
+        return (
+            explanation.reason,
+            f"{name}: was left out: {explanation.reason}; {explanation.remedy}.",
+        )
+    view = int(photographs.measurements.view[row])
+    if explanation.own >= FEW * usual[view]:
+        return "", (
+            f"{name}: shows little of the legs: found {much}, in the others of its view most; "
+            "look at its light and sharpness."
+        )
+    return NOTHING_LIKE, (
+        f"{name}: was left out: found {much}, and nothing else that it shows; check that it is a "
+        "photograph of this machine, taken by this camera at this reading."
+    )
+
+
+def _defect_notes(photographs: Photographs, defects: Mapping[int, str]) -> list[str]:
+    """Return what is to be said of images that show nothing."""
+    return [
+        f"{image_name(photographs, row)}: was left out: {why}; take it again."
+        for row, why in sorted(defects.items())
+    ]
+
+
+def _leg_notes(
+    photographs: Photographs,
+    placement: Placement,
+    outlines: Outlines,
+    found: Mapping[int, _Count],
+    reasons: Mapping[int, str],
+) -> list[str]:
+    """Return what is to be said of the legs that views are said to show."""
+    measurements, names = photographs.measurements, photographs.mechanism.leg_names
+    notes = []
+    for v, view in enumerate(measurements.views):
+        rows = [r for r in found if measurements.view[r] == v and r not in reasons]
+        if view.legs is None or not rows:
+            continue
+        own = np.isin(outlines.row, rows)
+        used = set(outlines.leg[own & outlines.used].tolist())
+        for leg in np.flatnonzero(photographs.wanted[v]).tolist():
+            mine = own & (outlines.leg == leg)
+            if leg in used or not used or not mine.any():
+                continue
+            why = Counter(outlines.reason[i] for i in np.flatnonzero(mine).tolist())
+            notes.append(
+                f"view {view.name}: legs names {names[leg]}, of which none of its images shows an "
+                f"outline that can be used ({why.most_common(1)[0][0]}); look at legcal detect, "
+                "or leave it out there."
+            )
+        good = {row: found[row] for row in rows}
+        notes += _left_out_legs(photographs, placement, v, _witnesses(photographs, good, v))
+    return notes
+
+
+def _left_out_legs(
+    photographs: Photographs, placement: Placement, v: int, rows: Sequence[int]
+) -> list[str]:
+    """Return a note on legs that a view leaves out although its images show them clearly."""
+    search = placement.search
+    clear = [
+        name
+        for leg, name in enumerate(photographs.mechanism.leg_names)
+        if not photographs.wanted[v, leg]
+        and search.cylinders[leg]
+        and all(
+            share_shown(search, placement.recognised, row, legs=np.array([leg])) >= SHOWN
+            for row in rows
+        )
+    ]
+    if not clear:
+        return []
+    return [
+        f"view {photographs.measurements.views[v].name}: legs leaves out {', '.join(clear)}, which "
+        "its images show clearly; name them there to use them."
+    ]

@@ -1,0 +1,288 @@
+"""Photographs, views, hints and radii that cannot be right: each is named, and the rest is used."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hexapod_example import Run
+from spoiled import Picture, Spoiled, spoiled
+
+from legcal import calibrate, detect, load_dataset
+from legcal.detection.exposure import expose
+from legcal.detection.picture import to_grey
+from legcal.disagreeing import disagreeing_images
+from legcal.errors import NotIdentifiable
+from legcal.overlays.detected import Detection
+from legcal.photographs import Placement, place, scene_at_poses
+from legcal.progress import no_progress
+from legcal.recognition.hints import hint_notes
+from legcal.refinement.choices import Choices
+from legcal.refinement.rejections import DISAGREES
+from legcal.workers import in_turn
+from legcal.workpiece import workpiece
+
+N = 6
+
+
+def _mirror(picture: Picture) -> Picture:
+    return picture[:, ::-1]
+
+
+def _upside_down(picture: Picture) -> Picture:
+    return picture[::-1, ::-1]
+
+
+def _blurred(picture: Picture) -> Any:
+    return cv2.GaussianBlur(picture, (0, 0), 3.0)
+
+
+def _moved(picture: Picture) -> Any:
+    return cv2.blur(picture, (13, 1))
+
+
+def _noise(level: float) -> Callable[[Picture], Any]:
+    rng = np.random.default_rng(1)
+    return lambda picture: level + 1.5 * rng.standard_normal(picture.shape)
+
+
+def _elsewhere(picture: Picture) -> Any:
+    rng = np.random.default_rng(2)
+    other = np.full(picture.shape, 90, dtype=np.uint8)
+    for _ in range(25):
+        x, y, width, height = rng.integers(5, 400, 4).tolist()
+        cv2.rectangle(other, (x, y), (x + width, y + height), int(rng.integers(20, 230)), -1)
+    return cv2.GaussianBlur(other, (0, 0), 0.6)
+
+
+CHANGED: dict[tuple[str, int], tuple[Callable[[Picture], Any], str]] = {
+    ("c1", 1): (lambda picture: 0 * picture, "the image is black, at most 0 of 255"),
+    ("c1", 2): (lambda picture: 0 * picture + 255, "the image is overexposed, at least 255"),
+    ("c1", 4): (_mirror, "the image is mirrored; replace it"),
+    ("c2", 1): (_blurred, r"the image is blurred by [23]\.\d px, the others of its view by \d"),
+    ("c2", 2): (_moved, r"the image is blurred by \d\.\d px, the others of its view by \d"),
+    ("c2", 4): (_upside_down, "the image is upside down"),
+    ("c3", 1): (_noise(110.0), "the image shows nothing, all of it within"),
+    ("c3", 2): (
+        _elsewhere,
+        "found 0 of 1[02] outlines where its reading has the legs, and nothing",
+    ),
+}
+SWAPPED = [(("c1", 3), ("c2", 5)), (("c3", 3), ("c3", 4))]
+
+
+@pytest.fixture(scope="module")
+def bad(tmp_path_factory: pytest.TempPathFactory) -> Spoiled:
+    """Nearly every way in which an image can be wrong."""
+    made = spoiled(tmp_path_factory.mktemp("bad") / "hexapod", N)
+    for (view, k), (change, _) in CHANGED.items():
+        made.change(view, k, change)
+    for one, other in SWAPPED:
+        made.swap(one, other)
+    made.entry["views"]["c3"]["legs"] = [f"leg{j}" for j in range(1, 6)]
+    made.write()
+    return made
+
+
+@pytest.fixture(scope="module")
+def detected(bad: Spoiled) -> Detection:
+    return detect(bad.path)
+
+
+def _note(notes: tuple[str, ...], image: str) -> str:
+    found = [note for note in notes if f"image {image}: " in note]
+    assert len(found) == 1, notes
+    return found[0]
+
+
+@pytest.mark.parametrize("where", CHANGED, ids=lambda where: f"{where[0]}_{where[1]}")
+def test_an_image_that_is_no_good_is_named_and_left_out(
+    bad: Spoiled, detected: Detection, where: tuple[str, int]
+) -> None:
+    row = bad.row(*where)
+    note = _note(detected.notes, row["image"])
+    assert note.startswith(f"view {where[0]}, image {row['image']}: was left out: ")
+    assert re.search(CHANGED[where][1], note), note
+    of_row = detected.outlines.row == bad.rows.index(row)
+    assert of_row.any()
+    assert not detected.outlines.used[of_row].any()
+
+
+def test_files_that_were_exchanged_are_told_from_each_other(
+    bad: Spoiled, detected: Detection
+) -> None:
+    (one, other), (near, far) = SWAPPED
+    for here, from_view, with_image in ((one, other, other), (other, one, one)):
+        image, given = bad.row(*here)["image"], bad.row(*with_image)["image"]
+        words = f"by the camera of view {from_view[0]} at the reading given for image {given};"
+        assert words in _note(detected.notes, image)
+    for here, of in ((near, far), (far, near)):
+        image, given = bad.row(*here)["image"], bad.row(*of)["image"]
+        assert f"shows the reading given for image {given};" in _note(detected.notes, image)
+
+
+def test_legs_that_a_view_leaves_out_although_it_shows_them_are_named(detected: Detection) -> None:
+    of_legs = [note for note in detected.notes if ": legs " in note]
+    assert of_legs == [
+        "view c3: legs leaves out leg6, which its images show clearly; name them there to use them."
+    ]
+
+
+def test_nothing_else_is_said_and_the_other_images_are_used(
+    bad: Spoiled, detected: Detection
+) -> None:
+    assert len(detected.notes) == len(CHANGED) + 2 * len(SWAPPED) + 1
+    assert detected.unplaced == {}
+    named = "".join(detected.notes)
+    for k, row in enumerate(bad.rows):
+        if f"image {row['image']}: " not in named:
+            own = detected.outlines.row == k
+            assert detected.outlines.used[own].mean() > 0.6
+
+
+def _placement(made: Spoiled) -> Placement:
+    work = workpiece(load_dataset(made.write()), in_turn, None, Choices(), use_cache=False)
+    scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
+    return place(work.photographs, scene, no_progress)
+
+
+def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
+    made = spoiled(tmp_path / "views", 4)
+    for k in range(4):
+        made.change("c1", k, _mirror)
+    views = made.entry["views"]
+    for name in ("c2", "c3"):
+        views[name], views[name]["T_base_camera"] = dict(views[name]), None
+    views["c2"]["T_base_camera"], views["c3"]["T_base_camera"] = (
+        {"xyz": [-0.7234, 0.5958, 0.288], "quat_xyzw": [-0.32591, 0.67154, -0.59867, 0.29053]},
+        {"xyz": [0.9335, 0.2578, 0.1912], "quat_xyzw": [0.41111, 0.57416, -0.55209, -0.44331]},
+    )
+    found = _placement(made)
+    assert list(found.unplaced) == ["c1"]
+    assert "images show the legs if left and right are exchanged" in found.unplaced["c1"]
+    assert len(found.notes) == 2
+    assert re.match(r"view c2: its T_base_camera was not used: .*it suits view c3", found.notes[0])
+    assert re.match(r"view c3: its T_base_camera was not used: .*it suits view c2", found.notes[1])
+
+
+def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:
+    from scipy.spatial.transform import RigidTransform, Rotation
+
+    T = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.identity())
+    for off, angle, n in (((0.03, 0, 0), 3.0, 0), ((0.15, 0, 0), 0.0, 1), ((0, 0, 0), 9.0, 1)):
+        turn = Rotation.from_rotvec([0.0, angle, 0.0], degrees=True)
+        hint = T * RigidTransform.from_components(off, turn)
+        assert len(hint_notes(["c1"], [hint], [T])) == n
+
+
+@pytest.mark.parametrize(
+    ("leg", "factor", "words"),
+    [
+        ("", 1.2, r"All legs are seen 1[4-9] % thinner than their radii in the model; the radii"),
+        ("leg3", 0.8, r"leg3 is seen 2\d % thicker than its radius in the model: found a radius"),
+    ],
+)
+def test_radii_that_are_wrong_by_a_fifth_are_found(
+    tmp_path: Path, leg: str, factor: float, words: str
+) -> None:
+    made = spoiled(tmp_path / "radii", 5)
+    made.scale_radii(factor, leg)
+    found = _placement(made)
+    assert found.unplaced == {}
+    assert len(found.notes) == 1
+    assert re.match(words, found.notes[0]), found.notes
+    wrong = [c.radius for of_leg in found.search.cylinders for c in of_leg]
+    assert np.allclose(wrong, 0.01, rtol=0.04)
+
+
+def test_blur_is_measured_whatever_the_light() -> None:
+    rng = np.random.default_rng(0)
+    picture = np.zeros((300, 400), np.float32)
+    for _ in range(40):
+        x, y, width, height = rng.integers(0, 250, 4).tolist()
+        cv2.rectangle(picture, (x, y), (x + width, y + height), float(rng.uniform(20, 200)), -1)
+    for blur in (1.0, 2.0, 4.0):
+        smooth = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur))
+        for light in (0.3, 1.0):
+            noisy = to_grey(light * smooth + rng.standard_normal(picture.shape))
+            assert expose(noisy).blur == pytest.approx(blur, rel=0.35, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("off", "words"),
+    [
+        ({2: 3e-3}, r"it shows a reading of leg3 of [\d.]+ \+- 0\.\d+ mm, given"),
+        ({0: 5e-3, 2: -4e-3, 4: 6e-3}, r"another pose than its reading says, .* leg1, leg3, leg5 "),
+        ("other", r"it shows the reading given for image images/c1_k05\.jpg; check which image"),
+    ],
+)
+def test_a_reading_that_the_outlines_contradict_is_named(
+    example_run: Run, off: dict[int, float] | str, words: str
+) -> None:
+    solution, dataset = example_run.calibration.solution, example_run.calibration.dataset
+    o, measurements, row = solution.outlines, dataset.measurements, 1
+    q = measurements.q.copy()
+    if isinstance(off, str):
+        q[row], q[4] = measurements.q[4], measurements.q[row]
+    else:
+        for leg, change in off.items():
+            q[row, leg] += change
+    out = (o.row == row) & o.used
+    reason = tuple(
+        f"{DISAGREES} by 5.0 px" if is_out else why
+        for is_out, why in zip(out.tolist(), o.reason, strict=True)
+    )
+    fit = replace(solution, outlines=replace(o, used=o.used & ~out, reason=reason))
+    notes = disagreeing_images(replace(measurements, q=q), dataset.mechanism, fit)
+    assert len(notes) == 1
+    assert notes[0].startswith("view c1, image images/c1_k02.jpg: ")
+    assert re.search(words, notes[0]), notes
+
+
+def test_good_photographs_are_not_doubted(example_run: Run) -> None:
+    notes = example_run.calibration.notes
+    assert [note for note in notes if not note.startswith("The start ")] == []
+
+
+@pytest.mark.slow
+def test_what_remains_is_calibrated_or_refused(bad: Spoiled, tmp_path: Path) -> None:
+    found = calibrate(bad.path, use_cache=False)
+    again = calibrate(bad.path)
+    assert found.verdict.trustworthy
+    assert [note for note in found.notes if "was left out" in note] == [
+        note for note in again.notes if "was left out" in note
+    ]
+    made = spoiled(tmp_path / "few", 4, ("c1", "c2"))
+    for k in range(3):
+        made.change("c1", k, _mirror)
+        made.change("c2", k, lambda picture: 0 * picture)
+    with pytest.raises(NotIdentifiable, match=r"cannot be identified") as refused:
+        calibrate(made.write())
+    assert any("is mirrored" in problem for problem in refused.value.problems)
+
+
+@pytest.mark.slow
+def test_without_hints_good_photographs_are_not_doubted(tmp_path: Path) -> None:
+    made = spoiled(tmp_path / "unknown", 8)
+    for view in made.entry["views"].values():
+        del view["T_base_camera"]
+    notes = calibrate(made.write()).notes
+    assert [note for note in notes if not note.startswith("The start ")] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hinted", [True, False])
+def test_a_focal_length_that_is_wrong_by_a_twentieth_is_named(tmp_path: Path, hinted: bool) -> None:
+    made = spoiled(tmp_path / "focal", 8)
+    path = made.path / "camera_info.yaml"
+    path.write_text(path.read_text().replace("645.15", "677.4"))
+    for view in made.entry["views"].values() if not hinted else ():
+        del view["T_base_camera"]
+    found = calibrate(made.write())
+    assert not found.verdict.trustworthy
+    assert any(note.startswith("The focal length of c1 does not agree") for note in found.notes)
+    assert any("camera_info.yaml" in note for note in found.notes)
