@@ -13,7 +13,7 @@ from legcal.recognition.starts import joined, pose_starts
 
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
 LAST = (0.008, 0.005, 0.004, 0.003)  # with the joints known better
-JOINT_ERROR = 0.01  # standard deviation of the joint centres of the nominal model [m]
+JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
 START_PICTURES, MOST_START_PICTURES = 2, 8  # whose bars suggest poses: at once, at most
 KEPT = (500, 40, 10)  # of the starts of a picture, of its refined ones, of all
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
@@ -21,7 +21,7 @@ SAME_MATCHES = 0.5  # share of common matches from which on two poses say the sa
 SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
 MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
 JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
-SHIFT_COST = 0.15  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
+SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
 # Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
 # lead over the next pose in legs of all images together, and as a part.
 CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
