@@ -186,7 +186,7 @@ def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, Int
     value = np.maximum(1.0 - (gap / reach) ** 2, 0.0)
     w0, w1 = width[:, :, 0, None], width[:, :, 1, None]
     expected = np.maximum(w0 - (w1 - w0) * a0 / run, np.float32(1e-6))
-    seen = _seen_width(bars).astype(np.float32)
+    seen = seen_width(bars).astype(np.float32)
     sigma = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen).astype(np.float32)
     pull = np.log(expected / seen) / (np.float32(WIDTH_REACH) * sigma)
     value *= np.maximum(1.0 - pull**2, 0.0)
@@ -206,7 +206,7 @@ def _reach(bars: Bars, X: Array, tolerance: float) -> Array:
     return np.asarray(tolerance / depth + SLACK_PIXELS * bars.pixel)
 
 
-def _seen_width(bars: Bars) -> Array:
+def seen_width(bars: Bars) -> Array:
     """Return the widths of bars (n,) in their middle, as wide as legs are that look like this."""
     return np.asarray(bars.width.mean(axis=1) + TOO_NARROW * bars.pixel)
 
@@ -306,7 +306,7 @@ def _equations(
     residual = np.einsum("ntpe,nte->ntp", parts, o)
     share = -a[..., 0] / run
     expected = np.maximum(width[..., 0] + (width[..., 1] - width[..., 0]) * share, 1e-6)
-    seen = _seen_width(bars)[found.bar]
+    seen = seen_width(bars)[found.bar]
     P = (1.0 - share)[..., None] * X[:, :, 0] + share[..., None] * X[:, :, 1]
     of_depth = np.zeros_like(P)
     of_depth[..., 2] = -1.0 / np.maximum(P[..., 2], NEAREST)

@@ -14,8 +14,9 @@ from legcal.recognition.starts import joined, pose_starts
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
 LAST = (0.008, 0.005, 0.004, 0.003)  # with the joints known better
 JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
-START_PICTURES, MOST_START_PICTURES = 2, 8  # whose bars suggest poses: at once, at most
-KEPT = (500, 40, 10)  # of the starts of a picture, of its refined ones, of all
+START_PICTURES = 1, 1, 2, 4  # whose bars suggest poses, as long as there is a doubt
+SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
+KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
 SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
 SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
@@ -110,20 +111,27 @@ def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
     n_legs : int
         Number of legs of the machine.
     """
-    order = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
+    by_merit = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
+    best_first = [pictures[k] for k in by_merit]
     nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
     best = _judged(pictures, nothing)
-    for first in range(0, min(len(order), MOST_START_PICTURES), START_PICTURES):
-        starts = [_starts(pictures[k], n_legs) for k in order[first : first + START_PICTURES]]
+    done = 0
+    for n in START_PICTURES:
+        if done >= len(pictures):
+            break
+        starts = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
+        done += n
         poses = joined([best.poses, *starts])
         if len(poses) == 0:
             continue
-        few = [pictures[k] for k in order[: first + START_PICTURES]]
-        poses = refined(few, poses, TOLERANCES[2:4], JOINT_ERROR)
-        score = supports(pictures, poses, TOLERANCES[3])[0].sum(axis=1)
+        poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
+        some = best_first[: max(SOME_PICTURES, done)]
+        score = supports(some, poses, TOLERANCES[3])[0].sum(axis=1)
         poses = poses.take(_distinct(poses, score, KEPT[2]))
-        poses = refined(pictures, poses, (*TOLERANCES[3:], *LAST), JOINT_ERROR)
-        best = _judged(pictures, poses)
+        poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
+        score = supports(some, poses, TOLERANCES[-1])[0].sum(axis=1)
+        poses = poses.take(_best(score, KEPT[3]))
+        best = _judged(pictures, refined(pictures, poses, LAST, JOINT_ERROR))
         if best.is_clear:
             break
     return best
