@@ -142,8 +142,9 @@ def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Ar
     X = X.reshape(-1, len(targets), 2, 3)
     z = np.maximum(X[..., 2:], NEAREST)
     xy = X[..., :2] / z
-    normal = np.cross(X[:, :, 0], X[:, :, 1])
-    flat = np.linalg.norm(normal[..., :2], axis=-1) / (np.linalg.norm(normal, axis=-1) + 1e-12)
+    normal = _vector_product(X[:, :, 0], X[:, :, 1])
+    level = normal[..., 0] ** 2 + normal[..., 1] ** 2
+    flat = np.sqrt(level / (level + normal[..., 2] ** 2 + 1e-24))
     width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
     front = (X[..., 2] > NEAREST).all(axis=-1)
     return X, xy, width, np.where(front, _shown(xy, picture.corners), 0.0)
@@ -242,15 +243,17 @@ def improved(
         if len(picture.bars) == 0 or len(picture.targets) == 0:
             continue
         J, J_leg, residual, weight = _equations(picture, poses, found, tolerance)
-        weighted = J * weight[..., None]
-        H += np.einsum("ntri,ntrj->nij", weighted, J)
-        b -= np.einsum("ntri,ntr->ni", weighted, residual)
+        weighted = (J * weight[..., None]).swapaxes(2, 3)  # (n, T, 6, 4)
+        H += (weighted @ J).sum(axis=1)
+        b -= (weighted @ residual[..., None])[..., 0].sum(axis=1)
         if joint_error > 0.0:
-            weighted_leg = J_leg * weight[..., None]
-            of_leg = np.eye(n_legs)[picture.targets.leg]  # (T, n_legs)
-            H_leg += np.einsum("ntri,ntrj,tl->nlij", weighted_leg, J_leg, of_leg, optimize=True)
-            H_cross += np.einsum("ntri,ntrj,tl->nlij", weighted, J_leg, of_leg, optimize=True)
-            b_leg -= np.einsum("ntri,ntr,tl->nli", weighted_leg, residual, of_leg, optimize=True)
+            weighted_leg = (J_leg * weight[..., None]).swapaxes(2, 3)
+            of_leg, cross = weighted_leg @ J_leg, weighted @ J_leg
+            gradient = (weighted_leg @ residual[..., None])[..., 0]
+            for piece, leg in enumerate(picture.targets.leg.tolist()):
+                H_leg[:, leg] += of_leg[:, piece]
+                H_cross[:, leg] += cross[:, piece]
+                b_leg[:, leg] -= gradient[:, piece]
     if joint_error == 0.0:
         xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
         return _moved(poses, xi, poses.shift, centre)
@@ -318,7 +321,7 @@ def _equations(
     D[:, :, 3] = 0.5 * g_along
     D = D @ picture.R  # by the ends in the frame of the poses
     X = (X - picture.t) @ picture.R
-    turning = np.cross(X[:, :, None], D).sum(axis=3)
+    turning = _vector_product(X[:, :, None], D).sum(axis=3)
     J = np.concatenate([turning, D.sum(axis=3)], axis=-1)
     in_base = D @ poses.R[:, None, None]
     at = place[:, None, :, None]  # (T, 1, 2, 1)
@@ -379,6 +382,14 @@ def _rotations(vectors: Array) -> Array:
     K = _cross(vectors / np.maximum(angle, 1e-12)[:, None])
     s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.asarray(np.eye(3) + s * K + (1.0 - c) * (K @ K))
+
+
+def _vector_product(x: Array, y: Array) -> Array:
+    """Return x x y (..., 3), in a third of the time of numpy's."""
+    out = np.empty(np.broadcast_shapes(x.shape, y.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., i] = x[..., j] * y[..., k] - x[..., k] * y[..., j]
+    return out
 
 
 def _cross(vectors: Array) -> Array:
