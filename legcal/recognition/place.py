@@ -26,8 +26,8 @@ SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of a
 # Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
 # lead over the next pose in legs of all images together, and as a part.
 CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
-ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.12, 0.45, 0.07
-LEAST_SUPPORT = 1.4  # legs in all images together
+ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.12
+LEAST_SUPPORT = 1.6  # legs in all images together
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
 

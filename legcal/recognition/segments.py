@@ -82,7 +82,7 @@ def _pieces(small: Grey) -> Array:
     lines = detector.detect(levels)[0]
     if lines is None:
         return np.zeros((0, 2, 2))
-    pieces = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 2) - 0.5
+    pieces = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 2)  # of middles of pixels
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MOST]
     return np.asarray(pieces[order[length[order] >= SHORTEST]])
