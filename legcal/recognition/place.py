@@ -12,11 +12,14 @@ from legcal.recognition.bars import Bars
 from legcal.recognition.starts import joined, pose_starts
 
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
-LAST = (0.008, 0.005, 0.004, 0.003)  # with the joints known better
+LAST = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
 JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
 START_PICTURES = 1, 1, 2, 4  # whose bars suggest poses, as long as there is a doubt
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
 KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
+N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
+POLISH = (0.018, 0.012, 0.008)  # tolerances
+POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
 SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
 SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
@@ -131,10 +134,36 @@ def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
         poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
         score = supports(some, poses, TOLERANCES[-1])[0].sum(axis=1)
         poses = poses.take(_best(score, KEPT[3]))
+        poses = joined([poses, _polished(some[:POLISHING], poses)])
         best = _judged(pictures, refined(pictures, poses, LAST, JOINT_ERROR))
         if best.is_clear:
             break
     return best
+
+
+def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
+    """Return for each of the best poses the best one around it that steps lead to.
+
+    A leg on a wrong bar keeps a pose, and the joints moved for it, from where all legs agree.
+    """
+    n_legs = poses.shift.shape[1]
+    found = []
+    for i in range(min(N_POLISHED, len(poses))):
+        around = _around(pictures, poses.R[i], poses.t[i], n_legs)
+        around = refined(pictures, around, POLISH, JOINT_ERROR)
+        score = supports(pictures, around, POLISH[-1])[0].sum(axis=1)
+        found.append(around.take(_best(score, 1)))
+    return joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
+
+
+def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Poses:
+    """Return poses around one: the machine turned a little, further, nearer, or as it is."""
+    ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
+    middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
+    turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
+    further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
+    new = Rotation.from_rotvec(turns).as_matrix() @ R
+    return Poses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
 
 
 def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int) -> Placed:
