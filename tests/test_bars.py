@@ -4,10 +4,11 @@ import leg_pictures as lp
 import numpy as np
 import pytest
 
+from legcal.geometry.types import Array
 from legcal.recognition.bars import LEAST_OVERLAP, NARROWEST, WIDEST, find_bars
 
 
-def _edges(width: float, length: float, *, turn: float = 0.0, same_way: bool = False) -> lp.Array:
+def _edges(width: float, length: float, *, turn: float = 0.0, same_way: bool = False) -> Array:
     """Return two parallel edges about the origin, in pixels."""
     x, y = 0.5 * length, 0.5 * width
     lines = np.array([[[x, y], [-x, y]], [[-x, -y], [x, -y]]])

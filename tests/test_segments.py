@@ -56,7 +56,7 @@ def test_outlines_are_found_on_the_sensor_plane_with_the_brighter_side(lens: Arr
             seen = abs(bar.B[1] / bar.B[2] - bar.A[1] / bar.A[2])
             assert np.linalg.norm(end - start) > 0.7 * min(seen, 0.47)
             left = np.array([end[1] - start[1], start[0] - end[0]])
-            assert left @ (axis[:2] - start) > 0.0  # the bar is brighter than the background
+            assert left @ (axis[:2] - start) > 0.0  # the bar is brighter
 
 
 def test_a_dark_bar_has_its_brighter_side_outside() -> None:
