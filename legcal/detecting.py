@@ -24,6 +24,7 @@ from legcal.overlays.detected import Detection
 from legcal.overlays.folder import DETECTION, check_detection_destination, write_detection
 from legcal.photographs import Scene, given_outlines, scene_at_poses
 from legcal.progress import Report, no_progress
+from legcal.recognition.hints import BEFORE_FIT, hint_notes
 from legcal.refinement.choices import Choices
 from legcal.report.destination import output_path
 from legcal.workers import worker_pool
@@ -126,7 +127,11 @@ def _observed(
     searched = placed[work.measurements.view[observed.outlines.row]]
     kept = searched | ~np.isin(observed.outlines.row, photographs.detect)
     found = choose_outlines(observed.outlines, kept)
-    return found, scene, placement.unplaced, placement.notes
+    views = work.measurements.views
+    hints = [view.T_base_camera for view in views]
+    cameras = placement.scene.T_base_camera
+    notes = hint_notes([view.name for view in views], hints, cameras, BEFORE_FIT)
+    return found, scene, placement.unplaced, (*notes, *placement.notes)
 
 
 def _in_file_order(

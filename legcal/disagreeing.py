@@ -39,8 +39,8 @@ class _Readings:
 
 def disagreeing_images(
     measurements: Measurements, mechanism: Mechanism, solution: Solution
-) -> tuple[str, ...]:
-    """Return a note on every image most of which the fit has rejected.
+) -> dict[int, str]:
+    """Return a note on every image most of which the fit has rejected, by row.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def disagreeing_images(
     """
     o = solution.outlines
     rejected = np.array([why.startswith(DISAGREES) for why in o.reason], dtype=np.bool_)
-    notes = []
+    notes = {}
     for row in np.unique(o.row[rejected]).tolist():
         judged = np.flatnonzero((o.row == row) & (rejected | o.used))
         wrong = judged[rejected[judged]]
@@ -68,11 +68,11 @@ def disagreeing_images(
         explanation = _explanation(measurements, mechanism, row, found)
         if not explanation and len(wrong) < MOST * len(judged):
             continue  # what is wrong there is not of this image
-        notes.append(
+        notes[row] = (
             f"{name}: {len(wrong)} of its {len(judged)} outlines disagree with the fit and were "
             f"left out; {explanation or SUITED}."
         )
-    return tuple(notes)
+    return notes
 
 
 def _readings(

@@ -14,9 +14,9 @@ from functools import partial
 
 import numpy as np
 
-from legcal.detection.detect import NOT_PLACED, Load
+from legcal.detection.detect import NOT_PLACED, Load, Method
 from legcal.detection.exposure import Exposure, expose, image_defects
-from legcal.detection.outline import HIDDEN, OUTSIDE
+from legcal.detection.outline import HIDDEN, OUTSIDE, outline_parts
 from legcal.detection.picture import to_grey
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.observations.outlines import Outlines
@@ -24,11 +24,13 @@ from legcal.observations.sets import is_edited
 from legcal.photographs import Joined, Photographs, Placement, Scene, counted, detect, place
 from legcal.progress import Report
 from legcal.recognition.doubts import Explanation, explain, share_shown
+from legcal.recognition.radii import Part
 
 FEW, USUALLY = 0.5, 0.3  # found, against the others of its view, which must find as much at least
 GOOD = 75.0  # percentile of what images find, for what good ones do
 WITNESSES = 3  # good images of a view that tell how much of the legs they show
 SHOWN = 0.5  # share of a leg's length in each of them, from which on it is clearly visible
+HARDLY = 0.3  # of the outlines of a part that should be seen
 NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
 
 
@@ -55,7 +57,11 @@ class Observed:
 
 
 def observe(
-    photographs: Photographs, scene: Scene, report: Report, joined: Joined = None
+    photographs: Photographs,
+    scene: Scene,
+    report: Report,
+    joined: Joined = None,
+    method: Method = outline_parts,
 ) -> Observed:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
@@ -69,15 +75,25 @@ def observe(
         Called as ``report(stage, done, total)``.
     joined : sequence of RigidTransform or None, for each view
         As :func:`legcal.photographs.place` has it.
+    method : callable
+        How outlines are measured.
     """
     defects = _defects(photographs, report)
     rows = photographs.detect
     usable = np.array([row for row in rows.tolist() if row not in defects], dtype=np.intp)
-    placement = place(replace(photographs, detect=usable), scene, report, joined)
+    searched = replace(photographs, detect=usable)
+    placement = place(searched, scene, report, joined)
+    outlines = detect(photographs, placement.scene, report, method=method)
+    doubtful = _parts_not_found(photographs, outlines)
+    if doubtful:
+        other = place(searched, scene, report, joined, doubtful)
+        if other.recognised.radii.factor:
+            mechanism = photographs.mechanism.with_cylinders(other.search.cylinders)
+            corrected = replace(photographs, mechanism=mechanism)
+            again = detect(corrected, other.scene, report, method=method)
+            if again.used.sum() > outlines.used.sum():
+                photographs, placement, outlines = corrected, other, again
     placement = _without_images(photographs, placement, usable, defects)
-    mechanism = photographs.mechanism.with_cylinders(placement.search.cylinders)
-    photographs = replace(photographs, mechanism=mechanism)
-    outlines = detect(photographs, placement.scene, report)
     view = photographs.measurements.view
     placed = [row for row in rows.tolist() if placement.scene.T_base_camera[view[row]] is not None]
     found = _found(outlines, [row for row in placed if row not in defects])
@@ -95,6 +111,19 @@ def observe(
     notes += _leg_notes(photographs, placement, outlines, found, reasons)
     placement = replace(placement, notes=(*placement.notes, *notes))
     return Observed(photographs, placement, rejected(outlines, reasons), reasons)
+
+
+def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]:
+    """Return the parts of legs, by leg and radius, of which hardly an outline can be used."""
+    visible = visible_outlines(outlines)
+    part = np.array(outlines.part)
+    parts = []
+    for j, leg in enumerate(photographs.mechanism.legs):
+        for link, radius in leg.radius_of_part.items():
+            own = visible & (outlines.leg == j) & (part == link)
+            if outlines.used[own].sum() <= HARDLY * own.sum():
+                parts.append((j, radius))
+    return parts
 
 
 def rejected(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:

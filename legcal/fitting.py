@@ -5,8 +5,8 @@
    the legs are measured near where that has them (section 3.1).
 3. The four steps give joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
 4. One fit of everything, started from the nominal model and from the steps, ends the work.
-5. Photographs in which anything was left in doubt are searched again close to that fit, and 3
-   and 4 are repeated.
+5. All photographs are searched again close to that fit and measured with all care, so that nothing
+   depends on where the search began, and 3 and 4 are repeated.
 
 Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Images that are
 kept aside are searched like the others, and not fitted.
@@ -15,6 +15,7 @@ kept aside are searched like the others, and not fitted.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -22,6 +23,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.board_views import BoardViews, base_of_board, observe_board
 from legcal.calibration import Steps
 from legcal.dataset.holdout import dataset_at
+from legcal.detection.outline import outline_parts
 from legcal.disagreeing import disagreeing_images
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.examining import Observed, observe
@@ -33,17 +35,20 @@ from legcal.observations.outlines import Outlines
 from legcal.observations.parts import outlines_at
 from legcal.observations.sets import choose_outlines, join_outlines, reject_unused_legs
 from legcal.photographs import (
+    Photographs,
     Scene,
     detect,
-    doubtful_rows,
     given_outlines,
     scene_at_poses,
 )
 from legcal.progress import Report
+from legcal.recognition.hints import hint_notes
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
 from legcal.starting import four_steps, starts_of_fit
 from legcal.workpiece import Workpiece
+
+LOST = 0.5  # of the outlines of an image: fewer were found
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +123,7 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
         outlines = given_outlines(photographs)
         return _noted(_fit(part, fitted, outlines, scene, board, progress), work.plan.notes)
     joined = None if board is None else board.T_board_camera
-    observed = observe(photographs, scene, progress, joined)
+    observed = observe(photographs, scene, progress, joined, partial(outline_parts, together=False))
     placement = observed.placement
     placement.require_one()
     other_radii = bool(placement.recognised.radii.factor)
@@ -129,20 +134,47 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
     if part.every_leg and (observed.left_out or placement.unplaced):
         _refuse_too_few(work, fitted, observed)
     found = _fit(part, fitted, outlines, scene, board, progress)
-    left_out = list(observed.left_out)
-    doubtful = np.setdiff1d(doubtful_rows(observed.photographs, found.judged), left_out)
-    if len(doubtful):
+    shown = np.setdiff1d(_placed_rows(photographs, scene), list(observed.left_out))
+    if len(shown):
+        first = disagreeing_images(part.measurements, part.mechanism, found.solution)
         scene = _fitted_scene(work, found.solution, scene)
-        again = observed.photographs.narrowed(doubtful, found.outlines)
+        again = observed.photographs.narrowed(shown, found.outlines)
         outlines = detect(again, scene, progress, near_fit=True)
         found = _fit(part, fitted, outlines, scene, board, progress)
+        notes = (*notes, *_lost(found, first))
     return replace(_noted(found, notes), other_radii=other_radii)
+
+
+def _lost(found: Found, first: dict[int, str]) -> list[str]:
+    """Return what a first fit said of images in which hardly anything is found near it."""
+    part, o = found.part, found.solution.outlines
+    last = disagreeing_images(part.measurements, part.mechanism, found.solution)
+    return [
+        note
+        for row, note in first.items()
+        if row not in last and o.used[o.row == row].mean() < LOST
+    ]
+
+
+def _placed_rows(photographs: Photographs, scene: Scene) -> IntArray:
+    """Return the searched rows whose views have a camera pose."""
+    view, rows = photographs.measurements.view, photographs.detect
+    placed = [scene.T_base_camera[v] is not None for v in view[rows].tolist()]
+    return rows[np.array(placed, dtype=np.bool_)]
 
 
 def _noted(found: Found, notes: tuple[str, ...]) -> Found:
     """Return what was found with what is to be said of the images, by themselves and by the fit."""
-    doubts = disagreeing_images(found.part.measurements, found.part.mechanism, found.solution)
-    return replace(found, notes=notes, doubts=doubts)
+    part, solution = found.part, found.solution
+    doubts = disagreeing_images(part.measurements, part.mechanism, solution)
+    shown = set(part.measurements.view[solution.outlines.row[solution.outlines.used]].tolist())
+    views = part.measurements.views
+    cameras = [
+        part.mechanism.T_base_Rb * T.inv() if v in shown else None
+        for v, T in enumerate(solution.T_camera_Rb)
+    ]
+    hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
+    return replace(found, notes=notes, doubts=(*hints, *doubts.values()))
 
 
 def _refuse_too_few(work: Workpiece, fitted: IntArray, observed: Observed) -> None:

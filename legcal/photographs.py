@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 
@@ -23,7 +23,7 @@ from legcal.detection.detect import (
     Method,
     detect_outlines,
 )
-from legcal.detection.outline import OUTSIDE, outline_parts
+from legcal.detection.outline import outline_parts
 from legcal.errors import NotVisible
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.leg import Cylinder
@@ -38,7 +38,7 @@ from legcal.observations.sets import (
     no_outlines,
 )
 from legcal.progress import Report
-from legcal.recognition.radii import radius_notes
+from legcal.recognition.radii import Part, radius_notes
 from legcal.recognition.recognise import Recognised, Search, recognise, shifted
 from legcal.workers import Run
 
@@ -154,21 +154,6 @@ class Photographs:
         return replace(self, detect=rows, keep=choose_outlines(outlines, kept))
 
 
-def doubtful_rows(photographs: Photographs, outlines: Outlines) -> IntArray:
-    """Return the searched rows in which an outline was not found, or rejected by the fit.
-
-    Parameters
-    ----------
-    photographs : Photographs
-        The images.
-    outlines : Outlines
-        All outlines after a fit, with what it rejected.
-    """
-    unused = ~outlines.used & ~is_edited(outlines)
-    unused &= np.array([reason != OUTSIDE for reason in outlines.reason], dtype=np.bool_)
-    return np.intersect1d(photographs.detect, outlines.row[unused])
-
-
 @dataclass(frozen=True, eq=False)
 class Placement:
     """What the images say of where everything is.
@@ -216,6 +201,7 @@ def place(
     scene: Scene,
     report: Report,
     joined: Joined = None,
+    doubtful: Collection[Part] = (),
 ) -> Placement:
     """Recognise the legs in the images, and place the cameras by them.
 
@@ -229,6 +215,8 @@ def place(
         Called as ``report(stage, done, total)``.
     joined : sequence of RigidTransform or None, for each view
         T_board_camera of the views that show a calibration board: they are placed together.
+    doubtful : collection of (int, float)
+        Parts that may have other radii, as :func:`legcal.recognition.recognise.recognise` has it.
     """
     search = Search(
         photographs.load,
@@ -243,6 +231,7 @@ def place(
         photographs.detect,
         scene.T_base_camera,
         joined,
+        doubtful=doubtful,
         run=photographs.run,
         progress=counted(report, "Recognising legs", len(photographs.detect)),
     )
@@ -254,7 +243,7 @@ def place(
         for v, (T, rough) in enumerate(zip(found.T_base_camera, scene.T_base_camera, strict=True))
     )
     unplaced = {views[v].name: why for v, why in found.unplaced.items()}
-    notes = (*found.notes, *radius_notes(found.radii, photographs.mechanism.leg_names))
+    notes = tuple(radius_notes(found.radii, photographs.mechanism.leg_names))
     search = replace(search, cylinders=found.radii.corrected(search.cylinders))
     return Placement(Scene(A, B, cameras, found.joint_error), unplaced, notes, search, found)
 

@@ -17,8 +17,9 @@ from legcal.detection.exposure import expose
 from legcal.detection.picture import to_grey
 from legcal.disagreeing import disagreeing_images
 from legcal.errors import NotIdentifiable
+from legcal.examining import observe
 from legcal.overlays.detected import Detection
-from legcal.photographs import Placement, place, scene_at_poses
+from legcal.photographs import Placement, scene_at_poses
 from legcal.progress import no_progress
 from legcal.recognition.hints import hint_notes
 from legcal.refinement.choices import Choices
@@ -144,10 +145,10 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
             assert detected.outlines.used[own].mean() > 0.6
 
 
-def _placement(made: Spoiled) -> Placement:
+def _observed(made: Spoiled) -> Placement:
     work = workpiece(load_dataset(made.write()), in_turn, None, Choices(), use_cache=False)
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
-    return place(work.photographs, scene, no_progress)
+    return observe(work.photographs, scene, no_progress).placement
 
 
 def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
@@ -161,7 +162,7 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
         {"xyz": [-0.7234, 0.5958, 0.288], "quat_xyzw": [-0.32591, 0.67154, -0.59867, 0.29053]},
         {"xyz": [0.9335, 0.2578, 0.1912], "quat_xyzw": [0.41111, 0.57416, -0.55209, -0.44331]},
     )
-    found = _placement(made)
+    found = detect(made.write())
     assert list(found.unplaced) == ["c1"]
     assert "images show the legs if left and right are exchanged" in found.unplaced["c1"]
     assert len(found.notes) == 2
@@ -191,7 +192,7 @@ def test_radii_that_are_wrong_by_a_fifth_are_found(
 ) -> None:
     made = spoiled(tmp_path / "radii", 5)
     made.scale_radii(factor, leg)
-    found = _placement(made)
+    found = _observed(made)
     assert found.unplaced == {}
     assert len(found.notes) == 1
     assert re.match(words, found.notes[0]), found.notes
@@ -238,9 +239,9 @@ def test_a_reading_that_the_outlines_contradict_is_named(
     )
     fit = replace(solution, outlines=replace(o, used=o.used & ~out, reason=reason))
     notes = disagreeing_images(replace(measurements, q=q), dataset.mechanism, fit)
-    assert len(notes) == 1
-    assert notes[0].startswith("view c1, image images/c1_k02.jpg: ")
-    assert re.search(words, notes[0]), notes
+    assert list(notes) == [row]
+    assert notes[row].startswith("view c1, image images/c1_k02.jpg: ")
+    assert re.search(words, notes[row]), notes
 
 
 def test_good_photographs_are_not_doubted(example_run: Run) -> None:

@@ -73,7 +73,7 @@ def expose(grey: Grey) -> Exposure:
 
 
 def _blur(grey: Grey) -> float:
-    """Return the blur of sharp edges [px], in the direction in which it is greatest."""
+    """Return the blur of sharp edges [px], in all directions but one."""
     (x, y), (coarse_x, coarse_y) = (_slopes(grey, s) for s in SCALES)
     fine, coarse = cv2.magnitude(x, y), cv2.magnitude(coarse_x, coarse_y)
     # The middle of an edge: beside it the ratio says nothing.
@@ -85,7 +85,9 @@ def _blur(grey: Grey) -> float:
     least = max(FEWEST_EDGES, int(FEWEST_PART * len(fine)))  # else they are corners of others
     of_direction = [direction == d for d in range(DIRECTIONS)]
     chosen = [own for own in of_direction if np.count_nonzero(own) >= least]
-    return max((_blur_of(fine[own], coarse[own]) for own in chosen), default=0.0)
+    blurs = sorted(_blur_of(fine[own], coarse[own]) for own in chosen)
+    # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
+    return blurs[min(1, len(blurs) - 1)] if blurs else 0.0
 
 
 def _blur_of(fine: Grey, coarse: Grey) -> float:

@@ -62,7 +62,7 @@ class MeasuredEdge:
 
 
 def measure_edges(
-    grey: Grey, camera: Camera, edges: Sequence[Edge]
+    grey: Grey, camera: Camera, edges: Sequence[Edge], together: bool = True
 ) -> tuple[list[MeasuredEdge | None], float]:
     """Fit the limb model and straight lines to all edges of an image.
 
@@ -74,6 +74,9 @@ def measure_edges(
         Its camera.
     edges : sequence of Edge
         All outlines to measure.
+    together : bool
+        Fit all blocks of an outline together in the end; without it lines are good to a few
+        hundredths of a pixel, in half the time.
 
     Returns
     -------
@@ -95,8 +98,10 @@ def measure_edges(
         if len(blocks.moved) == 0:
             return [None] * len(edges), tried
         blocks.settle(tried, LAST_ROUNDS, least_gain=LEAST_GAIN)
-        together = fit_together(blocks, blocks.kept(), tried, depth_for_blur(tried))
-        blur = together.blur
+        if not together:
+            return _roughly(edges, v, blocks, tried), tried
+        joint = fit_together(blocks, blocks.kept(), tried, depth_for_blur(tried))
+        blur = joint.blur
         if abs(np.log(blur / tried)) < SIMILAR:
             break
     return [
@@ -109,11 +114,35 @@ def measure_edges(
             blocks.lines,
             blocks.contrasts(),
             blocks.sharpness(),
-            together.ends,
-            together.covariance,
+            joint.ends,
+            joint.covariance,
             strict=True,
         )
     ], blur
+
+
+def _roughly(
+    edges: Sequence[Edge], v: Sequence[Array], blocks: Blocks, blur: float
+) -> list[MeasuredEdge | None]:
+    """Return the lines that the blocks give one by one, with the covariance that they claim."""
+    found: list[MeasuredEdge | None] = []
+    for edge, at, line, contrasts, sharp in zip(
+        edges, v, blocks.lines, blocks.contrasts(), blocks.sharpness(), strict=True
+    ):
+        if line is None:
+            found.append(None)
+            continue
+        contrast = float(np.median(contrasts[line.kept]))
+        is_step = float(np.median(sharp[line.kept])) > LEAST_GAIN
+        covariance = line.covariance + _shading_bias(contrast, blur) ** 2
+        moved = _moved(edge, at, line)
+        found.append(MeasuredEdge(moved, line, contrast, is_step, blur, covariance))
+    return found
+
+
+def _shading_bias(contrast: float, blur: float) -> float:
+    """Return how far shading moves an outline: its grey levels over the slope of the step [px]."""
+    return float(SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3))
 
 
 def _measured(
@@ -126,12 +155,13 @@ def _measured(
     ends: Array,
     spread: Array,
 ) -> MeasuredEdge:
-    """Return a measured edge; shading moves it by its grey levels over the slope of the step."""
+    """Return an edge that is measured by all its blocks together."""
     contrast = float(np.median(contrasts[line.kept]))
     is_step = float(np.median(sharp[line.kept])) > LEAST_GAIN
-    bias = SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3)
+    bias = _shading_bias(contrast, blur)
     to_piece = np.array([[1.0 - place, place] for place in (line.first, line.last)])
     covariance = WIDENING**2 * to_piece @ spread @ to_piece.T
+    covariance = 0.5 * (covariance + covariance.T)
     covariance += COMMON_BIAS**2 + TILT_BIAS**2 * np.eye(2) + bias**2
     return MeasuredEdge(v + epsilon * ends, line, contrast, is_step, blur, covariance)
 

@@ -130,6 +130,8 @@ def outline_parts(
     names: Sequence[str],
     wanted: BoolArray,
     window: Array,
+    *,
+    together: bool = True,
 ) -> list[PartOutlines]:
     """Find and measure the outlines of all parts in one image.
 
@@ -147,6 +149,8 @@ def outline_parts(
         The legs to look for, by their index.
     window : (n_legs,) array
         Largest distance of an outline from its prediction [px].
+    together : bool
+        As for :func:`legcal.detection.measure.measure_edges`.
 
     Returns
     -------
@@ -155,7 +159,7 @@ def outline_parts(
     """
     parts, results = find_parts(grey, camera, legs, names, wanted, window)
     if parts:
-        results.extend(_measure(grey, camera, parts))
+        results.extend(_measure(grey, camera, parts, together))
     return sorted(results, key=lambda result: result.leg)
 
 
@@ -242,14 +246,16 @@ def _in_front(
     return np.stack(front)
 
 
-def _measure(grey: Grey, camera: Camera, parts: Sequence[FoundPart]) -> list[PartOutlines]:
+def _measure(
+    grey: Grey, camera: Camera, parts: Sequence[FoundPart], together: bool
+) -> list[PartOutlines]:
     """Measure and judge the outlines of parts whose edges are known to a pixel."""
     edges = [
         Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
         for part in parts
         for v, epsilon in zip(part.pair.v, EPSILON, strict=True)
     ]
-    measured, _ = measure_edges(grey, camera, edges)
+    measured, _ = measure_edges(grey, camera, edges, together)
     return [
         _judge(camera, part, one, two)
         for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True)

@@ -1,11 +1,13 @@
 """Radii that pictures contradict: how wide bars are against what the model says (section 3.1).
 
 Lines place a camera, widths hardly do; so a leg that is seen wider or thinner at its place has
-another radius than the model says. Bars of wrong edges agree on nothing: bars of all views must.
+another radius than the model says. Bars of wrong edges agree on nothing: bars of most views must.
+Where light and shade meet on a leg they may agree all the same, so that only parts are asked whose
+outlines were not found.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,9 +64,20 @@ class OtherRadii:
     def of(self, leg: int, radius: float) -> float:
         """Return the factor of a part."""
         for (other, r), factor in self.factor.items():
-            if other == leg and abs(r - radius) <= EQUAL_RADII * radius:  # seen as one
+            if other == leg and _alike(r, radius):
                 return factor
         return self.common or 1.0
+
+    def only(self, doubtful: Collection[Part]) -> "OtherRadii":
+        """Return what is said of some parts; of all only where most of them are among these."""
+        mine = {
+            part: factor
+            for part, factor in self.factor.items()
+            if any(part[0] == leg and _alike(part[1], radius) for leg, radius in doubtful)
+        }
+        if self.common and len(mine) >= MOST_PARTS * len(self.factor):
+            return self
+        return OtherRadii(mine, self.sigma)
 
     def of_the_same(self, step: "OtherRadii") -> "OtherRadii":
         """Return what a step says of the parts whose radii this one has corrected."""
@@ -85,6 +98,11 @@ class OtherRadii:
             for (leg, r), s in self.sigma.items()
         }
         return OtherRadii(factor, sigma, self.common * (step.common or 1.0))
+
+
+def _alike(one: float, other: float) -> bool:
+    """Say whether cylinders of two radii are seen as one."""
+    return abs(one - other) <= EQUAL_RADII * other
 
 
 NO_OTHER_RADII = OtherRadii({}, {})
@@ -131,13 +149,14 @@ def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
 
     Bars of a part that something hides, or of wrong edges, do not agree with each other.
     """
-    middles = []
-    for values in views:
+    middles: list[float] = []
+    asked = [values for values in views if len(values) >= FEWEST]
+    for values in asked:
         middle = float(np.median(values))
         spread = 1.48 * float(np.median(np.abs(np.array(values) - middle)))
-        if len(values) >= FEWEST and spread < TIGHT:
+        if spread < TIGHT:
             middles.append(middle)
-    if not middles or np.ptp(middles) > CONSISTENT:
+    if not middles or 2 * len(middles) < len(asked) or np.ptp(middles) > CONSISTENT:
         return None
     sigma = max(float(np.std(middles)), NOISE) / float(np.sqrt(len(middles)))
     return float(np.mean(middles)), sigma
@@ -220,8 +239,8 @@ def radius_notes(found: OtherRadii, legs: Sequence[str]) -> list[str]:
         ]
     return [
         f"{legs[leg]} is seen {_away(factor)} than its radius in the model: found a radius of "
-        f"{1e3 * factor * radius:.2f} +- {1e3 * factor * radius * found.sigma[leg, radius]:.2f} "
-        f"mm, given {1e3 * radius:.2f} mm; that of the images was used; correct the model."
+        f"about {1e3 * factor * radius:.1f} mm, given {1e3 * radius:.2f} mm; that of the images "
+        "was used; correct the model."
         for (leg, radius), factor in sorted(found.factor.items())
     ]
 

@@ -5,7 +5,7 @@ its view begins; if the images do not agree near it, the view is searched as if 
 a pose that they agree on elsewhere is used and said.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,17 +18,25 @@ from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import find_bars
-from legcal.recognition.hints import hint_notes
+from legcal.recognition.groups import Group, group_views
 from legcal.recognition.mirror import mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
-from legcal.recognition.radii import LEFT, MOST_TURNS, OtherRadii, other_radii
+from legcal.recognition.radii import (
+    LEFT,
+    MOST_TURNS,
+    NO_OTHER_RADII,
+    OtherRadii,
+    Part,
+    other_radii,
+)
 from legcal.recognition.segments import find_segments
+from legcal.recognition.sentences import named, placing_problem
 from legcal.recognition.targets import Targets, targets_of
 from legcal.vision.camera import Camera
 from legcal.workers import Run, in_turn
 
 Load = Callable[[int], Image]
-NEAR_IMAGES = 6  # of a view that are searched where a rough pose is given, at first
+RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
@@ -48,8 +56,6 @@ class Recognised:
         How far the legs may still be from there [m].
     unplaced : dict of str
         Why views could not be placed, by view: one sentence for each.
-    notes : tuple of str
-        What else a reader should know: rough poses that are wrong.
     radii : OtherRadii
         Radii that the images contradict: the cameras were placed with those that they show.
     """
@@ -58,7 +64,6 @@ class Recognised:
     shift: Array
     joint_error: Array
     unplaced: dict[int, str]
-    notes: tuple[str, ...]
     radii: OtherRadii
 
 
@@ -115,6 +120,7 @@ def recognise(
     hints: Sequence[RigidTransform | None],
     joined: Sequence[RigidTransform | None] | None = None,
     *,
+    doubtful: Collection[Part] = (),
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
 ) -> Recognised:
@@ -131,6 +137,9 @@ def recognise(
     joined : sequence of RigidTransform or None, for each view
         T_x_camera of views that know how they stand to each other, by a calibration board x: they
         are placed together.
+    doubtful : collection of (int, float)
+        Parts, by leg and radius [m], whose outlines were not found with the radii of the model:
+        they may have others.
     progress : callable, optional
         Called with the row of each image when it has been searched.
     run : callable
@@ -141,7 +150,7 @@ def recognise(
     Recognised
         Also where views could not be placed.
     """
-    groups = _groups(search, rows, hints, joined)
+    groups = group_views(search.measurements, rows, hints, joined)
     near = [r for group in groups if group.hint is not None for r in group.some]
     far = [r for group in groups if group.hint is None for r in group.rows]
     pictures = _pictures(search, sorted([*near, *far]), progress, run)
@@ -158,8 +167,10 @@ def recognise(
     for g, anywhere in zip(doubted, _anywhere(groups, doubted, pictures, search, run), strict=True):
         found[g] = _better(found[g], anywhere)
     placed = [one for one in found if one is not None]
-    radii = _radii(search, groups, placed, pictures, run)
-    given, step = search.cylinders, radii
+    radii = NO_OTHER_RADII
+    if doubtful:
+        radii = _radii(search, groups, placed, pictures, run).only(doubtful)
+    given, step, as_given = search.cylinders, radii, (search, placed, pictures)
     for _ in range(MOST_TURNS):
         if not step.factor:
             break
@@ -168,67 +179,9 @@ def recognise(
         placed = _placed_again(search, groups, placed, pictures, run)
         step = radii.of_the_same(other_radii(_for_radii(groups, placed, pictures), LEFT))
         radii = radii.then(step)
-    return _gathered(search, groups, hints, placed, pictures, radii, run)
-
-
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """Views whose cameras are placed together, since they know how they stand to each other.
-
-    Attributes
-    ----------
-    views : list of int
-    T_group_camera : dict of RigidTransform, by view
-    rows, some : list of int
-        All images to use, and a few of them.
-    view_of_row : dict of int
-    hint : RigidTransform or None
-        T_base_group, roughly.
-    """
-
-    views: list[int]
-    T_group_camera: dict[int, RigidTransform]
-    rows: list[int]
-    some: list[int]
-    view_of_row: dict[int, int]
-    hint: RigidTransform | None
-
-    def pictures(self, of_row: dict[int, Picture], rows: Sequence[int]) -> list[Picture]:
-        """Return the pictures of some rows, in the frame of the group."""
-        found = []
-        for row in rows:
-            T = self.T_group_camera[self.view_of_row[row]].inv()
-            found.append(replace(of_row[row], R=T.rotation.as_matrix(), t=T.translation))
-        return found
-
-
-def _groups(
-    search: Search,
-    rows: IntArray,
-    hints: Sequence[RigidTransform | None],
-    joined: Sequence[RigidTransform | None] | None,
-) -> list[_Group]:
-    """Return the views that stand alone, and those that are joined."""
-    view_of = {int(row): int(search.measurements.view[row]) for row in rows}
-    views = sorted(set(view_of.values()))
-    together = [v for v in views if joined is not None and joined[v] is not None]
-    groups = [[v] for v in views if v not in together] + ([together] if together else [])
-    found = []
-    for group in groups:
-        own = [row for row, v in view_of.items() if v in group]
-        T = {v: RigidTransform.identity() for v in group}
-        if joined is not None and group == together:
-            T = {v: joined_v for v in group if (joined_v := joined[v]) is not None}
-        given = [(hint, T[v]) for v in group if (hint := hints[v]) is not None]
-        hint = None if not given else given[0][0] * given[0][1].inv()
-        found.append(_Group(group, T, own, _some(own), view_of, hint))
-    return found
-
-
-def _some(rows: Sequence[int]) -> list[int]:
-    """Return a few rows spread over all of them."""
-    chosen = np.linspace(0, len(rows) - 1, min(NEAR_IMAGES, len(rows)))
-    return [rows[int(k)] for k in np.unique(np.rint(chosen).astype(int))]
+    if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[1]):
+        (search, placed, pictures), radii = as_given, NO_OTHER_RADII  # the scale is not known well
+    return _gathered(search, groups, placed, pictures, radii, run)
 
 
 def _pictures(
@@ -243,7 +196,7 @@ def _pictures(
 
 
 def _anywhere(
-    groups: Sequence[_Group],
+    groups: Sequence[Group],
     chosen: Sequence[int],
     pictures: dict[int, Picture],
     search: Search,
@@ -260,7 +213,7 @@ def _place(groups: Sequence[Sequence[Picture]], n_legs: int, group: int) -> Plac
 
 def _radii(
     search: Search,
-    groups: Sequence[_Group],
+    groups: Sequence[Group],
     placed: Sequence[Placed],
     pictures: dict[int, Picture],
     run: Run,
@@ -280,7 +233,7 @@ def _radii(
 
 
 def _for_radii(
-    groups: Sequence[_Group], placed: Sequence[Placed], pictures: dict[int, Picture]
+    groups: Sequence[Group], placed: Sequence[Placed], pictures: dict[int, Picture]
 ) -> Iterator[tuple[int, list[Picture], Poses]]:
     """Return a few pictures of each group that was placed."""
     for g, (group, one) in enumerate(zip(groups, placed, strict=True)):
@@ -288,9 +241,14 @@ def _for_radii(
             yield g, group.pictures(pictures, group.some), one.poses
 
 
+def _mean_support(placed: Sequence[Placed]) -> float:
+    """Return how many legs agree in a picture, over all groups that were placed."""
+    return sum(float(one.support[0].mean()) for one in placed if one.is_convincing)
+
+
 def _placed_again(
     search: Search,
-    groups: Sequence[_Group],
+    groups: Sequence[Group],
     placed: Sequence[Placed],
     pictures: dict[int, Picture],
     run: Run,
@@ -322,8 +280,7 @@ def _better(near: Placed | None, anywhere: Placed) -> Placed:
 
 def _gathered(
     search: Search,
-    groups: Sequence[_Group],
-    hints: Sequence[RigidTransform | None],
+    groups: Sequence[Group],
     poses: Sequence[Placed],
     pictures: dict[int, Picture],
     radii: OtherRadii,
@@ -340,10 +297,12 @@ def _gathered(
     flipped = {row: one for g in lost for row, one in _flipped(groups[g], pictures).items()}
     mirrors = dict(zip(lost, _anywhere(groups, lost, flipped, search, run), strict=True))
     for g, (group, placed) in enumerate(zip(groups, poses, strict=True)):
-        name = _named([views[v].name for v in group.views])
+        name = named([views[v].name for v in group.views])
         if not placed.is_convincing:
             is_mirrored = mirrors[g].is_clear
-            sentence = _problem(name, placed, group.hint is not None, is_mirrored=is_mirrored)
+            sentence = placing_problem(
+                name, placed, group.hint is not None, is_mirrored=is_mirrored
+            )
             unplaced |= dict.fromkeys(group.views, sentence)
             continue
         of_leg = np.where(
@@ -354,53 +313,13 @@ def _gathered(
         for v in group.views:
             found[v] = placed.pose() * group.T_group_camera[v]
             shift[v], error[v] = placed.poses.shift[0], of_leg
-    notes = tuple(hint_notes([view.name for view in views], hints, found))
-    return Recognised(found, shift, error, unplaced, notes, radii)
+    return Recognised(found, shift, error, unplaced, radii)
 
 
-def _flipped(group: _Group, pictures: dict[int, Picture]) -> dict[int, Picture]:
+def _flipped(group: Group, pictures: dict[int, Picture]) -> dict[int, Picture]:
     """Return the pictures of a group with left and right exchanged."""
     found = mirrored([pictures[row] for row in group.rows])
     return dict(zip(group.rows, found, strict=True))
-
-
-def _named(names: Sequence[str]) -> str:
-    """Return the name of a view, or of a group."""
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
-
-
-def _problem(name: str, placed: Placed, hinted: bool, *, is_mirrored: bool) -> str:
-    """Say why a view could not be placed."""
-    if is_mirrored:
-        return (
-            f"view {name}: its camera could not be placed: found that its images show the legs if "
-            "left and right are exchanged, needed photographs as the camera took them; replace "
-            "the mirrored images by the originals."
-        )
-    where = "near its T_base_camera or anywhere else" if hinted else "anywhere"
-    if len(placed.poses) == 0:
-        return (
-            f"view {name}: its camera could not be placed: found no pair of edges in its images "
-            "that could be a leg, needed legs; check that the photographs show the machine, "
-            "sharp and neither black nor overexposed."
-        )
-    legs, n = float(placed.support[0].mean()), placed.expected[0].mean()
-    if not placed.is_enough:
-        return (
-            f"view {name}: its camera could not be placed: found no pose {where} at which its "
-            f"images show the legs (at the best one {legs:.1f} of {n:.0f} legs an image), needed "
-            f"{placed.needed:.1f}; check that the images belong to this machine and to their "
-            "readings, that they are no mirror images, and the camera file."
-        )
-    other = placed.pose(1)
-    apart = placed.pose().inv() * other
-    return (
-        f"view {name}: its camera could not be placed: found two poses at which its images show "
-        f"the legs about as well ({legs:.1f} and {placed.support[1].mean():.1f} legs an image; "
-        f"{1e3 * np.linalg.norm(apart.translation):.0f} mm and "
-        f"{np.degrees(apart.rotation.magnitude()):.0f} deg apart), needed one; add images at "
-        "readings that differ more between the legs, or a rough T_base_camera."
-    )
 
 
 def corners_of(camera: Camera) -> Array:
