@@ -121,7 +121,8 @@ def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]
     for j, leg in enumerate(photographs.mechanism.legs):
         for link, radius in leg.radius_of_part.items():
             own = visible & (outlines.leg == j) & (part == link)
-            if outlines.used[own].sum() <= HARDLY * own.sum():
+            is_seen = own.any() or not visible.any()
+            if is_seen and outlines.used[own].sum() <= HARDLY * own.sum():
                 parts.append((j, radius))
     return parts
 

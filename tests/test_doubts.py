@@ -142,7 +142,7 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
     for k, row in enumerate(bad.rows):
         if f"image {row['image']}: " not in named:
             own = detected.outlines.row == k
-            assert detected.outlines.used[own].mean() > 0.6
+            assert detected.outlines.used[own].mean() > 0.5
 
 
 def _observed(made: Spoiled) -> Placement:
@@ -183,7 +183,7 @@ def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:
 @pytest.mark.parametrize(
     ("leg", "factor", "words"),
     [
-        ("", 1.2, r"All legs are seen 1[4-9] % thinner than their radii in the model; the radii"),
+        ("", 1.2, r"All legs are seen 1[2-9] % thinner than their radii in the model; the radii"),
         ("leg3", 0.8, r"leg3 is seen 2\d % thicker than its radius in the model: found a radius"),
     ],
 )
@@ -197,7 +197,7 @@ def test_radii_that_are_wrong_by_a_fifth_are_found(
     assert len(found.notes) == 1
     assert re.match(words, found.notes[0]), found.notes
     wrong = [c.radius for of_leg in found.search.cylinders for c in of_leg]
-    assert np.allclose(wrong, 0.01, rtol=0.04)
+    assert np.allclose(wrong, 0.01, rtol=0.06)
 
 
 def test_blur_is_measured_whatever_the_light() -> None:

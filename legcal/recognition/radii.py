@@ -109,7 +109,10 @@ NO_OTHER_RADII = OtherRadii({}, {})
 
 
 def other_radii(
-    views: Iterable[tuple[int, Sequence[Picture], Poses]], different: float = DIFFERENT
+    views: Iterable[tuple[int, Sequence[Picture], Poses]],
+    different: float = DIFFERENT,
+    *,
+    alone: bool = False,
 ) -> OtherRadii:
     """Return the radii that differ from the model.
 
@@ -119,6 +122,8 @@ def other_radii(
         A view, pictures of it, and T_camera_base where they put the camera.
     different : float
         Logarithm of the factor from which on a radius is another one.
+    alone : bool
+        Whether all parts cannot differ alike.
     """
     samples: dict[Part, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for view, pictures, placed in views:
@@ -133,13 +138,15 @@ def other_radii(
     sigma = {part: found[1] for part, found in known.items()}
     common = float(np.median([value for value, _ in known.values()]))
     alike = np.mean([abs(value - common) < CONSISTENT for value, _ in known.values()])
-    if abs(common) > different and alike >= MOST_PARTS and len({leg for leg, _ in known}) > 1:
+    of_several = alike >= MOST_PARTS and len({leg for leg, _ in known}) > 1
+    if not alone and abs(common) > different and of_several:
         factor = float(np.exp(common))
         return OtherRadii(dict.fromkeys(samples, factor), sigma, factor)
+    bias = common if of_several else 0.0  # of bars, whatever the leg
     differing = {
-        part: float(np.exp(value))
+        part: float(np.exp(value - bias))
         for part, (value, sigma_value) in known.items()
-        if abs(value) > max(different, SURE * sigma_value)
+        if abs(value - bias) > max(different, SURE * sigma_value)
     }
     return OtherRadii(differing, {part: sigma[part] for part in differing})
 

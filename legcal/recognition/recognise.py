@@ -177,7 +177,8 @@ def recognise(
         search = replace(search, cylinders=radii.corrected(given))
         pictures = {row: search.retargeted(row, one) for row, one in pictures.items()}
         placed = _placed_again(search, groups, placed, pictures, run)
-        step = radii.of_the_same(other_radii(_for_radii(groups, placed, pictures), LEFT))
+        few = _for_radii(groups, placed, pictures)
+        step = radii.of_the_same(other_radii(few, LEFT, alone=not radii.common))
         radii = radii.then(step)
     if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[1]):
         (search, placed, pictures), radii = as_given, NO_OTHER_RADII  # the scale is not known well
