@@ -118,7 +118,7 @@ def draw(seed: int) -> Scene:
     coarse = bool(rng.random() < 0.25)
     with TemporaryDirectory() as folder:
         truth = write_true_model(nominal, _errors(coarse), rng, Path(folder))
-    n = int(rng.choice([1, 1, 2, 3, 4, 6]))
+    n = int(rng.choice([1, 2, 3, 4, 6, 8]))
     sampling = Sampling.EXTREME if rng.random() < 0.3 else Sampling.WORKSPACE
     poses = commanded_poses(truth, nominal, n, rng, sampling)
     shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))

@@ -4,7 +4,7 @@
     OMP_NUM_THREADS=1 python benchmarks/scenes.py --only SEED -o FOLDER
 
 A scene is a random shipped machine with errors against its nominal model, seen by a random camera
-in random light among clutter and behind occluders, in 1 to 6 images at random readings (see
+in random light among clutter and behind occluders, in 1 to 8 images at random readings (see
 ``random_scenes.py``). No rough camera pose and no legs are given. Results are lines of JSON, one a
 scene; scenes that the file has already are not made again. ``--only`` writes the images of a
 scene with all true outlines (thin), the bars (grey), and the outlines that were used (thick,
