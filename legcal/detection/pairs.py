@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from legcal.detection.band import Band
 from legcal.detection.picture import Grey, sample
-from legcal.detection.strips import edge_sharpness
+from legcal.detection.sharpness import edge_sharpness
 from legcal.geometry.types import Array, BoolArray
 from legcal.vision.camera import Camera
 
@@ -139,7 +139,7 @@ def _edge_lines(
     values, inside = sample(grey, 1, camera, xy)
     shape = (n_blocks, ROWS, v.shape[1])
     seen = inside.reshape(shape).all(axis=1) & ~hidden[:, None]
-    votes = np.maximum(*edge_sharpness(values.reshape(shape).mean(axis=1), seen))
+    votes = edge_sharpness(values.reshape(shape).mean(axis=1), seen)
     votes = votes[:, MARGIN:-MARGIN] * seen[:, MARGIN:-MARGIN]
     return _lines(votes / max(1, int(seen.any(axis=1).sum())), half)
 
