@@ -91,8 +91,12 @@ class Placed:
         """Whether the first pose leaves no doubt, so that no further search is needed."""
         if not self.is_enough:
             return False
-        share = float(self.support[0].sum() / self.expected[0].sum())
-        return share >= CLEAR_SUPPORT and (self.hinted or self._leads(CLEAR_LEAD, CLEAR_PART))
+        return self.share >= CLEAR_SUPPORT and (self.hinted or self._leads(CLEAR_LEAD, CLEAR_PART))
+
+    @property
+    def share(self) -> float:
+        """Share of the expected legs that agree with the first pose."""
+        return float(self.support[0].sum() / self.expected[0].sum()) if len(self.poses) else 0.0
 
     def _leads(self, legs: float, part: float) -> bool:
         """Say whether the first pose leads by so many legs and such a part of its score."""
