@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.recognition.agreement import Picture
-from legcal.recognition.mirror import mirrored
+from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
 
 HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
@@ -120,3 +120,33 @@ def test_pictures_of_nothing_give_no_pose() -> None:
         assert not placed.is_convincing
     wild = lp.picture(joints, joints, lp.camera(rng), rng, missing=1.1, n_clutter=12)
     assert not place_camera([wild] * 2, 6).is_convincing
+
+
+@pytest.mark.parametrize("missing", [0.2, 0.45])
+def test_mirrored_pictures_of_a_machine_without_symmetry_are_told_from_its_own(
+    missing: float,
+) -> None:
+    for seed in range(20, 23):
+        pictures, _ = _pictures(seed, 6, 4, **{**HARD, "missing": missing})
+        own, other = place_camera(pictures, 6), place_camera(mirrored(pictures), 6)
+        assert own.is_convincing
+        assert may_be_mirrored(other)
+        assert is_mirrored(other, own) or not other.is_convincing
+        assert not is_mirrored(own, other)
+
+
+def test_mirrored_pictures_of_a_planar_machine_are_believed() -> None:
+    rng = np.random.default_rng(3)
+    spatial, T = lp.machine(4, rng), lp.camera(rng)
+    flat = np.array([1.0, 1.0, 0.0])
+    made = lp.Machine(flat * spatial.A, flat * spatial.B)
+    steps = [
+        RigidTransform.from_components([*rng.uniform(-0.05, 0.05, 2), 0.0], Rotation.identity())
+        for _ in range(4)
+    ]
+    pictures = lp.pictures(made, T, steps, rng)
+    own, other = place_camera(pictures, 4), place_camera(mirrored(pictures), 4)
+    assert own.is_enough
+    assert other.is_enough
+    assert not is_mirrored(own, other)
+    assert not is_mirrored(other, own)
