@@ -263,7 +263,7 @@ def test_what_remains_is_calibrated_or_refused(bad: Spoiled, tmp_path: Path) -> 
         made.change("c2", k, lambda picture: 0 * picture)
     with pytest.raises(NotIdentifiable, match=r"cannot be identified") as refused:
         calibrate(made.write())
-    assert any("is mirrored" in problem for problem in refused.value.problems)
+    assert any("left and right are exchanged" in problem for problem in refused.value.problems)
 
 
 @pytest.mark.slow

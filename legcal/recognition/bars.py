@@ -19,6 +19,7 @@ LEAST_OVERLAP = 0.35  # of the longer edge
 SAME_WAY = 0.5  # what a pair counts at both of whose edges the picture changes the same way
 MOST = 48  # bars of a picture
 MOST_OF_EDGE = 4  # bars to which one edge belongs
+ALIKE = 0.35, 0.2  # of a bar that says the same as another: distance, widths in widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +120,7 @@ def find_bars(segments: Segments, most: int = MOST) -> Bars:
         for t, v in ((first, centre[0]), (last, centre[1]))
     )
     chosen = _best(np.where(good, merit, 0.0), i, j, len(ends), most)
+    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:most]
     start, stop = start[chosen], stop[chosen]
     full = np.linalg.norm(stop - start, axis=1)
     return Bars(
@@ -132,13 +134,32 @@ def find_bars(segments: Segments, most: int = MOST) -> Bars:
 
 
 def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int, most: int) -> IntArray:
-    """Return the best pairs, few of each edge."""
+    """Return the best pairs, few of each edge: more than wanted, some of them may be alike."""
     used = np.zeros(n_edges, dtype=np.intp)
     chosen: list[int] = []
     for k in np.argsort(-merit, kind="stable").tolist():
-        if merit[k] <= 0.0 or len(chosen) == most:
+        if merit[k] <= 0.0 or len(chosen) == 2 * most:
             break
         if max(used[i[k]], used[j[k]]) < MOST_OF_EDGE:
             used[[i[k], j[k]]] += 1
             chosen.append(k)
     return np.array(chosen, dtype=np.intp)
+
+
+def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
+    """Return which bars (n,), best first, do not lie within better ones of the same width."""
+    along = stop - start
+    length = np.linalg.norm(along, axis=1)
+    along = along / length[:, None]
+    # Ends of bar j in the frame of bar i.
+    to_ends = np.stack([start, stop], axis=1)[None] - start[:, None, None]
+    place = np.einsum("ijkx,ix->ijk", to_ends, along)
+    aside = to_ends[..., 1] * along[:, None, None, 0] - to_ends[..., 0] * along[:, None, None, 1]
+    middle = place.mean(axis=2)
+    alike = np.abs(aside).max(axis=2) <= ALIKE[0] * width[:, None]
+    alike &= (middle > 0.0) & (middle < length[:, None])
+    alike &= np.abs(width[None, :] - width[:, None]) <= ALIKE[1] * width[:, None]
+    kept = np.ones(len(start), dtype=np.bool_)
+    for j in range(1, len(start)):
+        kept[j] = not np.any(alike[:j, j] & kept[:j])
+    return kept

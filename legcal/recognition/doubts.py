@@ -18,7 +18,7 @@ from legcal.recognition.recognise import Recognised, Search, corners_of
 from legcal.recognition.segments import find_segments
 from legcal.recognition.targets import targets_of
 
-TOLERANCE = 0.006  # of an axis from its bar, on the sensor plane
+TOLERANCE = 0.006  # of an axis from its bar [m]
 UNPLACED = 0.015  # the same of a leg that nothing has moved from where the model has it
 CLEAR, BETTER = (
     0.35,

@@ -6,19 +6,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.recognition.agreement import Agreement, Picture, Poses, agreement, distances, improved
+from legcal.recognition.bars import Bars
 from legcal.recognition.starts import joined, pose_starts
 
-TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis, on the sensor plane
-JOINT_ERROR = 0.01  # standard deviation of the joint centres of the nominal model [m]
-START_PICTURES, MOST_START_PICTURES = 2, 8  # whose bars suggest poses: at once, at most
-KEPT = (500, 40, 10)  # of the starts of a picture, of its refined ones, of all
+TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
+LAST = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
+JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
+START_PICTURES = 1, 1, 2, 4  # whose bars suggest poses, as long as there is a doubt
+SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
+KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
+N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
+POLISH = (0.018, 0.012, 0.008)  # tolerances
+POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
 SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
+SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
 MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
-CLEAR_SUPPORT, CLEAR_LEAD = 0.35, 1.6  # share of the expected legs, against the next pose: no doubt
-ENOUGH_SUPPORT, ENOUGH_LEAD = 0.2, 1.25  # the same, to be believed at all
+JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
+SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
+# Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
+# lead over the next pose in legs of all images together, and as a part.
+CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
+ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.12
 LEAST_SUPPORT = 1.6  # legs in all images together
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
@@ -36,6 +47,8 @@ class Placed:
         How many legs agree in each picture, weighted by how well and how much of them.
     expected : (n, n_pictures) array
         How many legs each picture would show.
+    score : (n,) array
+        The support in all pictures together, less what the shifts of the joints cost: legs.
     leg_error : (n_legs,) array
         Root mean square distance of the legs from their bars at the first pose [m]; infinite for
         legs without any.
@@ -46,6 +59,7 @@ class Placed:
     poses: Poses
     support: Array
     expected: Array
+    score: Array
     leg_error: Array
     hinted: bool = False
 
@@ -62,23 +76,31 @@ class Placed:
 
     @property
     def lead(self) -> float:
-        """Support of the first pose against that of the second one."""
+        """Score of the first pose beyond that of the second one, in legs."""
         if len(self.poses) < 2:
             return float("inf")
-        return float(self.support[0].sum() / max(self.support[1].sum(), 1e-9))
+        return float(self.score[0] - self.score[1])
 
     @property
     def is_convincing(self) -> bool:
         """Whether the first pose is to be believed."""
-        return self.is_enough and (self.hinted or self.lead >= ENOUGH_LEAD)
+        return self.is_enough and (self.hinted or self._leads(ENOUGH_LEAD, ENOUGH_PART))
 
     @property
     def is_clear(self) -> bool:
         """Whether the first pose leaves no doubt, so that no further search is needed."""
         if not self.is_enough:
             return False
-        share = float(self.support[0].sum() / self.expected[0].sum())
-        return share >= CLEAR_SUPPORT and (self.hinted or self.lead >= CLEAR_LEAD)
+        return self.share >= CLEAR_SUPPORT and (self.hinted or self._leads(CLEAR_LEAD, CLEAR_PART))
+
+    @property
+    def share(self) -> float:
+        """Share of the expected legs that agree with the first pose."""
+        return float(self.support[0].sum() / self.expected[0].sum()) if len(self.poses) else 0.0
+
+    def _leads(self, legs: float, part: float) -> bool:
+        """Say whether the first pose leads by so many legs and such a part of its score."""
+        return self.lead >= max(legs, part * float(self.score[0]))
 
     def pose(self, i: int = 0) -> RigidTransform:
         """Return T_base_camera of a pose."""
@@ -96,23 +118,56 @@ def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
     n_legs : int
         Number of legs of the machine.
     """
-    order = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
+    by_merit = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
+    best_first = [pictures[k] for k in by_merit]
     nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
     best = _judged(pictures, nothing)
-    for first in range(0, min(len(order), MOST_START_PICTURES), START_PICTURES):
-        starts = [_starts(pictures[k], n_legs) for k in order[first : first + START_PICTURES]]
+    done = 0
+    for n in START_PICTURES:
+        if done >= len(pictures):
+            break
+        starts = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
+        done += n
         poses = joined([best.poses, *starts])
         if len(poses) == 0:
             continue
-        few = [pictures[k] for k in order[: first + START_PICTURES]]
-        poses = _refined(few, poses, TOLERANCES[2:4], JOINT_ERROR)
-        score = _support(pictures, poses, TOLERANCES[3])[0].sum(axis=1)
+        poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
+        some = best_first[: max(SOME_PICTURES, done)]
+        score = supports(some, poses, TOLERANCES[3])[0].sum(axis=1)
         poses = poses.take(_distinct(poses, score, KEPT[2]))
-        poses = _refined(pictures, poses, (*TOLERANCES[3:], *TOLERANCES[-2:]), JOINT_ERROR)
-        best = _judged(pictures, poses)
+        poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
+        score = supports(some, poses, TOLERANCES[-1])[0].sum(axis=1)
+        poses = poses.take(_best(score, KEPT[3]))
+        poses = joined([poses, _polished(some[:POLISHING], poses)])
+        best = _judged(pictures, refined(pictures, poses, LAST, JOINT_ERROR))
         if best.is_clear:
             break
     return best
+
+
+def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
+    """Return for each of the best poses the best one around it that steps lead to.
+
+    A leg on a wrong bar keeps a pose, and the joints moved for it, from where all legs agree.
+    """
+    n_legs = poses.shift.shape[1]
+    found = []
+    for i in range(min(N_POLISHED, len(poses))):
+        around = _around(pictures, poses.R[i], poses.t[i], n_legs)
+        around = refined(pictures, around, POLISH, JOINT_ERROR)
+        score = supports(pictures, around, POLISH[-1])[0].sum(axis=1)
+        found.append(around.take(_best(score, 1)))
+    return joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
+
+
+def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Poses:
+    """Return poses around one: the machine turned a little, further, nearer, or as it is."""
+    ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
+    middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
+    turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
+    further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
+    new = Rotation.from_rotvec(turns).as_matrix() @ R
+    return Poses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
 
 
 def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int) -> Placed:
@@ -131,8 +186,8 @@ def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_leg
     turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
-    poses = _refined(pictures, poses, TOLERANCES[:3])
-    poses = _refined(pictures, poses, (*TOLERANCES[2:], *TOLERANCES[-2:]), JOINT_ERROR)
+    poses = refined(pictures, poses, TOLERANCES[:3])
+    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST), JOINT_ERROR)
     found = _judged(pictures, poses)
     return replace(found, hinted=True)
 
@@ -142,25 +197,48 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
-        return Placed(poses, empty, empty, np.full(n_legs, np.inf))
-    found = [agreement(picture, poses, TOLERANCES[-1]) for picture in pictures]
+        return Placed(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
+    found = [agreement(picture, poses, JUDGED) for picture in pictures]
     values = [_one_bar_each(one) for one in found]
     shares = [picture.targets.share for picture in pictures]
     support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
     expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
-    matches = np.concatenate(
-        [np.where(v >= MATCHED, f.bar, -1) for v, f in zip(values, found, strict=True)], axis=1
-    )
-    kept: list[int] = []
-    for i in np.argsort(-support.sum(axis=1), kind="stable").tolist():
-        mine = matches[i] >= 0
-        least = max(1, int(np.count_nonzero(mine)))
-        common = [int(np.count_nonzero((matches[i] == matches[k]) & mine)) / least for k in kept]
-        if max(common, default=0.0) < SAME_MATCHES:
-            kept.append(i)
-    order = np.array(kept, dtype=np.intp)
+    cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / JOINT_ERROR**2
+    score = support.sum(axis=1) - SHIFT_COST * cost
+    order = _different(pictures, found, [v >= MATCHED for v in values], score)
     best = poses.take(order[:1])
-    return Placed(poses.take(order), support[order], expected[order], _leg_error(pictures, best))
+    error = _leg_error(pictures, best)
+    return Placed(poses.take(order), support[order], expected[order], score[order], error)
+
+
+def _different(
+    pictures: Sequence[Picture],
+    found: Sequence[Agreement],
+    matched: Sequence[BoolArray],
+    score: Array,
+) -> IntArray:
+    """Return the poses, best first, that put other legs on other bars than better ones do."""
+    common = np.zeros((len(score), len(score)))
+    for picture, agreed, match in zip(pictures, found, matched, strict=True):
+        if len(picture.bars) == 0:
+            continue
+        same = _one_leg(picture.bars)
+        for j in range(len(picture.targets)):
+            bar, has = agreed.bar[:, j], match[:, j]
+            common += same[np.ix_(bar, bar)] & has[:, None] & has[None, :]
+    least = np.maximum(np.diag(common), 1.0)
+    kept: list[int] = []
+    for i in np.argsort(-score, kind="stable").tolist():
+        if np.max(common[i, kept] / least[i], initial=0.0) < SAME_MATCHES:
+            kept.append(i)
+    return np.array(kept, dtype=np.intp)
+
+
+def _one_leg(bars: Bars) -> BoolArray:
+    """Return which bars (n, n) may be of one leg: they continue each other or overlap."""
+    apart = np.abs(np.einsum("ijx,ix->ij", bars.middle[None] - bars.middle[:, None], bars.normal))
+    near = np.maximum(apart, apart.T) <= SAME_BAR[1] * bars.width.mean(axis=1)[:, None]
+    return np.asarray(near & (np.abs(bars.along @ bars.along.T) >= np.cos(SAME_BAR[0])))
 
 
 def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
@@ -170,7 +248,7 @@ def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
     for picture in pictures:
         if len(picture.bars) == 0 or len(picture.targets) == 0:
             continue
-        found = agreement(picture, pose, TOLERANCES[-1])
+        found = agreement(picture, pose, JUDGED)
         matched = _one_bar_each(found)[0] >= MATCHED
         distance = distances(picture, pose, found)[0]
         np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
@@ -185,9 +263,9 @@ def _starts(picture: Picture, n_legs: int) -> Poses:
     poses = pose_starts(picture, n_legs)
     if len(poses) == 0:
         return poses
-    poses = poses.take(_best(_support([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
-    poses = _refined([picture], poses, TOLERANCES[:3])
-    score = _support([picture], poses, TOLERANCES[2])[0].sum(axis=1)
+    poses = poses.take(_best(supports([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
+    poses = refined([picture], poses, TOLERANCES[:3])
+    score = supports([picture], poses, TOLERANCES[2])[0].sum(axis=1)
     return poses.take(_distinct(poses, score, KEPT[1]))
 
 
@@ -195,19 +273,20 @@ def _merit(picture: Picture) -> float:
     return float(picture.bars.merit[:8].sum()) if len(picture.bars) else 0.0
 
 
-def _refined(
+def refined(
     pictures: Sequence[Picture],
     poses: Poses,
     tolerances: Sequence[float],
     joint_error: float = 0.0,
 ) -> Poses:
+    """Return poses after a step towards the bars for each of some tolerances."""
     for tolerance in tolerances:
         found = [agreement(picture, poses, tolerance) for picture in pictures]
         poses = improved(pictures, poses, found, tolerance, joint_error)
     return poses
 
 
-def _support(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
+def supports(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
     """Return the support and the expected number of legs, both (n_poses, n_pictures)."""
     support, expected = [], []
     for picture in pictures:

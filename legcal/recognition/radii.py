@@ -157,16 +157,28 @@ def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
     Bars of a part that something hides, or of wrong edges, do not agree with each other.
     """
     middles: list[float] = []
-    asked = [values for values in views if len(values) >= FEWEST]
+    asked = [np.array(values) for values in views if len(values) >= FEWEST]
     for values in asked:
+        values = values[np.abs(values - _densest(values)) <= CONSISTENT]
         middle = float(np.median(values))
-        spread = 1.48 * float(np.median(np.abs(np.array(values) - middle)))
-        if spread < TIGHT:
+        spread = 1.48 * float(np.median(np.abs(values - middle)))
+        if len(values) >= FEWEST and spread < TIGHT:
             middles.append(middle)
     if not middles or 2 * len(middles) < len(asked) or np.ptp(middles) > CONSISTENT:
         return None
     sigma = max(float(np.std(middles)), NOISE) / float(np.sqrt(len(middles)))
     return float(np.mean(middles)), sigma
+
+
+def _densest(values: Array) -> float:
+    """Return the middle of the shortest interval with more than half of the values.
+
+    Few bars of inner edges, where light and shade meet, do not move it as they move a median.
+    """
+    ordered = np.sort(values)
+    most = len(ordered) // 2 + 1
+    first = int(np.argmin(ordered[most - 1 :] - ordered[: len(ordered) - most + 1]))
+    return float(np.median(ordered[first : first + most]))
 
 
 def _by_lines(pictures: Sequence[Picture], placed: Poses) -> Poses:

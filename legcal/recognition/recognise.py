@@ -19,7 +19,7 @@ from legcal.observations.measurements import Measurements
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import find_bars
 from legcal.recognition.groups import Group, group_views
-from legcal.recognition.mirror import mirrored
+from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
 from legcal.recognition.place import Placed, place_camera, place_near
 from legcal.recognition.radii import (
     LEFT,
@@ -294,16 +294,14 @@ def _gathered(
     shift = np.zeros((n_views, n_legs, 2, 3))
     error = np.full((n_views, n_legs), UNSEEN_ERROR)
     unplaced: dict[int, str] = {}
-    lost = [g for g, placed in enumerate(poses) if not placed.is_convincing]
-    flipped = {row: one for g in lost for row, one in _flipped(groups[g], pictures).items()}
-    mirrors = dict(zip(lost, _anywhere(groups, lost, flipped, search, run), strict=True))
+    doubted = [g for g, placed in enumerate(poses) if may_be_mirrored(placed)]
+    flipped = {row: one for g in doubted for row, one in _flipped(groups[g], pictures).items()}
+    mirrors = dict(zip(doubted, _anywhere(groups, doubted, flipped, search, run), strict=True))
     for g, (group, placed) in enumerate(zip(groups, poses, strict=True)):
         name = named([views[v].name for v in group.views])
-        if not placed.is_convincing:
-            is_mirrored = mirrors[g].is_clear
-            sentence = placing_problem(
-                name, placed, group.hint is not None, is_mirrored=is_mirrored
-            )
+        exchanged = g in mirrors and is_mirrored(placed, mirrors[g])
+        if exchanged or not placed.is_convincing:
+            sentence = placing_problem(name, placed, group.hint is not None, is_mirrored=exchanged)
             unplaced |= dict.fromkeys(group.views, sentence)
             continue
         of_leg = np.where(

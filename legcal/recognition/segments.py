@@ -82,7 +82,7 @@ def _pieces(small: Grey) -> Array:
     lines = detector.detect(levels)[0]
     if lines is None:
         return np.zeros((0, 2, 2))
-    pieces = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 2) - 0.5
+    pieces = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 2)  # of middles of pixels
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
     order = np.argsort(-length, kind="stable")[:MOST]
     return np.asarray(pieces[order[length[order] >= SHORTEST]])
@@ -106,15 +106,15 @@ def _join(ends: Array) -> tuple[Array, Array]:
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     middle = ends.mean(axis=1)
     # Piece j against the line of piece i, the longer one (pieces come longest first).
-    to_ends = ends[None, :, :, :] - middle[:, None, None, :]
-    aside = np.abs(np.einsum("ijkx,ix->ijk", to_ends, normal)).max(axis=2)
-    place = np.einsum("ijkx,ix->ijk", to_ends, along)
-    gap = np.maximum(place.min(axis=2), -place.max(axis=2)) - 0.5 * length[:, None]
-    near = gap <= GAP * np.minimum(length[:, None], length[None, :])
+    i, j = np.nonzero(np.triu(along @ along.T >= np.cos(TURN), 1))
+    to_ends = ends[j] - middle[i, None]
+    aside = np.abs(np.einsum("nkx,nx->nk", to_ends, normal[i])).max(axis=1)
+    place = np.einsum("nkx,nx->nk", to_ends, along[i])
+    gap = np.maximum(place.min(axis=1), -place.max(axis=1)) - 0.5 * length[i]
     # A long way ahead a line is known less well.
-    allowed = ASIDE * (1.0 + 0.5 * np.maximum(gap, 0.0) / length[:, None])
-    parallel = along @ along.T >= np.cos(TURN)
-    i, j = np.nonzero(np.triu(near & parallel & (aside <= np.minimum(allowed, 2 * ASIDE)), 1))
+    allowed = ASIDE * (1.0 + 0.5 * np.maximum(gap, 0.0) / length[i])
+    near = (gap <= GAP * length[j]) & (aside <= np.minimum(allowed, 2 * ASIDE))
+    i, j = i[near], j[near]
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
     _, label = connected_components(graph, directed=False)
     lines, covered = [], []

@@ -11,19 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.geometry.types import Array
-from legcal.recognition.agreement import WIDTH_ERROR, Picture, Poses
+from legcal.geometry.types import Array, IntArray
+from legcal.recognition.agreement import WIDTH_ERROR, Picture, Poses, seen_width
 from legcal.recognition.bars import Bars
 from legcal.recognition.targets import Targets
 
-N_FIRST, N_SECOND = 14, 40  # best bars that are tried as the first one, and as the second
+N_FIRST, N_SECOND = 20, 40  # best bars that are tried as the first one, and as the second
 LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
-LONGER = 1.2  # a bar may be so much longer than the piece that it shows
+LONGER = 1.25, 3.0  # a bar is at most so much longer than the piece that it shows: factor, radii
 CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
 WIDTH_REACH = 2.5  # standard deviations of the width of the second bar
 SLACK = 0.2  # of the place along a piece, in its lengths
 TURNED = 1.05  # how far from a solution bars and legs may be that allow none, as a cosine
 CROSSING = 0.03  # sine between axes seen, below which the second bar does not tell the place
+MOST = 3000  # poses of a picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +34,8 @@ class _Firsts:
     u: Array  # (n, 3) direction in the camera frame, from base to platform
     P: Array  # (n, 3) where the middle of the piece is put [m]
     slack: Array  # (n,) how far along the leg it may be instead [m]
-    bar: Array  # (n,) int
-    target: Array  # (n,) int
+    bar: IntArray  # (n,)
+    target: IntArray  # (n,)
 
 
 def pose_starts(picture: Picture, n_legs: int) -> Poses:
@@ -58,88 +59,97 @@ def pose_starts(picture: Picture, n_legs: int) -> Poses:
     piece = targets.ends[:, 1] - targets.ends[:, 0]
     length = np.linalg.norm(piece, axis=1)
     direction = piece / length[:, None]
+    # All in frames whose x axis is the first leg: of the camera, and of the base link.
     U_c, U_b = _triads(firsts.u), _triads(direction)[firsts.target]
     rays, planes = _rays(bars), _planes(bars)
-    # Turn about the first leg that lays the second one into the plane of the second bar.
-    n = np.einsum("fxi,kx->fki", U_c, planes)[:, :, None, :]
-    w = np.einsum("fxi,lx->fli", U_b, direction)[:, None, :, :]
+    n_all, ray_all = planes @ U_c, rays @ U_c  # (n_firsts, n_bars, 3)
+    P_all = np.einsum("fxi,fx->fi", U_c, firsts.P)
+    w_all = direction @ U_b  # (n_firsts, n_targets, 3)
+    d_all = (middle[None] - middle[firsts.target][:, None]) @ U_b
+    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
+    n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
+    across = n[:, 0]
+    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < CROSSING, np.inf, across)
+    good = np.flatnonzero(np.abs(place) <= firsts.slack[f])
+    f, k, m = f[good], k[good], m[good]
+    cosine, sine, place = cosine[good], sine[good], place[good]
+    # Where the second bar's middle is on the second leg, and how wide it should be there.
+    X = d[good] + P[good]
+    X[:, 0] += place
+    v, ray = _turned(w_all[f, m], cosine, sine), ray_all[f, k]
+    vX, vr, Xr = _dot(v, X), _dot(v, ray), _dot(X, ray)
+    along = -(_dot(X, X) * vr - vX * Xr) / _safe(vX * vr - Xr)
+    depth = _dot(U_c[f, 2], X + along[:, None] * v)
+    flat = np.linalg.norm(planes[k][:, :2], axis=1)
+    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
+    seen = seen_width(bars)[k]
+    # The depth of the first leg is no better known.
+    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, bars.pixel / seen)
+    off = np.abs(np.log(expected / seen)) / (WIDTH_REACH * sigma)
+    good_along = np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]
+    good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
+    merit = bars.merit[k] + bars.merit[firsts.bar[f]]
+    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MOST]]
+    f, place = f[good], place[good]
+    R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
+    where = firsts.P[f] + place[:, None] * firsts.u[f]
+    t = where - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
+    return Poses.rigid(R, t, n_legs)
+
+
+def _turns(
+    firsts: _Firsts, targets: Targets, n: Array, w: Array
+) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
+    """Return the turns about a first leg that lay a second one into the plane of a second bar.
+
+    Indices of the first, the second bar and the second piece, and cosine and sine of the turn,
+    from the normals n (n_firsts, n_bars, 3) of the planes and the directions w (n_firsts,
+    n_targets, 3) of the pieces.
+    """
+    n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
     c0 = n[..., 0] * w[..., 0]
     c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
     c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
-    size = np.hypot(c1, c2)
-    good = np.abs(c0) <= TURNED * size
-    good &= (np.arange(len(bars)) != firsts.bar[:, None])[:, :, None]
+    good = c0**2 <= TURNED**2 * (c1**2 + c2**2)
+    good &= (np.arange(n.shape[1]) != firsts.bar[:, None])[:, :, None]
     good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
     f, k, m = np.nonzero(good)
-    cosine = np.clip(-c0[f, k, m] / np.maximum(size[f, k, m], 1e-12), -1.0, 1.0)
-    base, step = np.arctan2(c2[f, k, m], c1[f, k, m]), np.arccos(cosine)
+    c0, c1, c2 = (c[good].astype(np.float64) for c in (c0, c1, c2))
+    step = np.arccos(np.clip(-c0 / np.maximum(np.hypot(c1, c2), 1e-12), -1.0, 1.0))
+    base = np.arctan2(c2, c1)
     turn = np.concatenate([base + step, base - step])
     f, k, m = (np.concatenate([x, x]) for x in (f, k, m))
-    R = U_c[f] @ _about_x(turn) @ U_b[f].swapaxes(1, 2)
-    u, P = firsts.u[f], firsts.P[f]
-    apart = np.einsum("nij,nj->ni", R, middle[m] - middle[firsts.target[f]])
-    across = np.einsum("ni,ni->n", planes[k], u)
-    place = -np.einsum("ni,ni->n", planes[k], apart + P) / np.where(
-        np.abs(across) < CROSSING, np.inf, across
-    )
-    good = np.abs(place) <= firsts.slack[f]
-    # Where the second bar's middle is on the second leg, and how wide it should be there.
-    X = apart + P + place[:, None] * u
-    v = np.einsum("nij,nj->ni", R, direction[m])
-    ray = rays[k]
-    side = np.cross(np.cross(v, X), ray)
-    along = -np.einsum("ni,ni->n", side, X) / _safe(np.einsum("ni,ni->n", side, v))
-    depth = (X + along[:, None] * v)[:, 2]
-    good &= (np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]) & (depth > 0.0)
-    flat = np.linalg.norm(planes[k][:, :2], axis=1)
-    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
-    seen = bars.width.mean(axis=1)[k]
-    # The depth of the first leg is no better known.
-    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, bars.pixel / seen)
-    good &= np.abs(np.log(expected / seen)) <= WIDTH_REACH * sigma
-    R, u, P, f = R[good], u[good], P[good], f[good]
-    t = P + place[good, None] * u - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
-    return Poses.rigid(R, t, n_legs)
+    return f, k, m, np.cos(turn), np.sin(turn)
 
 
 def _firsts(bars: Bars, targets: Targets) -> _Firsts:
     """Take the best bars for every piece, with all leans that their edges allow."""
-    rays, planes = _rays(bars), _planes(bars)
-    u, P, slack, bar, target = [], [], [], [], []
+    n = min(N_FIRST, len(bars))
+    first = bars.take(np.arange(n))
+    rays, planes = _rays(first), _planes(first)
+    along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
+    ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    side = np.cross(ray, planes)  # in the plane of the axis, across the ray
+    side *= np.sign(_dot(side, along))[:, None]
+    width = seen_width(first)
+    cone = np.log(first.width[:, 1] / first.width[:, 0])[:, None, None]
+    sigma = (CONE + 1.5 * bars.pixel / width)[:, None, None]
     length = np.linalg.norm(targets.ends[:, 1] - targets.ends[:, 0], axis=1)
-    for i in range(min(N_FIRST, len(bars))):
-        along = np.append(bars.along[i], 0.0)
-        ray = rays[i] / np.linalg.norm(rays[i])
-        side = np.cross(ray, planes[i])  # in the plane of the axis, across the ray
-        side *= np.sign(side @ along)
-        width = float(bars.width[i].mean())
-        flat = float(np.linalg.norm(planes[i, :2]))
-        cone = float(np.log(bars.width[i, 1] / bars.width[i, 0]))
-        sigma = CONE + 1.5 * bars.pixel / width
-        for j in range(len(targets)):
-            z = 2.0 * float(targets.radius[j]) / (width * flat)
-            for lean in LEANS:
-                v = np.cos(lean) * side + np.sin(lean) * ray
-                # The ends of the bar on an axis along v, and how their widths differ.
-                reach = float(bars.half_length[i]) * z / max(abs(float(v @ along)), 0.2)
-                z0, z1 = z - reach * v[2], z + reach * v[2]
-                if min(z0, z1) <= 0.0 or 2.0 * reach > LONGER * length[j]:
-                    continue
-                if abs(np.log(z0 / z1) - cone) > 3.0 * sigma:
-                    continue
-                for sign in (1.0, -1.0):
-                    u.append(sign * v)
-                    P.append(z * rays[i])
-                    slack.append(max(0.5 * length[j] - reach, 0.0) + SLACK * length[j])
-                    bar.append(i)
-                    target.append(j)
-    return _Firsts(
-        np.array(u).reshape(-1, 3),
-        np.array(P).reshape(-1, 3),
-        np.array(slack),
-        np.array(bar, dtype=np.intp),
-        np.array(target, dtype=np.intp),
-    )
+    flat = np.linalg.norm(planes[:, :2], axis=1)
+    z = 2.0 * targets.radius / (width * flat)[:, None]  # (n, n_targets)
+    v = np.cos(LEANS)[:, None] * side[:, None] + np.sin(LEANS)[:, None] * ray[:, None]
+    # The ends of the bar on an axis along v, and how their widths differ.
+    steep = np.maximum(np.abs(np.einsum("nlx,nx->nl", v, along)), 0.2)
+    reach = (first.half_length[:, None] / steep)[:, None, :] * z[..., None]  # (n, n_targets, leans)
+    z0, z1 = z[..., None] - reach * v[:, None, :, 2], z[..., None] + reach * v[:, None, :, 2]
+    longest = LONGER[0] * length + LONGER[1] * targets.radius
+    good = (np.minimum(z0, z1) > 0.0) & (2.0 * reach <= longest[:, None])
+    ratio = np.log(np.where(good, z0, 1.0) / np.where(good, z1, 1.0))
+    good &= np.abs(ratio - cone) <= 3.0 * sigma
+    i, j, lean = np.nonzero(good)
+    slack = np.maximum(0.5 * length[j] - reach[good], 0.0) + SLACK * length[j]
+    u, P = v[i, lean], z[i, j][:, None] * rays[i]
+    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, slack, i, j)))
 
 
 def _rays(bars: Bars) -> Array:
@@ -162,11 +172,21 @@ def _triads(u: Array) -> Array:
     return np.stack([u, v, np.cross(u, v)], axis=2)
 
 
-def _about_x(angle: Array) -> Array:
+def _about_x(cosine: Array, sine: Array) -> Array:
     """Return rotations (n, 3, 3) about the x axis."""
-    c, s = np.cos(angle), np.sin(angle)
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    return np.stack([one, zero, zero, zero, c, -s, zero, s, c], axis=-1).reshape(-1, 3, 3)
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    rows = [one, zero, zero, zero, cosine, -sine, zero, sine, cosine]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def _turned(x: Array, cosine: Array, sine: Array) -> Array:
+    """Return vectors (n, 3) turned about the x axis."""
+    y, z = x[:, 1], x[:, 2]
+    return np.stack([x[:, 0], cosine * y - sine * z, sine * y + cosine * z], axis=-1)
+
+
+def _dot(x: Array, y: Array) -> Array:
+    return np.asarray(np.einsum("ni,ni->n", x, y))
 
 
 def _safe(x: Array) -> Array:

@@ -1,0 +1,152 @@
+"""The camera pose on which pictures of a view agree, from edges of known legs."""
+
+import leg_pictures as lp
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.recognition.agreement import Picture
+from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
+from legcal.recognition.place import Placed, place_camera, place_near
+
+HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
+
+
+def _pictures(
+    seed: int, n_legs: int, n: int, *, joint_error: float = 2e-3, **difficulty: float
+) -> tuple[list[Picture], RigidTransform]:
+    rng = np.random.default_rng(seed)
+    T, made = lp.camera(rng), lp.machine(n_legs, rng)
+    platforms = [lp.platform(rng) for _ in range(n)]
+    return lp.pictures(made, T, platforms, rng, joint_error=joint_error, **difficulty), T  # type: ignore[arg-type]
+
+
+def _is_right(placed: Placed, T: RigidTransform) -> bool:
+    away, angle = lp.apart(T, placed.pose())
+    return angle < np.deg2rad(5.0) and away < 0.1
+
+
+@pytest.mark.parametrize("n_legs", [3, 4, 6])
+def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int) -> None:
+    for seed in range(2):
+        pictures, T = _pictures(seed, n_legs, 4, **HARD)
+        placed = place_camera(pictures, n_legs)
+        assert placed.is_convincing
+        assert _is_right(placed, T)
+        assert placed.support.shape == placed.expected.shape == (len(placed.poses), 4)
+        assert np.all(np.diff(placed.score) <= 0.0)
+
+
+@pytest.mark.slow
+def test_no_wrong_pose_is_convincing() -> None:
+    right = []
+    for seed in range(60):
+        n_legs, n = 3 + seed % 4, 1 + seed % 5
+        coarse = 10e-3 if seed % 7 == 0 else 2e-3
+        pictures, T = _pictures(100 + seed, n_legs, n, joint_error=coarse, **HARD)
+        placed = place_camera(pictures, n_legs)
+        right.append(placed.is_convincing)
+        if placed.is_convincing:
+            assert _is_right(placed, T), seed
+    assert np.mean(right) > 0.75
+
+
+def test_a_model_that_is_wrong_by_ten_millimetres_suffices() -> None:
+    pictures, T = _pictures(8, 6, 5, joint_error=10e-3, **HARD)
+    placed = place_camera(pictures, 6)
+    assert placed.is_convincing
+    away, angle = lp.apart(T, placed.pose())
+    assert angle < np.deg2rad(6.0)
+    assert away < 0.15
+
+
+def test_mirrored_pictures_are_refused() -> None:
+    pictures, _ = _pictures(20, 6, 4, n_clutter=6, noise=0.3)
+    assert place_camera(pictures, 6).is_convincing
+    assert not place_camera(mirrored(pictures), 6).is_convincing
+
+
+def test_a_symmetric_machine_at_a_symmetric_reading_is_ambiguous_and_others_resolve_it() -> None:
+    rng = np.random.default_rng(2)
+    T, made = lp.camera(rng), lp.machine(3)
+    home = lp.pictures(made, T, [lp.platform()] * 3, rng)
+    placed = place_camera(home, 3)
+    assert placed.is_enough
+    assert not placed.is_convincing
+    other = placed.pose(1).inv() * placed.pose(0)
+    assert other.rotation.magnitude() == pytest.approx(2.0 * np.pi / 3.0, abs=0.05)
+    more = lp.pictures(made, T, [lp.platform(rng) for _ in range(3)], rng)
+    resolved = place_camera([*home, *more], 3)
+    assert resolved.is_convincing
+    assert _is_right(resolved, T)
+
+
+def test_a_rough_pose_is_improved() -> None:
+    pictures, T = _pictures(4, 6, 4, **HARD)
+    off = RigidTransform.from_components(
+        [0.02, -0.02, 0.03], Rotation.from_rotvec([0.03, -0.02, 0])
+    )
+    placed = place_near(pictures, T * off, 6)
+    assert placed.hinted
+    assert placed.is_convincing
+    assert _is_right(placed, T)
+    assert lp.apart(T, placed.pose())[1] < 0.5 * lp.apart(T, T * off)[1]
+
+
+def test_a_rough_pose_of_another_place_is_not_believed() -> None:
+    pictures, T = _pictures(4, 6, 4, **HARD)
+    other = RigidTransform.from_rotation(Rotation.from_euler("z", 1.9)) * T
+    placed = place_near(pictures, other, 6)
+    assert not placed.is_clear
+
+
+def test_the_error_of_a_leg_tells_how_far_it_is_from_its_bars() -> None:
+    pictures, _ = _pictures(5, 6, 5)
+    placed = place_camera(pictures, 6)
+    assert np.all(placed.leg_error[np.isfinite(placed.leg_error)] < 6e-3)
+    assert np.isfinite(placed.leg_error).sum() >= 4
+
+
+def test_pictures_of_nothing_give_no_pose() -> None:
+    rng = np.random.default_rng(0)
+    made, where = lp.machine(6, rng), lp.platform(rng)
+    joints = made.A, made.posed(where)
+    empty = lp.picture(joints, joints, lp.camera(rng), rng, missing=1.1)
+    for pictures in ([empty], [empty, empty]):
+        placed = place_camera(pictures, 6)
+        assert len(placed.poses) == 0
+        assert not placed.is_enough
+        assert not placed.is_clear
+        assert not placed.is_convincing
+    wild = lp.picture(joints, joints, lp.camera(rng), rng, missing=1.1, n_clutter=12)
+    assert not place_camera([wild] * 2, 6).is_convincing
+
+
+@pytest.mark.parametrize("missing", [0.2, 0.45])
+def test_mirrored_pictures_of_a_machine_without_symmetry_are_told_from_its_own(
+    missing: float,
+) -> None:
+    for seed in range(20, 23):
+        pictures, _ = _pictures(seed, 6, 4, **{**HARD, "missing": missing})
+        own, other = place_camera(pictures, 6), place_camera(mirrored(pictures), 6)
+        assert own.is_convincing
+        assert may_be_mirrored(other)
+        assert is_mirrored(other, own) or not other.is_convincing
+        assert not is_mirrored(own, other)
+
+
+def test_mirrored_pictures_of_a_planar_machine_are_believed() -> None:
+    rng = np.random.default_rng(3)
+    spatial, T = lp.machine(4, rng), lp.camera(rng)
+    flat = np.array([1.0, 1.0, 0.0])
+    made = lp.Machine(flat * spatial.A, flat * spatial.B)
+    steps = [
+        RigidTransform.from_components([*rng.uniform(-0.05, 0.05, 2), 0.0], Rotation.identity())
+        for _ in range(4)
+    ]
+    pictures = lp.pictures(made, T, steps, rng)
+    own, other = place_camera(pictures, 4), place_camera(mirrored(pictures), 4)
+    assert own.is_enough
+    assert other.is_enough
+    assert not is_mirrored(own, other)
+    assert not is_mirrored(other, own)

@@ -1,0 +1,114 @@
+"""Straight edges of rendered pictures, against where they are."""
+
+import numpy as np
+import pytest
+from rendering import Bar, Light, render
+
+from legcal.detection.picture import Grey, to_grey
+from legcal.geometry.types import Array
+from legcal.recognition.segments import Segments, find_segments
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
+
+F = 500.0
+
+
+def _camera(distortion: Array | None = None, scale: int = 1) -> Camera:
+    K = scale * np.array([[F, 0.0, 160.2], [0.0, F, 119.1], [0.0, 0.0, 1.0 / scale]])
+    return Camera(K, 320 * scale, 240 * scale, np.zeros(0) if distortion is None else distortion)
+
+
+BARS = [
+    Bar(np.array([-0.12, 0.14, 0.8]), np.array([-0.05, -0.14, 0.85]), 0.013, 170.0),
+    Bar(np.array([0.06, -0.15, 0.8]), np.array([0.1, 0.13, 0.9]), 0.016, 150.0),
+]
+SHADELESS = Light(ambient=1.0, diffuse=0.0)
+
+
+def _picture(camera: Camera, bars: list[Bar], background: float = 40.0, noise: float = 1.5) -> Grey:
+    image = render(camera, bars, background, SHADELESS, blur=0.6, noise=noise, supersample=3)
+    return to_grey(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+
+
+def _lines(bar: Bar) -> Array:
+    u = (bar.B - bar.A) / np.linalg.norm(bar.B - bar.A)
+    return outlines_of_axis(u, bar.A, bar.radius)
+
+
+def _nearest(found: Segments, line: Array) -> int:
+    """Return the edge whose ends are nearest to a line of the sensor plane."""
+    offset = found.ends @ line[:2] + line[2]
+    return int(np.argmin(np.abs(offset).max(axis=1)))
+
+
+@pytest.mark.parametrize("lens", [None, np.array([-0.3, 0.1, 0.001, -0.002, 0.0])])
+def test_outlines_are_found_on_the_sensor_plane_with_the_brighter_side(lens: Array | None) -> None:
+    camera = _camera(lens)
+    found = find_segments(_picture(camera, BARS), camera)
+    assert found.pixel == pytest.approx(1.0 / F)
+    for bar in BARS:
+        axis = (bar.A + bar.B) / (bar.A + bar.B)[2]
+        for line in _lines(bar):
+            i = _nearest(found, line)
+            start, end = found.ends[i]
+            offset = (found.ends[i] @ line[:2] + line[2]) / np.linalg.norm(line[:2])
+            assert np.abs(offset).max() < 1.2 * found.pixel
+            seen = abs(bar.B[1] / bar.B[2] - bar.A[1] / bar.A[2])
+            assert np.linalg.norm(end - start) > 0.7 * min(seen, 0.47)
+            left = np.array([end[1] - start[1], start[0] - end[0]])
+            assert left @ (axis[:2] - start) > 0.0  # the bar is brighter
+
+
+def test_a_dark_bar_has_its_brighter_side_outside() -> None:
+    camera = _camera()
+    dark = Bar(BARS[0].A, BARS[0].B, BARS[0].radius, 30.0)
+    found = find_segments(_picture(camera, [dark], background=150.0), camera)
+    axis = (dark.A + dark.B) / (dark.A + dark.B)[2]
+    for line in _lines(dark):
+        start, end = found.ends[_nearest(found, line)]
+        assert np.array([end[1] - start[1], start[0] - end[0]]) @ (axis[:2] - start) < 0.0
+
+
+def test_an_edge_that_something_crosses_is_one_edge_and_says_how_much_of_it_was_seen() -> None:
+    camera = _camera()
+    across = Bar(np.array([-0.3, 0.02, 0.6]), np.array([0.3, -0.02, 0.6]), 0.03, 90.0)
+    whole, crossed = (
+        find_segments(_picture(camera, bars), camera) for bars in (BARS[:1], [BARS[0], across])
+    )
+    for line in _lines(BARS[0]):
+        i, j = _nearest(whole, line), _nearest(crossed, line)
+        length = [
+            np.linalg.norm(f.ends[k, 1] - f.ends[k, 0]) for f, k in ((whole, i), (crossed, j))
+        ]
+        assert length[1] > 0.9 * length[0]
+        assert whole.covered[i] > 0.95
+        assert crossed.covered[j] < 0.9
+
+
+def test_large_pictures_are_reduced_and_give_the_same_edges() -> None:
+    small, large = _camera(), _camera(scale=4)
+    found = [find_segments(_picture(camera, BARS), camera) for camera in (small, large)]
+    assert found[1].pixel <= found[0].pixel
+    for bar in BARS:
+        for line in _lines(bar):
+            one, two = (f.ends[_nearest(f, line)] for f in found)
+            offset = (np.concatenate([one, two]) @ line[:2] + line[2]) / np.linalg.norm(line[:2])
+            assert np.abs(offset).max() < 1.2 * found[0].pixel
+
+
+def test_the_depth_of_the_file_and_its_exposure_change_little() -> None:
+    camera = _camera()
+    grey = _picture(camera, BARS, noise=0.5)
+    found = [find_segments(grey * factor, camera) for factor in (np.float32(1.0), np.float32(0.25))]
+    assert abs(len(found[0]) - len(found[1])) <= 2
+    for bar in BARS:
+        for line in _lines(bar):
+            for f in found:
+                offset = f.ends[_nearest(f, line)] @ line[:2] + line[2]
+                assert np.abs(offset).max() < 1.2 * f.pixel
+
+
+@pytest.mark.parametrize("level", [0.0, 255.0, 90.0])
+def test_a_picture_of_nothing_has_no_edges(level: float) -> None:
+    camera = _camera()
+    assert len(find_segments(np.full((240, 320), level, dtype=np.float32), camera)) == 0
