@@ -4,6 +4,8 @@ Noise grows with light, and a surface has texture: a dark background is several 
 lit leg in front of it, so that the foot of the blurred step tells more of its place than the top.
 """
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.special import ndtr
 
@@ -78,7 +80,7 @@ def _variance(distance: Samples, light: Samples, weight: Samples) -> Array:
 def _of_edges(variance: Array, kept: BoolArray, bounds: IntArray) -> Array:
     """Return the median variance of the kept blocks of each edge, NaN where too few tell it."""
     of_edge = np.full(len(bounds) - 1, np.nan)
-    for i, (first, last) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+    for i, (first, last) in enumerate(pairwise(bounds.tolist())):
         told = variance[first:last][kept[first:last] & np.isfinite(variance[first:last])]
         if len(told) >= FEWEST:
             of_edge[i] = np.median(told)
