@@ -48,6 +48,9 @@ from legcal.refinement.solution import Solution
 from legcal.starting import four_steps, starts_of_fit
 from legcal.workpiece import Workpiece
 
+# That of all outlines that are measured in photographs: light at the limb that no model of shading
+# foresees looks like other radii, so that residuals never show it [px].
+LIMB_BIAS = {"bias of many edges": 0.02}
 LOST = 0.5  # of the outlines of an image: fewer were found
 
 
@@ -220,6 +223,9 @@ def _fit(
     steps = four_steps(part, seen, board, progress)
     progress("Fit of everything", 0, 1)
     starts = starts_of_fit(part, seen, scene, steps, board)
+    choices = part.choices
+    if any(part.measurements.image) and "detected" in seen.source:
+        choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
     solution = refine_from_best(
         part.fitted_legs,
         part.measurements,
@@ -227,7 +233,7 @@ def _fit(
         starts,
         axes=part.axes,
         board=None if board is None else board.seen(fitted),
-        choices=part.choices,
+        choices=choices,
     )
     progress("Fit of everything", 1, 1)
     corners = None if board is None else board.judged(solution)

@@ -57,6 +57,15 @@ def test_parameters_from_photographs_are_about_as_wrong_as_their_sigmas(example_
     assert 0.2 < np.mean(np.square(pulls)) < 2.0
 
 
+def test_radii_are_known_no_better_than_light_at_the_limb_allows(example_run: Run) -> None:
+    document = json.loads((example_run.output / "result.json").read_text())
+    radii = [p for p in document["parameters"] if ".radius." in p["name"]]
+    assert len(radii) == 6
+    for radius in radii:
+        assert abs(radius["value"] - 0.01) < 3.0 * radius["sigma"], radius["name"]
+        assert radius["sigma"] < 0.05e-3
+
+
 def test_the_verdict_is_positive_and_the_change_is_known_well(example_run: Run) -> None:
     verdict, platform = example_run.calibration.verdict, example_run.calibration.platform
     assert verdict.trustworthy
