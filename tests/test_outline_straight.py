@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from legcal.detection.straight import COMMON_BIAS, TILT_BIAS, StraightFit, fit_straight
+from legcal.detection.straight import (
+    COMMON_BIAS,
+    TILT_BIAS,
+    StraightFit,
+    fit_straight,
+    fit_straights,
+)
 
 
 def fitted(line: StraightFit | None) -> StraightFit:
@@ -73,3 +79,25 @@ def test_too_few_blocks_give_no_line() -> None:
     variance = np.where(np.arange(10) < 3, 1e-3, np.inf)
     assert fit_straight(position, np.zeros(10), variance) is None
     assert fit_straight(np.full(10, 0.5), np.zeros(10), np.full(10, 1e-3)) is None
+
+
+def test_lines_of_several_outlines_are_those_of_each() -> None:
+    rng = np.random.default_rng(4)
+    counts = [50, 3, 0, 21, 12, 8]
+    position = np.concatenate([np.linspace(0.0, 1.0, n) for n in counts])
+    shift = 0.3 * position + 0.05 * rng.standard_normal(len(position))
+    shift[10:20] += 0.8
+    variance = rng.uniform(1e-4, 4e-3, len(position))
+    variance[rng.random(len(position)) < 0.1] = np.inf
+    variance[-8:-3] = np.inf
+    bounds = np.cumsum([0, *counts])
+    lines = fit_straights(bounds, position, shift, variance)
+    assert [line is None for line in lines] == [False, True, True, False, False, True]
+    for line, first, last in zip(lines, bounds[:-1], bounds[1:], strict=True):
+        own = slice(first, last)
+        alone = fit_straight(position[own], shift[own], variance[own])
+        assert (line is None) == (alone is None)
+        if line is not None and alone is not None:
+            np.testing.assert_allclose(line.ends, alone.ends, atol=1e-12)
+            np.testing.assert_array_equal(line.kept, alone.kept)
+            np.testing.assert_allclose(line.covariance, alone.covariance, rtol=1e-9)

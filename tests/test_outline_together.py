@@ -1,9 +1,12 @@
 """Blocks of an outline fitted together: places, blur and covariance of exact profiles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from legcal.detection import pool
 from legcal.detection.blocks import Blocks
 from legcal.detection.limb import Samples
 from legcal.detection.pooled import fit_together
@@ -142,3 +145,34 @@ def test_outlines_without_blocks_stay_where_they_are() -> None:
     np.testing.assert_array_equal(found.ends, np.zeros((1, 2)))
     assert np.all(np.diag(found.covariance[0]) >= 1.0)
     assert found.blur == 0.5
+
+
+@pytest.mark.parametrize("amplitude", [BRIGHT, DARK, GLINT], ids=["bright", "dark", "glint"])
+def test_sums_over_pixels_tell_of_places_and_blurs_nearby(
+    amplitude: Array, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks, every = outline(amplitude, (0.1, -0.05), 0.5, noise=0.2), np.ones(40, dtype=np.bool_)
+    found = fit_together(blocks, every, 0.54, DEPTH)
+    monkeypatch.setattr(pool, "NEARBY", (0.0, 0.0))  # sums anew in every round
+    anew = fit_together(blocks, every, 0.54, DEPTH)
+    np.testing.assert_allclose(found.ends, anew.ends, atol=4e-3)
+    np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.05)
+    assert found.blur == pytest.approx(anew.blur, rel=5e-3)
+
+
+def test_outlines_that_have_settled_do_not_depend_on_others() -> None:
+    slow, quick = outline(GLINT, (0.2, -0.2), 0.5, noise=0.3), outline(BRIGHT, (0.0, 0.0), 0.5)
+    both = replace(
+        slow,
+        bounds=np.array([0, 40, 80]),
+        lines=[None, None],
+        **{
+            name: np.concatenate([getattr(slow, name), getattr(quick, name)])
+            for name in (
+                "d", "grey", "weight", "gain", "position", "half_width", "moved", "contrast",
+                "sharp",
+            )
+        },
+    )  # fmt: skip
+    found = fit_together(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
+    np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)

@@ -86,29 +86,56 @@ def band_of_leg(
     Band or None
         From the first to the last point of the longest stretch that the image shows.
     """
-    length = float(np.linalg.norm(B_camera - A_camera))
-    u = (B_camera - A_camera) / length
-    s = np.linspace(start, end, N_SAMPLES)
-    axis = A_camera + s[:, None] * u
-    inside = in_picture(camera, axis, NEAREST * length)
-    if np.count_nonzero(inside) < 2:
-        return None
-    first, last = longest_run(inside)
-    if last == first:
-        return None
-    ends = axis[[first, last], :2] / axis[[first, last], 2:]
-    along = ends[1] - ends[0]
-    distance = float(np.linalg.norm(along))
+    ends = np.array([[start], [end]])
+    return bands_of_legs(camera, A_camera[None], B_camera[None], *ends)[0]
+
+
+def bands_of_legs(
+    camera: Camera, A_camera: Array, B_camera: Array, start: Array, end: Array
+) -> list[Band | None]:
+    """Return the bands along the visible stretches of legs, as :func:`band_of_leg` does for one.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    A_camera, B_camera : (n, 3) array
+        Predicted joint centres in the camera frame [m].
+    start, end : (n,) array
+        The stretches of the axes that are of interest, as distances from A [m].
+    """
+    length = np.linalg.norm(B_camera - A_camera, axis=1)
+    u = (B_camera - A_camera) / length[:, None]
+    s = start[:, None] + (end - start)[:, None] * np.linspace(0.0, 1.0, N_SAMPLES)
+    axis = A_camera[:, None] + s[..., None] * u[:, None]
+    inside = in_picture(camera, axis, NEAREST * length[:, None])
     m = moment(u, A_camera)
-    if distance == 0.0 or np.linalg.norm(m) < 1e-6 * length:
-        return None  # seen end-on
-    middle = ends.mean(axis=0)
-    scale = float(np.sqrt(abs(np.linalg.det(camera.pixels_per_unit(middle)))))
-    normal = m[:2] / np.linalg.norm(m[:2])
-    return Band(ends[0], along / distance, normal, scale, distance * scale)
+    runs = [longest_run(one) if np.count_nonzero(one) > 1 else (0, 0) for one in inside]
+    first, last = np.array(runs, dtype=np.intp).reshape(-1, 2).T
+    legs = np.arange(len(axis))
+    shown = last > first
+    ends = np.stack([axis[legs, first], axis[legs, last]], axis=1)
+    ends = ends[..., :2] / np.where(shown[:, None, None], ends[..., 2:], 1.0)
+    along = ends[:, 1] - ends[:, 0]
+    distance, offset = np.linalg.norm(along, axis=1), np.linalg.norm(m, axis=1)
+    shown &= (distance > 0.0) & (offset >= 1e-6 * length)  # others are seen end-on
+    middle = np.where(shown[:, None], ends.mean(axis=1), 0.0)
+    scale = np.sqrt(np.abs(np.linalg.det(camera.pixels_per_unit(middle))))
+    return [
+        Band(
+            ends[i, 0],
+            along[i] / distance[i],
+            m[i, :2] / np.linalg.norm(m[i, :2]),
+            float(scale[i]),
+            float(distance[i] * scale[i]),
+        )
+        if shown[i]
+        else None
+        for i in legs.tolist()
+    ]
 
 
-def in_picture(camera: Camera, P_camera: Array, nearest: float) -> BoolArray:
+def in_picture(camera: Camera, P_camera: Array, nearest: Array | float) -> BoolArray:
     """Return whether points (..., 3) are in front of the camera and inside its image, (...)."""
     depth = P_camera[..., 2]
     front = depth > nearest

@@ -15,12 +15,12 @@ from legcal.detection.limb import N_BASIS, Samples, basis
 from legcal.geometry.types import Array
 
 BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
-BLUR_BLOCKS = 24
+BLUR_BLOCKS = 16
 BLUR_ROUNDS = 2
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 # Prior precision of the amplitudes, in units of the contrast of a block.
 RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
-BACKGROUND, BEND = (0, 1), (0, 1, 4)  # functions of the limb model without an edge
+BEND = (0, 1, 4)  # functions of the limb model without an edge
 STEP = 0.8  # largest step of a block [px]
 
 
@@ -38,17 +38,14 @@ class BlockFit:
         Mean square residual of the block [grey levels^2].
     contrast : (n,) array
         Step from the background to the leg, a pixel and a half inside [grey levels].
-    gain : (n,) array
-        How much chi^2 falls by there being an edge at all.
     sharp : (n,) array
-        How much it falls by there being a step or a limb, and not only a bend of the shading.
+        How much chi^2 falls by there being a step or a limb, and not only a bend of the shading.
     """
 
     shift: Array
     variance: Array
     noise: Array
     contrast: Array
-    gain: Array
     sharp: Array
 
 
@@ -94,11 +91,8 @@ def fit_blocks(
     reference = np.broadcast_to(np.asarray(1.5 + blur, dtype=np.float32), (len(d), 1))
     at, _ = basis(reference, half_width, blur)
     contrast = np.sum(at[:, 2:, 0] * amplitude[:, 2:, 0], axis=1)
-    gain, sharp = (
-        _without(normal, right, y, kept) / np.maximum(noise, 1e-9) - freedom
-        for kept in (BACKGROUND, BEND)
-    )
-    return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast, gain, sharp)
+    sharp = _without(normal, right, y, BEND) / np.maximum(noise, 1e-9) - freedom
+    return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast, sharp)
 
 
 def _without(normal: Array, right: Array, y: Samples, kept: Sequence[int]) -> Array:

@@ -1,6 +1,6 @@
 """Sub-pixel lines of all outlines of an image, from edges known to about a pixel.
 
-A first round with a wide blur and every second block pulls the lines in; then the blur of the
+A first round with a wide blur and a few blocks pulls the lines in; then the blur of the
 image is estimated from its best blocks, and lines settle robustly on blocks that are fitted apart.
 At last all blocks of an outline that lie on its line are fitted together, and the blur to all
 outlines. Pixels are used as far as the blurred outline reaches and little farther, since the
@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.detection.blocks import Blocks, Edge
+from legcal.detection.blocks import Blocks
 from legcal.detection.fit import depth_for_blur, estimate_blur
 from legcal.detection.picture import Grey
 from legcal.detection.pooled import fit_together
+from legcal.detection.profiles import Edge
 from legcal.detection.straight import StraightFit
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
@@ -24,9 +25,9 @@ __all__ = ["Edge", "MeasuredEdge", "measure_edges"]
 
 FIRST_BLUR = 1.0  # [px]
 LEAST_GAIN = 30  # in chi^2, by which a block shows an edge at all
-FIRST_STEP = 2
+FIRST_BLOCKS = 12  # of an outline
 FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # at most
-TRIALS, SIMILAR = 3, 0.12  # of the blur, until its logarithm changes by less than this
+TRIALS, SIMILAR = 3, 0.25  # of the blur, until its logarithm changes by less than this
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
 COMMON_BIAS, TILT_BIAS = 0.012, 0.02  # of both ends, of each end [px]
@@ -86,18 +87,18 @@ def measure_edges(
         Standard deviation of the blur of the image [px].
     """
     v = [edge.v for edge in edges]
-    blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, step=FIRST_STEP)
+    blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, FIRST_BLOCKS)
     if len(blocks.moved) == 0:
         return [None] * len(edges), FIRST_BLUR
-    blocks.settle(FIRST_BLUR, FIRST_ROUNDS, least_gain=-np.inf)
+    blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
     blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
     v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     for _ in range(TRIALS):
         tried = blur
-        blocks = Blocks.read(grey, camera, edges, v, tried, step=1)
+        blocks = Blocks.read(grey, camera, edges, v, tried)
         if len(blocks.moved) == 0:
             return [None] * len(edges), tried
-        blocks.settle(tried, LAST_ROUNDS, least_gain=LEAST_GAIN)
+        blocks.settle(tried, LAST_ROUNDS)
         if not together:
             return _roughly(edges, v, blocks, tried), tried
         joint = fit_together(blocks, blocks.kept(), tried, depth_for_blur(tried))

@@ -11,7 +11,7 @@ import numpy as np
 
 from legcal.detection.band import Band, band_of_leg
 from legcal.detection.measure import Edge, MeasuredEdge, measure_edges
-from legcal.detection.pairs import Pair, block_positions, find_pair
+from legcal.detection.pairs import Pair, PairSearch, block_positions, find_pairs
 from legcal.detection.picture import Grey
 from legcal.detection.pieces import Piece
 from legcal.detection.prediction import PredictedLeg, hidden_by
@@ -113,13 +113,15 @@ class FoundPart:
             begins and ends (2,) as fractions of the band, covariance (2, 2) there [px^2].
         """
         result = _rejected(self.leg, self.piece, "")
-        for i, line in enumerate(lines):
-            if line is None:
-                continue
-            v, place, result.covariance[i] = line
-            offset = v[0] + (v[1] - v[0]) * place
-            result.h[i] = self.band.line(*v)
-            result.ends[i] = camera.distort(self.band.points(place * self.band.length, offset))
+        found = [i for i, line in enumerate(lines) if line is not None]
+        if found:
+            v, place, covariance = (
+                np.array(x) for x in zip(*(line for line in lines if line is not None), strict=True)
+            )
+            offset = v[:, :1] + (v[:, 1:] - v[:, :1]) * place
+            result.h[found] = self.band.line(v[:, 0], v[:, 1])
+            result.ends[found] = camera.distort(self.band.points(place * self.band.length, offset))
+            result.covariance[found] = covariance
         return result
 
 
@@ -185,32 +187,53 @@ def find_parts(
     rejected : list of PartOutlines
         The others, with the reason.
     """
-    parts: list[FoundPart] = []
+    sought: list[_Sought] = []
     rejected: list[PartOutlines] = []
     for leg in legs:
         if not wanted[leg.leg]:
             continue
         for piece, h in zip(leg.pieces, leg.outlines, strict=True):
-            found = _find(grey, camera, legs, names, leg, piece, h, float(window[leg.leg]))
-            if isinstance(found, str):
-                rejected.append(_rejected(leg, piece, found))
+            one = _seek(camera, legs, names, leg, piece, h)
+            if isinstance(one, str):
+                rejected.append(_rejected(leg, piece, one))
             else:
-                parts.append(found)
+                sought.append(one)
+    searches = [
+        PairSearch(one.band, one.predicted, one.hidden, float(window[one.leg.leg]))
+        for one in sought
+    ]
+    parts: list[FoundPart] = []
+    for one, pair in zip(sought, find_pairs(grey, camera, searches), strict=True):
+        if pair is None:
+            rejected.append(_rejected(one.leg, one.piece, "no convincing pair of edges"))
+        else:
+            parts.append(FoundPart(one.leg, one.piece, one.band, one.predicted, one.hidden, pair))
     return parts, rejected
 
 
-def _find(
-    grey: Grey,
+@dataclass(frozen=True, eq=False)
+class _Sought:
+    """A part that should be in the image, as :class:`FoundPart` has it."""
+
+    leg: PredictedLeg
+    piece: Piece
+    band: Band
+    predicted: Array
+    hidden: BoolArray
+
+
+def _seek(
     camera: Camera,
     legs: Sequence[PredictedLeg],
     names: Sequence[str],
     leg: PredictedLeg,
     piece: Piece,
     h: Array,
-    window: float,
-) -> FoundPart | str:
-    """Find the pair of edges of a part, or say why not."""
-    band = band_of_leg(camera, leg.A_camera, leg.B_camera, piece.start, piece.end)
+) -> _Sought | str:
+    """Return where a part should be, or say why it cannot be found."""
+    band: Band | None = leg.band
+    if len(leg.pieces) > 1:
+        band = band_of_leg(camera, leg.A_camera, leg.B_camera, piece.start, piece.end)
     if band is None:
         return OUTSIDE
     predicted = band.offsets(h[:, None, :], np.array([0.0, band.length]))
@@ -220,16 +243,12 @@ def _find(
         return f"too narrow, {width:.1f} px wide"
     if band.length < least:
         return f"too short, {band.length:.0f} px in the image"
-    t = block_positions(band)
-    front = _in_front(legs, leg, h, band, t)
+    front = _in_front(legs, leg, h, band, block_positions(band))
     free = np.all(front < 0, axis=0)
     if np.mean(free) * band.length < least:
         values, counts = np.unique(front[front >= 0], return_counts=True)
         return f"{HIDDEN} {names[values[np.argmax(counts)]]}"
-    pair = find_pair(grey, camera, band, predicted, ~free, window)
-    if pair is None:
-        return "no convincing pair of edges"
-    return FoundPart(leg, piece, band, predicted, ~free, pair)
+    return _Sought(leg, piece, band, predicted, ~free)
 
 
 def _in_front(
@@ -238,12 +257,10 @@ def _in_front(
     """Return which leg hides each outline (2, n_t) at t [px] of a band, -1 where it is free."""
     s = leg.distance_along(band, t)
     axis = leg.A_camera + s[:, None] * leg.u
-    front = []
-    for normal, epsilon in zip(h, EPSILON, strict=True):
-        radius = epsilon * float(normal @ leg.A_camera)
-        line = axis - epsilon * radius * normal
-        front.append(hidden_by(leg, legs, line, MARGIN / band.scale))
-    return np.stack(front)
+    radius = EPSILON * (h @ leg.A_camera)
+    lines = axis - (EPSILON * radius)[:, None, None] * h[:, None]
+    front = hidden_by(leg, legs, lines.reshape(-1, 3), MARGIN / band.scale)
+    return np.asarray(front.reshape(2, -1))
 
 
 def _measure(

@@ -7,6 +7,7 @@ distance. Where one side of a leg is as bright as what is behind it there is no 
 that no other line near its prediction rivals may stand alone.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,17 +56,12 @@ class Pair:
         return bool(np.all(self.found) and np.all(off <= tolerance))
 
 
-def find_pair(
-    grey: Grey, camera: Camera, band: Band, predicted: Array, hidden: BoolArray, window: float
-) -> Pair | None:
-    """Find the two outlines of a part.
+@dataclass(frozen=True, eq=False)
+class PairSearch:
+    """Where the outlines of a part are looked for.
 
-    Parameters
+    Attributes
     ----------
-    grey : Grey
-        The image.
-    camera : Camera
-        The camera.
     band : Band
         Frame along the part.
     predicted : (2, 2) array
@@ -74,15 +70,41 @@ def find_pair(
         Which of the :func:`block_positions` other legs hide.
     window : float
         Largest distance of an edge from its prediction, at either end [px].
+    """
+
+    band: Band
+    predicted: Array
+    hidden: BoolArray
+    window: float
+
+
+def find_pairs(grey: Grey, camera: Camera, searches: Sequence[PairSearch]) -> list[Pair | None]:
+    """Find the two outlines of parts.
+
+    Parameters
+    ----------
+    grey : Grey
+        The image.
+    camera : Camera
+        The camera.
+    searches : sequence of PairSearch
+        Where the outlines of each part are looked for.
 
     Returns
     -------
-    Pair or None
+    list of Pair or None
         None where no two edges are convincing, nor one alone.
     """
-    lines = [_edge_lines(grey, camera, band, v, hidden, window) for v in predicted]
-    width = predicted[1] - predicted[0]
-    together = _best_pair(lines[0], lines[1], width, window)
+    if not searches:
+        return []
+    lines = _edge_lines(grey, camera, searches)
+    return [_pair(*one) for one in zip(searches, lines[::2], lines[1::2], strict=True)]
+
+
+def _pair(search: PairSearch, *lines: tuple[Array, Array]) -> Pair | None:
+    """Return the two outlines of a part among lines near each of them."""
+    predicted = search.predicted
+    together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], search.window)
     lone = [_alone(*candidates) for candidates in lines]
     if together is not None:
         shifts = np.stack([lines[edge][0][i] for edge, i in enumerate(together)])
@@ -133,21 +155,36 @@ def block_positions(band: Band) -> Array:
 
 
 def _edge_lines(
-    grey: Grey, camera: Camera, band: Band, predicted: Array, hidden: BoolArray, window: float
-) -> tuple[Array, Array]:
-    """Return lines near a predicted edge: shifts at both ends (n, 2) [px], and scores (n,)."""
-    half = int(np.ceil(window))
-    n_blocks = len(hidden)
-    rows = (np.arange(n_blocks * ROWS) + 0.5) / (n_blocks * ROWS)
-    centre = predicted[0] + (predicted[1] - predicted[0]) * rows
-    v = centre[:, None] + np.arange(-half - MARGIN, half + MARGIN + 1.0)
-    xy = band.points(rows[:, None] * band.length, v)
-    values, inside = sample(grey, 1, camera, xy)
-    shape = (n_blocks, ROWS, v.shape[1])
-    seen = inside.reshape(shape).all(axis=1) & ~hidden[:, None]
-    votes = edge_sharpness(values.reshape(shape).mean(axis=1), seen)
-    votes = votes[:, MARGIN:-MARGIN] * seen[:, MARGIN:-MARGIN]
-    return _lines(votes / max(1, int(seen.any(axis=1).sum())), half)
+    grey: Grey, camera: Camera, searches: Sequence[PairSearch]
+) -> list[tuple[Array, Array]]:
+    """Return lines near both edges of each part: shifts at both ends (n, 2) [px], scores (n,)."""
+    halves = [int(np.ceil(search.window)) for search in searches]
+    reach = max(halves) + MARGIN
+    far = np.array([-float(reach), float(reach)])
+    ends, hidden = [], []
+    for search in searches:
+        n_rows = len(search.hidden) * ROWS
+        rows = (np.arange(n_rows) + 0.5) / n_rows
+        centre = search.predicted[:, :1] + np.diff(search.predicted, axis=1) * rows
+        v = centre[..., None] + far
+        ends.append(search.band.points((rows * search.band.length)[:, None], v).reshape(-1, 2, 2))
+        hidden += [search.hidden] * 2
+    pixels = camera.distort(np.concatenate(ends))
+    # So near an edge the lens moves pixels in proportion to their distance from it.
+    part = np.linspace(0.0, 1.0, 2 * reach + 1)[:, None]
+    pixels = pixels[:, None, 0] + (pixels[:, None, 1] - pixels[:, None, 0]) * part
+    values, inside = sample(grey, camera, pixels)
+    n_columns = len(part)
+    seen = inside.reshape(-1, ROWS, n_columns).all(axis=1) & ~np.concatenate(hidden)[:, None]
+    profiles = values.reshape(-1, ROWS, n_columns).mean(axis=1)
+    bounds = np.cumsum([0, *(len(one) for one in hidden)])
+    votes = edge_sharpness(profiles, seen, bounds) * seen
+    lines = []
+    for k, half in enumerate(np.repeat(halves, 2).tolist()):
+        own = slice(bounds[k], bounds[k + 1]), slice(reach - half, reach + half + 1)
+        n_seen = int(seen[bounds[k] : bounds[k + 1]].any(axis=1).sum())
+        lines.append(_lines(votes[own] / max(1, n_seen), half))
+    return lines
 
 
 def _lines(votes: Array, half: int) -> tuple[Array, Array]:

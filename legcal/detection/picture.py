@@ -40,19 +40,17 @@ def reduce(grey: Grey, factor: int) -> Grey:
     return np.asarray(small, dtype=np.float32)
 
 
-def sample(grey: Grey, factor: int, camera: Camera, xy: Array) -> tuple[Grey, NDArray[np.bool_]]:
-    """Sample an image at points of the sensor plane, bilinearly.
+def sample(grey: Grey, camera: Camera, pixels: Array) -> tuple[Grey, NDArray[np.bool_]]:
+    """Sample an image bilinearly.
 
     Parameters
     ----------
     grey : Grey
-        The image, reduced by ``factor``.
-    factor : int
-        How much smaller it is than the camera's image.
+        The image.
     camera : Camera
-        The camera.
-    xy : (n, m, 2) array
-        Points of the sensor plane.
+        Its camera.
+    pixels : (n, m, 2) array
+        Where it is sampled [px].
 
     Returns
     -------
@@ -61,10 +59,7 @@ def sample(grey: Grey, factor: int, camera: Camera, xy: Array) -> tuple[Grey, ND
     inside : (n, m) array of bool
         False for points outside the image, whose values repeat the border.
     """
-    pixels = camera.distort(xy)
-    inside = pixels_inside(camera, pixels, margin=0.5 * factor)
-    small = ((pixels + 0.5) / factor - 0.5).astype(np.float32)
-    values = cv2.remap(
-        grey, small[..., 0], small[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    inside = pixels_inside(camera, pixels, margin=0.5)
+    x, y = (np.ascontiguousarray(pixels[..., k], dtype=np.float32) for k in (0, 1))
+    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float32), inside

@@ -2,6 +2,10 @@
 
 The amplitudes of every block are eliminated, so that what is solved for is what the outline has in
 common: amplitudes as polynomials along it, its line, and the blur.
+
+Pixels are needed once or twice only: what they say is held by the products of the powers of their
+depths, summed over each block. Slopes and widenings of profiles are sums of the same powers, so
+these products tell of places and blurs nearby as well.
 """
 
 from dataclasses import dataclass
@@ -9,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.detection.blocks import Blocks
-from legcal.detection.powers import N_POWERS, powers
+from legcal.detection.powers import N_POWERS, powers_with_room
 from legcal.detection.shading import N_AMPLITUDES, profile_functions
 from legcal.geometry.types import Array, BoolArray, IntArray
 
@@ -23,11 +27,14 @@ ROUGH = 0.02  # displacement of single blocks [px]
 NEAR = (0.02, 0.35)  # standard deviation of the lines that it starts from: [px] and in blurs
 BLURS = (0.2, 4.0)  # [px]
 LEAST_SAMPLES = 30  # of a block
+ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on some are joined, so many at most
 LARGEST_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
-SETTLED = 0.01  # step of every line below which the rounds end [px]
+NEARBY = (0.08, 0.05)  # the same up to which products of powers tell of a place and a blur
+SETTLED = 0.01  # step of a line below which its rounds end [px]
 ODD = (1.5, 4.0)  # noise in that of a typical block from where on one counts less, and not at all
 LEAST_NOISE = 0.05  # [grey levels^2]
 
+ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
 
 
@@ -41,17 +48,66 @@ class Round:
     noise: Array  # (n_edges,) [grey levels^2]
     inverse: Array  # (n_edges, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)
 
+    def some(self, edges: BoolArray) -> "Round":
+        """Return the unknowns of some edges."""
+        return Round(
+            self.amplitude[edges],
+            self.line[edges],
+            self.log_blur[edges],
+            self.noise[edges],
+            self.inverse[edges],
+        )
+
+    def replaced(self, edges: BoolArray, others: "Round") -> "Round":
+        """Return these unknowns with others of some edges."""
+        together = Round(
+            self.amplitude.copy(),
+            self.line.copy(),
+            self.log_blur.copy(),
+            self.noise.copy(),
+            self.inverse.copy(),
+        )
+        together.amplitude[edges], together.line[edges] = others.amplitude, others.line
+        together.log_blur[edges], together.noise[edges] = others.log_blur, others.noise
+        together.inverse[edges] = others.inverse
+        return together
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """The pixels of short blocks, of which a few make a block of the pool."""
+
+    d: Array  # (n, m) from the lines on which the blocks had settled [px]
+    weight: Array  # (n, m)
+    light: Array  # (n, m) times the weight, less the mean of the edge
+    gain: Array  # (n,)
+    along: Array  # (n, N_ALONG) polynomials at the blocks
+    edge: IntArray  # (n,)
+    joined: IntArray  # (n,) the block of the pool to which each belongs
+
+    def products(self, line: Array, log_blur: Array, edges: BoolArray) -> Array:
+        """Return the products of powers and light, summed over blocks of some edges.
+
+        (n_blocks, N_POWERS + 1, N_POWERS + 1)
+        """
+        some = edges[self.edge]
+        edge = self.edge[some]
+        moved = self.gain[some] * np.sum(line[edge] * self.along[some, :2], axis=1)
+        z = (self.d[some] - moved[:, None]) / np.exp(log_blur)[edge][:, None]
+        U = powers_with_room(z)  # in double precision: sums nearly cancel
+        U *= self.weight[some][..., None]
+        U[..., -1] = self.light[some]
+        first = np.flatnonzero(np.diff(self.joined[some], prepend=-1))
+        return np.asarray(np.add.reduceat(U.swapaxes(1, 2) @ U, first, axis=0))
+
 
 @dataclass(eq=False)
 class Pool:
     """The blocks of all edges, and which belong together."""
 
-    d: Array  # (n, m) from the lines on which the blocks had settled [px]
-    weight: Array  # (n, m)
-    light: Array  # (n, m) times the weight, less the mean of the edge
-    power: Array  # (n,) its sum of squares
+    pixels: Pixels
+    power: Array  # (n,) sum of squares of the light of each block
     n_samples: Array  # (n,)
-    usable: BoolArray  # (n,)
     gain: Array  # (n,)
     edge: IntArray  # (n,)
     bounds: IntArray  # (n_edges + 1,)
@@ -60,80 +116,141 @@ class Pool:
     contrast: Array  # (n_edges,)
     depth: float
     seen: BoolArray  # (n_edges,) edges with usable blocks
-    latest: tuple[Round | None, tuple[Array, Array]]  # sums, and where the unknowns were
+    # Products of powers and light of each block, and where the lines were and how wide the blur.
+    products: Array  # (n, N_POWERS + 1, N_POWERS + 1)
+    at_line: Array  # (n_edges, 2) NaN before products are known
+    at_log_blur: Array  # (n_edges,)
 
     @classmethod
     def of(cls, blocks: Blocks, kept: BoolArray, depth: float) -> "Pool":
         """Return what is needed of some blocks."""
-        d, grey, weight, half_width = (
-            np.asarray(x, dtype=np.float64) for x in blocks.samples(slice(None))
-        )
-        bounds = blocks.bounds
-        edge = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
+        n_edges = len(blocks.bounds) - 1
+        of_edge = np.repeat(np.arange(n_edges), np.diff(blocks.bounds))
+        usable = kept & (np.count_nonzero(blocks.weight, axis=1) >= LEAST_SAMPLES)
+        d, grey, weight, _ = (np.asarray(x, np.float64) for x in blocks.samples(usable))
+        edge = of_edge[usable]
         n_samples = np.count_nonzero(weight, axis=1)
-        usable = kept & (n_samples >= LEAST_SAMPLES)
-        counted = usable[:, None] * weight
 
         def total(values: Array) -> Array:
-            sums = np.bincount(edge, values.sum(axis=1), len(bounds) - 1)
-            return np.asarray(sums, dtype=np.float64)
+            return np.asarray(np.bincount(edge, values, n_edges), dtype=np.float64)
 
-        seen = total(counted) > 0.0
-        level = total(counted * grey) / np.maximum(total(counted), 1e-9)
+        weights = total(weight.sum(axis=1))
+        level = total(np.sum(weight * grey, axis=1)) / np.maximum(weights, 1e-9)
         light = (grey - level[edge][:, None]) * weight
-        spread = total(usable[:, None] * light**2) / np.maximum(total(counted > 0.0), 1.0)
-        rise = 2.0 * blocks.position - 1.0
+        power = np.sum(light**2, axis=1)
+        spread = total(power) / np.maximum(total(n_samples), 1.0)
+        rise = 2.0 * blocks.position[usable] - 1.0
         along = np.stack([np.ones_like(rise), rise, 1.5 * rise**2 - 0.5], axis=1)
-        first = np.minimum(bounds[:-1], max(len(d) - 1, 0))
+        joined = _joined(np.bincount(edge, minlength=n_edges))
+        pixels = Pixels(d, weight, light, blocks.gain[usable], along, edge, joined)
+        first = np.flatnonzero(np.diff(joined, prepend=-1))
+        n_joined = np.diff(first, append=len(joined))
+
+        def summed(values: Array) -> Array:
+            return np.asarray(np.add.reduceat(values, first, axis=0), dtype=np.float64)
+
+        some = np.minimum(blocks.bounds[:-1], max(len(of_edge) - 1, 0))
         return cls(
-            d, weight, light, np.sum(light**2, axis=1), n_samples, usable, blocks.gain, edge,
-            bounds, along, half_width[first, 0], 2.0 * np.sqrt(spread) + 1.0, depth, seen,
-            (None, (np.empty(0), np.empty(0))),
-        )  # fmt: skip
+            pixels,
+            summed(power),
+            summed(n_samples),
+            summed(pixels.gain) / n_joined,
+            edge[first],
+            np.searchsorted(edge[first], np.arange(n_edges + 1)),
+            summed(along) / n_joined[:, None],
+            np.asarray(blocks.half_width[some, 0], dtype=np.float64),
+            2.0 * np.sqrt(spread) + 1.0,
+            depth,
+            weights > 0.0,
+            np.empty((len(first), N_POWERS + 1, N_POWERS + 1)),
+            np.full((n_edges, 2), np.nan),
+            np.full(n_edges, np.nan),
+        )
 
     def first_amplitudes(self, at: Round) -> Round:
         """Return the amplitudes that an outline has in common, with its line where it is."""
-        gram, right = self._sums(at)
+        self._know(at, np.ones(len(self.half_width), dtype=np.bool_))
         values, _, _ = profile_functions(self.half_width, np.exp(at.log_blur), self.depth)
-        of_edge = values @ self._of_edges(gram, self.usable) @ values.swapaxes(1, 2)
+        products = self._of_edges(self.products, np.ones((len(self.edge), 1)))[:, 0]
+        of_edge = values @ products[:, :-1, :-1] @ values.swapaxes(1, 2)
         prior = at.noise[:, None] / (COMMON * self.contrast[:, None]) ** 2 + 1e-9
         of_edge += prior[:, :, None] * np.eye(N_AMPLITUDES)
-        target = values @ self._of_edges(right[..., None], self.usable)
+        target = values @ products[:, :-1, -1:]
         at.amplitude[:, 0] = np.linalg.solve(of_edge, target)[..., 0]
         return at
 
     def rounds(self, at: Round, log_blur: float, sigma: float, n: int) -> Round:
         """Take Gauss-Newton steps, ``n`` at most, the blur known to ``sigma`` beforehand."""
+        moving = np.ones(len(self.half_width), dtype=np.bool_)
         for _ in range(n):
             before = at
-            at = self._round(at, log_blur, sigma)
-            steps = np.abs(at.line - before.line), np.abs(at.log_blur - before.log_blur)
-            if max(float(step.max()) for step in steps) < SETTLED:
+            at = self._round(at, moving, log_blur, sigma)
+            step = np.maximum(
+                np.abs(at.line - before.line).max(axis=1), np.abs(at.log_blur - before.log_blur)
+            )
+            moving = step >= SETTLED
+            if not np.any(moving):
                 break
         return at
 
-    def _round(self, at: Round, log_blur: float, sigma: float) -> Round:
-        """Take one step."""
+    def _know(self, at: Round, edges: BoolArray) -> None:
+        """Sum the products of some edges again, those that have moved from where they are."""
+        blur = np.exp(self.at_log_blur)
+        moved = np.abs(at.line - self.at_line).sum(axis=1) / blur
+        widened = np.abs(at.log_blur - self.at_log_blur)
+        lost = edges & ~((moved < NEARBY[0]) & (widened < NEARBY[1]))
+        if np.any(lost):
+            own = lost[self.edge]
+            if np.any(own):
+                self.products[own] = self.pixels.products(at.line, at.log_blur, lost)
+            self.at_line[lost], self.at_log_blur[lost] = at.line[lost], at.log_blur[lost]
+
+    def _round(self, at: Round, moving: BoolArray, log_blur: float, sigma: float) -> Round:
+        """Take one step of some edges."""
+        self._know(at, moving)
+        if np.all(moving):
+            return self._step(at, log_blur, sigma)
+        return at.replaced(moving, self._part(moving)._step(at.some(moving), log_blur, sigma))
+
+    def _part(self, edges: BoolArray) -> "Pool":
+        """Return the blocks of some edges."""
+        own = edges[self.edge]
+        edge = (np.cumsum(edges) - 1)[self.edge[own]]
+        return Pool(
+            self.pixels,
+            self.power[own],
+            self.n_samples[own],
+            self.gain[own],
+            edge,
+            np.searchsorted(edge, np.arange(np.count_nonzero(edges) + 1)),
+            self.along[own],
+            self.half_width[edges],
+            self.contrast[edges],
+            self.depth,
+            self.seen[edges],
+            self.products[own],
+            self.at_line[edges],
+            self.at_log_blur[edges],
+        )
+
+    def _step(self, at: Round, log_blur: float, sigma: float) -> Round:
+        """Take one step of all edges."""
         normal, right, expected = self._blocks(at)
         normal /= at.noise[self.edge][:, None, None]
         right /= at.noise[self.edge][:, None]
+        # A block's own amplitudes and place are eliminated, its blur is that of the edge:
+        # what is left is known of what the edge has in common.
         own = self._own_precision()
-        inverse = np.linalg.inv(normal + _diagonal(own))
-        fitted = (inverse @ (right + own * expected)[..., None])[..., 0]
-        noise, weight = self._noise(at, normal, right, fitted)
-        # A block's own amplitudes are eliminated: what is left is known of the common ones.
-        eliminated = normal @ inverse
-        normal = (normal - eliminated @ normal) * weight[:, None, None]
-        right = (right - (eliminated @ right[..., None])[..., 0]) * weight[:, None]
+        free = np.asarray(np.linalg.inv(normal[:, :BLUR, :BLUR] + _diagonal(own)), np.float64)
+        fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
+        noise, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
+        known = _eliminated(normal, right, free, own)
+        sums = self._of_edges(known, self.along[:, ONE] * self.along[:, OTHER] * weight[:, None])
         n = len(self.half_width)
-        system, target = (
-            np.empty((n, N_ALONG, N_UNKNOWNS, N_ALONG, N_UNKNOWNS)),
-            np.empty((n, N_ALONG, N_UNKNOWNS)),
-        )
-        for i, one in enumerate(self.along.T):
-            target[:, i] = self._of_edges(right[..., None], one)[..., 0]
-            for j, other in enumerate(self.along.T[: i + 1]):
-                system[:, i, :, j] = system[:, j, :, i] = self._of_edges(normal, one * other)
+        system = np.empty((n, N_ALONG, N_UNKNOWNS, N_ALONG, N_UNKNOWNS))
+        for k, (i, j) in enumerate(zip(ONE, OTHER, strict=True)):
+            system[:, i, :, j] = system[:, j, :, i] = sums[:, k, :, :-1]
+        target = sums[:, :N_ALONG, :, -1]
         precision, pull = self._known_before(at, log_blur, sigma)
         shape = n, N_ALONG * N_UNKNOWNS
         whole = system.reshape(*shape, -1) + _diagonal(precision.reshape(shape))
@@ -152,33 +269,26 @@ class Pool:
             np.asarray(inverse),
         )
 
-    def _sums(self, at: Round) -> tuple[Array, Array]:
-        """Return products of the powers of every block, and of them with its light."""
-        if at is self.latest[0]:
-            return self.latest[1]
-        moved = self.gain * np.sum(at.line[self.edge] * self.along[:, :2], axis=1)
-        z = (self.d - moved[:, None]) / np.exp(at.log_blur)[self.edge][:, None]
-        U = np.empty((*z.shape, N_POWERS + 1))  # in double precision: sums nearly cancel
-        np.multiply(powers(z), self.weight[..., None], out=U[..., :-1])
-        U[..., -1] = self.light
-        products = U.swapaxes(1, 2) @ U
-        sums = products[:, :-1, :-1], products[:, :-1, -1]
-        self.latest = at, sums
-        return sums
-
     def _blocks(self, at: Round) -> tuple[Array, Array, Array]:
         """Return the normal equations of all blocks, and the unknowns that are expected."""
-        gram, right = self._sums(at)
-        functions = profile_functions(self.half_width, np.exp(at.log_blur), self.depth)
-        values, slopes, widenings = (f[self.edge] for f in functions)
-        expected = np.zeros((len(self.edge), N_UNKNOWNS))
-        amplitude = np.einsum("nj,njk->nk", self.along, at.amplitude[self.edge])
+        values, slopes, widenings = profile_functions(
+            self.half_width, np.exp(self.at_log_blur), self.depth
+        )
+        edge = self.edge
+        moved = self.gain * np.sum((at.line - self.at_line)[edge] * self.along[:, :2], axis=1)
+        widened = values + (at.log_blur - self.at_log_blur)[:, None, None] * widenings
+        amplitude = np.einsum("nj,njk->nk", self.along, at.amplitude[edge])
+        design = np.empty((len(edge), N_UNKNOWNS, N_POWERS))
+        design[:, :N_AMPLITUDES] = widened[edge] - moved[:, None, None] * slopes[edge]
+        for k, of in ((SHIFT, slopes), (BLUR, widenings)):
+            of_polynomials = (at.amplitude @ of)[edge]
+            design[:, k] = np.einsum("nj,njp->np", self.along, of_polynomials)
+        design[:, SHIFT] *= -self.gain[:, None]
+        with_light = design @ self.products[:, :-1]
+        normal = with_light[..., :-1] @ design.swapaxes(1, 2)
+        expected = np.zeros((len(edge), BLUR))
         expected[:, :N_AMPLITUDES] = amplitude
-        row = amplitude[:, None, :]
-        shift = -self.gain[:, None, None] * (row @ slopes)
-        design = np.concatenate([values, shift, row @ widenings], axis=1)
-        normal = design @ gram @ design.swapaxes(1, 2)
-        return normal, (design @ right[..., None])[..., 0], expected
+        return normal, with_light[..., -1], expected
 
     def _noise(self, at: Round, normal: Array, right: Array, fitted: Array) -> tuple[Array, Array]:
         """Return the noise of each edge, and how much each block counts by its own."""
@@ -186,18 +296,17 @@ class Pool:
         explained = np.sum(fitted * explained, axis=1) * at.noise[self.edge]
         of_block = np.maximum(self.power - explained, 0.0) / np.maximum(self.n_samples - 5.0, 1.0)
         of_edge = np.ones(len(self.half_width))
-        for k in np.flatnonzero(self.seen):
-            block = slice(self.bounds[k], self.bounds[k + 1])
-            of_edge[k] = np.median(of_block[block][self.usable[block]])
+        middle = (self.bounds[:-1] + self.bounds[1:]) // 2
+        of_edge[self.seen] = of_block[np.lexsort((of_block, self.edge))][middle[self.seen]]
         of_edge = np.asarray(np.maximum(of_edge, LEAST_NOISE))
         excess = of_block / of_edge[self.edge]
-        return of_edge, self.usable * np.clip((ODD[1] - excess) / (ODD[1] - ODD[0]), 0.0, 1.0)
+        return of_edge, np.clip((ODD[1] - excess) / (ODD[1] - ODD[0]), 0.0, 1.0)
 
     def _own_precision(self) -> Array:
-        """Return how little the unknowns of single blocks scatter, (n, N_UNKNOWNS)."""
-        precision = np.empty((len(self.edge), N_UNKNOWNS))
+        """Return how little amplitudes and places of single blocks scatter, (n, BLUR)."""
+        precision = np.empty((len(self.edge), BLUR))
         precision[:, :N_AMPLITUDES] = (OF_BLOCKS * self.contrast[self.edge][:, None]) ** -2
-        precision[:, SHIFT], precision[:, BLUR] = ROUGH**-2, 1e10
+        precision[:, SHIFT] = ROUGH**-2
         return precision
 
     def _known_before(self, at: Round, log_blur: float, sigma: float) -> tuple[Array, Array]:
@@ -214,13 +323,46 @@ class Pool:
         pull[:, 0, BLUR] = (log_blur - at.log_blur) * sigma**-2
         return precision, pull
 
-    def _of_edges(self, values: Array, weight: Array | BoolArray) -> Array:
-        """Return sums over the blocks of each edge, of values (n, i, j) times weights (n,)."""
-        totals = np.zeros((len(self.half_width), *values.shape[1:]))
-        some = np.flatnonzero(np.diff(self.bounds))
-        weighted = values * weight[:, None, None]
-        totals[some] = np.add.reduceat(weighted, self.bounds[:-1][some], axis=0)
-        return totals
+    def _of_edges(self, values: Array, weight: Array) -> Array:
+        """Return sums over the blocks of each edge, (n_edges, k, i, j).
+
+        Of values (n, i, j) times weights (n, k).
+        """
+        n, k = len(self.half_width), weight.shape[1]
+        flat = values.reshape(len(values), -1)
+        sums = np.empty((n, k, flat.shape[1]))
+        for edge in range(n):
+            own = slice(self.bounds[edge], self.bounds[edge + 1])
+            sums[edge] = weight[own].T @ flat[own]
+        return sums.reshape(n, k, *values.shape[1:])
+
+
+def _joined(counts: IntArray) -> IntArray:
+    """Return which of successive blocks become one, given how many there are of each edge."""
+    joined, n_before = [np.empty(0, dtype=np.intp)], 0
+    for n in counts.tolist():
+        index = np.arange(n) // int(np.clip(n // ENOUGH, 1, LONGEST))
+        joined.append(n_before + index)
+        n_before += int(index[-1]) + 1 if n else 0
+    return np.concatenate(joined)
+
+
+def _eliminated(normal: Array, right: Array, free: Array, own: Array) -> Array:
+    """Return normal equations (n, N_UNKNOWNS, N_UNKNOWNS + 1) without what is a block's own.
+
+    ``own`` is the precision with which its unknowns are known to be those of the edge, and ``free``
+    the covariance of all unknowns but the blur, were there no others.
+    """
+    known = np.empty((len(own), N_UNKNOWNS, N_UNKNOWNS + 1))
+    # N - N (N + P)^-1 N = P - P (N + P)^-1 P, where P is the own precision.
+    known[:, :BLUR, :BLUR] = _diagonal(own) - own[:, :, None] * free * own[:, None, :]
+    others = np.stack([normal[:, :BLUR, BLUR], right[:, :BLUR]], axis=-1)
+    solved = free @ others
+    known[:, :BLUR, BLUR:] = own[..., None] * solved
+    known[:, BLUR, :BLUR] = known[:, :BLUR, BLUR]
+    left = np.stack([normal[:, BLUR, BLUR], right[:, BLUR]], axis=-1)
+    known[:, BLUR, BLUR:] = left - np.sum(others[..., :1] * solved, axis=1)
+    return known
 
 
 def _diagonal(values: Array) -> Array:

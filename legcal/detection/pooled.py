@@ -59,7 +59,7 @@ def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> 
     """
     pool = Pool.of(blocks, kept, depth)
     n = len(pool.half_width)
-    if n == 0 or not np.any(pool.usable):
+    if n == 0 or not np.any(pool.seen):
         return Together(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur)
     start = Round(
         np.zeros((n, N_ALONG, N_AMPLITUDES)),

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, IntArray
 
 # Columns: 1, z, the Gaussian g(z), z g(z), and blurred powers; the last letter is the power.
 ONE, Z, GAUSS, Z_GAUSS, STEP, LESS_HALF, Z_LESS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)
@@ -22,7 +22,7 @@ _BEFORE, _AFTER, _PER_UNIT = 24.0, 24.0, 256  # range of the table, and entries 
 
 
 def _tabulate() -> Array:
-    """Tabulate the functions for z in [-_BEFORE, _AFTER], (n, N_POWERS)."""
+    """Tabulate the functions for z in [-_BEFORE, _AFTER], (n, N_POWERS + 1)."""
     coarse = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / 32.0)
     root = np.linspace(0.0, 7.0, 1401)  # substitute x = root^2: the integrands are smooth
     kernel = np.exp(-0.5 * (root**2 - coarse[:, None]) ** 2) / np.sqrt(2.0 * np.pi)
@@ -38,13 +38,24 @@ def _tabulate() -> Array:
         np.ones_like(z), z, gauss, z * gauss, step, less_half, z * less_half, half, ramp,
         three_halves, square,
     ]  # fmt: skip
-    return np.stack(columns, axis=1)
+    return np.stack([*columns, np.zeros_like(z)], axis=1)
 
 
-_TABLE = _tabulate()
+_TABLE_WITH_ROOM = _tabulate()
+_TABLE = np.ascontiguousarray(_TABLE_WITH_ROOM[:, :N_POWERS])
 
 
 def powers(z: Array) -> Array:
     """Return the functions at distances z (...) in units of the blur, (..., N_POWERS)."""
+    return np.asarray(_TABLE.take(_places(z), axis=0))
+
+
+def powers_with_room(z: Array) -> Array:
+    """Return the functions, and a column of zeros beside them, (..., N_POWERS + 1)."""
+    return np.asarray(_TABLE_WITH_ROOM.take(_places(z), axis=0))
+
+
+def _places(z: Array) -> IntArray:
+    """Return the nearest entries of the tables."""
     place = np.clip((z + _BEFORE) * _PER_UNIT + 0.5, 0.0, len(_TABLE) - 1.0)
-    return np.asarray(_TABLE.take(place.astype(np.int32), axis=0))
+    return place.astype(np.intp)

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.band import Band, band_of_leg
+from legcal.detection.band import Band, bands_of_legs
 from legcal.detection.pieces import Piece, visible_pieces
 from legcal.geometry.types import Array, IntArray
 from legcal.mechanism.leg import Cylinder
@@ -40,7 +41,7 @@ class PredictedLeg:
     outlines: Array
     band: Band
 
-    @property
+    @cached_property
     def u(self) -> Array:
         """Unit direction from base to platform, (3,)."""
         AB = self.B_camera - self.A_camera
@@ -97,20 +98,19 @@ def predict_legs(
     """
     T_camera_base = T_base_camera.inv()
     A_camera, B_camera = T_camera_base.apply(A_base), T_camera_base.apply(B_base)
+    length = np.linalg.norm(B_camera - A_camera, axis=1)
+    u = (B_camera - A_camera) / length[:, None]
+    pieces = [visible_pieces(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
+    ends = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in pieces]
+    bands = bands_of_legs(camera, A_camera, B_camera, *np.array(ends).reshape(-1, 2).T)
     legs = []
-    for leg, (A, B) in enumerate(zip(A_camera, B_camera, strict=True)):
-        length = float(np.linalg.norm(B - A))
-        pieces = visible_pieces(cylinders[leg], length)
-        if not pieces:
+    for leg, (some, band) in enumerate(zip(pieces, bands, strict=True)):
+        radii = np.array([piece.radius for piece in some])
+        A = A_camera[leg]
+        if band is None or np.linalg.norm(A - u[leg] * (u[leg] @ A)) <= 1.01 * radii.max():
             continue
-        start, end = pieces[0].start, max(piece.end for piece in pieces)
-        band = band_of_leg(camera, A, B, start, end)
-        radii = np.array([piece.radius for piece in pieces])
-        u = (B - A) / length
-        if band is None or np.linalg.norm(A - u * (u @ A)) <= 1.01 * radii.max():
-            continue
-        outlines = outlines_of_axis(u[None], A[None], radii)
-        legs.append(PredictedLeg(row, leg, A, B, pieces, outlines, band))
+        outlines = outlines_of_axis(u[leg : leg + 1], A[None], radii)
+        legs.append(PredictedLeg(row, leg, A, B_camera[leg], some, outlines, band))
     return legs
 
 
@@ -135,21 +135,25 @@ def hidden_by(
     (n,) array of int
         Index of the leg in front, -1 where the view is free.
     """
+    others = [other for other in others if other.leg != leg.leg]
     front = np.full(len(P_camera), -1, dtype=np.intp)
+    if not others:
+        return front
     distance = np.linalg.norm(P_camera, axis=1)
     ray = P_camera / distance[:, None]
-    for other in others:
-        if other.leg == leg.leg:
-            continue
-        u, A = other.u, other.A_camera
-        length = float(np.linalg.norm(other.B_camera - A))
-        # The point of the other leg's axis nearest to the viewing ray, and the ray's nearest point.
-        c = ray @ u
-        sine2 = np.maximum(1.0 - c**2, 1e-12)
-        along = np.clip((c * (ray @ A) - u @ A) / sine2, 0.0, length)
-        nearest = A + along[:, None] * u
-        depth = np.sum(ray * nearest, axis=1)
-        gap = np.linalg.norm(nearest - depth[:, None] * ray, axis=1)
-        radius = max(piece.radius for piece in other.pieces)
-        front[(gap < radius + margin * depth) & (depth < distance)] = other.leg
+    u, A, B = (
+        np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in others), strict=True)
+    )
+    length = np.linalg.norm(B - A, axis=1)
+    radius = np.array([max(piece.radius for piece in other.pieces) for other in others])
+    # The points of other legs' axes nearest to the viewing rays, and the rays' nearest points.
+    c, to_A = ray @ u.T, ray @ A.T  # (n, n_others)
+    sine2 = np.maximum(1.0 - c**2, 1e-12)
+    along = np.clip((c * to_A - np.sum(u * A, axis=1)) / sine2, 0.0, length)
+    depth = to_A + along * c
+    nearest = A + along[..., None] * u
+    gap = np.linalg.norm(nearest - depth[..., None] * ray[:, None], axis=-1)
+    is_hidden = (gap < radius + margin * depth) & (depth < distance[:, None])
+    for k, other in enumerate(others):
+        front[is_hidden[:, k]] = other.leg
     return front

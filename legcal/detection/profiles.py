@@ -4,6 +4,7 @@ No pixel is interpolated: rows of the picture (columns, where the outline is fla
 read as they are, and the distance of every pixel centre from the outline is computed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from legcal.detection.band import Band
 from legcal.detection.limb import Samples
 from legcal.detection.picture import Grey
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.camera import Camera
 
 SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
@@ -21,13 +22,40 @@ NODE_SPACING = 16.0  # between points at which the lens distortion is computed [
 
 
 @dataclass(frozen=True, eq=False)
-class Profiles:
-    """Blocks of pixels along one outline.
+class Edge:
+    """An outline that is known to about a pixel.
 
     Attributes
     ----------
-    t : (n_blocks,) array
-        Positions of the blocks along the band [px].
+    band : Band
+        The frame of its part.
+    v : (2,) array
+        Offsets at both ends of the band [px].
+    epsilon : float
+        +1 for edge 1, whose inside has greater v, -1 for edge 2.
+    half_width : float
+        Half of the width of the part in the image [px].
+    hidden : (n,) array of bool
+        Which of n equal stretches of the band other legs hide.
+    """
+
+    band: Band
+    v: Array
+    epsilon: float
+    half_width: float
+    hidden: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Profiles:
+    """Blocks of pixels along outlines.
+
+    Attributes
+    ----------
+    bounds : (n_edges + 1,) array of int
+        The first block of each outline.
+    position : (n_blocks,) array
+        Positions of the blocks, as fractions of the bands.
     gain : (n_blocks,) array
         Pixels of distance in the image per unit of v of the band; near 1.
     d : (n_blocks, n_samples) array of float32
@@ -38,34 +66,24 @@ class Profiles:
         False for samples outside the image or out of range.
     """
 
-    t: Array
+    bounds: IntArray
+    position: Array
     gain: Array
     d: Samples
     grey: Samples
     inside: BoolArray
 
-    def take(self, blocks: BoolArray) -> "Profiles":
-        """Return a selection of the blocks."""
-        return Profiles(
-            self.t[blocks],
-            self.gain[blocks],
-            self.d[blocks],
-            self.grey[blocks],
-            self.inside[blocks],
-        )
-
 
 def read_profiles(
     grey: Grey,
     camera: Camera,
-    band: Band,
-    v: Array,
-    epsilon: float,
-    depth_range: tuple[float, float],
-    reach: int,
+    edges: Sequence[Edge],
+    v: Sequence[Array],
+    depths: tuple[float, Array],
     n_rows: int,
+    most: int | None = None,
 ) -> Profiles:
-    """Read the pixels beside an outline.
+    """Read the pixels beside outlines, where nothing hides them.
 
     Parameters
     ----------
@@ -73,62 +91,154 @@ def read_profiles(
         The image.
     camera : Camera
         Its camera.
-    band : Band
-        The frame in which the outline is given.
-    v : (2,) array
-        Offsets of the outline at both ends of the band [px].
-    epsilon : float
-        +1 for edge 1, whose inside has greater v, -1 for edge 2.
-    depth_range : tuple of float
-        Least and greatest distance inside the outline that is read [px].
-    reach : int
-        Pixels read to each side, the same for all outlines of an image.
+    edges : sequence of Edge
+        The outlines, at least one.
+    v : sequence of (2,) array
+        Offsets of each at both ends of its band [px], in place of its own.
+    depths : float, (n_edges,) array
+        Distances from the outlines that are read, outside and inside of each [px].
     n_rows : int
         Rows of a block.
+    most : int, optional
+        About how many blocks of each outline are read, at even distances; all of them by default.
     """
-    n_nodes = max(3, int(band.length / NODE_SPACING) + 1)
-    t = np.linspace(0.0, band.length, n_nodes)
-    xy = band.points(t, v[0] + (v[1] - v[0]) * t / band.length)
-    nodes = camera.distort(xy)
-    across = np.einsum("nij,j->ni", camera.pixels_per_unit(xy), band.normal)
-    flat = bool(abs(nodes[-1, 0] - nodes[0, 0]) > abs(nodes[-1, 1] - nodes[0, 1]))
-    if flat:  # read columns: exchange x and y
-        grey, nodes, across = grey.T, nodes[:, ::-1], across[:, ::-1]
-    order = np.argsort(nodes[:, 1], kind="stable")
-    along, offset = nodes[order, 1], nodes[order, 0]
-    first, last = np.ceil(along[0]), np.floor(along[-1])
-    available = max(0, int(last - first) + 1)
-    stride = max(1, int(np.ceil(available / MAX_ROWS)))
-    n_blocks = available // (n_rows * stride)
-    rows = first + stride * np.arange(n_blocks * n_rows)
-    centre = np.interp(rows, along, offset)
-    slope = np.gradient(offset, along)
-    tangent = np.interp(rows, along, slope)
+    nodes = _nodes(camera, edges, np.array(v))
+    rows = nodes.rows(n_rows)
+    # Blocks that are read: a few consecutive rows of one edge.
+    position = nodes.at(rows, nodes.position).reshape(-1, n_rows).mean(axis=1)
+    edge = rows.edge[::n_rows]
+    free = np.ones(len(edge), dtype=np.bool_)
+    if most is not None:
+        first = np.searchsorted(edge, np.arange(len(edges) + 1))
+        step = np.maximum(np.diff(first) // most, 1)
+        free = (np.arange(len(edge)) - first[edge]) % step[edge] == 0
+    for k, one in enumerate(edges):
+        if np.any(one.hidden):
+            n, own = len(one.hidden), slice(*np.searchsorted(edge, [k, k + 1]))
+            free[own] &= ~one.hidden[np.clip((position[own] * n).astype(np.intp), 0, n - 1)]
+    rows = rows.some(np.repeat(free, n_rows))
+    edge = edge[free]
+    centre, tangent = nodes.at(rows, nodes.offset), nodes.at(rows, nodes.slope)
     cosine = 1.0 / np.sqrt(1.0 + tangent**2)
-    columns = np.rint(centre)[:, None] + np.arange(-reach, reach + 1.0)
-    sign = epsilon * np.sign(np.interp(rows, along, across[order, 0]))
-    d = (columns - centre[:, None]) * (cosine * sign)[:, None]
-    height, width = grey.shape
-    inside = (columns >= 0) & (columns < width) & (rows[:, None] >= 0) & (rows[:, None] < height)
-    inside &= (d >= depth_range[0]) & (d <= depth_range[1])
-    values = grey[
-        np.clip(rows, 0, height - 1).astype(np.intp)[:, None],
-        np.clip(columns, 0, width - 1).astype(np.intp),
-    ]
-    shape = (n_blocks, n_rows * (2 * reach + 1))
-    inside = _unsaturated(d.reshape(shape), values.reshape(shape), inside.reshape(shape))
+    across = nodes.at(rows, nodes.across)
+    outside, inside_of = depths[0], depths[1][rows.edge]
+    first = np.ceil(centre - np.where(across > 0.0, outside, inside_of) / cosine)
+    n_columns = int(np.max((outside + inside_of) / cosine, initial=0.0)) + 1
+    columns = first[:, None] + np.arange(n_columns)
+    d = (columns - centre[:, None]) * (cosine * np.sign(across))[:, None]
+    height, width = len(grey), grey.shape[1]
+    flat = nodes.flat[rows.edge][:, None]
+    along = rows.along[:, None]
+    n_columns_there, n_rows_there = np.where(flat, height, width), np.where(flat, width, height)
+    inside = (columns >= 0) & (columns < n_columns_there) & (along >= 0) & (along < n_rows_there)
+    inside &= (d >= -outside) & (d <= inside_of[:, None])
+    row = np.clip(along, 0, n_rows_there - 1) * np.where(flat, 1, width)
+    column = np.clip(columns, 0, n_columns_there - 1) * np.where(flat, width, 1)
+    values = np.asarray(np.ravel(grey).take((row + column).astype(np.intp)), dtype=np.float32)
+    shape = (len(edge), n_rows * n_columns)
+    distance, values = d.reshape(shape).astype(np.float32), values.reshape(shape)
     # A step dv moves the outline by dv across; its part normal to the tangent is the gain.
-    gain = np.abs(np.interp(rows, along, across[order, 0] - across[order, 1] * slope))
+    gain = np.abs(nodes.at(rows, nodes.gain)) * cosine
     return Profiles(
-        np.interp(rows, along, t[order]).reshape(n_blocks, n_rows).mean(axis=1),
-        (gain * cosine / band.scale).reshape(n_blocks, n_rows).mean(axis=1),
-        d.reshape(shape).astype(np.float32),
-        values.reshape(shape).astype(np.float32),
-        inside,
+        np.searchsorted(edge, np.arange(len(edges) + 1)),
+        position[free],
+        gain.reshape(-1, n_rows).mean(axis=1),
+        distance,
+        values,
+        _unsaturated(distance, values, inside.reshape(shape)),
     )
 
 
-def _unsaturated(d: Array, grey: Grey, inside: BoolArray) -> BoolArray:
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of pixels (columns, where an outline is flat) that outlines cross, edge by edge."""
+
+    edge: IntArray  # (n,)
+    along: Array  # (n,) y of rows, x of columns [px]
+    node: IntArray  # (n,) the node before it, among those of all edges
+    part: Array  # (n,) how far it is towards the next
+
+    def some(self, chosen: BoolArray) -> "_Rows":
+        """Return a selection."""
+        return _Rows(self.edge[chosen], self.along[chosen], self.node[chosen], self.part[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """Points of outlines between which the image is taken to be without distortion."""
+
+    flat: BoolArray  # (n_edges,) whether an outline crosses columns in place of rows
+    position: Array  # (n_edges, n_nodes) fractions of the bands
+    along: Array  # (n_edges, n_nodes) y, or x of flat outlines, rising [px]
+    offset: Array  # (n_edges, n_nodes) x, or y of flat outlines [px]
+    slope: Array  # (n_edges, n_nodes) the change of offset by along
+    across: Array  # (n_edges, n_nodes) how offset changes inwards; only its sign is of use
+    gain: Array  # (n_edges, n_nodes) px of offset, along held, by px of v
+
+    def rows(self, n_rows: int) -> _Rows:
+        """Return the rows of all whole blocks."""
+        first, last = np.ceil(self.along[:, 0]), np.floor(self.along[:, -1])
+        available = np.maximum(0, (last - first).astype(np.intp) + 1)
+        stride = np.maximum(1, -(-available // MAX_ROWS))
+        n = available // (n_rows * stride) * n_rows
+        edge = np.repeat(np.arange(len(n)), n)
+        number = np.arange(len(edge)) - np.repeat(np.cumsum(n) - n, n)
+        along = first[edge] + stride[edge] * number
+        n_nodes = self.along.shape[1]
+        apart = 4.0 * np.abs(self.along).max(initial=0.0) + 1.0  # puts one edge after the other
+        keys = self.along + apart * np.arange(len(n))[:, None]
+        node = np.searchsorted(keys.ravel(), along + apart * edge, side="right") - 1
+        node = np.clip(node, edge * n_nodes, edge * n_nodes + n_nodes - 2)
+        here, there = self.along.ravel()[node], self.along.ravel()[node + 1]
+        return _Rows(edge, along, node, (along - here) / np.maximum(there - here, 1e-9))
+
+    def at(self, rows: _Rows, values: Array) -> Array:
+        """Return values of nodes (n_edges, n_nodes) at rows (n,)."""
+        values = values.ravel()
+        here = values[rows.node]
+        return np.asarray(here + (values[rows.node + 1] - here) * rows.part)
+
+
+def _nodes(camera: Camera, edges: Sequence[Edge], v: Array) -> _Nodes:
+    """Return points of all outlines with offsets v (n_edges, 2) [px]."""
+    bands = [edge.band for edge in edges]
+    length, scale = np.array([[b.length, b.scale] for b in bands]).T[..., None]
+    origin, along, normal = np.array([[b.origin, b.along, b.normal] for b in bands]).swapaxes(0, 1)
+    origin, along, normal = origin[:, None], along[:, None], normal[:, None]
+    position = np.linspace(0.0, 1.0, max(3, int(length.max() / NODE_SPACING) + 1))
+    at = v[:, :1] + (v[:, 1:] - v[:, :1]) * position
+    xy = origin + (length / scale * position)[..., None] * along + (at / scale)[..., None] * normal
+    pixels = camera.distort(xy)
+    across = np.sum(camera.pixels_per_unit(xy) * normal[:, :, None, :], axis=-1) / scale[..., None]
+    reach = np.abs(pixels[:, -1] - pixels[:, 0])
+    flat = reach[:, 0] > reach[:, 1]
+    pixels, across = (np.where(flat[:, None, None], x[..., ::-1], x) for x in (pixels, across))
+    order = np.argsort(pixels[..., 1], axis=1, kind="stable")
+    offset, along_px = (np.take_along_axis(pixels[..., k], order, axis=1) for k in (0, 1))
+    inwards, besides = (np.take_along_axis(across[..., k], order, axis=1) for k in (0, 1))
+    slope = _slopes(offset, along_px)
+    epsilon = np.array([[edge.epsilon] for edge in edges])
+    return _Nodes(
+        flat,
+        np.take_along_axis(np.broadcast_to(position, order.shape), order, axis=1),
+        along_px,
+        offset,
+        slope,
+        epsilon * inwards,
+        inwards - besides * slope,
+    )
+
+
+def _slopes(y: Array, x: Array) -> Array:
+    """Return dy/dx at the points of curves (n, m) with rising x, to second order inside."""
+    rise = np.diff(y, axis=1) / np.maximum(np.diff(x, axis=1), 1e-9)
+    apart = np.diff(x, axis=1)
+    part = apart[:, :-1] / np.maximum(apart[:, :-1] + apart[:, 1:], 1e-9)
+    inner = rise[:, :-1] + (rise[:, 1:] - rise[:, :-1]) * part
+    return np.concatenate([rise[:, :1], inner, rise[:, -1:]], axis=1)
+
+
+def _unsaturated(d: Samples, grey: Grey, inside: BoolArray) -> BoolArray:
     """Leave out the depths of each block from which on the leg saturates the picture."""
     bright = np.where(inside & (grey >= SATURATED) & (d > 0.0), d, np.inf)
     limit = np.partition(bright, FEW, axis=1)[:, FEW]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 
 TUKEY = 4.0  # sigmas at which a block counts no longer
 N_ROUNDS = 10
@@ -90,34 +90,80 @@ def fit_straight(
     StraightFit or None
         None if fewer than ``LEAST_BLOCKS`` blocks agree.
     """
-    usable = variance < largest
-    if np.count_nonzero(usable) < LEAST_BLOCKS:
-        return None
-    along, moved = position[usable], shift[usable]
-    floored = variance[usable] + LEAST_SCATTER**2
-    design = np.stack([1.0 - along, along])
-    products = np.stack([design[0] ** 2, design[0] * design[1], design[1] ** 2])
-    ends, factor = np.full(2, _weighted_median(moved, 1.0 / floored)), 1.0
+    return fit_straights(np.array([0, len(position)]), position, shift, variance, largest)[0]
+
+
+def fit_straights(
+    bounds: IntArray, position: Array, shift: Array, variance: Array, largest: float = np.inf
+) -> list[StraightFit | None]:
+    """Fit a line to each of several outlines, as :func:`fit_straight` does to one.
+
+    Parameters
+    ----------
+    bounds : (n_edges + 1,) array of int
+        The first block of each outline.
+    position, shift, variance, largest
+        Of the blocks of all outlines, one outline after the other.
+    """
+    counts = np.diff(bounds)
+    filled = np.arange(int(counts.max(initial=0))) < counts[:, None]  # (n_edges, n_most)
+
+    def padded(values: Array) -> Array:
+        table = np.zeros(filled.shape)
+        table[filled] = values
+        return table
+
+    along, moved, noise = (padded(values) for values in (position, shift, variance))
+    usable = filled & (noise < largest)
+    n_usable = np.count_nonzero(usable, axis=1)
+    fits = n_usable >= LEAST_BLOCKS
+    along, moved = np.where(usable, along, 0.0), np.where(usable, moved, 0.0)
+    floored = np.where(usable, noise + LEAST_SCATTER**2, 1.0)
+    start = _weighted_medians(np.where(usable, moved, np.inf), usable / floored)
+    ends = np.repeat(np.where(fits, start, 0.0)[:, None], 2, axis=1)
+    factor, robust = np.ones(len(counts)), np.zeros(filled.shape)
+    moving = fits.copy()
     for turn in range(N_ROUNDS):
-        pull = np.abs(moved - ends @ design) / np.sqrt(floored)
+        off = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
+        pull = np.abs(off) / np.sqrt(floored)
         if turn < N_SCALES:
-            factor = max(1.0, 1.4826 * _median(pull))
-        robust = np.maximum(1.0 - (pull / (TUKEY * factor)) ** 2, 0.0) ** 2
-        weight = robust / floored
-        a, b, c = products @ weight
+            scatter = 1.4826 * _medians(np.where(usable, pull, np.inf), n_usable)
+            factor = np.where(fits, np.maximum(1.0, scatter), 1.0)
+        counted = usable * np.maximum(1.0 - (pull / (TUKEY * factor[:, None])) ** 2, 0.0) ** 2
+        weight = counted / floored
+        one, other = weight * (1.0 - along), weight * along
+        a, b, c = (
+            np.sum(w * x, axis=1) for w, x in ((one, 1.0 - along), (one, along), (other, along))
+        )
+        p, q = np.sum(one * moved, axis=1), np.sum(other * moved, axis=1)
         determinant = a * c - b * b
-        if np.count_nonzero(robust) < LEAST_BLOCKS or determinant < 1e-9 * a * c:
-            return None
-        p, q = design @ (weight * moved)
-        before, ends = ends, np.array([c * p - b * q, a * q - b * p]) / determinant
-        if turn >= N_SCALES and np.abs(ends - before).max() < 1e-4:
+        lost = (np.count_nonzero(counted, axis=1) < LEAST_BLOCKS) | (determinant < 1e-9 * a * c)
+        fits &= ~(moving & lost)
+        moving &= fits
+        safe = np.where(moving, determinant, 1.0)
+        after = np.stack([c * p - b * q, a * q - b * p], axis=1) / safe[:, None]
+        step = np.abs(after - ends).max(axis=1)
+        ends[moving], robust[moving] = after[moving], counted[moving]
+        if turn >= N_SCALES:
+            moving &= step >= 1e-4
+        if not np.any(moving):
             break
     on_line = robust > 0.0
-    kept = usable.copy()
-    kept[usable] = on_line
-    residual = (moved - ends @ design)[on_line]
-    scaled = floored[on_line] * factor**2
-    return StraightFit(ends, kept, float(np.mean(on_line)), along[on_line], residual, scaled)
+    residual = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
+    scaled = floored * factor[:, None] ** 2
+    return [
+        StraightFit(
+            ends[i],
+            on_line[i, : counts[i]],
+            float(np.count_nonzero(on_line[i]) / n_usable[i]),
+            along[i, on_line[i]],
+            residual[i, on_line[i]],
+            scaled[i, on_line[i]],
+        )
+        if fits[i]
+        else None
+        for i in range(len(counts))
+    ]
 
 
 def _correlation_length(pull: Array) -> float:
@@ -138,8 +184,18 @@ def _median(values: Array) -> float:
     return float(np.partition(values, middle)[middle])
 
 
-def _weighted_median(values: Array, weight: Array) -> float:
-    """Return the median of values with weights."""
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+def _medians(values: Array, n: IntArray) -> Array:
+    """Return the middle of the n (k,) smallest of each row of values (k, m), the upper of two."""
+    if values.shape[1] == 0:
+        return np.zeros(len(values))
+    return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), n // 2])
+
+
+def _weighted_medians(values: Array, weight: Array) -> Array:
+    """Return the median of each row of values (k, m) with weights."""
+    if values.shape[1] == 0:
+        return np.zeros(len(values))
+    order = np.argsort(values, axis=1, kind="stable")
+    total = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
+    at = np.count_nonzero(total < 0.5 * total[:, -1:], axis=1)
+    return np.asarray(np.take_along_axis(values, order, axis=1)[np.arange(len(values)), at])
