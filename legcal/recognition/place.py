@@ -18,6 +18,7 @@ START_PICTURES = 1, 1, 2, 4  # whose bars suggest poses, as long as there is a d
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
 KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
 N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
+N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
 POLISH = (0.018, 0.012, 0.008)  # tolerances
 POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
@@ -30,7 +31,7 @@ SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of a
 # Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
 # lead over the next pose in legs of all images together, and as a part.
 CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
-ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.12
+ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
 LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
@@ -109,7 +110,9 @@ class Placed:
         return RigidTransform.from_components(self.poses.t[i], R).inv()
 
 
-def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
+def place_camera(
+    pictures: Sequence[Picture], n_legs: int, starts: Sequence[int] = START_PICTURES
+) -> Placed:
     """Return the camera poses on which most legs of all pictures of a view agree.
 
     Parameters
@@ -118,30 +121,31 @@ def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
         Of one camera pose, at different readings.
     n_legs : int
         Number of legs of the machine.
+    starts : sequence of int
+        How many pictures more suggest poses, as long as there is a doubt.
     """
     by_merit = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
     best_first = [pictures[k] for k in by_merit]
     nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
     best = _judged(pictures, nothing)
     done = 0
-    for n in START_PICTURES:
+    for n in starts:
         if done >= len(pictures):
             break
-        starts = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
+        suggested = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
         done += n
-        poses = joined([best.poses, *starts])
+        poses = joined([best.poses, *suggested])
         if len(poses) == 0:
             continue
         poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
         some = best_first[: max(SOME_PICTURES, done)]
         score = supports(some, poses, TOLERANCES[3])[0].sum(axis=1)
         poses = poses.take(_distinct(poses, score, KEPT[2]))
+        poses = joined([poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))])
         poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
         score = supports(some, poses, TOLERANCES[-1])[0].sum(axis=1)
         poses = poses.take(_best(score, KEPT[3]))
-        best_few = poses.take(np.arange(min(N_POLISHED, len(poses))))
-        from_behind = refined(some, _reversed(some, best_few), TOLERANCES[3:], JOINT_ERROR)
-        poses = joined([poses, from_behind, _polished(some[:POLISHING], poses)])
+        poses = joined([poses, _polished(some[:POLISHING], poses)])
         best = _judged(pictures, refined(pictures, poses, LAST, JOINT_ERROR))
         if best.is_clear:
             break
