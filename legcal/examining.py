@@ -18,6 +18,7 @@ from legcal.detection.detect import NOT_PLACED, Load, Method
 from legcal.detection.exposure import Exposure, expose, image_defects
 from legcal.detection.outline import HIDDEN, OUTSIDE, outline_parts
 from legcal.detection.picture import to_grey
+from legcal.detection.verdict import WRONG_WIDTH
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import is_edited
@@ -114,15 +115,23 @@ def observe(
 
 
 def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]:
-    """Return the parts of legs, by leg and radius, of which hardly an outline can be used."""
+    """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
+
+    One that is used although the width of its part is wrong speaks for no radius.
+    """
     visible = visible_outlines(outlines)
+    which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))
+    of_wrong_width = {
+        one for one, why in zip(which, outlines.reason, strict=True) if why.startswith(WRONG_WIDTH)
+    }
+    used = outlines.used & np.array([one not in of_wrong_width for one in which], dtype=np.bool_)
     part = np.array(outlines.part)
     parts = []
     for j, leg in enumerate(photographs.mechanism.legs):
         for link, radius in leg.radius_of_part.items():
             own = visible & (outlines.leg == j) & (part == link)
             is_seen = own.any() or not visible.any()
-            if is_seen and outlines.used[own].sum() <= HARDLY * own.sum():
+            if is_seen and used[own].sum() <= HARDLY * own.sum():
                 parts.append((j, radius))
     return parts
 

@@ -15,7 +15,7 @@ from legcal.detection.pairs import Pair, PairSearch, block_positions, find_pairs
 from legcal.detection.picture import Grey
 from legcal.detection.pieces import Piece
 from legcal.detection.prediction import PredictedLeg, hidden_by
-from legcal.detection.verdict import LEAST_LENGTH, qualities, verdicts
+from legcal.detection.verdict import LEAST_LENGTH, qualities, verdict
 from legcal.geometry.types import Array, BoolArray
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -283,19 +283,23 @@ def _judge(
     camera: Camera, part: FoundPart, one: MeasuredEdge | None, two: MeasuredEdge | None
 ) -> PartOutlines:
     """Turn the measured edges of a part into outlines with verdicts."""
+    judged = verdict(part.pair, part.width, part.band.length, (one, two))
     lines = [
         None
         if edge is None
-        else (edge.v, np.array([edge.line.first, edge.line.last]), edge.covariance)
+        else (
+            edge.v,
+            np.array([edge.line.first, edge.line.last]),
+            edge.covariance + judged.bias**2,
+        )
         for edge in (one, two)
     ]
-    reasons = verdicts(part.pair, part.width, part.band.length, (one, two))
     contrast, length, residual = np.transpose(
         [qualities(edge, part.band.length) for edge in (one, two)]
     )
     return replace(
         part.outlines(camera, lines),
-        reasons=reasons,
+        reasons=judged.reasons,
         contrast=contrast,
         length=length,
         residual=residual,

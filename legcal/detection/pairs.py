@@ -49,6 +49,12 @@ class Pair:
     found: BoolArray
     alone: BoolArray
 
+    def suits(self, width: Array) -> bool:
+        """Say whether both edges were found at the distance of the part's outlines (2,) [px]."""
+        off = np.abs(self.v[1] - self.v[0] - width)
+        tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
+        return bool(np.all(self.found) and np.all(off <= tolerance))
+
 
 @dataclass(frozen=True, eq=False)
 class PairSearch:
