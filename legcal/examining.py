@@ -21,7 +21,16 @@ from legcal.detection.picture import to_grey
 from legcal.geometry.types import BoolArray, IntArray
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import is_edited
-from legcal.photographs import Joined, Photographs, Placement, Scene, counted, detect, place
+from legcal.photographs import (
+    Joined,
+    Photographs,
+    Placement,
+    Scene,
+    counted,
+    detect,
+    place,
+    usual_blur,
+)
 from legcal.progress import Report
 from legcal.recognition.doubts import Explanation, explain, share_shown
 from legcal.recognition.radii import Part
@@ -48,12 +57,15 @@ class Observed:
         Of all images; those of images that are left out are rejected.
     left_out : dict of str
         Why images were left out, by row.
+    blur : tuple of float
+        Standard deviation of the usual blur of each view [px]; NaN where none was measured.
     """
 
     photographs: Photographs
     placement: Placement
     outlines: Outlines
     left_out: dict[int, str]
+    blur: tuple[float, ...]
 
 
 def observe(
@@ -83,14 +95,16 @@ def observe(
     usable = np.array([row for row in rows.tolist() if row not in defects], dtype=np.intp)
     searched = replace(photographs, detect=usable)
     placement = place(searched, scene, report, joined)
-    outlines = detect(photographs, placement.scene, report, method=method)
+    blurs: dict[int, float] = {}
+    measure = partial(detect, report=report, method=method, blur_of_row=blurs)
+    outlines = measure(photographs, placement.scene)
     doubtful = _parts_not_found(photographs, outlines)
     if doubtful:
         other = place(searched, scene, report, joined, doubtful)
         if other.recognised.radii.factor:
             mechanism = photographs.mechanism.with_cylinders(other.search.cylinders)
             corrected = replace(photographs, mechanism=mechanism)
-            again = detect(corrected, other.scene, report, method=method)
+            again = measure(corrected, other.scene)
             if again.used.sum() > outlines.used.sum():
                 photographs, placement, outlines = corrected, other, again
     placement = _without_images(photographs, placement, usable, defects)
@@ -110,7 +124,8 @@ def observe(
     notes = [*_defect_notes(photographs, {r: w for r, w in defects.items() if r in placed}), *notes]
     notes += _leg_notes(photographs, placement, outlines, found, reasons)
     placement = replace(placement, notes=(*placement.notes, *notes))
-    return Observed(photographs, placement, rejected(outlines, reasons), reasons)
+    blur = usual_blur(photographs, blurs)
+    return Observed(photographs, placement, rejected(outlines, reasons), reasons, blur)
 
 
 def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]:
