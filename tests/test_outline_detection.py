@@ -115,7 +115,7 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
     found = detect(cam, bars, np.rint(image).astype(np.uint8))
     assert np.all(found.used), found.reason
     error = errors(cam, bars, found)
-    assert np.abs(error).max() < (0.2 if blur < 1.0 else 0.35)
+    assert np.abs(error).max() < (0.2 if blur < 1.0 else 0.4)
     assert np.median(np.abs(error)) < (0.08 if blur < 1.0 else 0.15)
     assert abs(float(error.mean())) < (
         0.05 if blur < 1.0 else 0.15

@@ -11,7 +11,7 @@ import numpy as np
 
 from legcal.camera_calibration.adjustment import SeenCorners
 from legcal.camera_calibration.board_spec import board_of
-from legcal.camera_calibration.files import check_camera_place, write_camera
+from legcal.camera_calibration.files import CAMERA_FILE, write_camera
 from legcal.camera_calibration.image_files import common_size, listed_images
 from legcal.camera_calibration.judgement import (
     FEWEST_IMAGES,
@@ -89,7 +89,7 @@ def calibrate_camera(
             f"{', '.join(get_args(DistortionModel))}; correct it."
         )
     if output is not None:
-        check_camera_place(Path(output))
+        CAMERA_FILE.check_place(Path(output))
     wanted = board_of(board)
     paths = listed_images([images] if isinstance(images, str | Path) else images)
     size = common_size(paths)

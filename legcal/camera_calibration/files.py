@@ -2,52 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from legcal.camera_calibration.result import CameraCalibration
-from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.atomic import write_atomically
-from legcal.files.schema import parse_yaml, read_text
+from legcal.files.own_yaml import OwnYaml
 from legcal.vision.camera_schema import CALIBRATED
 from legcal.vision.camera_writer import camera_info
 
-_WHAT = "camera file"
+CAMERA_FILE = OwnYaml(
+    "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"
+)
 _DIGITS = 6  # of figures that describe the calibration
-
-
-def check_camera_place(path: Path) -> None:
-    """Refuse a place where no camera file can be written, or another file stands.
-
-    Raises
-    ------
-    UsageError
-        With what is there instead.
-    """
-    start = f"{path}: the camera could not be written: found"
-    if not path.name or os.path.isdir(path):
-        raise UsageError(f"{start} a folder, needed the name of a file; give one in it.")
-    if not os.path.isdir(path.parent):
-        raise UsageError(
-            f"{start} no folder {path.parent}, needed one that exists; create it or give another "
-            "file."
-        )
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise UsageError(
-            f"{start} that {path.parent} cannot be written to, needed permission to create files "
-            "in it; give another file."
-        )
-    if not os.path.lexists(path):
-        return
-    try:
-        is_own = CALIBRATED in parse_yaml(read_text(path, _WHAT), path, _WHAT)
-    except DatasetError:
-        is_own = False
-    if not is_own:
-        raise UsageError(
-            f"{start} another file of that name, needed a new file or one that this command wrote; "
-            "give another file."
-        )
 
 
 def write_camera(calibration: CameraCalibration, path: Path) -> None:
@@ -56,11 +21,10 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
     Raises
     ------
     UsageError
-        As :func:`check_camera_place`.
+        If another file stands there, or none can be written.
     OutOfResources
         If the file cannot be written.
     """
-    check_camera_place(path)
     names, sigma = calibration.names, calibration.sigma.tolist()
     block = {
         "version": 1,
@@ -75,13 +39,7 @@ def write_camera(calibration: CameraCalibration, path: Path) -> None:
         "warnings": list(calibration.warnings),
     }
     text = camera_info(calibration.camera, path.stem, {CALIBRATED: block})
-    try:
-        write_atomically(path, text.encode())
-    except OSError as error:
-        raise OutOfResources(
-            f"{path}: the camera could not be written: found '{error.strerror}', needed a folder "
-            "that takes it; free some space or give another file."
-        ) from error
+    CAMERA_FILE.write(path, text)
 
 
 def _short(value: float) -> float:

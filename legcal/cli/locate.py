@@ -51,7 +51,7 @@ def locate(
 ) -> None:
     """Find the base in the world and the tool in the platform from measured tool poses."""
     from legcal.files.quantity import ANGLE, LENGTH, parse_quantity
-    from legcal.location.document import check_place, location_document, write_location
+    from legcal.location.document import LOCATION_FILE, location_document, write_location
     from legcal.location.locate import locate as run
     from legcal.location.urdf_frames import write_located_model
     from legcal.mechanism.load import load_mechanism
@@ -65,7 +65,7 @@ def locate(
     def quantity(text: str | None, units: Mapping[str, float], what: str) -> float | None:
         return None if text is None else parse_quantity(text, units, what)
 
-    check_place(output)
+    LOCATION_FILE.check_place(output)
     mechanism = load_mechanism(model)
     location = run(
         mechanism,

@@ -10,6 +10,7 @@ import numpy as np
 
 from legcal.detection.fit import depth_for_blur, fit_blocks
 from legcal.detection.limb import Samples
+from legcal.detection.noise import evened_weights
 from legcal.detection.picture import Grey
 from legcal.detection.profiles import Edge, read_profiles
 from legcal.detection.response import to_light
@@ -81,6 +82,11 @@ class Blocks:
         """Return distances from the current lines, grey levels, weights, half-widths."""
         d = self.d[blocks] - self.moved[blocks, None].astype(np.float32)
         return d, self.grey[blocks], self.weight[blocks], self.half_width[blocks]
+
+    def even_noise(self, kept: BoolArray, blur: float) -> None:
+        """Weigh the pixels by the noise that is seen on both sides of each edge."""
+        d = self.samples(slice(None))[0]
+        self.weight = evened_weights(d, self.grey, self.weight, self.bounds, kept, blur)
 
     def contrasts(self) -> list[Array]:
         """Return the contrasts of the blocks of each edge, without sign."""

@@ -109,7 +109,9 @@ def measure_edges(
         blocks.settle(tried, LAST_ROUNDS)
         if not together:
             return _roughly(edges, v, blocks, tried), tried
-        joint = fit_together(blocks, blocks.kept(), tried, depth_for_blur(tried))
+        kept = blocks.kept()
+        blocks.even_noise(kept, tried)
+        joint = fit_together(blocks, kept, tried, depth_for_blur(tried))
         blur = joint.blur
         if abs(np.log(blur / tried)) < SIMILAR:
             break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,9 +9,9 @@ import numpy as np
 import yaml
 from pydantic import BeforeValidator, Field
 
-from legcal.errors import DatasetError, OutOfResources, UsageError
-from legcal.files.atomic import write_atomically
+from legcal.errors import DatasetError
 from legcal.files.motion import MotionEntry
+from legcal.files.own_yaml import OwnYaml
 from legcal.files.schema import FileSchema, Number, Version, parse_yaml, read_text, validate
 from legcal.geometry.frames import motion_to_xyz_quat
 from legcal.location.location import NAMES, Location, MeasurementNoise, RowResidual
@@ -20,6 +19,7 @@ from legcal.location.open_part import OpenPart
 
 WHAT = "location file"
 KEY = "legcal_location"
+LOCATION_FILE = OwnYaml("the location", WHAT, KEY, "a new file or an earlier location")
 _SYMMETRIC = 1e-9  # relative
 _NONE = 1e-12  # below zero: rounding
 
@@ -171,40 +171,6 @@ def location_document(location: Location) -> dict[str, Any]:
     }
 
 
-def check_place(path: Path) -> None:
-    """Refuse a place where a location cannot be written.
-
-    Raises
-    ------
-    UsageError
-        If its folder is missing, or something else than a location stands there.
-    """
-    start = f"{path}: the location could not be written: found"
-    if not os.path.isdir(path.parent):
-        raise UsageError(
-            f"{start} no folder {path.parent}, needed one that exists; create it or give another "
-            "file."
-        )
-    if os.path.isdir(path):
-        raise UsageError(f"{start} a folder, needed the name of a file; give one in it.")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise UsageError(
-            f"{start} that {path.parent} cannot be written to, needed permission to create files "
-            "in it; give another file."
-        )
-    if not os.path.lexists(path):
-        return
-    try:
-        is_location = KEY in parse_yaml(read_text(path, WHAT), path, WHAT)
-    except DatasetError:
-        is_location = False
-    if not is_location:
-        raise UsageError(
-            f"{start} another file of that name, needed a new file or an earlier location; give "
-            "another file."
-        )
-
-
 def write_location(location: Location, file: str | Path) -> None:
     """Write a location; an earlier one is replaced, any other file is not.
 
@@ -218,12 +184,10 @@ def write_location(location: Location, file: str | Path) -> None:
     Raises
     ------
     UsageError
-        As :func:`check_place`.
+        If another file stands there, or none can be written.
     OutOfResources
         If the file cannot be written.
     """
-    path = Path(file)
-    check_place(path)
     text = yaml.safe_dump(
         location_document(location),
         sort_keys=False,
@@ -231,13 +195,7 @@ def write_location(location: Location, file: str | Path) -> None:
         allow_unicode=True,
         width=120,
     )
-    try:
-        write_atomically(path, text.encode())
-    except OSError as error:
-        raise OutOfResources(
-            f"{path}: the location could not be written: found '{error.strerror}', needed a folder "
-            "that takes it; free some space or give another file."
-        ) from error
+    LOCATION_FILE.write(Path(file), text)
 
 
 def load_location(file: str | Path) -> Location:
