@@ -7,7 +7,6 @@ may show instead. Whatever is wrong is left out with a reason, and said once.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,20 +17,36 @@ from legcal.detection.detect import NOT_PLACED, Load, Method
 from legcal.detection.exposure import Exposure, expose, image_defects
 from legcal.detection.outline import HIDDEN, OUTSIDE, outline_parts
 from legcal.detection.picture import to_grey
+from legcal.detection.verdict import WRONG_WIDTH
 from legcal.geometry.types import BoolArray, IntArray
+from legcal.image_notes import (
+    FEW,
+    WITNESSES,
+    OutlineCount,
+    defect_notes,
+    judged,
+    leg_notes,
+    witnesses,
+)
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import is_edited
-from legcal.photographs import Joined, Photographs, Placement, Scene, counted, detect, place
+from legcal.photographs import (
+    Joined,
+    Photographs,
+    Placement,
+    Scene,
+    counted,
+    detect,
+    place,
+    usual_blur,
+)
 from legcal.progress import Report
 from legcal.recognition.doubts import Explanation, explain, share_shown
 from legcal.recognition.radii import Part
 
-FEW, USUALLY = 0.5, 0.3  # found, against the others of its view, which must find as much at least
+USUALLY = 0.3  # the least that images of a view must find to be compared with
 GOOD = 75.0  # percentile of what images find, for what good ones do
-WITNESSES = 3  # good images of a view that tell how much of the legs they show
-SHOWN = 0.5  # share of a leg's length in each of them, from which on it is clearly visible
 HARDLY = 0.3  # of the outlines of a part that should be seen
-NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +63,15 @@ class Observed:
         Of all images; those of images that are left out are rejected.
     left_out : dict of str
         Why images were left out, by row.
+    blur : tuple of float
+        Standard deviation of the usual blur of each view [px]; NaN where none was measured.
     """
 
     photographs: Photographs
     placement: Placement
     outlines: Outlines
     left_out: dict[int, str]
+    blur: tuple[float, ...]
 
 
 def observe(
@@ -83,14 +101,16 @@ def observe(
     usable = np.array([row for row in rows.tolist() if row not in defects], dtype=np.intp)
     searched = replace(photographs, detect=usable)
     placement = place(searched, scene, report, joined)
-    outlines = detect(photographs, placement.scene, report, method=method)
+    blurs: dict[int, float] = {}
+    measure = partial(detect, report=report, method=method, blur_of_row=blurs)
+    outlines = measure(photographs, placement.scene)
     doubtful = _parts_not_found(photographs, outlines)
     if doubtful:
         other = place(searched, scene, report, joined, doubtful)
         if other.recognised.radii.factor:
             mechanism = photographs.mechanism.with_cylinders(other.search.cylinders)
             corrected = replace(photographs, mechanism=mechanism)
-            again = detect(corrected, other.scene, report, method=method)
+            again = measure(corrected, other.scene)
             if again.used.sum() > outlines.used.sum():
                 photographs, placement, outlines = corrected, other, again
     placement = _without_images(photographs, placement, usable, defects)
@@ -103,26 +123,35 @@ def observe(
     reasons = {row: why for row, why in defects.items() if row in placed}
     notes = []
     for row, explanation in explained.items():
-        reason, note = _judged(photographs, row, explanation, usual, found)
+        reason, note = judged(photographs, row, explanation, usual, found)
         notes.append(note)
         if reason:
             reasons[row] = reason
-    notes = [*_defect_notes(photographs, {r: w for r, w in defects.items() if r in placed}), *notes]
-    notes += _leg_notes(photographs, placement, outlines, found, reasons)
+    notes = [*defect_notes(photographs, {r: w for r, w in defects.items() if r in placed}), *notes]
+    notes += leg_notes(photographs, placement, outlines, found, reasons)
     placement = replace(placement, notes=(*placement.notes, *notes))
-    return Observed(photographs, placement, rejected(outlines, reasons), reasons)
+    blur = usual_blur(photographs, blurs)
+    return Observed(photographs, placement, rejected(outlines, reasons), reasons, blur)
 
 
 def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]:
-    """Return the parts of legs, by leg and radius, of which hardly an outline can be used."""
+    """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
+
+    One that is used although the width of its part is wrong speaks for no radius.
+    """
     visible = visible_outlines(outlines)
+    which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))
+    of_wrong_width = {
+        one for one, why in zip(which, outlines.reason, strict=True) if why.startswith(WRONG_WIDTH)
+    }
+    used = outlines.used & np.array([one not in of_wrong_width for one in which], dtype=np.bool_)
     part = np.array(outlines.part)
     parts = []
     for j, leg in enumerate(photographs.mechanism.legs):
         for link, radius in leg.radius_of_part.items():
             own = visible & (outlines.leg == j) & (part == link)
             is_seen = own.any() or not visible.any()
-            if is_seen and outlines.used[own].sum() <= HARDLY * own.sum():
+            if is_seen and used[own].sum() <= HARDLY * own.sum():
                 parts.append((j, radius))
     return parts
 
@@ -179,27 +208,14 @@ def _without_images(
     return replace(placement, scene=scene, unplaced=unplaced)
 
 
-@dataclass(frozen=True)
-class _Count:
-    """How many outlines of an image were found, of those that it should show."""
-
-    used: int
-    visible: int
-
-    @property
-    def share(self) -> float:
-        """Their ratio."""
-        return self.used / self.visible
-
-
-def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, _Count]:
+def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
     """Return how many outlines were found in images that should show any, by row."""
     visible = visible_outlines(outlines)
     counts = {}
     for row in rows:
         own = (outlines.row == row) & visible
         if own.any():
-            counts[row] = _Count(int(outlines.used[own].sum()), int(own.sum()))
+            counts[row] = OutlineCount(int(outlines.used[own].sum()), int(own.sum()))
     return counts
 
 
@@ -211,7 +227,7 @@ def visible_outlines(outlines: Outlines) -> BoolArray:
     )
 
 
-def _doubted(found: Mapping[int, _Count], view: IntArray) -> list[int]:
+def _doubted(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
     """Return the images in which far fewer outlines were found than in others of their view."""
     doubted = []
     for row, count in found.items():
@@ -223,16 +239,10 @@ def _doubted(found: Mapping[int, _Count], view: IntArray) -> list[int]:
     return doubted
 
 
-def _witnesses(photographs: Photographs, found: Mapping[int, _Count], view: int) -> list[int]:
-    """Return the images of a view in which most was found."""
-    own = [row for row in found if photographs.measurements.view[row] == view]
-    return sorted(own, key=lambda row: -found[row].share)[:WITNESSES]
-
-
 def _usual(
     photographs: Photographs,
     placement: Placement,
-    found: Mapping[int, _Count],
+    found: Mapping[int, OutlineCount],
     doubted: Sequence[int],
 ) -> dict[int, float]:
     """Return how much of the legs good images show, for views with images in doubt."""
@@ -240,7 +250,7 @@ def _usual(
     usual = {}
     for v in views:
         good = {row: count for row, count in found.items() if row not in doubted}
-        rows = _witnesses(photographs, good, v)
+        rows = witnesses(photographs, good, v)
         task = partial(share_shown, placement.search, placement.recognised)
         usual[v] = float(np.median(list(photographs.run(task, rows)) or [0.0]))
     return usual
@@ -255,99 +265,3 @@ def _explained(
     """Return what images show, by row."""
     task = partial(explain, placement.search, placement.recognised, dict(usual))
     return dict(zip(rows, photographs.run(task, rows), strict=True))
-
-
-def image_name(photographs: Photographs, row: int) -> str:
-    """Return what an image is called in notes."""
-    measurements = photographs.measurements
-    view = measurements.views[int(measurements.view[row])]
-    return f"view {view.name}, image {measurements.image[row]}"
-
-
-def _judged(
-    photographs: Photographs,
-    row: int,
-    explanation: Explanation,
-    usual: Mapping[int, float],
-    found: Mapping[int, _Count],
-) -> tuple[str, str]:
-    """Return why an image is left out, "" if it is not, and the sentence that says so."""
-    name, count = image_name(photographs, row), found[row]
-    much = f"{count.used} of {count.visible} outlines where its reading has the legs"
-    if explanation.reason:
-        return (
-            explanation.reason,
-            f"{name}: was left out: {explanation.reason}; {explanation.remedy}.",
-        )
-    view = int(photographs.measurements.view[row])
-    if explanation.own >= FEW * usual[view]:
-        return "", (
-            f"{name}: shows little of the legs: found {much}, in the others of its view most; "
-            "look at its light and sharpness."
-        )
-    return NOTHING_LIKE, (
-        f"{name}: was left out: found {much}, and nothing else that it shows; check that it is a "
-        "photograph of this machine, taken by this camera at this reading."
-    )
-
-
-def _defect_notes(photographs: Photographs, defects: Mapping[int, str]) -> list[str]:
-    """Return what is to be said of images that show nothing."""
-    return [
-        f"{image_name(photographs, row)}: was left out: {why}; take it again."
-        for row, why in sorted(defects.items())
-    ]
-
-
-def _leg_notes(
-    photographs: Photographs,
-    placement: Placement,
-    outlines: Outlines,
-    found: Mapping[int, _Count],
-    reasons: Mapping[int, str],
-) -> list[str]:
-    """Return what is to be said of the legs that views are said to show."""
-    measurements, names = photographs.measurements, photographs.mechanism.leg_names
-    notes = []
-    for v, view in enumerate(measurements.views):
-        rows = [r for r in found if measurements.view[r] == v and r not in reasons]
-        if view.legs is None or not rows:
-            continue
-        own = np.isin(outlines.row, rows)
-        used = set(outlines.leg[own & outlines.used].tolist())
-        for leg in np.flatnonzero(photographs.wanted[v]).tolist():
-            mine = own & (outlines.leg == leg)
-            if leg in used or not used or not mine.any():
-                continue
-            why = Counter(outlines.reason[i] for i in np.flatnonzero(mine).tolist())
-            notes.append(
-                f"view {view.name}: legs names {names[leg]}, of which none of its images shows an "
-                f"outline that can be used ({why.most_common(1)[0][0]}); look at legcal detect, "
-                "or leave it out there."
-            )
-        good = {row: found[row] for row in rows}
-        notes += _left_out_legs(photographs, placement, v, _witnesses(photographs, good, v))
-    return notes
-
-
-def _left_out_legs(
-    photographs: Photographs, placement: Placement, v: int, rows: Sequence[int]
-) -> list[str]:
-    """Return a note on legs that a view leaves out although its images show them clearly."""
-    search = placement.search
-    clear = [
-        name
-        for leg, name in enumerate(photographs.mechanism.leg_names)
-        if not photographs.wanted[v, leg]
-        and search.cylinders[leg]
-        and all(
-            share_shown(search, placement.recognised, row, legs=np.array([leg])) >= SHOWN
-            for row in rows
-        )
-    ]
-    if not clear:
-        return []
-    return [
-        f"view {photographs.measurements.views[v].name}: legs leaves out {', '.join(clear)}, which "
-        "its images show clearly; name them there to use them."
-    ]

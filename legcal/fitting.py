@@ -142,7 +142,11 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
         first = disagreeing_images(part.measurements, part.mechanism, found.solution)
         scene = _fitted_scene(work, found.solution, scene)
         again = observed.photographs.narrowed(shown, found.outlines)
-        outlines = detect(again, scene, progress, near_fit=True)
+        methods = [
+            outline_parts if np.isnan(blur) else partial(outline_parts, blur=blur)
+            for blur in observed.blur
+        ]
+        outlines = detect(again, scene, progress, near_fit=True, method=methods)
         found = _fit(part, fitted, outlines, scene, board, progress)
         notes = (*notes, *_lost(found, first))
     return replace(_noted(found, notes), other_radii=other_radii)

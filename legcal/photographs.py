@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 
@@ -254,10 +254,14 @@ def detect(
     report: Report,
     *,
     near_fit: bool = False,
-    method: Method = outline_parts,
+    method: Method | Sequence[Method] = outline_parts,
     stage: str = "Measuring outlines",
+    blur_of_row: dict[int, float] | None = None,
 ) -> Outlines:
-    """Return all outlines: those searched for near the scene, and those kept."""
+    """Return all outlines: those searched for near the scene, and those kept.
+
+    ``method`` and ``blur_of_row`` are those of :func:`legcal.detection.detect.detect_outlines`.
+    """
     stage = f"{stage} again" if near_fit else stage
     found = detect_outlines(
         photographs.load,
@@ -273,8 +277,18 @@ def detect(
         progress=counted(report, stage, len(photographs.detect)),
         joint_error=0.0 if near_fit else scene.joint_error,
         pixel_error=NEAR_FIT_PX if near_fit else PIXEL_ERROR,
+        blur_of_row=blur_of_row,
     )
     return given_outlines(photographs, found)
+
+
+def usual_blur(photographs: Photographs, blur_of_row: Mapping[int, float]) -> tuple[float, ...]:
+    """Return the blur of most images of each view [px]; NaN where none was measured."""
+    view = photographs.measurements.view
+    of_view: list[list[float]] = [[] for _ in photographs.measurements.views]
+    for row, blur in blur_of_row.items():
+        of_view[int(view[row])].append(blur)
+    return tuple(float(np.median(blurs)) if blurs else np.nan for blurs in of_view)
 
 
 def given_outlines(photographs: Photographs, found: Outlines | None = None) -> Outlines:

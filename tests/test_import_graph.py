@@ -17,6 +17,7 @@ LAYERS = (
     "detection",
     "recognition",
     "photographs",
+    "image_notes",
     "examining",
     "dataset",
     "camera_calibration",

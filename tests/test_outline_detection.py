@@ -1,6 +1,8 @@
 """Detection on rendered scenes whose outlines are known exactly, and on sample photographs."""
 
 import json
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -9,7 +11,8 @@ import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.detect import detect_outlines
+from legcal.detection.detect import Method, detect_outlines
+from legcal.detection.outline import outline_parts
 from legcal.geometry.types import Array, Image
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements, View
@@ -44,7 +47,13 @@ def cylinder(b: Bar, radius: float | None = None) -> tuple[Cylinder, ...]:
 
 
 def detect(
-    cam: Camera, bars: list[Bar], image: Image, off: float = 2e-3, radius: float | None = None
+    cam: Camera,
+    bars: list[Bar],
+    image: Image,
+    off: float = 2e-3,
+    radius: float | None = None,
+    method: Method | Sequence[Method] = outline_parts,
+    blur_of_row: dict[int, float] | None = None,
 ) -> Outlines:
     """Detect bars whose predicted joints are ``off`` metres wrong in every coordinate."""
     rng = np.random.default_rng(0)
@@ -59,6 +68,8 @@ def detect(
         [IDENTITY],
         np.ones((1, len(bars)), dtype=np.bool_),
         [f"leg{i + 1}" for i in range(len(bars))],
+        method=method,
+        blur_of_row=blur_of_row,
     )
 
 
@@ -111,6 +122,28 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
     )  # signed: half a pixel somewhere would show
     sigma = np.sqrt([np.diag(c) for c in found.covariance])
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 2.0
+
+
+@pytest.mark.parametrize("known", [0.45, 0.6])
+def test_outlines_near_a_fit_are_found_with_the_blur_of_other_images(known: float) -> None:
+    background, albedo, light, blur = SCENES["bright on dark"]
+    cam = camera()
+    bars = [bar(-0.09, 0.03, albedo), bar(0.08, -0.05, albedo)]
+    image = render(cam, bars, background, light, blur=blur, noise=2.0, supersample=4)
+    blurs: dict[int, float] = {}
+    found = detect(
+        cam,
+        bars,
+        np.rint(image).astype(np.uint8),
+        off=2e-4,  # as after a fit: some tenths of a pixel
+        method=[partial(outline_parts, blur=known)],
+        blur_of_row=blurs,
+    )
+    assert np.all(found.used), found.reason
+    error = errors(cam, bars, found)
+    assert np.abs(error).max() < 0.2
+    assert np.median(np.abs(error)) < 0.08
+    assert blurs[0] == pytest.approx(np.hypot(blur, 0.29), rel=0.25)  # with that of the pixels
 
 
 def test_an_edge_stands_alone_where_the_other_side_is_as_dark_as_the_background() -> None:

@@ -155,8 +155,8 @@ def test_sums_over_pixels_tell_of_places_and_blurs_nearby(
     found = fit_together(blocks, every, 0.54, DEPTH)
     monkeypatch.setattr(pool, "NEARBY", (0.0, 0.0))  # sums anew in every round
     anew = fit_together(blocks, every, 0.54, DEPTH)
-    np.testing.assert_allclose(found.ends, anew.ends, atol=4e-3)
-    np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.05)
+    np.testing.assert_allclose(found.ends, anew.ends, atol=8e-3)
+    np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.2)
     assert found.blur == pytest.approx(anew.blur, rel=5e-3)
 
 

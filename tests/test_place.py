@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.recognition.agreement import Picture
+from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
-from legcal.recognition.place import Placed, place_camera, place_near
+from legcal.recognition.place import Placed, _reversed, place_camera, place_near
 
 HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
 
@@ -150,3 +150,24 @@ def test_mirrored_pictures_of_a_planar_machine_are_believed() -> None:
     assert other.is_enough
     assert not is_mirrored(own, other)
     assert not is_mirrored(other, own)
+
+
+def test_a_flat_machine_is_seen_alike_with_near_and_far_exchanged() -> None:
+    rng = np.random.default_rng(4)
+    joints = np.append(rng.uniform(-0.2, 0.2, (8, 2)), np.zeros((8, 1)), axis=1)
+    targets = lp.pieces(joints[:4], joints[4:])
+    nothing = lp.picture((joints[:4], joints[4:]), (joints[:4], joints[4:]), lp.camera(rng), rng)
+    R = Rotation.random(5, rng=rng).as_matrix()
+    middle = targets.ends.reshape(-1, 3).mean(axis=0)
+    far = np.array([0.3, -0.2, 200.0])
+    poses = Poses.rigid(R, far - R @ middle, 4)
+    other = _reversed([nothing], poses)
+    assert np.allclose(np.linalg.det(other.R), 1.0)
+    for pose in range(5):
+        here, there = (p.R[pose] @ targets.ends[..., None] for p in (poses, other))
+        here, there = here[..., 0] + poses.t[pose], there[..., 0] + other.t[pose]
+        assert np.abs(here[..., :2] / here[..., 2:] - there[..., :2] / there[..., 2:]).max() < 1e-5
+        assert np.abs(here[..., 2] + there[..., 2] - 2.0 * far[2]).max() < 1e-3
+    again = _reversed([nothing], other)
+    assert np.allclose(again.R, poses.R)
+    assert np.allclose(again.t, poses.t)

@@ -48,7 +48,8 @@ def detect_outlines(
     pixel_error: float = PIXEL_ERROR,
     progress: Progress | None = None,
     run: Run = in_turn,
-    method: Method = outline_parts,
+    method: Method | Sequence[Method] = outline_parts,
+    blur_of_row: dict[int, float] | None = None,
 ) -> Outlines:
     """Find and measure the outlines of all legs, near where aligned cameras should see them.
 
@@ -77,8 +78,10 @@ def detect_outlines(
     run : callable
         How the images are searched: in turn, or by the processes of
         :func:`legcal.workers.worker_pool`.
-    method : callable
+    method : callable, or one for each view
         How the outlines of an image are found and measured; it travels to worker processes.
+    blur_of_row : dict, optional
+        Takes the standard deviation of the blur of each image that was measured [px], by row.
 
     Returns
     -------
@@ -88,11 +91,15 @@ def detect_outlines(
     """
     error = np.broadcast_to(np.asarray(joint_error, dtype=np.float64), np.shape(wanted))
     guide = _Guide(load, measurements, A_base, B_base, cylinders, T_base_camera, wanted, error)
-    search = partial(_search_outlines, guide, method, tuple(leg_names), pixel_error)
+    methods = (method,) * len(measurements.views) if callable(method) else tuple(method)
+    search = partial(_search_outlines, guide, methods, tuple(leg_names), pixel_error)
     rows = _rows_with_images(measurements)
     found = []
     for row, parts in zip(rows, run(search, rows), strict=True):
         found.append(parts)
+        blurs = [part.blur for part in parts if np.isfinite(part.blur)]
+        if blur_of_row is not None and blurs:
+            blur_of_row[row] = blurs[0]  # that of the image
         if progress is not None:
             progress(row)
     return _table(rows, found)
@@ -120,7 +127,7 @@ class _Guide:
 
 def _search_outlines(
     guide: _Guide,
-    method: Method,
+    methods: Sequence[Method],
     leg_names: tuple[str, ...],
     pixel_error: float,
     row: int,
@@ -137,7 +144,7 @@ def _search_outlines(
     for leg in predicted:
         window[leg.leg] = pixel_error + guide.joint_error[view, leg.leg] * _pixels_per_metre(leg)
     grey = to_grey(guide.load(row))
-    found = method(grey, camera, predicted, leg_names, wanted, window)
+    found = methods[view](grey, camera, predicted, leg_names, wanted, window)
     missing = set(np.flatnonzero(wanted).tolist()) - {leg.leg for leg in predicted}
     found.extend(_unsearched(j, cylinders[j], OUTSIDE) for j in missing if len(cylinders[j]))
     return sorted(found, key=lambda part: part.leg)

@@ -63,7 +63,11 @@ class MeasuredEdge:
 
 
 def measure_edges(
-    grey: Grey, camera: Camera, edges: Sequence[Edge], together: bool = True
+    grey: Grey,
+    camera: Camera,
+    edges: Sequence[Edge],
+    together: bool = True,
+    blur: float | None = None,
 ) -> tuple[list[MeasuredEdge | None], float]:
     """Fit the limb model and straight lines to all edges of an image.
 
@@ -78,6 +82,9 @@ def measure_edges(
     together : bool
         Fit all blocks of an outline together in the end; without it lines are good to a few
         hundredths of a pixel, in half the time.
+    blur : float, optional
+        Standard deviation of the blur as other images of the view show it [px]; the edges are then
+        taken to be known to a few tenths of a pixel.
 
     Returns
     -------
@@ -87,12 +94,13 @@ def measure_edges(
         Standard deviation of the blur of the image [px].
     """
     v = [edge.v for edge in edges]
-    blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, FIRST_BLOCKS)
-    if len(blocks.moved) == 0:
-        return [None] * len(edges), FIRST_BLUR
-    blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
-    blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
-    v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
+    if blur is None:
+        blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, FIRST_BLOCKS)
+        if len(blocks.moved) == 0:
+            return [None] * len(edges), FIRST_BLUR
+        blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
+        blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
+        v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     for _ in range(TRIALS):
         tried = blur
         blocks = Blocks.read(grey, camera, edges, v, tried)

@@ -4,6 +4,7 @@ Reading order: where the parts should be and what hides them; the pair of edges;
 fitted to all outlines of the image together; the verdict on each part, with the reason.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,7 +16,7 @@ from legcal.detection.pairs import Pair, PairSearch, block_positions, find_pairs
 from legcal.detection.picture import Grey
 from legcal.detection.pieces import Piece
 from legcal.detection.prediction import PredictedLeg, hidden_by
-from legcal.detection.verdict import LEAST_LENGTH, qualities, verdicts
+from legcal.detection.verdict import LEAST_LENGTH, qualities, verdict
 from legcal.geometry.types import Array, BoolArray
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
@@ -24,6 +25,7 @@ OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one
 MARGIN = 4.0  # beside a leg in front [px]
 NARROWEST = 5.0  # [px]
+NEAR_PREDICTION = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
 
 
 def _unknown() -> Array:
@@ -51,6 +53,8 @@ class PartOutlines:
     contrast, length, residual : (2,) array
         How well each was seen, as in :class:`legcal.observations.outlines.Outlines` [grey levels,
         px, px]; NaN where nothing was found.
+    blur : float
+        Standard deviation of the blur of the image [px]; NaN if it was not measured.
     """
 
     leg: int
@@ -62,6 +66,7 @@ class PartOutlines:
     contrast: Array = field(default_factory=_unknown)
     length: Array = field(default_factory=_unknown)
     residual: Array = field(default_factory=_unknown)
+    blur: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +104,12 @@ class FoundPart:
         """Half of the width that the edges have in the middle [px]."""
         return float(0.5 * np.mean(self.pair.v[1] - self.pair.v[0]))
 
+    @property
+    def near(self) -> Array:
+        """Offsets as predicted where an edge was found no farther than it is known, (2, 2) [px]."""
+        is_near = np.abs(self.pair.v - self.predicted).max() <= NEAR_PREDICTION
+        return self.predicted if is_near else self.pair.v
+
     def outlines(
         self, camera: Camera, lines: Sequence[tuple[Array, Array, Array] | None]
     ) -> PartOutlines:
@@ -134,6 +145,7 @@ def outline_parts(
     window: Array,
     *,
     together: bool = True,
+    blur: float | None = None,
 ) -> list[PartOutlines]:
     """Find and measure the outlines of all parts in one image.
 
@@ -151,8 +163,9 @@ def outline_parts(
         The legs to look for, by their index.
     window : (n_legs,) array
         Largest distance of an outline from its prediction [px].
-    together : bool
-        As for :func:`legcal.detection.measure.measure_edges`.
+    together, blur
+        As for :func:`legcal.detection.measure.measure_edges`; with a blur that is known, outlines
+        are taken to be where they are predicted, where an edge is seen there.
 
     Returns
     -------
@@ -161,7 +174,7 @@ def outline_parts(
     """
     parts, results = find_parts(grey, camera, legs, names, wanted, window)
     if parts:
-        results.extend(_measure(grey, camera, parts, together))
+        results.extend(_measure(grey, camera, parts, together, blur))
     return sorted(results, key=lambda result: result.leg)
 
 
@@ -264,17 +277,21 @@ def _in_front(
 
 
 def _measure(
-    grey: Grey, camera: Camera, parts: Sequence[FoundPart], together: bool
+    grey: Grey,
+    camera: Camera,
+    parts: Sequence[FoundPart],
+    together: bool,
+    blur: float | None,
 ) -> list[PartOutlines]:
     """Measure and judge the outlines of parts whose edges are known to a pixel."""
     edges = [
         Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
         for part in parts
-        for v, epsilon in zip(part.pair.v, EPSILON, strict=True)
+        for v, epsilon in zip(part.pair.v if blur is None else part.near, EPSILON, strict=True)
     ]
-    measured, _ = measure_edges(grey, camera, edges, together)
+    measured, blur = measure_edges(grey, camera, edges, together, blur)
     return [
-        _judge(camera, part, one, two)
+        replace(_judge(camera, part, one, two), blur=blur)
         for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True)
     ]
 
@@ -283,19 +300,23 @@ def _judge(
     camera: Camera, part: FoundPart, one: MeasuredEdge | None, two: MeasuredEdge | None
 ) -> PartOutlines:
     """Turn the measured edges of a part into outlines with verdicts."""
+    judged = verdict(part.pair, part.width, part.band.length, (one, two))
     lines = [
         None
         if edge is None
-        else (edge.v, np.array([edge.line.first, edge.line.last]), edge.covariance)
+        else (
+            edge.v,
+            np.array([edge.line.first, edge.line.last]),
+            edge.covariance + judged.bias**2,
+        )
         for edge in (one, two)
     ]
-    reasons = verdicts(part.pair, part.width, part.band.length, (one, two))
     contrast, length, residual = np.transpose(
         [qualities(edge, part.band.length) for edge in (one, two)]
     )
     return replace(
         part.outlines(camera, lines),
-        reasons=reasons,
+        reasons=judged.reasons,
         contrast=contrast,
         length=length,
         residual=residual,

@@ -9,14 +9,14 @@ that no other line near its prediction rivals may stand alone.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from legcal.detection.band import Band
 from legcal.detection.picture import Grey, sample
 from legcal.detection.sharpness import edge_sharpness
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.camera import Camera
 
 BLOCK_LENGTH = 8.0  # [px]
@@ -48,6 +48,12 @@ class Pair:
     v: Array
     found: BoolArray
     alone: BoolArray
+
+    def suits(self, width: Array) -> bool:
+        """Say whether both edges were found at the distance of the part's outlines (2,) [px]."""
+        off = np.abs(self.v[1] - self.v[0] - width)
+        tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
+        return bool(np.all(self.found) and np.all(off <= tolerance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +171,13 @@ def _edge_lines(
         hidden += [search.hidden] * 2
     pixels = camera.distort(np.concatenate(ends))
     # So near an edge the lens moves pixels in proportion to their distance from it.
-    part = np.linspace(0.0, 1.0, 2 * reach + 1)[:, None]
-    pixels = pixels[:, None, 0] + (pixels[:, None, 1] - pixels[:, None, 0]) * part
-    values, inside = sample(grey, camera, pixels)
+    part = np.linspace(0.0, 1.0, 2 * reach + 1, dtype=np.float32)
+    first, change = (
+        pixels[:, 0].astype(np.float32),
+        np.diff(pixels, axis=1)[:, 0].astype(np.float32),
+    )
+    x, y = (first[:, k : k + 1] + change[:, k : k + 1] * part for k in (0, 1))
+    values, inside = sample(grey, camera, x, y)
     n_columns = len(part)
     seen = inside.reshape(-1, ROWS, n_columns).all(axis=1) & ~np.concatenate(hidden)[:, None]
     profiles = values.reshape(-1, ROWS, n_columns).mean(axis=1)
@@ -183,13 +193,9 @@ def _edge_lines(
 
 def _lines(votes: Array, half: int) -> tuple[Array, Array]:
     """Add votes (n_blocks, 2 half + 1) along lines; return shifts and scores of separate maxima."""
-    position = (np.arange(len(votes)) + 0.5) / len(votes) - 0.5
     differences = np.arange(-half, half + 1)
-    reach = half // 2 + 1
-    padded = np.pad(votes, ((0, 0), (reach, reach)))
-    columns = np.rint(differences[:, None] * position).astype(np.intp) + reach
-    runs = sliding_window_view(padded, votes.shape[1], axis=1)
-    score = runs[np.arange(len(votes)), columns].sum(axis=1)
+    padded = np.pad(votes, ((0, 0), (half // 2 + 1, half // 2 + 1)))
+    score = padded.ravel()[_along_lines(len(votes), half)].sum(axis=1)
     shifts, scores = [], []
     for _ in range(KEPT):
         i, j = divmod(int(np.argmax(score)), score.shape[1])
@@ -199,3 +205,18 @@ def _lines(votes: Array, half: int) -> tuple[Array, Array]:
         scores.append(float(score[i, j]))
         score[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3] = 0.0
     return np.array(shifts, dtype=np.float64).reshape(-1, 2), np.array(scores)
+
+
+@lru_cache(maxsize=512)
+def _along_lines(n_blocks: int, half: int) -> IntArray:
+    """Return where votes lie along lines, by the difference of their ends and their middle.
+
+    (2 half + 1, n_blocks, 2 half + 1) places in a table (n_blocks, 2 (half + half // 2) + 3).
+    """
+    position = (np.arange(n_blocks) + 0.5) / n_blocks - 0.5
+    reach = half // 2 + 1
+    column = np.rint(np.arange(-half, half + 1)[:, None] * position).astype(np.intp) + reach
+    row = np.arange(n_blocks) * (2 * half + 1 + 2 * reach)
+    places = (row + column)[..., None] + np.arange(2 * half + 1)
+    places.setflags(write=False)
+    return places

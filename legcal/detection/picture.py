@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from legcal.detection.band import pixels_inside
-from legcal.geometry.types import Array, Image
+from legcal.geometry.types import Image
 from legcal.vision.camera import Camera
 
 Grey = NDArray[np.float32]
@@ -40,7 +39,7 @@ def reduce(grey: Grey, factor: int) -> Grey:
     return np.asarray(small, dtype=np.float32)
 
 
-def sample(grey: Grey, camera: Camera, pixels: Array) -> tuple[Grey, NDArray[np.bool_]]:
+def sample(grey: Grey, camera: Camera, x: Grey, y: Grey) -> tuple[Grey, NDArray[np.bool_]]:
     """Sample an image bilinearly.
 
     Parameters
@@ -49,7 +48,7 @@ def sample(grey: Grey, camera: Camera, pixels: Array) -> tuple[Grey, NDArray[np.
         The image.
     camera : Camera
         Its camera.
-    pixels : (n, m, 2) array
+    x, y : (n, m) array
         Where it is sampled [px].
 
     Returns
@@ -59,7 +58,6 @@ def sample(grey: Grey, camera: Camera, pixels: Array) -> tuple[Grey, NDArray[np.
     inside : (n, m) array of bool
         False for points outside the image, whose values repeat the border.
     """
-    inside = pixels_inside(camera, pixels, margin=0.5)
-    x, y = (np.ascontiguousarray(pixels[..., k], dtype=np.float32) for k in (0, 1))
+    inside = (x >= 0.5) & (x <= camera.width - 1.5) & (y >= 0.5) & (y <= camera.height - 1.5)
     values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float32), inside

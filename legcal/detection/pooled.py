@@ -20,7 +20,7 @@ from legcal.geometry.types import Array, BoolArray
 
 OPEN_BLUR, EVEN_BLUR = 0.7, 0.03  # of the logarithm of the blur, first and from edge to edge
 UNEQUAL_BLUR = 0.05  # that outlines of one image seem to have, in its logarithm
-FIRST_ROUNDS, LAST_ROUNDS = 3, 8  # at most
+FIRST_ROUNDS, LAST_ROUNDS = 2, 8  # at most
 
 
 @dataclass(frozen=True, eq=False)

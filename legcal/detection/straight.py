@@ -123,19 +123,17 @@ def fit_straights(
     ends = np.repeat(np.where(fits, start, 0.0)[:, None], 2, axis=1)
     factor, robust = np.ones(len(counts)), np.zeros(filled.shape)
     moving = fits.copy()
+    sigma, share = np.sqrt(floored), usable / floored
+    products = share * np.stack(
+        [(1.0 - along) ** 2, (1.0 - along) * along, along**2, (1.0 - along) * moved, along * moved]
+    )
     for turn in range(N_ROUNDS):
-        off = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
-        pull = np.abs(off) / np.sqrt(floored)
+        pull = np.abs(moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along) / sigma
         if turn < N_SCALES:
             scatter = 1.4826 * _medians(np.where(usable, pull, np.inf), n_usable)
             factor = np.where(fits, np.maximum(1.0, scatter), 1.0)
         counted = usable * np.maximum(1.0 - (pull / (TUKEY * factor[:, None])) ** 2, 0.0) ** 2
-        weight = counted / floored
-        one, other = weight * (1.0 - along), weight * along
-        a, b, c = (
-            np.sum(w * x, axis=1) for w, x in ((one, 1.0 - along), (one, along), (other, along))
-        )
-        p, q = np.sum(one * moved, axis=1), np.sum(other * moved, axis=1)
+        a, b, c, p, q = np.einsum("knm,nm->kn", products, counted)
         determinant = a * c - b * b
         lost = (np.count_nonzero(counted, axis=1) < LEAST_BLOCKS) | (determinant < 1e-9 * a * c)
         fits &= ~(moving & lost)

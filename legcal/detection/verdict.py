@@ -1,6 +1,7 @@
 """The verdict on both outlines of a part: how well they were seen, and whether to use them."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,20 +15,41 @@ LEAST_AGREEMENT = 0.6  # share of the blocks with an edge that must lie on the l
 LEAST_KEPT = 0.25  # share of all unhidden blocks that must
 LONE_KEPT = 0.5  # the same of an edge without its partner
 LARGEST_SCATTER = (0.6, 1.2)  # of the blocks of an edge: [px] and in blurs
-LARGEST_SIGMA = 0.5  # [px]
+LARGEST_SIGMA = 1.0  # [px]
 WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
+WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of a reason
+SURER = 0.75  # by which factor an outline must be surer than the edge of a shade
+NARROW_BIAS = 0.15  # of such an outline, in what the width is too small
 
 
-def verdicts(
+@dataclass(frozen=True)
+class Verdict:
+    """Which outlines of a part are used.
+
+    Attributes
+    ----------
+    reasons : tuple of two str
+        Why each outline cannot be trusted, "" if it can.
+    bias : float
+        How far used ones may be off besides their covariance [px].
+    """
+
+    reasons: tuple[str, str]
+    bias: float = 0.0
+
+
+def verdict(
     pair: Pair,
     expected: Array,
     length: float,
     measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
-) -> tuple[str, str]:
-    """Return why each edge of a part cannot be trusted, "" if it can.
+) -> Verdict:
+    """Judge both edges of a part.
 
-    Two edges vouch for each other by their distance. One whose partner fails must be
-    convincing by itself.
+    Two edges vouch for each other by their distance, as they were measured or at least as they were
+    found. One whose partner fails otherwise must be convincing by itself. Where they are too
+    near to each other, one is where light and shade meet on the leg: a bend that is known less
+    well than the other one, which is an outline.
 
     Parameters
     ----------
@@ -40,29 +62,52 @@ def verdicts(
     measured : tuple of two MeasuredEdge or None
         Edge 1 and edge 2; None where no straight line fits.
     """
-    one, two = measured
     width = float(np.mean(pair.v[1] - pair.v[0]))
     reasons = [
         _reason(edge, length, width) if seen else "no convincing edge"
         for edge, seen in zip(measured, pair.found, strict=True)
     ]
+    one, two = measured
+    if one is not None and two is not None and not any(reasons):
+        return _by_width(one, two, expected)
+    vouched = pair.suits(expected)
     stands = [
-        bool(may) and edge is not None and edge.is_step and np.mean(edge.line.kept) >= LONE_KEPT
+        bool(may or vouched) and edge is not None and _is_clear_step(edge)
         for edge, may in zip(measured, pair.alone, strict=True)
     ]
-    if one is not None and two is not None and not any(reasons):
-        widths = two.v - one.v
-        mismatch = np.abs(widths - expected) / (WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected)
-        if mismatch.max() > 1.0:
-            i = int(np.argmax(mismatch))
-            found = f"{widths[i]:.1f} px for {expected[i]:.1f} px"
-            return (f"width inconsistent with the radius, {found}",) * 2
-    partners = reasons[::-1]
     first, second = (
-        reason or ("" if not partner or alone else f"its other outline: {partner}")
-        for reason, partner, alone in zip(reasons, partners, stands, strict=True)
+        reason or ("" if alone else f"its other outline: {partner}")
+        for reason, partner, alone in zip(reasons, reasons[::-1], stands, strict=True)
     )
-    return first, second
+    return Verdict((first, second))
+
+
+def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array) -> Verdict:
+    """Judge two edges that may be trusted but for their distance."""
+    widths = two.v - one.v
+    mismatch = np.abs(widths - expected) / (WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected)
+    if mismatch.max() <= 1.0:
+        return Verdict(("", ""))
+    i = int(np.argmax(mismatch))
+    reason = f"{WRONG_WIDTH}, {widths[i]:.1f} px for {expected[i]:.1f} px"
+    sigma_one, sigma_two = _sigma(one), _sigma(two)
+    surer, ratio = (
+        (one, sigma_one / sigma_two) if sigma_one < sigma_two else (two, sigma_two / sigma_one)
+    )
+    if np.any(widths >= expected) or ratio > SURER or not _is_clear_step(surer):
+        return Verdict((reason, reason))
+    bias = NARROW_BIAS * float(np.abs(widths - expected).max())
+    return Verdict(("", reason) if surer is one else (reason, ""), bias)
+
+
+def _is_clear_step(edge: MeasuredEdge) -> bool:
+    """Say whether an edge is a step of the picture on most of its length."""
+    return edge.is_step and float(np.mean(edge.line.kept)) >= LONE_KEPT
+
+
+def _sigma(edge: MeasuredEdge) -> float:
+    """Return the standard deviation of an edge at its worse end [px]."""
+    return float(np.sqrt(np.diag(edge.covariance).max()))
 
 
 def qualities(edge: MeasuredEdge | None, length: float) -> tuple[float, float, float]:
@@ -112,7 +157,7 @@ def _reason(edge: MeasuredEdge | None, length: float, width: float) -> str:
         return f"low contrast, {edge.contrast:.1f} grey levels"
     if line.scatter > max(LARGEST_SCATTER[0], LARGEST_SCATTER[1] * edge.blur):
         return f"edge too rough, scatter {line.scatter:.2f} px"
-    sigma = float(np.sqrt(np.diag(edge.covariance).max()))
+    sigma = _sigma(edge)
     if sigma > LARGEST_SIGMA:
         return f"edge too uncertain, sigma {sigma:.2f} px"
     return ""

@@ -18,10 +18,12 @@ START_PICTURES = 1, 1, 2, 4  # whose bars suggest poses, as long as there is a d
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
 KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
 N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
+N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
 POLISH = (0.018, 0.012, 0.008)  # tolerances
 POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
 SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
+OTHER_TURN, OTHER_PLACE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
 SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
 MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
 JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
@@ -29,15 +31,15 @@ SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of a
 # Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
 # lead over the next pose in legs of all images together, and as a part.
 CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
-ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.12
-LEAST_SUPPORT = 1.6  # legs in all images together
+ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
+LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Poses of a camera, best first, each with other legs on other bars than the better ones.
+    """Poses of a camera, best first, each far from the better ones or with legs on other bars.
 
     Attributes
     ----------
@@ -108,7 +110,9 @@ class Placed:
         return RigidTransform.from_components(self.poses.t[i], R).inv()
 
 
-def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
+def place_camera(
+    pictures: Sequence[Picture], n_legs: int, starts: Sequence[int] = START_PICTURES
+) -> Placed:
     """Return the camera poses on which most legs of all pictures of a view agree.
 
     Parameters
@@ -117,24 +121,27 @@ def place_camera(pictures: Sequence[Picture], n_legs: int) -> Placed:
         Of one camera pose, at different readings.
     n_legs : int
         Number of legs of the machine.
+    starts : sequence of int
+        How many pictures more suggest poses, as long as there is a doubt.
     """
     by_merit = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
     best_first = [pictures[k] for k in by_merit]
     nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
     best = _judged(pictures, nothing)
     done = 0
-    for n in START_PICTURES:
+    for n in starts:
         if done >= len(pictures):
             break
-        starts = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
+        suggested = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
         done += n
-        poses = joined([best.poses, *starts])
+        poses = joined([best.poses, *suggested])
         if len(poses) == 0:
             continue
         poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
         some = best_first[: max(SOME_PICTURES, done)]
         score = supports(some, poses, TOLERANCES[3])[0].sum(axis=1)
         poses = poses.take(_distinct(poses, score, KEPT[2]))
+        poses = joined([poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))])
         poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
         score = supports(some, poses, TOLERANCES[-1])[0].sum(axis=1)
         poses = poses.take(_best(score, KEPT[3]))
@@ -158,6 +165,25 @@ def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
         score = supports(pictures, around, POLISH[-1])[0].sum(axis=1)
         found.append(around.take(_best(score, 1)))
     return joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
+
+
+def _reversed(pictures: Sequence[Picture], poses: Poses) -> Poses:
+    """Return the poses that show a flat machine alike from far: near and far exchanged.
+
+    The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
+    through its middle that faces the camera.
+    """
+    ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
+    if len(ends) == 0:
+        return poses
+    middle = ends.mean(axis=0)
+    normal = np.linalg.svd(ends - middle, full_matrices=False)[2][2]
+    at = poses.R @ middle + poses.t
+    facing = at / np.linalg.norm(at, axis=1, keepdims=True)
+    in_plane = np.eye(3) - 2.0 * np.outer(normal, normal)
+    in_depth = np.eye(3) - 2.0 * facing[:, :, None] * facing[:, None, :]
+    R = in_depth @ poses.R @ in_plane
+    return Poses.rigid(R, at - R @ middle, poses.shift.shape[1])
 
 
 def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Poses:
@@ -205,7 +231,7 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
     expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / JOINT_ERROR**2
     score = support.sum(axis=1) - SHIFT_COST * cost
-    order = _different(pictures, found, [v >= MATCHED for v in values], score)
+    order = _different(pictures, poses, found, [v >= MATCHED for v in values], score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
     return Placed(poses.take(order), support[order], expected[order], score[order], error)
@@ -213,11 +239,16 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
 
 def _different(
     pictures: Sequence[Picture],
+    poses: Poses,
     found: Sequence[Agreement],
     matched: Sequence[BoolArray],
     score: Array,
 ) -> IntArray:
-    """Return the poses, best first, that put other legs on other bars than better ones do."""
+    """Return the poses, best first, that put other legs on other bars than better ones do.
+
+    So do poses that are far from them: legs in a plane that is seen from its edge are on the same
+    bars from below.
+    """
     common = np.zeros((len(score), len(score)))
     for picture, agreed, match in zip(pictures, found, matched, strict=True):
         if len(picture.bars) == 0:
@@ -229,7 +260,8 @@ def _different(
     least = np.maximum(np.diag(common), 1.0)
     kept: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
-        if np.max(common[i, kept] / least[i], initial=0.0) < SAME_MATCHES:
+        alike = common[i, kept] / least[i] >= SAME_MATCHES
+        if not np.any(alike & _near(poses, kept, i, OTHER_TURN, OTHER_PLACE)):
             kept.append(i)
     return np.array(kept, dtype=np.intp)
 
@@ -310,15 +342,19 @@ def _best(score: Array, n: int) -> IntArray:
 def _distinct(poses: Poses, score: Array, n: int) -> IntArray:
     """Return the best poses that differ from better ones."""
     kept: list[int] = []
-    distance = np.linalg.norm(poses.t, axis=1)
     for i in np.argsort(-score, kind="stable").tolist():
         if len(kept) == n:
             break
-        if kept:
-            trace = np.einsum("kij,ij->k", poses.R[kept], poses.R[i])
-            turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
-            apart = np.linalg.norm(poses.t[kept] - poses.t[i], axis=1)
-            if np.any((turn < SAME_TURN) & (apart < SAME_PLACE * distance[i])):
-                continue
-        kept.append(i)
+        if not np.any(_near(poses, kept, i, SAME_TURN, SAME_PLACE)):
+            kept.append(i)
     return np.array(kept, dtype=np.intp)
+
+
+def _near(poses: Poses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
+    """Return which of some poses are within an angle and a part of the distance of pose i."""
+    trace = np.einsum("kij,ij->k", poses.R[some], poses.R[i])
+    turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+    # Where the camera stands in the base link.
+    at = -np.einsum("kij,ki->kj", poses.R[some], poses.t[some])
+    apart = np.linalg.norm(at + poses.R[i].T @ poses.t[i], axis=1)
+    return np.asarray((turn < angle) & (apart < part * np.linalg.norm(poses.t[i])))

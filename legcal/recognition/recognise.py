@@ -20,7 +20,7 @@ from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import find_bars
 from legcal.recognition.groups import Group, group_views
 from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
-from legcal.recognition.place import Placed, place_camera, place_near
+from legcal.recognition.place import START_PICTURES, Placed, place_camera, place_near
 from legcal.recognition.radii import (
     LEFT,
     MOST_TURNS,
@@ -38,6 +38,7 @@ from legcal.workers import Run, in_turn
 Load = Callable[[int], Image]
 RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
+MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
 
@@ -202,14 +203,17 @@ def _anywhere(
     pictures: dict[int, Picture],
     search: Search,
     run: Run,
+    starts: Sequence[int] = START_PICTURES,
 ) -> list[Placed]:
     """Return the cameras of some groups by all of their images, searched for anywhere."""
     of_group = [groups[g].pictures(pictures, groups[g].rows) for g in chosen]
-    return list(run(partial(_place, of_group, search.n_legs), range(len(chosen))))
+    return list(run(partial(_place, of_group, search.n_legs, starts), range(len(chosen))))
 
 
-def _place(groups: Sequence[Sequence[Picture]], n_legs: int, group: int) -> Placed:
-    return place_camera(groups[group], n_legs)
+def _place(
+    groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], group: int
+) -> Placed:
+    return place_camera(groups[group], n_legs, starts)
 
 
 def _radii(
@@ -296,7 +300,8 @@ def _gathered(
     unplaced: dict[int, str] = {}
     doubted = [g for g, placed in enumerate(poses) if may_be_mirrored(placed)]
     flipped = {row: one for g in doubted for row, one in _flipped(groups[g], pictures).items()}
-    mirrors = dict(zip(doubted, _anywhere(groups, doubted, flipped, search, run), strict=True))
+    others = _anywhere(groups, doubted, flipped, search, run, starts=MIRRORED_STARTS)
+    mirrors = dict(zip(doubted, others, strict=True))
     for g, (group, placed) in enumerate(zip(groups, poses, strict=True)):
         name = named([views[v].name for v in group.views])
         exchanged = g in mirrors and is_mirrored(placed, mirrors[g])

@@ -1,0 +1,164 @@
+"""How fast photographs are turned into outlines, and whether memory grows with their number.
+
+    OMP_NUM_THREADS=1 python benchmarks/speed.py [--memory N]
+
+The images of the sample dataset (1024 x 768, six legs) are decoded beforehand. Times are those of
+the processor, for one image: what is seen of exposure and blur; legs recognised and cameras placed,
+near rough camera poses or without any; the brief measurement of all outlines near there, and the
+one with all care near a fit. Of these images/s, "measured once" is what a first measurement asks,
+recognition included, and "calibrate" is all that a calibration does with an image. Peak memory is
+that of processes which measure N and 3 N images that they read one by one.
+"""
+
+import argparse
+import multiprocessing
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.dataset.folder import load_dataset
+from legcal.detection.exposure import expose
+from legcal.detection.outline import outline_parts
+from legcal.detection.picture import to_grey
+from legcal.geometry.types import Image
+from legcal.mechanism.kinematics import forward_kinematics
+from legcal.observations.sets import no_outlines
+from legcal.photographs import Photographs, Placement, Scene, detect, place, usual_blur
+from legcal.progress import no_progress
+from legcal.workers import in_turn
+
+DATASET = Path(__file__).resolve().parents[1] / "examples" / "hexapod"
+N_MEMORY = 15
+
+T = TypeVar("T")
+
+
+def sample() -> tuple[Photographs, Scene]:
+    """Return the images of the sample and the nominal scene, with rough camera poses."""
+    dataset = load_dataset(DATASET)
+    mechanism, measurements = dataset.mechanism, dataset.measurements
+    platforms = [forward_kinematics(mechanism, q) for q in measurements.q]
+    A = np.repeat(mechanism.A_base[None], measurements.n_rows, axis=0)
+    B = np.array([T.apply(mechanism.B_platform) for T in platforms])
+    rows = np.arange(measurements.n_rows)
+    load = dataset.image_reader(rows.tolist())
+    photographs = Photographs(mechanism, measurements, load, in_turn, rows, no_outlines())
+    return photographs, Scene(A, B, tuple(view.T_base_camera for view in measurements.views))
+
+
+def without_poses(scene: Scene) -> Scene:
+    """Return a scene of whose cameras nothing is known."""
+    nothing: tuple[RigidTransform | None, ...] = (None,) * len(scene.T_base_camera)
+    return replace(scene, T_base_camera=nothing)
+
+
+class Stopwatch:
+    """Times of stages [ms of the processor an image]."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.spent = n, dict[str, float]()
+
+    def __call__(self, stage: str, action: Callable[[], T]) -> T:
+        """Return what an action gives, and take its time."""
+        begin = time.process_time()
+        result = action()
+        self.spent[stage] = 1e3 * (time.process_time() - begin) / self.n
+        print(f"{stage:44s}{self.spent[stage]:8.1f} ms", flush=True)
+        return result
+
+    def rate(self, words: str, *stages: str) -> None:
+        """Print how many images a second some stages let through."""
+        total = sum(self.spent[stage] for stage in stages)
+        print(f"{words:44s}{total:8.1f} ms{1e3 / total:8.1f} images/s")
+
+
+def measure_speed() -> None:
+    """Print the time of every stage, and images a second."""
+    photographs, scene = sample()
+    rows = photographs.detect.tolist()
+    decoded: list[Image] = [np.asarray(photographs.load(row)) for row in rows]
+    photographs = replace(photographs, load=decoded.__getitem__)
+    watch = Stopwatch(len(rows))
+    begin = np.array(rows[:3])
+    detect(replace(photographs, detect=begin), scene, no_progress)  # what is computed only once
+    watch("exposure and blur", lambda: [expose(to_grey(image)) for image in decoded])
+    near = watch("recognition near poses", lambda: place(photographs, scene, no_progress))
+    watch("recognition without", lambda: place(photographs, without_poses(scene), no_progress))
+    blurs: dict[int, float] = {}
+    brief = partial(outline_parts, together=False)
+    watch(
+        "outlines in brief",
+        lambda: detect(photographs, near.scene, no_progress, method=brief, blur_of_row=blurs),
+    )
+    watch("outlines with all care", lambda: detect(photographs, near.scene, no_progress))
+    methods = [partial(outline_parts, blur=blur) for blur in usual_blur(photographs, blurs)]
+    fitted = settled(photographs, near)
+    watch(
+        "outlines with all care near a fit",
+        lambda: detect(photographs, fitted, no_progress, near_fit=True, method=methods),
+    )
+    for words in ("near poses", "without"):
+        begins = "exposure and blur", f"recognition {words}", "outlines in brief"
+        watch.rate(f"measured once, {words}", *begins)
+        watch.rate(f"calibrate, {words}", *begins, "outlines with all care near a fit")
+
+
+def settled(photographs: Photographs, placement: Placement) -> Scene:
+    """Return the scene that the images show, which a fit would hardly change."""
+    return replace(placement.scene, joint_error=0.0)
+
+
+def peak_memory(n: int) -> float:
+    """Return the greatest memory of a process that measures n images [MB]."""
+    photographs, scene = sample()
+    rows = np.arange(n) % len(photographs.detect)
+    measurements = photographs.measurements
+    measurements = replace(
+        measurements,
+        image=tuple(measurements.image[row] for row in rows),
+        view=measurements.view[rows],
+        pose=np.arange(n),
+        q=measurements.q[rows],
+    )
+    load = photographs.load
+    photographs = replace(
+        photographs,
+        measurements=measurements,
+        load=lambda row: load(int(rows[row])),
+        detect=np.arange(n),
+    )
+    scene = replace(scene, A_base=scene.A_base[rows], B_base=scene.B_base[rows])
+    for row in range(n):
+        expose(to_grey(photographs.load(row)))
+    detect(photographs, place(photographs, scene, no_progress).scene, no_progress)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def measure_memory(n: int) -> None:
+    """Print the greatest memory for n and 3 n images."""
+    context = multiprocessing.get_context("spawn")
+    for count in (n, 3 * n):
+        with context.Pool(1) as pool:
+            print(
+                f"{f'peak memory, {count} images':44s}{pool.apply(peak_memory, (count,)):8.0f} MB"
+            )
+
+
+def main() -> None:
+    """Measure speed, then memory."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--memory", type=int, default=N_MEMORY, help=f"images; {N_MEMORY}")
+    options = parser.parse_args()
+    measure_speed()
+    measure_memory(options.memory)
+
+
+if __name__ == "__main__":
+    main()
