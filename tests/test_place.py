@@ -171,3 +171,13 @@ def test_a_flat_machine_is_seen_alike_with_near_and_far_exchanged() -> None:
     again = _reversed([nothing], other)
     assert np.allclose(again.R, poses.R)
     assert np.allclose(again.t, poses.t)
+
+
+@pytest.mark.parametrize(("rival", "is_believed"), [(2.0, True), (2.6, False)])
+def test_few_legs_are_believed_only_without_a_rival(rival: float, is_believed: bool) -> None:
+    poses = Poses.rigid(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 6)
+    support, expected = np.array([[0.9] * 4, [rival / 4] * 4]), np.full((2, 4), 6.0)
+    placed = Placed(poses, support, expected, support.sum(axis=1), np.zeros(6))
+    assert 0.12 < placed.share < 0.2
+    assert placed.is_convincing == is_believed
+    assert not placed.is_clear

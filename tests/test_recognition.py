@@ -1,5 +1,7 @@
 """Cameras and legs from bars of known geometry: right, or refused, never guessed."""
 
+from typing import ClassVar
+
 import cv2
 import numpy as np
 import pytest
@@ -7,12 +9,14 @@ from numpy.random import Generator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import load_mechanism
-from legcal.geometry.types import Array
+from legcal.geometry.types import Array, Image
 from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
+from legcal.observations.measurements import Measurements, View
 from legcal.recognition.agreement import Picture, Poses, agreement, improved
 from legcal.recognition.bars import Bars, find_bars
 from legcal.recognition.place import Placed, place_camera, place_near
+from legcal.recognition.recognise import Recognised, Search, recognise
 from legcal.recognition.segments import Segments, find_segments
 from legcal.recognition.starts import pose_starts
 from legcal.recognition.targets import Targets, targets_of
@@ -21,6 +25,7 @@ from legcal.vision.cylinder import outlines_of_axis
 
 PIXEL = 2.0 / 1000.0
 CORNERS = np.array([[-0.52, -0.4], [0.52, 0.4]])
+CAMERA = Camera(np.array([[500.0, 0.0, 260.0], [0.0, 500.0, 200.0], [0.0, 0.0, 1.0]]), 520, 400)
 
 
 @pytest.fixture(scope="module")
@@ -227,3 +232,59 @@ def test_an_empty_picture_has_neither_edges_nor_bars() -> None:
     segments = find_segments(np.zeros((240, 320), dtype=np.float32), camera)
     assert len(segments) == 0
     assert len(find_bars(Segments(segments.ends, segments.covered, segments.pixel))) == 0
+
+
+class _Known(Search):
+    """A search whose pictures are made already."""
+
+    made: ClassVar[list[Picture]] = []
+
+    def picture(self, row: int) -> Picture:
+        return self.made[row]
+
+
+def _recognised(
+    mechanism: Mechanism, pictures: list[Picture], hint: RigidTransform | None
+) -> Recognised:
+    """Return what is recognised in the pictures of one view."""
+    n, n_legs = len(pictures), mechanism.n_legs
+    rows, names = np.arange(n), tuple(f"{k}.png" for k in range(n))
+    measurements = Measurements(
+        (View("c1", CAMERA),), names, np.zeros(n, dtype=np.intp), rows, np.zeros((n, n_legs)), 1e-6
+    )
+    nowhere, cylinders = np.zeros((n, n_legs, 3)), [leg.cylinders for leg in mechanism.legs]
+    wanted = np.ones((1, n_legs), dtype=np.bool_)
+    search = _Known(_no_image, measurements, nowhere, nowhere, cylinders, wanted)
+    _Known.made[:] = pictures
+    return recognise(search, rows, [hint])
+
+
+def _no_image(row: int) -> Image:
+    raise AssertionError(row)
+
+
+@pytest.mark.parametrize("hidden", [2, 3])
+def test_many_images_with_a_rough_pose_and_hidden_legs_are_placed(
+    hexapod: Mechanism, hidden: int
+) -> None:
+    rng = np.random.default_rng(hidden)
+    T = looking_at(np.array([0.8, -0.5, 0.35]), CENTRE, 0.4)
+    pictures = pictures_of(hexapod, T, readings_of(hexapod, 15, rng), rng, 10, hidden)
+    found = _recognised(hexapod, pictures, T).T_base_camera[0]
+    assert found is not None
+    assert np.degrees((T.inv() * found).rotation.magnitude()) < 2.0
+
+
+@pytest.mark.parametrize("spread", [0.05, 0.1])
+def test_a_rough_pose_turned_by_a_symmetry_of_the_machine_is_not_believed(
+    hexapod: Mechanism, spread: float
+) -> None:
+    rng = np.random.default_rng(1)
+    T = looking_at(np.array([0.9, 0.3, 0.35]), CENTRE, 0.2)
+    travel = np.array([leg.travel for leg in hexapod.legs])
+    share = 0.5 + spread * rng.uniform(-1.0, 1.0, (3, 6))
+    pictures = pictures_of(hexapod, T, travel[:, 0] + share * np.ptp(travel, axis=1), rng, 10, 0)
+    turned = RigidTransform.from_rotation(Rotation.from_euler("z", 120.0, degrees=True)) * T
+    found = _recognised(hexapod, pictures, turned).T_base_camera[0]
+    assert found is not None
+    assert np.degrees((T.inv() * found).rotation.magnitude()) < 2.0

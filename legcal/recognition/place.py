@@ -32,6 +32,8 @@ SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of a
 # lead over the next pose in legs of all images together, and as a part.
 CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
 ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
+FEW_SUPPORT, FEW_LEAD, FEW_PART = 0.12, 0.9, 0.3  # of one that shows few legs and has no rival
+HINTED_SUPPORT = 0.6  # share near a rough pose that leaves no doubt
 LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
@@ -69,7 +71,9 @@ class Placed:
     def needed(self) -> float:
         """How many legs must agree in a picture on average for a pose to be believed."""
         n = self.support.shape[1]
-        return float(max(ENOUGH_SUPPORT * self.expected[0].mean(), LEAST_SUPPORT / n))
+        alone = not self.hinted and self._leads(FEW_LEAD, FEW_PART)
+        share = FEW_SUPPORT if alone else ENOUGH_SUPPORT
+        return float(max(share * self.expected[0].mean(), LEAST_SUPPORT / n))
 
     @property
     def is_enough(self) -> bool:
@@ -93,7 +97,9 @@ class Placed:
         """Whether the first pose leaves no doubt, so that no further search is needed."""
         if not self.is_enough:
             return False
-        return self.share >= CLEAR_SUPPORT and (self.hinted or self._leads(CLEAR_LEAD, CLEAR_PART))
+        if self.hinted:
+            return self.share >= HINTED_SUPPORT
+        return self.share >= CLEAR_SUPPORT and self._leads(CLEAR_LEAD, CLEAR_PART)
 
     @property
     def share(self) -> float:

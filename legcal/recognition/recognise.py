@@ -166,7 +166,12 @@ def recognise(
     missing = [r for g in doubted for r in groups[g].rows if r not in pictures]
     pictures |= _pictures(search, missing, progress, run)
     for g, anywhere in zip(doubted, _anywhere(groups, doubted, pictures, search, run), strict=True):
-        found[g] = _better(found[g], anywhere)
+        hint = groups[g].hint
+        if hint is None:
+            found[g] = anywhere
+            continue
+        of_group = groups[g].pictures(pictures, groups[g].rows)
+        found[g] = _better(place_near(of_group, hint, search.n_legs), anywhere)
     placed = [one for one in found if one is not None]
     radii = NO_OTHER_RADII
     if doubtful:
@@ -203,11 +208,10 @@ def _anywhere(
     pictures: dict[int, Picture],
     search: Search,
     run: Run,
-    starts: Sequence[int] = START_PICTURES,
 ) -> list[Placed]:
     """Return the cameras of some groups by all of their images, searched for anywhere."""
     of_group = [groups[g].pictures(pictures, groups[g].rows) for g in chosen]
-    return list(run(partial(_place, of_group, search.n_legs, starts), range(len(chosen))))
+    return list(run(partial(_place, of_group, search.n_legs, START_PICTURES), range(len(chosen))))
 
 
 def _place(
@@ -271,10 +275,8 @@ def _placed_again(
     return found
 
 
-def _better(near: Placed | None, anywhere: Placed) -> Placed:
+def _better(near: Placed, anywhere: Placed) -> Placed:
     """Return the pose with the greater support, that near a rough pose if they are alike."""
-    if near is None:
-        return anywhere
     if len(anywhere.poses) == 0 or not anywhere.is_convincing:
         return near
     if len(near.poses) == 0:
@@ -299,9 +301,9 @@ def _gathered(
     error = np.full((n_views, n_legs), UNSEEN_ERROR)
     unplaced: dict[int, str] = {}
     doubted = [g for g, placed in enumerate(poses) if may_be_mirrored(placed)]
-    flipped = {row: one for g in doubted for row, one in _flipped(groups[g], pictures).items()}
-    others = _anywhere(groups, doubted, flipped, search, run, starts=MIRRORED_STARTS)
-    mirrors = dict(zip(doubted, others, strict=True))
+    flipped = [_flipped(groups[g], poses[g], pictures) for g in doubted]
+    place = partial(_place, flipped, n_legs, MIRRORED_STARTS)
+    mirrors = dict(zip(doubted, run(place, range(len(doubted))), strict=True))
     for g, (group, placed) in enumerate(zip(groups, poses, strict=True)):
         name = named([views[v].name for v in group.views])
         exchanged = g in mirrors and is_mirrored(placed, mirrors[g])
@@ -320,10 +322,10 @@ def _gathered(
     return Recognised(found, shift, error, unplaced, radii)
 
 
-def _flipped(group: Group, pictures: dict[int, Picture]) -> dict[int, Picture]:
-    """Return the pictures of a group with left and right exchanged."""
-    found = mirrored([pictures[row] for row in group.rows])
-    return dict(zip(group.rows, found, strict=True))
+def _flipped(group: Group, placed: Placed, pictures: dict[int, Picture]) -> list[Picture]:
+    """Return the pictures by which a group was placed, with left and right exchanged."""
+    few = placed.hinted and placed.support.shape[1] == len(group.some)
+    return mirrored(group.pictures(pictures, group.some if few else group.rows))
 
 
 def corners_of(camera: Camera) -> Array:
