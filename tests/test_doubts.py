@@ -166,8 +166,8 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     assert list(found.unplaced) == ["c1"]
     assert "images show the legs if left and right are exchanged" in found.unplaced["c1"]
     assert len(found.notes) == 2
-    assert re.match(r"view c2: its T_base_camera was not used: .*it suits view c3", found.notes[0])
-    assert re.match(r"view c3: its T_base_camera was not used: .*it suits view c2", found.notes[1])
+    assert re.match(r"view c2: its T_base_camera is wrong: .*it suits view c3", found.notes[0])
+    assert re.match(r"view c3: its T_base_camera is wrong: .*it suits view c2", found.notes[1])
 
 
 def test_a_rough_pose_may_be_off_by_what_rough_poses_are() -> None:

@@ -1,7 +1,7 @@
 """Grey levels as light: what the lens blurs is light, and many cameras encode it.
 
 A camera with a gamma g writes (light)^(1/g). A blurred step between dark and bright is then no
-blurred step of grey levels: taken for one, it lies up to 0.3 px towards the dark side, so
+blurred step of grey levels: taken for one, it lies half of the blur towards the dark side, so
 that bright legs seem thicker before a dark background, and dark ones thinner before a bright one.
 """
 

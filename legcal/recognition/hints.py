@@ -57,7 +57,7 @@ def hint_notes(
             else f"it suits view {other}: check whether views or their images were exchanged"
         )
         notes.append(
-            f"view {name}: its T_base_camera was not used: found it {1e3 * apart:.0f} mm and "
+            f"view {name}: its T_base_camera is wrong: found it {1e3 * apart:.0f} mm and "
             f"{np.degrees(angle):.0f} deg from where the images put the camera (xyz: [{x:.3f}, "
             f"{y:.3f}, {z:.3f}]), needed a rough pose; {remedy}."
         )

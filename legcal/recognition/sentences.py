@@ -33,7 +33,8 @@ def placing_problem(name: str, placed: Placed, hinted: bool, *, is_mirrored: boo
             f"view {name}: its camera could not be placed: found no pose {where} at which its "
             f"images show the legs (at the best one {legs:.1f} of {n:.0f} legs an image), needed "
             f"{placed.needed:.1f}; check that the images belong to this machine and to their "
-            "readings, that they are no mirror images, and the camera file."
+            "readings, that they are no mirror images, the camera file, and the legs of the view "
+            "if dataset.yaml names them."
         )
     other = placed.pose(1)
     apart = placed.pose().inv() * other
