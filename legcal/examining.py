@@ -120,14 +120,14 @@ def observe(
     doubted = _doubted(found, view)
     usual = _usual(photographs, placement, found, doubted)
     explained = _explained(photographs, placement, usual, doubted)
-    reasons = {row: why for row, why in defects.items() if row in placed}
-    notes = []
+    lost = _lost_views(photographs, usable)  # each has a sentence of its own
+    reasons = dict(defects)
+    notes = defect_notes(photographs, {r: w for r, w in defects.items() if view[r] not in lost})
     for row, explanation in explained.items():
         reason, note = judged(photographs, row, explanation, usual, found)
         notes.append(note)
         if reason:
             reasons[row] = reason
-    notes = [*defect_notes(photographs, {r: w for r, w in defects.items() if r in placed}), *notes]
     notes += leg_notes(photographs, placement, outlines, found, reasons)
     placement = replace(placement, notes=(*placement.notes, *notes))
     blur = usual_blur(photographs, blurs)
@@ -186,16 +186,20 @@ def _defects(photographs: Photographs, report: Report) -> dict[int, str]:
     return image_defects(exposures, {row: int(view[row]) for row in rows})
 
 
+def _lost_views(photographs: Photographs, usable: IntArray) -> set[int]:
+    """Return the searched views all of whose images show nothing."""
+    view = photographs.measurements.view
+    return set(view[photographs.detect].tolist()) - set(view[usable].tolist())
+
+
 def _without_images(
     photographs: Photographs, placement: Placement, usable: IntArray, defects: Mapping[int, str]
 ) -> Placement:
     """Return the placement with views unplaced all of whose images show nothing."""
     measurements = photographs.measurements
-    lost = set(measurements.view[photographs.detect].tolist())
-    lost -= set(measurements.view[usable].tolist())
     cameras = list(placement.scene.T_base_camera)
     unplaced = dict(placement.unplaced)
-    for v in sorted(lost):
+    for v in sorted(_lost_views(photographs, usable)):
         name = measurements.views[v].name
         own = [row for row in defects if measurements.view[row] == v]
         cameras[v] = None

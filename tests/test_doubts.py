@@ -151,6 +151,24 @@ def _observed(made: Spoiled) -> Placement:
     return observe(work.photographs, scene, no_progress).placement
 
 
+def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
+    tmp_path: Path,
+) -> None:
+    made = spoiled(tmp_path / "views", 4, ("c1", "c2"))
+    black = [made.change("c1", k, lambda picture: 0 * picture) for k in range(3)]
+    made.change("c1", 3, _elsewhere)
+    for k in range(4):
+        made.change("c2", k, lambda picture: 0 * picture)
+    found = _observed(made)
+    assert list(found.unplaced) == ["c1", "c2"]
+    assert list(found.notes) == [
+        f"view c1, image {image}: was left out: the image is black, at most 0 of 255 grey levels; "
+        "take it again."
+        for image in black
+    ]
+    assert "in its 4 images" in found.unplaced["c2"]  # once for all of them
+
+
 def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     made = spoiled(tmp_path / "views", 4)
     for k in range(4):
