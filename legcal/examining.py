@@ -232,7 +232,10 @@ def visible_outlines(outlines: Outlines) -> BoolArray:
 
 
 def _doubted(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
-    """Return the images in which far fewer outlines were found than in others of their view."""
+    """Return the images in which far fewer outlines were found than in others of their view.
+
+    Where a view has few images, all others are compared with.
+    """
     doubted = []
     for row, count in found.items():
         own = [other.share for r, other in found.items() if view[r] == view[row]]
@@ -249,14 +252,17 @@ def _usual(
     found: Mapping[int, OutlineCount],
     doubted: Sequence[int],
 ) -> dict[int, float]:
-    """Return how much of the legs good images show, for views with images in doubt."""
+    """Return how much of the legs good images show, for views with images in doubt.
+
+    There is always a good one: an image is in doubt where others show far more.
+    """
     views = np.unique(photographs.measurements.view[list(doubted)]).tolist() if doubted else []
     usual = {}
     for v in views:
         good = {row: count for row, count in found.items() if row not in doubted}
         rows = witnesses(photographs, good, v)
         task = partial(share_shown, placement.search, placement.recognised)
-        usual[v] = float(np.median(list(photographs.run(task, rows)) or [0.0]))
+        usual[v] = float(np.median(list(photographs.run(task, rows))))
     return usual
 
 

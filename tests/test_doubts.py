@@ -17,15 +17,17 @@ from legcal.detection.exposure import expose
 from legcal.detection.picture import to_grey
 from legcal.disagreeing import disagreeing_images
 from legcal.errors import NotIdentifiable
-from legcal.examining import observe
+from legcal.examining import _usual, observe
+from legcal.image_notes import NOTHING_LIKE, OutlineCount, judged
 from legcal.overlays.detected import Detection
 from legcal.photographs import Placement, scene_at_poses
 from legcal.progress import no_progress
+from legcal.recognition.doubts import Explanation
 from legcal.recognition.hints import hint_notes
 from legcal.refinement.choices import Choices
 from legcal.refinement.rejections import DISAGREES
 from legcal.workers import in_turn
-from legcal.workpiece import workpiece
+from legcal.workpiece import Workpiece, workpiece
 
 N = 6
 
@@ -145,8 +147,12 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
             assert detected.outlines.used[own].mean() > 0.5
 
 
+def _work(made: Spoiled) -> Workpiece:
+    return workpiece(load_dataset(made.write()), in_turn, None, Choices(), use_cache=False)
+
+
 def _observed(made: Spoiled) -> Placement:
-    work = workpiece(load_dataset(made.write()), in_turn, None, Choices(), use_cache=False)
+    work = _work(made)
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
     return observe(work.photographs, scene, no_progress).placement
 
@@ -167,6 +173,24 @@ def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
         for image in black
     ]
     assert "in its 4 images" in found.unplaced["c2"]  # once for all of them
+
+
+def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: Path) -> None:
+    made = spoiled(tmp_path / "alone", 3, ("c1", "c2"))
+    work = _work(made)
+    photographs, view = work.photographs, work.measurements.view
+    placement = _observed(made)
+    (alone,) = np.flatnonzero(view == 1)[:1].tolist()
+    found = {row: OutlineCount(11, 12) for row in np.flatnonzero(view == 0).tolist()}
+    found[alone] = OutlineCount(1, 12)
+    usual = _usual(photographs, placement, found, [alone])
+    assert usual[1] > 0.3
+    reason, note = judged(photographs, alone, Explanation(0.0), usual, found)
+    assert reason == NOTHING_LIKE
+    assert "was left out: found 1 of 12 outlines where its reading has the legs" in note
+    reason, note = judged(photographs, alone, Explanation(usual[1]), usual, found)
+    assert reason == ""
+    assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
 
 
 def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
