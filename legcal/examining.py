@@ -48,6 +48,7 @@ USUALLY = 0.3  # the least that images of a view must find to be compared with
 GOOD = 75.0  # percentile of what images find, for what good ones do
 HARDLY = 0.3  # of the outlines of a part that should be seen
 
+NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
 
 @dataclass(frozen=True, eq=False)
 class Observed:
@@ -157,10 +158,14 @@ def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]
 
 
 def rejected(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
-    """Return outlines with those of some images rejected; edited ones stay."""
+    """Return outlines with those of some images rejected; edited ones stay.
+
+    Those that an image should not show keep the reason for that, so that they do not count as
+    expected there.
+    """
     out = np.isin(outlines.row, list(reasons)) & ~is_edited(outlines)
     reason = tuple(
-        reasons[row] if is_out else why
+        reasons[row] if is_out and not why.startswith(NOT_IN_SIGHT) else why
         for row, is_out, why in zip(
             outlines.row.tolist(), out.tolist(), outlines.reason, strict=True
         )
@@ -226,7 +231,7 @@ def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
 def visible_outlines(outlines: Outlines) -> BoolArray:
     """Return which outlines an image should show."""
     return np.array(
-        [not why.startswith((OUTSIDE, HIDDEN, NOT_PLACED)) for why in outlines.reason],
+        [not why.startswith((*NOT_IN_SIGHT, NOT_PLACED)) for why in outlines.reason],
         dtype=np.bool_,
     )
 

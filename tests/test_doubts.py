@@ -17,7 +17,7 @@ from legcal.detection.exposure import expose
 from legcal.detection.picture import to_grey
 from legcal.disagreeing import disagreeing_images
 from legcal.errors import NotIdentifiable
-from legcal.examining import _usual, observe
+from legcal.examining import _usual, observe, rejected
 from legcal.image_notes import NOTHING_LIKE, OutlineCount, judged
 from legcal.overlays.detected import Detection
 from legcal.photographs import Placement, scene_at_poses
@@ -113,6 +113,21 @@ def test_an_image_that_is_no_good_is_named_and_left_out(
     of_row = detected.outlines.row == bad.rows.index(row)
     assert of_row.any()
     assert not detected.outlines.used[of_row].any()
+
+
+def test_left_out_images_keep_what_they_should_not_show(example_run: Run) -> None:
+    o = example_run.calibration.solution.outlines
+    one = np.flatnonzero(o.row == o.row[0])[:4]
+    reasons = ("outside the image", "hidden by leg2", "low contrast, 2.1 grey levels", "")
+    reason, used = list(o.reason), o.used.copy()
+    for i, why in zip(one.tolist(), reasons, strict=True):
+        reason[i], used[i] = why, not why
+    before = replace(o, reason=tuple(reason), used=used)
+    out = rejected(before, {int(o.row[0]): "the image is black"})
+    assert not out.used[o.row == o.row[0]].any()
+    assert [out.reason[i] for i in one] == [*reasons[:2], *2 * ["the image is black"]]
+    others = o.row != o.row[0]
+    assert np.array_equal(out.used[others], before.used[others])
 
 
 def test_files_that_were_exchanged_are_told_from_each_other(
