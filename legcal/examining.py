@@ -43,12 +43,13 @@ from legcal.photographs import (
 from legcal.progress import Report
 from legcal.recognition.doubts import Explanation, explain, share_shown
 from legcal.recognition.radii import Part
+from legcal.vision.intrinsics import camera_numbers
 
 USUALLY = 0.3  # the least that images of a view must find to be compared with
 GOOD = 75.0  # percentile of what images find, for what good ones do
 HARDLY = 0.3  # of the outlines of a part that should be seen
-
 NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
+
 
 @dataclass(frozen=True, eq=False)
 class Observed:
@@ -187,8 +188,14 @@ def _defects(photographs: Photographs, report: Report) -> dict[int, str]:
     ):
         exposures[row] = exposure
         count(row)
-    view = photographs.measurements.view
-    return image_defects(exposures, {row: int(view[row]) for row in rows})
+    view, views = photographs.measurements.view, photographs.measurements.views
+    numbers = [camera_numbers(one.camera) for one in views]
+    camera = [numbers.index(own) for own in numbers]  # the first view of the same camera
+    return image_defects(
+        exposures,
+        {row: int(view[row]) for row in rows},
+        {row: camera[view[row]] for row in rows},
+    )
 
 
 def _lost_views(photographs: Photographs, usable: IntArray) -> set[int]:
@@ -209,9 +216,9 @@ def _without_images(
         own = [row for row in defects if measurements.view[row] == v]
         cameras[v] = None
         unplaced[name] = (
-            f"view {name}: its camera could not be placed: found nothing to see in its "
-            f"{len(own)} images ({measurements.image[own[0]]}: {defects[own[0]]}), needed "
-            "photographs of the legs; take them again."
+            f"view {name}: its camera could not be placed: found nothing to see in its {len(own)} "
+            f"image{'s' * (len(own) != 1)} ({measurements.image[own[0]]}: {defects[own[0]]}), "
+            "needed photographs of the legs; take them again."
         )
     scene = replace(placement.scene, T_base_camera=tuple(cameras))
     return replace(placement, scene=scene, unplaced=unplaced)

@@ -13,7 +13,7 @@ from hexapod_example import Run
 from spoiled import Picture, Spoiled, spoiled
 
 from legcal import calibrate, detect, load_dataset
-from legcal.detection.exposure import expose
+from legcal.detection.exposure import Exposure, expose, image_defects
 from legcal.detection.picture import to_grey
 from legcal.disagreeing import disagreeing_images
 from legcal.errors import NotIdentifiable
@@ -268,6 +268,33 @@ def test_blur_is_measured_whatever_the_light() -> None:
         for light in (0.3, 1.0):
             noisy = to_grey(light * smooth + rng.standard_normal(picture.shape))
             assert expose(noisy).blur == pytest.approx(blur, rel=0.35, abs=0.3)
+
+
+def test_blurred_images_are_compared_with_their_camera_where_their_view_has_few() -> None:
+    blurs = [0.8, 0.9, 1.0, 4.0, 3.8, 4.0]
+    exposures = {row: Exposure(10.0, 200.0, 150.0, blur) for row, blur in enumerate(blurs)}
+    alone, one = {row: row for row in exposures}, dict.fromkeys(exposures, 0)
+    soft = {row: int(row >= 4) for row in exposures}  # another camera, of which there are two
+    found = image_defects(exposures, alone, soft)
+    assert found == {3: "the image is blurred by 4.0 px, the others of its camera by 0.9"}
+    found = image_defects(exposures, one, soft)
+    assert [(row, "of its view" in why) for row, why in found.items()] == [
+        (row, True) for row in (3, 4, 5)
+    ]
+    soft = {row: int(row >= 3) for row in exposures}
+    assert image_defects(exposures, soft, one) == {}  # a soft view is compared with itself
+
+
+def test_a_blurred_image_that_is_alone_in_its_view_is_named(tmp_path: Path) -> None:
+    made = spoiled(tmp_path / "hand", 3, ("c1", "c2"))
+    image = made.change("c2", 1, _blurred)
+    made.rows = [*made.rows[:3], made.row("c2", 1)]
+    found = _observed(made)
+    assert list(found.unplaced) == ["c2"]
+    words = (
+        rf"in its 1 image \({image}: the image is blurred by \d\.\d px, the others of its camera"
+    )
+    assert re.search(words, found.unplaced["c2"]), found.unplaced
 
 
 @pytest.mark.parametrize(
