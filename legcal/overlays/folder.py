@@ -232,11 +232,14 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
 def _caption(detection: Detection, row: int) -> str:
     """Return what stands below the picture of a row."""
     view, outlines = detection.view_of(row), detection.outlines
+    measurements = detection.dataset.measurements
     here = outlines.used[outlines.row == row]
     said = f"{np.count_nonzero(here)} of {len(here)} outlines used"
     if view in detection.unplaced:
-        said = "the camera could not be placed: legs are drawn where dataset.yaml has it"
-    text = f"{view}  {detection.dataset.measurements.image[row]}  {said}"
+        said = "the camera could not be placed"
+        if detection.T_base_camera[int(measurements.view[row])] is not None:
+            said += ": legs are drawn where it was expected"
+    text = f"{view}  {measurements.image[row]}  {said}"
     return text.encode("ascii", "replace").decode()
 
 
