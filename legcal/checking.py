@@ -86,12 +86,15 @@ def check(
         work = workpiece(dataset, run, None, choices, use_cache=True, every_leg=False)
         found = observe_and_fit(work, np.arange(dataset.measurements.n_rows), progress)
     if dataset.axes is None and not found.outlines.used.any():
-        raise NotVisible(
+        refusal = (
             f"{dataset.folder}: the earlier result could not be tested: found no used outline in "
             "any image, needed some; take images that show the legs."
         )
+        raise NotVisible([refusal, *found.notes])
     solution = in_file_order(found.solution, found.part.order, dataset)
-    return _compare(dataset, earlier, solution, known, significance)
+    tested = _compare(dataset, earlier, solution, known, significance)
+    notes = (*dataset.notes, *found.notes, *found.doubts, *solution.notes)
+    return replace(tested, notes=tuple(dict.fromkeys(notes)))
 
 
 def check_significance(significance: float) -> None:
@@ -247,8 +250,7 @@ def _compare(
         _rms(shift[:, :3] ** 2),
         _rms(variance[:, :3]),
     )
-    notes = (*dataset.notes, *solution.notes)
-    return Check(dataset, earlier, solution, movement, at_platform, notes)
+    return Check(dataset, earlier, solution, movement, at_platform)
 
 
 def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:

@@ -7,7 +7,7 @@ written beside the dataset.
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from legcal.dataset.folder import Dataset, load_dataset
 from legcal.errors import DatasetError
 from legcal.examining import observe
 from legcal.geometry.types import IntArray
+from legcal.mechanism.leg import Cylinder
 from legcal.observations.canonical_order import inverse, restore_outlines
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import choose_outlines, reject_unused_legs
@@ -76,7 +77,7 @@ def detect(
     rows = _rows_with_image(dataset)
     with worker_pool(workers) as run:
         work = workpiece(dataset, run, None, Choices(), use_cache=False)
-        detection = _in_file_order(work, rows, *_observed(work, progress))
+        detection = _in_file_order(work, rows, _observed(work, progress))
         if output is not None:
             write_detection(detection, Path(output), run, progress)
     return detection
@@ -100,10 +101,33 @@ def _rows_with_image(dataset: Dataset) -> IntArray:
     return np.array(rows, dtype=np.intp)
 
 
-def _observed(
-    work: Workpiece, progress: Report
-) -> tuple[Outlines, Scene, dict[str, str], tuple[str, ...]]:
-    """Return all outlines, where the images put everything, unplaced views, and notes."""
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """What the images show, in the order of work.
+
+    Attributes
+    ----------
+    outlines : Outlines
+        All of them.
+    scene : Scene
+        Where the images put everything.
+    cylinders : tuple, for each leg a tuple of Cylinder
+        With the radii that the outlines were searched by.
+    unplaced : dict of str
+        Why views could not be placed, by name.
+    notes : tuple of str
+        What else a reader should know.
+    """
+
+    outlines: Outlines
+    scene: Scene
+    cylinders: tuple[tuple[Cylinder, ...], ...]
+    unplaced: dict[str, str]
+    notes: tuple[str, ...]
+
+
+def _observed(work: Workpiece, progress: Report) -> _Observed:
+    """Return what the images show."""
     photographs = work.photographs
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
     board = observe_board(work, progress)
@@ -113,7 +137,7 @@ def _observed(
             cameras = board.cameras(T_base_board, scene.T_base_camera)
             scene = replace(scene, T_base_camera=cameras)
     if len(photographs.detect) == 0:
-        return given_outlines(photographs), scene, {}, ()
+        return _Observed(given_outlines(photographs), scene, photographs.cylinders, {}, ())
     joined = None if board is None else board.T_board_camera
     observed = observe(photographs, scene, progress, joined)
     placement = observed.placement
@@ -131,29 +155,29 @@ def _observed(
     hints = [view.T_base_camera for view in views]
     cameras = placement.scene.T_base_camera
     notes = hint_notes([view.name for view in views], hints, cameras, BEFORE_FIT)
-    return found, scene, placement.unplaced, (*notes, *placement.notes)
+    return _Observed(
+        found,
+        scene,
+        observed.photographs.cylinders,
+        placement.unplaced,
+        (*notes, *placement.notes),
+    )
 
 
-def _in_file_order(
-    work: Workpiece,
-    images: IntArray,
-    outlines: Outlines,
-    scene: Scene,
-    unplaced: dict[str, str],
-    notes: tuple[str, ...],
-) -> Detection:
+def _in_file_order(work: Workpiece, images: IntArray, found: _Observed) -> Detection:
     """Return what was found in the order of the files."""
     dataset, order = work.dataset, work.order
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
-    restored = restore_outlines(outlines, order)
+    restored, scene = restore_outlines(found.outlines, order), found.scene
     names = dataset.mechanism.leg_names
     return Detection(
         dataset=dataset,
         outlines=reject_unused_legs(restored, dataset.measurements, names),
         A_base=scene.A_base[rows][:, legs],
         B_base=scene.B_base[rows][:, legs],
+        cylinders=tuple(found.cylinders[leg] for leg in legs.tolist()),
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
-        unplaced=unplaced,
-        notes=(*dataset.notes, *notes, *work.reached.notes(work.measurements)),
+        unplaced=found.unplaced,
+        notes=(*dataset.notes, *found.notes, *work.reached.notes(work.measurements)),
     )

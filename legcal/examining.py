@@ -43,10 +43,12 @@ from legcal.photographs import (
 from legcal.progress import Report
 from legcal.recognition.doubts import Explanation, explain, share_shown
 from legcal.recognition.radii import Part
+from legcal.vision.intrinsics import camera_numbers
 
 USUALLY = 0.3  # the least that images of a view must find to be compared with
 GOOD = 75.0  # percentile of what images find, for what good ones do
 HARDLY = 0.3  # of the outlines of a part that should be seen
+NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,14 +122,14 @@ def observe(
     doubted = _doubted(found, view)
     usual = _usual(photographs, placement, found, doubted)
     explained = _explained(photographs, placement, usual, doubted)
-    reasons = {row: why for row, why in defects.items() if row in placed}
-    notes = []
+    lost = _lost_views(photographs, usable)  # each has a sentence of its own
+    reasons = dict(defects)
+    notes = defect_notes(photographs, {r: w for r, w in defects.items() if view[r] not in lost})
     for row, explanation in explained.items():
         reason, note = judged(photographs, row, explanation, usual, found)
         notes.append(note)
         if reason:
             reasons[row] = reason
-    notes = [*defect_notes(photographs, {r: w for r, w in defects.items() if r in placed}), *notes]
     notes += leg_notes(photographs, placement, outlines, found, reasons)
     placement = replace(placement, notes=(*placement.notes, *notes))
     blur = usual_blur(photographs, blurs)
@@ -157,10 +159,14 @@ def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]
 
 
 def rejected(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
-    """Return outlines with those of some images rejected; edited ones stay."""
+    """Return outlines with those of some images rejected; edited ones stay.
+
+    Those that an image should not show keep the reason for that, so that they do not count as
+    expected there.
+    """
     out = np.isin(outlines.row, list(reasons)) & ~is_edited(outlines)
     reason = tuple(
-        reasons[row] if is_out else why
+        reasons[row] if is_out and not why.startswith(NOT_IN_SIGHT) else why
         for row, is_out, why in zip(
             outlines.row.tolist(), out.tolist(), outlines.reason, strict=True
         )
@@ -182,8 +188,20 @@ def _defects(photographs: Photographs, report: Report) -> dict[int, str]:
     ):
         exposures[row] = exposure
         count(row)
+    view, views = photographs.measurements.view, photographs.measurements.views
+    numbers = [camera_numbers(one.camera) for one in views]
+    camera = [numbers.index(own) for own in numbers]  # the first view of the same camera
+    return image_defects(
+        exposures,
+        {row: int(view[row]) for row in rows},
+        {row: camera[view[row]] for row in rows},
+    )
+
+
+def _lost_views(photographs: Photographs, usable: IntArray) -> set[int]:
+    """Return the searched views all of whose images show nothing."""
     view = photographs.measurements.view
-    return image_defects(exposures, {row: int(view[row]) for row in rows})
+    return set(view[photographs.detect].tolist()) - set(view[usable].tolist())
 
 
 def _without_images(
@@ -191,18 +209,16 @@ def _without_images(
 ) -> Placement:
     """Return the placement with views unplaced all of whose images show nothing."""
     measurements = photographs.measurements
-    lost = set(measurements.view[photographs.detect].tolist())
-    lost -= set(measurements.view[usable].tolist())
     cameras = list(placement.scene.T_base_camera)
     unplaced = dict(placement.unplaced)
-    for v in sorted(lost):
+    for v in sorted(_lost_views(photographs, usable)):
         name = measurements.views[v].name
         own = [row for row in defects if measurements.view[row] == v]
         cameras[v] = None
         unplaced[name] = (
-            f"view {name}: its camera could not be placed: found nothing to see in its "
-            f"{len(own)} images ({measurements.image[own[0]]}: {defects[own[0]]}), needed "
-            "photographs of the legs; take them again."
+            f"view {name}: its camera could not be placed: found nothing to see in its {len(own)} "
+            f"image{'s' * (len(own) != 1)} ({measurements.image[own[0]]}: {defects[own[0]]}), "
+            "needed photographs of the legs; take them again."
         )
     scene = replace(placement.scene, T_base_camera=tuple(cameras))
     return replace(placement, scene=scene, unplaced=unplaced)
@@ -222,13 +238,16 @@ def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
 def visible_outlines(outlines: Outlines) -> BoolArray:
     """Return which outlines an image should show."""
     return np.array(
-        [not why.startswith((OUTSIDE, HIDDEN, NOT_PLACED)) for why in outlines.reason],
+        [not why.startswith((*NOT_IN_SIGHT, NOT_PLACED)) for why in outlines.reason],
         dtype=np.bool_,
     )
 
 
 def _doubted(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
-    """Return the images in which far fewer outlines were found than in others of their view."""
+    """Return the images in which far fewer outlines were found than in others of their view.
+
+    Where a view has few images, all others are compared with.
+    """
     doubted = []
     for row, count in found.items():
         own = [other.share for r, other in found.items() if view[r] == view[row]]
@@ -245,14 +264,17 @@ def _usual(
     found: Mapping[int, OutlineCount],
     doubted: Sequence[int],
 ) -> dict[int, float]:
-    """Return how much of the legs good images show, for views with images in doubt."""
+    """Return how much of the legs good images show, for views with images in doubt.
+
+    There is always a good one: an image is in doubt where others show far more.
+    """
     views = np.unique(photographs.measurements.view[list(doubted)]).tolist() if doubted else []
     usual = {}
     for v in views:
         good = {row: count for row, count in found.items() if row not in doubted}
         rows = witnesses(photographs, good, v)
         task = partial(share_shown, placement.search, placement.recognised)
-        usual[v] = float(np.median(list(photographs.run(task, rows)) or [0.0]))
+        usual[v] = float(np.median(list(photographs.run(task, rows))))
     return usual
 
 

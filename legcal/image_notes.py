@@ -12,8 +12,8 @@ from legcal.observations.outlines import Outlines
 from legcal.photographs import Photographs, Placement
 from legcal.recognition.doubts import Explanation, share_shown
 
-FEW = 0.5  # found, against the others of its view
-WITNESSES = 3  # good images of a view that tell how much of the legs they show
+FEW = 0.5  # found, against other images
+WITNESSES = 3  # good images that tell how much of the legs they show
 SHOWN = 0.5  # share of a leg's length in each of them, from which on it is clearly visible
 NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
 
@@ -32,9 +32,9 @@ class OutlineCount:
 
 
 def witnesses(photographs: Photographs, found: Mapping[int, OutlineCount], view: int) -> list[int]:
-    """Return the images of a view in which most was found."""
+    """Return the images of a view in which most was found; of all views if it has none."""
     own = [row for row in found if photographs.measurements.view[row] == view]
-    return sorted(own, key=lambda row: -found[row].share)[:WITNESSES]
+    return sorted(own or found, key=lambda row: -found[row].share)[:WITNESSES]
 
 
 def image_name(photographs: Photographs, row: int) -> str:
@@ -62,8 +62,8 @@ def judged(
     view = int(photographs.measurements.view[row])
     if explanation.own >= FEW * usual[view]:
         return "", (
-            f"{name}: shows little of the legs: found {much}, in the others of its view most; "
-            "look at its light and sharpness."
+            f"{name}: shows little of the legs: found {much}, in other images most; look "
+            " at its light and sharpness."
         )
     return NOTHING_LIKE, (
         f"{name}: was left out: found {much}, and nothing else that it shows; check that it is a "

@@ -44,11 +44,22 @@ from legcal.workers import Run
 
 Joined = Sequence[RigidTransform | None] | None
 NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
+# Besides whole packages, what decides which outlines and notes are stored.
+_DECIDING = (
+    "photographs.py",
+    "examining.py",
+    "image_notes.py",
+    "disagreeing.py",
+    "fitting.py",
+    "board_views.py",
+)
 
 
 def detection_settings() -> dict[str, object]:
     """Return what detected outlines depend on besides the dataset: windows, and the code itself."""
     digest = hashlib.sha256()
+    for name in _DECIDING:
+        digest.update(files("legcal").joinpath(name).read_bytes())
     for package in ("recognition", "detection", "vision", "geometry"):
         for source in sorted(files(f"legcal.{package}").iterdir(), key=lambda source: source.name):
             if source.name.endswith(".py"):

@@ -1,6 +1,7 @@
 """The table of outlines as a cache: what is detected again, what is kept, what wins."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from dataset_folder import JOINTS, Folder, folder, hexapod
 from outline_tables import assert_same, outlines_of
 
+import legcal
 from legcal.dataset.cache import (
     fingerprint,
     plan_dataset,
@@ -31,6 +33,7 @@ from legcal.observations.sets import (
     outline_keys,
 )
 from legcal.observations.table import write_observations
+from legcal.photographs import detection_settings
 
 __all__ = ["folder"]
 
@@ -278,6 +281,24 @@ def test_settings_model_and_version_change_the_fingerprint(
     assert fingerprint(other, SETTINGS) != before
     monkeypatch.setattr("legcal.dataset.cache.__version__", "0.0.0")
     assert fingerprint(dataset, SETTINGS) != before
+
+
+def test_every_source_that_decides_what_is_stored_is_in_the_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = Path(legcal.__file__).parent
+    shutil.copytree(here, tmp_path / "legcal", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(
+        "legcal.photographs.files", lambda package: tmp_path / package.replace(".", "/")
+    )
+    found = {detection_settings()["code"]}
+    assert found == {detection_settings()["code"]}
+    names = ["photographs", "examining", "image_notes", "fitting", "board_views", "detection/fit"]
+    for n, name in enumerate(names, start=2):
+        with (tmp_path / "legcal" / f"{name}.py").open("a") as file:
+            file.write("CHANGED = 1\n")
+        found.add(detection_settings()["code"])
+        assert len(found) == n, name
 
 
 def test_order_of_rows_and_views_does_not_change_the_fingerprint(folder: Folder) -> None:

@@ -136,3 +136,10 @@ def test_fewer_than_three_images_are_refused() -> None:
     refuse_undetermined(found, ["a", "b", "c"])
     with pytest.raises(NotIdentifiable, match=r"found 2 images with the board \(a, b\), needed 3"):
         refuse_undetermined(replace(found, images=(0, 1)), ["a", "b"])
+    left_out = ["c: 20 of its 40 corners disagree"]
+    words = (
+        r"found 2 images with the board that agree \(a, b\), and 1 more that had to be left out "
+        r"\(c: 20 of its 40 corners disagree\), needed 3 at least and better 10; see that the board"
+    )
+    with pytest.raises(NotIdentifiable, match=words):
+        refuse_undetermined(replace(found, images=(0, 1)), ["a", "b"], left_out)

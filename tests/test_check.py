@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 from legcal import calibrate, check
 from legcal.cli.app import app
 from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
+from legcal.fitting import Found, observe_and_fit
 from legcal.mechanism.leg_steps import moved_legs
 from legcal.mechanism.load import load_mechanism
 from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
@@ -255,6 +257,21 @@ def test_an_image_that_says_nothing_is_refused(result: Path, images: Path, tmp_p
         csv.writer(file).writerows([header, *rows])
     with pytest.raises(NotVisible, match="found no used outline in any image"):
         check(blank, result)
+
+
+def test_what_is_said_of_the_images_is_passed_on(
+    result: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left_out = "view c1, image k01: was left out: the image is black; take it again."
+    doubt = "view c1, image k02: its reading does not agree with its outlines."
+
+    def noted(*arguments: Any) -> Found:
+        return replace(observe_and_fit(*arguments), notes=(left_out, doubt), doubts=(doubt,))
+
+    monkeypatch.setattr("legcal.checking.observe_and_fit", noted)
+    found = check(images, result)
+    assert [note for note in found.notes if "view c1, image" in note] == [left_out, doubt]
+    assert set(found.document()["notes"]) >= {left_out, doubt, *found.solution.notes}
 
 
 @pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])

@@ -17,10 +17,13 @@ from repeated_images import SIZE, RepeatedImages, repeated_images
 
 from legcal import cli, detect, load_dataset
 from legcal.errors import DatasetError, UsageError
+from legcal.examining import Observed, observe
+from legcal.observations.canonical_order import canonical_order
 from legcal.observations.outlines import QUALITY
 from legcal.observations.table import read_observations
 from legcal.overlays.detected import Detection
-from legcal.overlays.folder import picture_names
+from legcal.overlays.folder import _caption, picture_names
+from legcal.photographs import Photographs
 
 BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
 
@@ -121,6 +124,40 @@ def test_views_without_a_camera_pose_are_told_and_drawn_where_they_were_expected
     assert list(found.unplaced) == ["c2"]
     assert {found.view_of(row) for row in found.outlines.row.tolist()} == {"c1"}
     assert len(found.predicted(4)) == 6
+
+
+def test_captions_say_only_of_a_camera_with_a_hint_where_it_was_expected(
+    found: Detection,
+) -> None:
+    assert _caption(found, 0).startswith("c1  images/p0_0.png  1")
+    assert _caption(found, 4).endswith(
+        "the camera could not be placed: legs are drawn where it was expected"
+    )
+    unknown = replace(found, T_base_camera=(found.T_base_camera[0], None))
+    assert unknown.predicted(4) == []
+    assert _caption(unknown, 4).endswith("the camera could not be placed")
+
+
+def test_legs_are_drawn_by_the_radii_that_were_searched_by(
+    one_image: RepeatedImages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def thicker(photographs: Photographs, *others: Any) -> Observed:
+        cylinders = [
+            [replace(c, radius=c.radius * (2.0 + j)) for c in of_leg]
+            for j, of_leg in enumerate(photographs.cylinders)
+        ]
+        wrong = replace(photographs, mechanism=photographs.mechanism.with_cylinders(cylinders))
+        return replace(observe(photographs, *others), photographs=wrong)
+
+    monkeypatch.setattr("legcal.detecting.observe", thicker)
+    found = detect(one_image.path)
+    legs = {leg.leg: leg for leg in found.predicted(0)}
+    assert len(legs) == 6
+    order = canonical_order(found.dataset.measurements, found.dataset.mechanism.leg_names).legs
+    for at, j in enumerate(order.tolist()):
+        nominal = {c.link: c.radius for c in found.dataset.mechanism.legs[j].cylinders}
+        for piece in legs[j].pieces:
+            assert piece.radius == pytest.approx((2.0 + at) * nominal[piece.link])
 
 
 def test_the_written_table_is_read_as_what_was_found(

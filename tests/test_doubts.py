@@ -13,19 +13,21 @@ from hexapod_example import Run
 from spoiled import Picture, Spoiled, spoiled
 
 from legcal import calibrate, detect, load_dataset
-from legcal.detection.exposure import expose
+from legcal.detection.exposure import Exposure, expose, image_defects
 from legcal.detection.picture import to_grey
 from legcal.disagreeing import disagreeing_images
 from legcal.errors import NotIdentifiable
-from legcal.examining import observe
+from legcal.examining import _usual, observe, rejected
+from legcal.image_notes import NOTHING_LIKE, OutlineCount, judged
 from legcal.overlays.detected import Detection
 from legcal.photographs import Placement, scene_at_poses
 from legcal.progress import no_progress
+from legcal.recognition.doubts import Explanation
 from legcal.recognition.hints import hint_notes
 from legcal.refinement.choices import Choices
 from legcal.refinement.rejections import DISAGREES
 from legcal.workers import in_turn
-from legcal.workpiece import workpiece
+from legcal.workpiece import Workpiece, workpiece
 
 N = 6
 
@@ -113,6 +115,21 @@ def test_an_image_that_is_no_good_is_named_and_left_out(
     assert not detected.outlines.used[of_row].any()
 
 
+def test_left_out_images_keep_what_they_should_not_show(example_run: Run) -> None:
+    o = example_run.calibration.solution.outlines
+    one = np.flatnonzero(o.row == o.row[0])[:4]
+    reasons = ("outside the image", "hidden by leg2", "low contrast, 2.1 grey levels", "")
+    reason, used = list(o.reason), o.used.copy()
+    for i, why in zip(one.tolist(), reasons, strict=True):
+        reason[i], used[i] = why, not why
+    before = replace(o, reason=tuple(reason), used=used)
+    out = rejected(before, {int(o.row[0]): "the image is black"})
+    assert not out.used[o.row == o.row[0]].any()
+    assert [out.reason[i] for i in one] == [*reasons[:2], *2 * ["the image is black"]]
+    others = o.row != o.row[0]
+    assert np.array_equal(out.used[others], before.used[others])
+
+
 def test_files_that_were_exchanged_are_told_from_each_other(
     bad: Spoiled, detected: Detection
 ) -> None:
@@ -145,10 +162,50 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
             assert detected.outlines.used[own].mean() > 0.5
 
 
+def _work(made: Spoiled) -> Workpiece:
+    return workpiece(load_dataset(made.write()), in_turn, None, Choices(), use_cache=False)
+
+
 def _observed(made: Spoiled) -> Placement:
-    work = workpiece(load_dataset(made.write()), in_turn, None, Choices(), use_cache=False)
+    work = _work(made)
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
     return observe(work.photographs, scene, no_progress).placement
+
+
+def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
+    tmp_path: Path,
+) -> None:
+    made = spoiled(tmp_path / "views", 4, ("c1", "c2"))
+    black = [made.change("c1", k, lambda picture: 0 * picture) for k in range(3)]
+    made.change("c1", 3, _elsewhere)
+    for k in range(4):
+        made.change("c2", k, lambda picture: 0 * picture)
+    found = _observed(made)
+    assert list(found.unplaced) == ["c1", "c2"]
+    assert list(found.notes) == [
+        f"view c1, image {image}: was left out: the image is black, at most 0 of 255 grey levels; "
+        "take it again."
+        for image in black
+    ]
+    assert "in its 4 images" in found.unplaced["c2"]  # once for all of them
+
+
+def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: Path) -> None:
+    made = spoiled(tmp_path / "alone", 3, ("c1", "c2"))
+    work = _work(made)
+    photographs, view = work.photographs, work.measurements.view
+    placement = _observed(made)
+    (alone,) = np.flatnonzero(view == 1)[:1].tolist()
+    found = {row: OutlineCount(11, 12) for row in np.flatnonzero(view == 0).tolist()}
+    found[alone] = OutlineCount(1, 12)
+    usual = _usual(photographs, placement, found, [alone])
+    assert usual[1] > 0.3
+    reason, note = judged(photographs, alone, Explanation(0.0), usual, found)
+    assert reason == NOTHING_LIKE
+    assert "was left out: found 1 of 12 outlines where its reading has the legs" in note
+    reason, note = judged(photographs, alone, Explanation(usual[1]), usual, found)
+    assert reason == ""
+    assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
 
 
 def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
@@ -211,6 +268,33 @@ def test_blur_is_measured_whatever_the_light() -> None:
         for light in (0.3, 1.0):
             noisy = to_grey(light * smooth + rng.standard_normal(picture.shape))
             assert expose(noisy).blur == pytest.approx(blur, rel=0.35, abs=0.3)
+
+
+def test_blurred_images_are_compared_with_their_camera_where_their_view_has_few() -> None:
+    blurs = [0.8, 0.9, 1.0, 4.0, 3.8, 4.0]
+    exposures = {row: Exposure(10.0, 200.0, 150.0, blur) for row, blur in enumerate(blurs)}
+    alone, one = {row: row for row in exposures}, dict.fromkeys(exposures, 0)
+    soft = {row: int(row >= 4) for row in exposures}  # another camera, of which there are two
+    found = image_defects(exposures, alone, soft)
+    assert found == {3: "the image is blurred by 4.0 px, the others of its camera by 0.9"}
+    found = image_defects(exposures, one, soft)
+    assert [(row, "of its view" in why) for row, why in found.items()] == [
+        (row, True) for row in (3, 4, 5)
+    ]
+    soft = {row: int(row >= 3) for row in exposures}
+    assert image_defects(exposures, soft, one) == {}  # a soft view is compared with itself
+
+
+def test_a_blurred_image_that_is_alone_in_its_view_is_named(tmp_path: Path) -> None:
+    made = spoiled(tmp_path / "hand", 3, ("c1", "c2"))
+    image = made.change("c2", 1, _blurred)
+    made.rows = [*made.rows[:3], made.row("c2", 1)]
+    found = _observed(made)
+    assert list(found.unplaced) == ["c2"]
+    words = (
+        rf"in its 1 image \({image}: the image is blurred by \d\.\d px, the others of its camera"
+    )
+    assert re.search(words, found.unplaced["c2"]), found.unplaced
 
 
 @pytest.mark.parametrize(

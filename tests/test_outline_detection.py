@@ -189,6 +189,7 @@ def test_edges_near_the_leg_are_not_taken_for_it() -> None:
         start, end = (181 + offset - slope // 2, 269), (181 + offset + slope // 2, 0)
         cv2.line(image, start, end, level, 2, cv2.LINE_AA)
     found = detect(cam, bars, image.astype(np.uint8))
+    assert np.any(found.used), found.reason
     error = errors(cam, bars, found)
     assert np.all(np.abs(error) < 1.0)
 
@@ -259,6 +260,7 @@ def test_a_faint_leg_gets_a_wide_covariance_or_none() -> None:
         cam, bars, np.rint(render(cam, bars, 52.0, flat, supersample=3)).astype(np.uint8)
     )
     assert np.all(clear.used)
+    assert np.any(faint.used), faint.reason
     for i in np.flatnonzero(faint.used):
         assert np.trace(faint.covariance[i]) > 2.0 * np.trace(clear.covariance[i])
 

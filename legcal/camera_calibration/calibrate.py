@@ -108,7 +108,8 @@ def calibrate_camera(
             f"The camera could not be calibrated: found no {model} camera that explains the "
             "corners, needed one; check the board and the model of the lens."
         )
-    refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images])
+    left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
+    refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
     result = _result(wanted, paths, found, shown, fitted)
     if output is not None:
         write_camera(result, Path(output))

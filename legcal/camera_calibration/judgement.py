@@ -44,7 +44,7 @@ def coverage(found: Agreed) -> float:
     return float(cv2.contourArea(hull)) / (camera.width * camera.height)
 
 
-def refuse_undetermined(found: Agreed, names: Sequence[str]) -> None:
+def refuse_undetermined(found: Agreed, names: Sequence[str], left_out: Sequence[str] = ()) -> None:
     """Raise NotIdentifiable if the images do not determine the camera.
 
     Parameters
@@ -53,10 +53,12 @@ def refuse_undetermined(found: Agreed, names: Sequence[str]) -> None:
         What the images gave.
     names : sequence of str
         The images that were used.
+    left_out : sequence of str, optional
+        Others that show the board, each with the reason why it was not used.
     """
     n = len(found.images)
     if n < FEWEST_IMAGES:
-        raise too_few_images(n, names)
+        raise too_few_images(n, names, left_out)
     camera = found.adjusted.camera
     f = float(camera.K[0, 0])
     sigma = float(np.sqrt(found.adjusted.covariance[0, 0] * found.scale))
@@ -77,14 +79,19 @@ def refuse_undetermined(found: Agreed, names: Sequence[str]) -> None:
         )
 
 
-def too_few_images(n: int, names: Sequence[str]) -> NotIdentifiable:
-    """Return the refusal of so few images with the board."""
+def too_few_images(n: int, names: Sequence[str], left_out: Sequence[str] = ()) -> NotIdentifiable:
+    """Return the refusal of so few images with the board, saying why others were left out."""
     found = f"{n} images" if n != 1 else "1 image"
     which = f" ({', '.join(names)})" if names else ""
+    others, mend = "", ""
+    if left_out:
+        told = "; ".join(left_out)
+        others = f" that agree{which}, and {len(left_out)} more that had to be left out ({told})"
+        mend = "see that the board is flat and does not move while it is photographed, and "
     return NotIdentifiable(
-        f"The camera could not be calibrated: found {found} with the board{which}, needed "
-        f"{FEWEST_IMAGES} at least and better {FEW_IMAGES}; take more, with the board tilted to "
-        "all sides."
+        f"The camera could not be calibrated: found {found} with the board{others or which}, "
+        f"needed {FEWEST_IMAGES} at least and better {FEW_IMAGES}; {mend}take more, with the "
+        "board tilted to all sides."
     )
 
 

@@ -22,9 +22,9 @@ WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
 STRONG = 95.0  # percentile of the slopes from which on they count
 FEWEST_EDGES, FEWEST_PART = 100, 0.1  # places of a direction, and of all
 LARGEST_BLUR = 8.0  # that the scales can tell [px]
-MUCH_BLURRED = (2.0, 1.2)  # against the view: factor, and more [px]
-SHARP = 40.0  # percentile of the blurs of a view, for what is usual there
-FEWEST = 3  # images of a view, to be compared
+MUCH_BLURRED = (2.0, 1.2)  # against others: factor, and more [px]
+SHARP = 40.0  # percentile of blurs, for what is usual
+FEWEST = 3  # images, to be compared
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,10 @@ def _slopes(grey: Grey, sigma: float) -> tuple[Grey, Grey]:
     return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)
 
 
-def image_defects(exposures: Mapping[int, Exposure], view: Mapping[int, int]) -> dict[int, str]:
-    """Return why images cannot be used: by themselves, or beside the others of their view.
+def image_defects(
+    exposures: Mapping[int, Exposure], view: Mapping[int, int], camera: Mapping[int, int]
+) -> dict[int, str]:
+    """Return why images cannot be used: by themselves, or beside others.
 
     Parameters
     ----------
@@ -117,18 +119,22 @@ def image_defects(exposures: Mapping[int, Exposure], view: Mapping[int, int]) ->
         Of each row.
     view : mapping
         The view of each row: its images show about the same through the same lens.
+    camera : mapping
+        The camera of each row. Images of views that have few, such as those of a camera in the
+        hand, are compared with all of their camera.
     """
     found = {row: why for row, exposure in exposures.items() if (why := exposure.defect)}
-    for v in sorted(set(view.values())):
-        rows = [row for row in exposures if view[row] == v and row not in found]
-        if len(rows) < FEWEST:
+    good = {row: exposure.blur for row, exposure in exposures.items() if row not in found}
+    for row, blur in good.items():
+        others, whose = [b for r, b in good.items() if view[r] == view[row]], "view"
+        if len(others) < FEWEST:
+            others, whose = [b for r, b in good.items() if camera[r] == camera[row]], "camera"
+        if len(others) < FEWEST:
             continue
-        usual = float(np.percentile([exposures[row].blur for row in rows], SHARP))
+        usual = float(np.percentile(others, SHARP))
         factor, more = MUCH_BLURRED
-        for row in rows:
-            blur = exposures[row].blur
-            if blur > max(factor * usual, usual + more):
-                found[row] = (
-                    f"the image is blurred by {blur:.1f} px, the others of its view by {usual:.1f}"
-                )
+        if blur > max(factor * usual, usual + more):
+            found[row] = (
+                f"the image is blurred by {blur:.1f} px, the others of its {whose} by {usual:.1f}"
+            )
     return found

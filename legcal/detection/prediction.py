@@ -53,20 +53,6 @@ class PredictedLeg:
         u, A = self.u, self.A_camera
         return np.asarray((ray * A[2] - band.along @ A[:2]) / (band.along @ u[:2] - ray * u[2]))
 
-    def piece_at(self, t: Array) -> IntArray:
-        """Return the index of the piece seen at t [px] of the leg's band, -1 where none is."""
-        s = self.distance_along(self.band, t)
-        index = np.full(t.shape, -1, dtype=np.intp)
-        for i, piece in enumerate(self.pieces):
-            index[(s >= piece.start) & (s <= piece.end)] = i
-        return index
-
-    def edge_offsets(self, t: Array) -> Array:
-        """Return v [px] of both outlines at t [px] of the leg's band, (2, n_t)."""
-        index = self.piece_at(t)
-        both = np.stack([self.band.offsets(h, t[:, None]) for h in self.outlines.swapaxes(0, 1)])
-        return np.asarray(np.take_along_axis(both, index[None, :, None], axis=2)[..., 0])
-
 
 def predict_legs(
     camera: Camera,

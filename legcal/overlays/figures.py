@@ -38,7 +38,7 @@ class ViewFigures:
     rejected : mapping of str to int
         How many outlines are not used, by the reason without its figures, the most first.
     problem : str
-        Why its images were not searched, "" if they were.
+        Why its camera could not be placed, "" if it was.
     """
 
     images: int

@@ -22,7 +22,6 @@ from legcal.dataset.dataset import ImageReader
 from legcal.dataset.folder import OBSERVATIONS_NAME
 from legcal.errors import OutOfResources, UsageError
 from legcal.files.inside import path_problem
-from legcal.geometry.types import IntArray
 from legcal.observations.sets import choose_outlines
 from legcal.observations.table import row_names, write_observations
 from legcal.overlays.detected import Detection
@@ -187,19 +186,15 @@ def _draw_all(
     detection: Detection, folder: Path, pictures: Mapping[int, str], run: Run, progress: Report
 ) -> None:
     """Write the picture of every row that has an image."""
-    rows = np.array(list(pictures), dtype=np.intp)
+    rows = list(pictures)
     for file in pictures.values():
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
     gallery = _Gallery(
-        detection.dataset.image_reader(rows.tolist()),
-        tuple(tuple(_marks(detection, row)) for row in rows.tolist()),
-        tuple(_caption(detection, row) for row in rows.tolist()),
+        detection.dataset.image_reader(rows),
+        tuple(tuple(_marks(detection, row)) for row in rows),
+        tuple(_caption(detection, row) for row in rows),
         tuple(folder / file for file in pictures.values()),
     )
-    _in_chunks(gallery, rows, run, progress)
-
-
-def _in_chunks(gallery: _Gallery, rows: IntArray, run: Run, progress: Report) -> None:
     progress("Drawing overlays", 0, len(rows))
     for done, _ in enumerate(run(partial(_write_picture, gallery), range(len(rows))), start=1):
         progress("Drawing overlays", done, len(rows))
@@ -232,11 +227,14 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
 def _caption(detection: Detection, row: int) -> str:
     """Return what stands below the picture of a row."""
     view, outlines = detection.view_of(row), detection.outlines
+    measurements = detection.dataset.measurements
     here = outlines.used[outlines.row == row]
     said = f"{np.count_nonzero(here)} of {len(here)} outlines used"
     if view in detection.unplaced:
-        said = "the camera could not be placed: legs are drawn where dataset.yaml has it"
-    text = f"{view}  {detection.dataset.measurements.image[row]}  {said}"
+        said = "the camera could not be placed"
+        if detection.T_base_camera[int(measurements.view[row])] is not None:
+            said += ": legs are drawn where it was expected"
+    text = f"{view}  {measurements.image[row]}  {said}"
     return text.encode("ascii", "replace").decode()
 
 

@@ -45,7 +45,7 @@ class Check:
     solution: Solution
     movement: Movement
     at_platform: PlatformPair
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def sentence(self) -> str:
