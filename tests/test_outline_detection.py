@@ -124,6 +124,37 @@ def test_outlines_are_found_where_they_are(name: str) -> None:
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 2.0
 
 
+@pytest.mark.parametrize(
+    ("level", "blur"),
+    [(252.0, 0.5), (270.0, 0.3), (270.0, 1.0), (300.0, 0.5), (300.0, 1.0), (400.0, 1.0)],
+)
+def test_a_saturated_background_moves_no_outline(level: float, blur: float) -> None:
+    cam = camera()
+    bars = [bar(-0.05, 0.02, 60.0), bar(0.06, 0.02, 60.0)]
+    behind = np.full((270, 360), 120.0)
+    behind[:, 181:] = level  # behind the second leg
+    image = render(cam, bars, behind, blur=blur, noise=1.0, supersample=4)
+    blurs: dict[int, float] = {}
+    clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
+    found = detect(cam, bars, clipped, off=1e-3, blur_of_row=blurs)
+    assert np.all(found.used), found.reason
+    error = errors(cam, bars, found)
+    sigma = np.sqrt([np.diag(c) for c in found.covariance])
+    assert np.abs(error).max() < 0.15
+    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.5
+    assert blurs[0] == pytest.approx(np.hypot(blur, 0.29), rel=0.15)  # with that of the pixels
+
+
+def test_outlines_are_rejected_where_saturation_leaves_nothing_of_the_step() -> None:
+    cam = camera()
+    bars = [bar(-0.05, 0.02, 60.0), bar(0.06, 0.02, 60.0)]
+    image = render(cam, bars, 1000.0, blur=0.5, noise=1.0, supersample=4)
+    clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
+    found = detect(cam, bars, clipped, off=1e-3)
+    assert not np.any(found.used), errors(cam, bars, found)
+    assert any("the background is overexposed" in reason for reason in found.reason), found.reason
+
+
 @pytest.mark.parametrize("known", [0.45, 0.6])
 def test_outlines_near_a_fit_are_found_with_the_blur_of_other_images(known: float) -> None:
     background, albedo, light, blur = SCENES["bright on dark"]

@@ -56,7 +56,8 @@ def outline(
     zeros = np.zeros(n)
     return Blocks(
         d.astype(np.float32), grey.astype(np.float32), one, np.ones(n), np.array([0, n]), position,
-        np.full((n, 1), HALF_WIDTH, dtype=np.float32), zeros, zeros.copy(), zeros.copy(), [None],
+        np.full((n, 1), HALF_WIDTH, dtype=np.float32), np.full(n, -np.inf, dtype=np.float32),
+        zeros, zeros.copy(), zeros.copy(), [None],
     )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Which of two measured edges of a leg are its outlines."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,13 @@ def _judged(
     v = np.stack([np.zeros(2), WIDTH + off])
     pair = Pair(v, np.ones(2, dtype=np.bool_), np.full(2, alone))
     return verdict(pair, WIDTH, LENGTH, (one, two))
+
+
+def test_an_outline_before_a_saturated_background_needs_some_of_its_step() -> None:
+    whole, most = _edge(np.zeros(2)), replace(_edge(WIDTH), clipped=0.2)
+    assert _judged(0.0, whole, most).reasons == ("", "")
+    found = _judged(0.0, whole, replace(most, clipped=0.5))
+    assert found.reasons[1] == "the background is overexposed, 1.0 px of the step are left"
 
 
 def test_two_edges_at_the_distance_of_the_radius_are_used() -> None:

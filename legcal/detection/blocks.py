@@ -20,6 +20,7 @@ from legcal.vision.camera import Camera
 
 SHALLOWEST = 0.8  # largest used depth, in half-widths
 ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
+LEAST_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
 ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on longer ones are made, so many times
 ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
 VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
@@ -37,6 +38,7 @@ class Blocks:
     bounds: IntArray  # (n_edges + 1,) first block of each edge
     position: Array  # (n,) as fractions of the bands
     half_width: Samples  # (n, 1)
+    clipped: Samples  # (n,) up to where the background saturates the picture [px], or -inf
     moved: Array  # (n,) [px]
     contrast: Array  # (n,) [grey levels]
     sharp: Array  # (n,) chi^2
@@ -62,6 +64,9 @@ class Blocks:
         half_width = np.array([edge.half_width for edge in edges])
         depths = outer, np.minimum(outer, SHALLOWEST * half_width)
         read = read_profiles(grey, camera, edges, v, depths, rows, most)
+        if rows < LEAST_ROWS_CLIPPED and np.any(read.clipped > -np.inf):
+            # Too few pixels of a sharp step are left in short blocks.
+            read = read_profiles(grey, camera, edges, v, depths, LEAST_ROWS_CLIPPED, most)
         light, weight = to_light(read.grey, read.inside, camera.gamma)
         n = len(read.position)
         return cls(
@@ -72,6 +77,7 @@ class Blocks:
             read.bounds,
             read.position,
             np.repeat(half_width, np.diff(read.bounds)).astype(np.float32)[:, None],
+            read.clipped,
             np.zeros(n),
             np.zeros(n),
             np.zeros(n),
@@ -91,6 +97,14 @@ class Blocks:
     def contrasts(self) -> list[Array]:
         """Return the contrasts of the blocks of each edge, without sign."""
         return np.split(np.abs(self.contrast), self.bounds[1:-1])
+
+    def clipping(self) -> list[Array]:
+        """Return up to which distance inside each line the background saturates blocks [px]."""
+        return np.split(self.clipped - self.moved, self.bounds[1:-1])
+
+    def merit(self) -> Array:
+        """Return how much each block tells of the blur: nothing where half of the step is cut."""
+        return np.where(self.clipped > self.moved, 0.0, np.abs(self.contrast))
 
     def kept(self) -> BoolArray:
         """Return which blocks lie on the lines of their edges, (n,)."""

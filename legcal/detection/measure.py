@@ -7,8 +7,9 @@ outlines. Pixels are used as far as the blurred outline reaches and little farth
 further inside, the less the shading is that of a limb.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,6 +50,9 @@ class MeasuredEdge:
         Whether most blocks show a step or a limb, and not only a bend of the shading.
     blur : float
         Standard deviation of the blur of the image [px].
+    clipped : float
+        Up to which depth inside the outline the background saturates the picture, in blurs, by the
+        median block; -inf where it does not.
     covariance : (2, 2) array
         Of the offsets at both ends of the used piece [px^2]: that of the line, and what shading
         that the model leaves out does to an outline of this contrast.
@@ -60,6 +64,7 @@ class MeasuredEdge:
     is_step: bool
     blur: float
     covariance: Array
+    clipped: float = -math.inf
 
 
 def measure_edges(
@@ -99,7 +104,7 @@ def measure_edges(
         if len(blocks.moved) == 0:
             return [None] * len(edges), FIRST_BLUR
         blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
-        blur = estimate_blur(*blocks.samples(slice(None)), np.abs(blocks.contrast))
+        blur = estimate_blur(*blocks.samples(slice(None)), blocks.merit())
         v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     for _ in range(TRIALS):
         tried = blur
@@ -118,13 +123,17 @@ def measure_edges(
     return [
         None
         if line is None
-        else _measured(_moved(edge, at, line), edge.epsilon, line, step, sharp, blur, ends, spread)
-        for edge, at, line, step, sharp, ends, spread in zip(
+        else replace(
+            _measured(_moved(edge, at, line), edge.epsilon, line, step, sharp, blur, ends, spread),
+            clipped=(float(np.median(clipped[line.kept])) - float(ends.mean())) / blur,
+        )
+        for edge, at, line, step, sharp, clipped, ends, spread in zip(
             edges,
             v,
             blocks.lines,
             blocks.contrasts(),
             blocks.sharpness(),
+            blocks.clipping(),
             joint.ends,
             joint.covariance,
             strict=True,

@@ -17,6 +17,8 @@ from legcal.vision.camera import Camera
 
 SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
 FEW = 4  # such pixels of a block that may be noise
+ROUGHLY = 1.0  # how far an outline may be off [px]
+MOSTLY = 0.5  # share of them from some distance on with which a background is clipped
 MAX_ROWS = 512  # along one outline
 NODE_SPACING = 16.0  # between points at which the lens distortion is computed [px]
 
@@ -63,7 +65,10 @@ class Profiles:
     grey : (n_blocks, n_samples) array of float32
         Grey levels.
     inside : (n_blocks, n_samples) array of bool
-        False for samples outside the image or out of range.
+        False for samples outside the image or out of range, and saturated ones.
+    clipped : (n_blocks,) array of float32
+        Up to which distance inside the background saturates the picture [px]; -inf where it does
+        not.
     """
 
     bounds: IntArray
@@ -72,6 +77,7 @@ class Profiles:
     d: Samples
     grey: Samples
     inside: BoolArray
+    clipped: Samples
 
 
 def read_profiles(
@@ -137,6 +143,8 @@ def read_profiles(
     values = np.asarray(np.ravel(grey).take((row + column).astype(np.intp)), dtype=np.float32)
     shape = (len(edge), n_rows * n_columns)
     distance, values = d.reshape(shape).astype(np.float32), values.reshape(shape)
+    inside = inside.reshape(shape)
+    clipped, bright = _unsaturated(distance, values, inside)
     # A step dv moves the outline by dv across; its part normal to the tangent is the gain.
     gain = np.abs(nodes.at(rows, nodes.gain)) * cosine
     return Profiles(
@@ -145,7 +153,8 @@ def read_profiles(
         gain.reshape(-1, n_rows).mean(axis=1),
         distance,
         values,
-        _unsaturated(distance, values, inside.reshape(shape)),
+        inside & (distance > clipped[:, None]) & (distance < bright[:, None]),
+        clipped,
     )
 
 
@@ -238,8 +247,19 @@ def _slopes(y: Array, x: Array) -> Array:
     return np.concatenate([rise[:, :1], inner, rise[:, -1:]], axis=1)
 
 
-def _unsaturated(d: Samples, grey: Grey, inside: BoolArray) -> BoolArray:
-    """Leave out the depths of each block from which on the leg saturates the picture."""
-    bright = np.where(inside & (grey >= SATURATED) & (d > 0.0), d, np.inf)
-    limit = np.partition(bright, FEW, axis=1)[:, FEW]
-    return np.asarray(inside & (d < limit[:, None]))
+def _unsaturated(d: Samples, grey: Grey, inside: BoolArray) -> tuple[Samples, Samples]:
+    """Return between which depths (n,) of each block nothing saturates the picture.
+
+    Clipped, a background ends the blurred step too early, and the outline would seem to lie where
+    the rest of the step does. One whose noise alone reaches saturation is not clipped.
+    """
+    bright = inside & (grey >= SATURATED)
+    behind = np.partition(np.where(bright & (d < 0.0), d, -np.inf), -1 - FEW, axis=1)[:, -1 - FEW]
+    beyond = inside & (d <= behind[:, None])
+    n_bright = np.count_nonzero(beyond & bright, axis=1)
+    clipped = (n_bright > MOSTLY * np.count_nonzero(beyond, axis=1))[:, None]
+    # The line may be off: what is bright near it is the background, where that is clipped.
+    near = np.where(clipped, np.float32(ROUGHLY), np.float32(0.0))
+    first = np.max(np.where(bright & clipped & (d < near), d, -np.inf), axis=1)
+    last = np.partition(np.where(bright & (d > near), d, np.inf), FEW, axis=1)[:, FEW]
+    return first, last

@@ -16,6 +16,8 @@ LEAST_KEPT = 0.25  # share of all unhidden blocks that must
 LONE_KEPT = 0.5  # the same of an edge without its partner
 LARGEST_SCATTER = (0.6, 1.2)  # of the blocks of an edge: [px] and in blurs
 LARGEST_SIGMA = 1.0  # [px]
+STEP_END = 1.5  # depth up to which the blurred step reaches [blurs]
+LEAST_STEP = 1.15  # of it that a saturated background must leave [px]
 WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
 WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of a reason
 SURER = 0.75  # by which factor an outline must be surer than the edge of a shade
@@ -143,6 +145,9 @@ def _reason(edge: MeasuredEdge | None, length: float, width: float) -> str:
     """Return why an edge cannot be trusted whatever its partner, "" if it can."""
     if edge is None:
         return "edge hardly visible"
+    step = (STEP_END - edge.clipped) * edge.blur
+    if step < LEAST_STEP:
+        return f"the background is overexposed, {max(step, 0.0):.1f} px of the step are left"
     line = edge.line
     least = max(LEAST_LENGTH[0], LEAST_LENGTH[1] * width)
     visible = (line.last - line.first) * length
