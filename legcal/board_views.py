@@ -70,23 +70,34 @@ class BoardViews:
         return replace(self.corners, used=used, reason=reason)
 
     def placed(self, cameras: Sequence[RigidTransform | None]) -> RigidTransform | None:
-        """Return where cameras have the board on the average, T_x_board; None if none shows it.
+        """Return where most cameras have the board, T_x_board; None if none shows it.
+
+        Those that disagree with most others are left out: one wrong pose must not turn all.
 
         Parameters
         ----------
         cameras : sequence of RigidTransform or None
             T_x_camera of each view; x is any frame.
         """
-        found = [
-            T_x_camera * T_board_camera.inv()
-            for T_x_camera, T_board_camera in zip(cameras, self.T_board_camera, strict=True)
-            if T_x_camera is not None and T_board_camera is not None
-        ]
+        found = list(self.places(cameras).values())
         if not found:
             return None
-        together = RigidTransform.concatenate(found)
+        agreeing = [
+            [other for other in found if _agree(one, other, among_hints=True)] for one in found
+        ]
+        together = RigidTransform.concatenate(max(agreeing, key=len))
         middle = np.median(together.translation, axis=0)
         return RigidTransform.from_components(middle, together.rotation.mean())
+
+    def places(self, cameras: Sequence[RigidTransform | None]) -> dict[int, RigidTransform]:
+        """Return where each camera that shows the board has it, T_x_board by view."""
+        return {
+            v: T_x_camera * T_board_camera.inv()
+            for v, (T_x_camera, T_board_camera) in enumerate(
+                zip(cameras, self.T_board_camera, strict=True)
+            )
+            if T_x_camera is not None and T_board_camera is not None
+        }
 
     def cameras(
         self, T_x_board: RigidTransform, others: Sequence[RigidTransform | None]
@@ -104,7 +115,7 @@ def observe_board(work: Workpiece, progress: Report) -> BoardViews | None:
     Raises
     ------
     NotVisible
-        If no image shows the board, or none of a view whose camera nobody placed.
+        If no image shows the board, or that of a hand-held view does not.
     DatasetError
         If what is shown cannot be the board that the dataset describes, or it has moved.
     """
@@ -112,7 +123,7 @@ def observe_board(work: Workpiece, progress: Report) -> BoardViews | None:
     if dataset.board is None:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
-    needed = {view.name for view in used if view.T_base_camera is None}
+    needed = {view.name for view in used if view.hand_held}
     if dataset.corners is not None:
         corners = reorder_corners(dataset.corners, work.order)
     else:
@@ -147,14 +158,15 @@ def base_of_board(
     Raises
     ------
     DatasetError
-        If what the dataset says of both cannot be true together.
+        If the dataset has the board where none of these cameras sees it.
     """
     given, by_cameras = work.dataset.T_base_board, board.placed(hints)
     if given is None or by_cameras is None:
         return given if by_cameras is None else by_cameras
     apart = given.inv() * by_cameras
     far, turned = float(np.linalg.norm(apart.translation)), float(apart.rotation.magnitude())
-    if far > _FAR or turned > _TURNED:
+    # Wrong poses beside a right one are named when the images have placed their cameras.
+    if not any(_agree(given, place) for place in board.places(hints).values()):
         raise DatasetError(
             f"{work.dataset.yaml_path}: board.T_base_board and the T_base_camera of the views "
             f"could not be used together: found the board {1e3 * far:.0f} mm and "
@@ -163,6 +175,13 @@ def base_of_board(
             "board, those of the cameras, or the dimensions of the board."
         )
     return given
+
+
+def _agree(one: RigidTransform, other: RigidTransform, *, among_hints: bool = False) -> bool:
+    """Say whether two places of the board are as near as hints are good, or as two of them are."""
+    apart, wide = one.inv() * other, 2.0 if among_hints else 1.0
+    far, turned = float(np.linalg.norm(apart.translation)), float(apart.rotation.magnitude())
+    return far <= wide * _FAR and turned <= wide * _TURNED
 
 
 def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -> tuple[str, ...]:

@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
-from legcal.board_views import BoardViews, base_of_board, board_notes
+from legcal.board_views import BoardViews, base_of_board, board_notes, observe_board
 from legcal.calibration import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.mechanism.parametrization import geometries, vector_of
 from legcal.observations.corners import found_corners
+from legcal.observations.measurements import Measurements, View
 from legcal.refinement.known_parameters import BOARD_SCALE
 from legcal.simulation.settings import Level
 from legcal.vision.board import Board
+from legcal.vision.camera import Camera
 
 Edit = Callable[[dict[str, Any]], None]
 HIDDEN = 5  # corners that are moved
@@ -136,6 +138,25 @@ def test_a_board_and_cameras_that_contradict_each_other_are_refused() -> None:
     assert base_of_board(work, board, (None, camera)) is None
 
 
+def test_one_wrong_pose_of_a_camera_turns_no_other() -> None:
+    shown = (RigidTransform.from_translation([0.0, 0.0, -1.0]),) * 3
+    none = np.zeros(0)
+    corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
+    board = BoardViews(Board("chessboard", 7, 6, 0.03), corners, shown, ())
+    place = RigidTransform.from_translation([0.3, 0.0, 0.0])
+    turned = RigidTransform.from_rotation(Rotation.from_euler("z", 90.0, degrees=True))
+    hints = (turned * place * shown[0], place * shown[1], place * shown[2])
+    work: Any = SimpleNamespace(
+        dataset=SimpleNamespace(T_base_board=None, yaml_path="dataset.yaml")
+    )
+    found = base_of_board(work, board, hints)
+    assert found is not None
+    np.testing.assert_allclose(found.as_matrix(), place.as_matrix(), atol=1e-12)
+    work.dataset.T_base_board = place
+    assert base_of_board(work, board, hints) is place
+    assert base_of_board(work, board, (*hints[:1], None, *hints[2:])) is place
+
+
 def test_a_board_of_other_squares_is_refused(in_the_hand: Path, tmp_path: Path) -> None:
     def smaller(document: dict[str, Any]) -> None:
         document["board"]["square"] *= 0.95
@@ -185,3 +206,26 @@ def test_views_that_lost_the_board_are_named() -> None:
     lost = replace(corners, used=np.array([True, False]))
     (note,) = board_notes(dataset, solution, lost)
     assert note.startswith("No image of c2 shows the calibration board")
+
+
+def test_only_views_in_the_hand_need_the_board() -> None:
+    board = Board("chessboard", 7, 6, 0.03)
+    rows = np.arange(2, dtype=np.intp)
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    camera = View("c1", Camera(K, 640, 480))
+    tilt = RigidTransform.from_components([-0.05, -0.04, 0.6], Rotation.from_rotvec([0.5, 0.2, 0]))
+    px = camera.camera.project(tilt.apply(board.points))
+    n = board.n_corners
+    corners = found_corners(np.zeros(n, dtype=np.intp), np.arange(n), px, np.full(n, 0.05))
+    views = (camera, replace(camera, name="c2"))
+    m = Measurements(views, ("a.png", "b.png"), rows, rows, np.zeros((2, 1)), 1e-6)
+    order = SimpleNamespace(rows=rows, legs=rows[:1], views=rows)
+    dataset = SimpleNamespace(board=board, corners=corners, yaml_path="dataset.yaml")
+    work: Any = SimpleNamespace(dataset=dataset, measurements=m, order=order)
+    found = observe_board(work, lambda *_: None)
+    assert found is not None
+    assert found.T_board_camera[0] is not None
+    assert found.T_board_camera[1] is None
+    work.measurements = replace(m, views=(camera, replace(views[1], hand_held=True)))
+    with pytest.raises(NotVisible, match="view c2"):
+        observe_board(work, lambda *_: None)

@@ -77,7 +77,7 @@ def expand_hand_held(
             continue
         for k, row in enumerate(rows.tolist(), start=1):
             index[row] = len(new)
-            new.append(replace(measurements.views[v], name=f"{name}-{k}"))
+            new.append(replace(measurements.views[v], name=f"{name}-{k}", hand_held=True))
             origin.append(v)
         taken = [f"{name}-{k + 1}" for k in range(len(rows)) if f"{name}-{k + 1}" in views]
         problems += [

@@ -21,6 +21,7 @@ from legcal.vision.camera import Camera
 SHALLOWEST = 0.8  # largest used depth, in half-widths
 ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
 LEAST_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
+SOME_CLIPPED = 0.1  # share of the blocks of an image from which on they are that long
 ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on longer ones are made, so many times
 ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
 VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
@@ -64,7 +65,7 @@ class Blocks:
         half_width = np.array([edge.half_width for edge in edges])
         depths = outer, np.minimum(outer, SHALLOWEST * half_width)
         read = read_profiles(grey, camera, edges, v, depths, rows, most)
-        if rows < LEAST_ROWS_CLIPPED and np.any(read.clipped > -np.inf):
+        if rows < LEAST_ROWS_CLIPPED and np.mean(read.clipped > -np.inf) > SOME_CLIPPED:
             # Too few pixels of a sharp step are left in short blocks.
             read = read_profiles(grey, camera, edges, v, depths, LEAST_ROWS_CLIPPED, most)
         light, weight = to_light(read.grey, read.inside, camera.gamma)

@@ -25,12 +25,15 @@ class View:
         A rough pose of the camera in the base link, good to 2 cm and 2 degrees.
     legs : tuple of str or None
         Use only these legs in this view; None for all.
+    hand_held : bool
+        Whether this is one image of a camera in the hand, which only the board can place.
     """
 
     name: str
     camera: Camera
     T_base_camera: RigidTransform | None = None
     legs: tuple[str, ...] | None = None
+    hand_held: bool = False
 
 
 @dataclass(frozen=True, eq=False)
