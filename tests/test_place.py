@@ -181,3 +181,11 @@ def test_few_legs_are_believed_only_without_a_rival(rival: float, is_believed: b
     assert 0.12 < placed.share < 0.2
     assert placed.is_convincing == is_believed
     assert not placed.is_clear
+
+
+def test_a_single_image_of_three_legs_suffices_near_a_rough_pose() -> None:
+    pictures, T = _pictures(11, 3, 1)
+    assert not place_camera(pictures, 3).is_clear
+    near = place_near(pictures, T, 3)
+    assert near.is_convincing
+    assert _is_right(near, T)

@@ -35,6 +35,7 @@ ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
 FEW_SUPPORT, FEW_LEAD, FEW_PART = 0.12, 0.9, 0.3  # of one that shows few legs and has no rival
 HINTED_SUPPORT = 0.6  # share near a rough pose that leaves no doubt
 LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
+HINTED_LEAST = 1.6  # the same near a rough pose
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
 
@@ -73,7 +74,8 @@ class Placed:
         n = self.support.shape[1]
         alone = not self.hinted and self._leads(FEW_LEAD, FEW_PART)
         share = FEW_SUPPORT if alone else ENOUGH_SUPPORT
-        return float(max(share * self.expected[0].mean(), LEAST_SUPPORT / n))
+        least = HINTED_LEAST if self.hinted else LEAST_SUPPORT
+        return float(max(share * self.expected[0].mean(), least / n))
 
     @property
     def is_enough(self) -> bool:
