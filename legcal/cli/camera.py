@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from legcal.cli.calibrate import MOST_WORKERS
-from legcal.cli.options import JsonOption
+from legcal.cli.options import JsonOption, WorkersOption
 from legcal.cli.output import print_json, print_table
 from legcal.processors import processors
 
@@ -44,10 +44,7 @@ def camera(
     model: Annotated[
         Model, typer.Option(help="How the lens distorts; equidistant for a fisheye.")
     ] = Model.PLUMB_BOB,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes that search images; by default as many as calibrate."),
-    ] = None,
+    workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""

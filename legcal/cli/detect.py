@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from legcal.cli.calibrate import MOST_WORKERS
-from legcal.cli.options import JsonOption
+from legcal.cli.options import JsonOption, WorkersOption
 from legcal.cli.output import print_json, print_table
 from legcal.processors import processors
 
@@ -27,10 +27,7 @@ def detect(
             "found in it.",
         ),
     ],
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes that search images; by default as many as calibrate."),
-    ] = None,
+    workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the outlines of the legs and show them over the images, to see what went wrong."""

@@ -14,3 +14,7 @@ ModelArgument = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")
 ]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Processes that search images; by default as many as calibrate."),
+]

@@ -103,6 +103,13 @@ class Agreement:
     bar: IntArray
     visible: Array
 
+    @property
+    def one_bar_each(self) -> Array:
+        """The values, where a bar counts for the piece that it suits best."""
+        same = self.bar[:, :, None] == self.bar[:, None, :]
+        better = self.value[:, None, :] > self.value[:, :, None]
+        return np.where(np.any(same & better, axis=2), 0.0, self.value)
+
 
 def agreement(picture: Picture, poses: Poses, tolerance: float) -> Agreement:
     """Judge poses by a picture.

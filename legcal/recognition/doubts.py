@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.detection.picture import to_grey
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import IntArray
 from legcal.recognition.agreement import Picture, Poses, agreement
-from legcal.recognition.bars import Bars, find_bars
+from legcal.recognition.bars import Bars
 from legcal.recognition.mirror import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
 from legcal.recognition.recognise import Recognised, Search, corners_of
-from legcal.recognition.segments import find_segments
 from legcal.recognition.targets import targets_of
 
 TOLERANCE = 0.006  # of an axis from its bar [m]
@@ -67,7 +65,7 @@ def share_shown(
         The legs to look for; by default those that the view is said to show.
     """
     view = int(search.measurements.view[row])
-    picture = _picture(search, _bars(search, row, view), row, view, legs)
+    picture = _picture(search, search.bars(row, view), row, view, legs)
     return _share(picture, found, view, TOLERANCE if legs is None else UNPLACED)
 
 
@@ -87,7 +85,7 @@ def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: 
     """
     measurements = search.measurements
     view = int(measurements.view[row])
-    bars = _bars(search, row, view)
+    bars = search.bars(row, view)
     picture = _picture(search, bars, row, view)
     own = _share(picture, found, view)
     others = [
@@ -104,7 +102,7 @@ def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: 
         if w == view or found.T_base_camera[w] is None or not _same_size(search, view, w):
             continue
         same = other_view.camera is measurements.views[view].camera
-        seen = bars if same else _bars(search, row, w)
+        seen = bars if same else search.bars(row, w)
         there = [row, *(other for other in rows if measurements.view[other] == w)]
         readings = [(_share(_picture(search, seen, other, w), found, w), other) for other in there]
         for share, other in _best(readings):
@@ -147,12 +145,6 @@ def _same_size(search: Search, view: int, other: int) -> bool:
     return (one.width, one.height) == (two.width, two.height)
 
 
-def _bars(search: Search, row: int, view: int) -> Bars:
-    """Return the bars of an image as if the camera of a view had taken it."""
-    camera = search.measurements.views[view].camera
-    return find_bars(find_segments(to_grey(search.load(row)), camera))
-
-
 def _picture(
     search: Search, bars: Bars, row: int, view: int, legs: IntArray | None = None
 ) -> Picture:
@@ -172,11 +164,4 @@ def _share(picture: Picture, found: Recognised, view: int, tolerance: float = TO
     seen = agreement(picture, pose, tolerance)
     share = picture.targets.share
     visible = float((seen.visible @ share)[0])
-    return float(one_bar_each(seen.value, seen.bar)[0] @ share) / visible if visible > 0.0 else 0.0
-
-
-def one_bar_each(value: Array, bar: IntArray) -> Array:
-    """Return the agreement (n_poses, n_pieces) where a bar counts for the piece it suits best."""
-    same = bar[:, :, None] == bar[:, None, :]
-    better = value[:, None, :] > value[:, :, None]
-    return np.where(np.any(same & better, axis=2), 0.0, value)
+    return float(seen.one_bar_each[0] @ share) / visible if visible > 0.0 else 0.0

@@ -233,7 +233,7 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
         empty = np.zeros((0, len(pictures)))
         return Placed(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
     found = [agreement(picture, poses, JUDGED) for picture in pictures]
-    values = [_one_bar_each(one) for one in found]
+    values = [one.one_bar_each for one in found]
     shares = [picture.targets.share for picture in pictures]
     support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
     expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
@@ -289,7 +289,7 @@ def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
         if len(picture.bars) == 0 or len(picture.targets) == 0:
             continue
         found = agreement(picture, pose, JUDGED)
-        matched = _one_bar_each(found)[0] >= MATCHED
+        matched = found.one_bar_each[0] >= MATCHED
         distance = distances(picture, pose, found)[0]
         np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
         np.add.at(count, picture.targets.leg[matched], 1.0)
@@ -331,16 +331,9 @@ def supports(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tup
     support, expected = [], []
     for picture in pictures:
         found = agreement(picture, poses, tolerance)
-        support.append(_one_bar_each(found) @ picture.targets.share)
+        support.append(found.one_bar_each @ picture.targets.share)
         expected.append(found.visible @ picture.targets.share)
     return np.stack(support, axis=1), np.stack(expected, axis=1)
-
-
-def _one_bar_each(found: Agreement) -> Array:
-    """Return the agreement of pieces, where a bar counts for the piece that it suits best."""
-    same = found.bar[:, :, None] == found.bar[:, None, :]
-    better = found.value[:, None, :] > found.value[:, :, None]
-    return np.where(np.any(same & better, axis=2), 0.0, found.value)
 
 
 def _best(score: Array, n: int) -> IntArray:

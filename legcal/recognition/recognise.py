@@ -17,7 +17,7 @@ from legcal.geometry.types import Array, BoolArray, Image, IntArray
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements
 from legcal.recognition.agreement import Picture, Poses
-from legcal.recognition.bars import find_bars
+from legcal.recognition.bars import Bars, find_bars
 from legcal.recognition.groups import Group, group_views
 from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
 from legcal.recognition.place import START_PICTURES, Placed, place_camera, place_near
@@ -102,8 +102,12 @@ class Search:
         """Return what the image of a row shows, and what it should."""
         view = int(self.measurements.view[row])
         camera = self.measurements.views[view].camera
-        bars = find_bars(find_segments(to_grey(self.load(row)), camera))
-        return Picture(bars, self.targets(row, view), corners_of(camera))
+        return Picture(self.bars(row, view), self.targets(row, view), corners_of(camera))
+
+    def bars(self, row: int, view: int) -> Bars:
+        """Return the bars of an image as if the camera of a view had taken it."""
+        camera = self.measurements.views[view].camera
+        return find_bars(find_segments(to_grey(self.load(row)), camera))
 
     def targets(self, row: int, view: int) -> Targets:
         """Return the legs at the reading of a row that a view is said to show."""
