@@ -117,8 +117,7 @@ def _join(ends: Array) -> tuple[Array, Array]:
     near = (gap <= GAP * length[j]) & (aside <= np.minimum(allowed, 2 * ASIDE))
     i, j = i[near], j[near]
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
-    _, label = connected_components(graph, directed=False)
-    label = np.asarray(label, dtype=np.intp)
+    label: IntArray = np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
     order = np.argsort(label, kind="stable")
     found, covered = _fitted(ends[order], length[order], label[order])
     long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= LEAST_LENGTH
