@@ -7,13 +7,13 @@ may show instead. Whatever is wrong is left out with a reason, and said once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from legcal.detection.detect import NOT_PLACED, Load, Method
+from legcal.detection.detect import NOT_PLACED, Method
 from legcal.detection.exposure import Exposure, expose, image_defects
 from legcal.detection.outline import HIDDEN, OUTSIDE, outline_parts
 from legcal.detection.picture import to_grey
@@ -38,11 +38,15 @@ from legcal.photographs import (
     counted,
     detect,
     place,
+    search_in,
     usual_blur,
 )
 from legcal.progress import Report
+from legcal.recognition.bars import Bars
 from legcal.recognition.doubts import Explanation, explain, share_shown
+from legcal.recognition.groups import group_views
 from legcal.recognition.radii import Part
+from legcal.recognition.recognise import Search
 from legcal.vision.intrinsics import camera_numbers
 
 USUALLY = 0.3  # the least that images of a view must find to be compared with
@@ -98,17 +102,17 @@ def observe(
     method : callable
         How outlines are measured.
     """
-    defects = _defects(photographs, report)
+    defects, bars = _looked_at(photographs, scene, report, joined)
     rows = photographs.detect
     usable = np.array([row for row in rows.tolist() if row not in defects], dtype=np.intp)
     searched = replace(photographs, detect=usable)
-    placement = place(searched, scene, report, joined)
+    placement = place(searched, scene, report, joined, known=bars)
     blurs: dict[int, float] = {}
     measure = partial(detect, report=report, method=method, blur_of_row=blurs)
     outlines = measure(photographs, placement.scene)
     doubtful = _parts_not_found(photographs, outlines)
     if doubtful:
-        other = place(searched, scene, report, joined, doubtful)
+        other = place(searched, scene, report, joined, doubtful, bars)
         if other.recognised.radii.factor:
             mechanism = photographs.mechanism.with_cylinders(other.search.cylinders)
             corrected = replace(photographs, mechanism=mechanism)
@@ -174,28 +178,39 @@ def rejected(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
     return replace(outlines, used=outlines.used & ~out, reason=reason)
 
 
-def _expose(load: Load, row: int) -> Exposure:
-    return expose(to_grey(load(row)))
+def _look(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, Bars | None]:
+    """Return how an image was exposed, and the bars of those that are to be recognised."""
+    image = search.load(row)
+    view = int(search.measurements.view[row])
+    bars = replace(search, load=lambda _: image).bars(row, view) if row in rows else None
+    return expose(to_grey(image)), bars
 
 
-def _defects(photographs: Photographs, report: Report) -> dict[int, str]:
-    """Return why images show nothing, by row."""
-    rows = photographs.detect.tolist()
+def _looked_at(
+    photographs: Photographs, scene: Scene, report: Report, joined: Joined
+) -> tuple[dict[int, str], dict[int, Bars]]:
+    """Return why images show nothing, and the bars of those that are recognised first, by row."""
+    rows, view = photographs.detect.tolist(), photographs.measurements.view
     count = counted(report, "Looking at images", len(rows))
-    exposures = {}
-    for row, exposure in zip(
-        rows, photographs.run(partial(_expose, photographs.load), rows), strict=True
-    ):
+    hints = scene.T_base_camera
+    groups = group_views(photographs.measurements, photographs.detect, hints, joined)
+    first = {r for g in groups for r in (g.rows if g.hint is None else g.some)}
+    exposures, bars = {}, {}
+    look = partial(_look, search_in(photographs, scene), first)
+    for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
         exposures[row] = exposure
+        if own is not None:
+            bars[row] = own
         count(row)
-    view, views = photographs.measurements.view, photographs.measurements.views
+    views = photographs.measurements.views
     numbers = [camera_numbers(one.camera) for one in views]
     camera = [numbers.index(own) for own in numbers]  # the first view of the same camera
-    return image_defects(
+    defects = image_defects(
         exposures,
         {row: int(view[row]) for row in rows},
         {row: camera[view[row]] for row in rows},
     )
+    return defects, bars
 
 
 def _lost_views(photographs: Photographs, usable: IntArray) -> set[int]:

@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -38,6 +39,8 @@ from legcal.observations.sets import (
     no_outlines,
 )
 from legcal.progress import Report
+from legcal.recognition.bars import Bars
+from legcal.recognition.looked_at import LookedAt
 from legcal.recognition.radii import Part, radius_notes
 from legcal.recognition.recognise import Recognised, Search, recognise, shifted
 from legcal.workers import Run
@@ -207,12 +210,28 @@ class Placement:
         return (*dict.fromkeys(self.unplaced.values()), *self.notes)
 
 
+def search_in(
+    photographs: Photographs, scene: Scene, known: Mapping[int, Bars] = MappingProxyType({})
+) -> Search:
+    """Return what is searched for in the images, some of whose bars are known."""
+    return LookedAt(
+        photographs.load,
+        photographs.measurements,
+        scene.A_base,
+        scene.B_base,
+        photographs.cylinders,
+        photographs.wanted,
+        dict(known),
+    )
+
+
 def place(
     photographs: Photographs,
     scene: Scene,
     report: Report,
     joined: Joined = None,
     doubtful: Collection[Part] = (),
+    known: Mapping[int, Bars] = MappingProxyType({}),
 ) -> Placement:
     """Recognise the legs in the images, and place the cameras by them.
 
@@ -228,15 +247,10 @@ def place(
         T_board_camera of the views that show a calibration board: they are placed together.
     doubtful : collection of (int, float)
         Parts that may have other radii, as :func:`legcal.recognition.recognise.recognise` has it.
+    known : mapping of Bars
+        The bars of images that were looked at before, by row.
     """
-    search = Search(
-        photographs.load,
-        photographs.measurements,
-        scene.A_base,
-        scene.B_base,
-        photographs.cylinders,
-        photographs.wanted,
-    )
+    search = search_in(photographs, scene, known)
     found = recognise(
         search,
         photographs.detect,

@@ -172,6 +172,23 @@ def _observed(made: Spoiled) -> Placement:
     return observe(work.photographs, scene, no_progress).placement
 
 
+def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: Path) -> None:
+    made = spoiled(tmp_path / "read", 4, ("c1", "c2"))
+    del made.entry["views"]["c2"]["T_base_camera"]
+    work = _work(made)
+    scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
+    photographs, read = work.photographs, list[int]()
+
+    def load(row: int) -> Any:
+        read.append(row)
+        return photographs.load(row)
+
+    observed = observe(replace(photographs, load=load), scene, no_progress)
+    assert observed.placement.unplaced == {}
+    rows = photographs.detect.tolist()
+    assert read == [*rows, *rows]
+
+
 def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
     tmp_path: Path,
 ) -> None:

@@ -60,9 +60,10 @@ class Band:
         The sign is that of eq (3): positive on the side of greater v.
         """
         ends = np.stack([np.asarray(v0, dtype=np.float64), np.asarray(v1, dtype=np.float64)], -1)
-        xy = self.points(np.array([0.0, self.length]), ends)
-        rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
-        h = np.cross(rays[..., 0, :], rays[..., 1, :])
+        (x0, y0), (x1, y1) = np.moveaxis(
+            self.points(np.array([0.0, self.length]), ends), (-2, -1), (0, 1)
+        )
+        h = np.stack([y0 - y1, x1 - x0, x0 * y1 - x1 * y0], axis=-1)  # the vector product of rays
         h /= np.linalg.norm(h, axis=-1, keepdims=True)
         return np.asarray(h * np.sign(h[..., :2] @ self.normal)[..., None])
 

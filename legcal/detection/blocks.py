@@ -140,7 +140,8 @@ class Blocks:
         for _ in range(n_rounds):
             chosen = np.repeat(active, counts)
             fit = fit_blocks(*self.samples(chosen), blur)
-            self.contrast[chosen], self.sharp[chosen] = fit.contrast, fit.sharp
+            self.contrast[chosen] = fit.contrast(self.half_width[chosen], blur)
+            self.sharp[chosen] = fit.sharpness()
             bounds = np.concatenate([[0], np.cumsum(counts[active])])
             gain, position, before = (x[chosen] for x in (self.gain, self.position, self.moved))
             shift = (before + fit.shift) / gain  # a line holds the whole shift

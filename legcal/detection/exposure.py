@@ -4,6 +4,7 @@ The blur is that of the sharpest edges. An edge of blur sigma that is blurred by
 slope proportional to (sigma^2 + s^2)^(-1/2); slopes after two such s give sigma, whatever the step.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,11 +17,15 @@ BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey
 NEARLY_ALL = 0.5  # percent of an image that may be otherwise
 LEAST_RANGE = 10.0  # of an image in which something can be seen [grey levels]
 REDUCTION = 8  # before the range is taken, so that noise does not count
-SCALES = (1.0, 2.5)  # at which slopes are compared, standard deviations [px]
+SCALES = (0.95, 2.5)  # at which slopes are compared, standard deviations [px]
+# The first is that of the filter of slopes alone. The second is taken from means of four pixels,
+# where that filter is twice as wide.
+_BLUR_OF_HALF = 0.5 * math.sqrt(SCALES[1] ** 2 - 4.0 * SCALES[0] ** 2 - 0.25)
+SPARSE = 6  # every such row and column is enough for percentiles
 DIRECTIONS = 4  # of edges: what moves is blurred in one
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
 STRONG = 95.0  # percentile of the slopes from which on they count
-FEWEST_EDGES, FEWEST_PART = 100, 0.1  # places of a direction, and of all
+FEWEST_EDGES, FEWEST_PART = 40, 0.1  # places of a direction, and of all
 LARGEST_BLUR = 8.0  # that the scales can tell [px]
 MUCH_BLURRED = (2.0, 1.2)  # against others: factor, and more [px]
 SHARP = 40.0  # percentile of blurs, for what is usual
@@ -68,19 +73,13 @@ def expose(grey: Grey) -> Exposure:
     """
     small = reduce(grey, max(1, min(REDUCTION, min(grey.shape) // 16)))
     low, high = np.percentile(small, [NEARLY_ALL, 100.0 - NEARLY_ALL])
-    dark, bright = np.percentile(grey[::4, ::4], [NEARLY_ALL, 100.0 - NEARLY_ALL])
+    dark, bright = np.percentile(grey[::SPARSE, ::SPARSE], [NEARLY_ALL, 100.0 - NEARLY_ALL])
     return Exposure(float(dark), float(bright), float(high - low), _blur(grey))
 
 
 def _blur(grey: Grey) -> float:
     """Return the blur of sharp edges [px], in all directions but one."""
-    (x, y), (coarse_x, coarse_y) = (_slopes(grey, s) for s in SCALES)
-    fine, coarse = cv2.magnitude(x, y), cv2.magnitude(coarse_x, coarse_y)
-    # The middle of an edge: beside it the ratio says nothing.
-    edge = fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))
-    edge &= coarse >= np.percentile(coarse[::4, ::4], WEAK)
-    angle = np.arctan2(coarse_y[edge], coarse_x[edge])
-    fine, coarse = fine[edge], np.maximum(coarse[edge], 1e-3)
+    fine, coarse, angle = _edges(grey)
     direction = np.rint(angle / (np.pi / DIRECTIONS)).astype(np.intp) % DIRECTIONS
     least = max(FEWEST_EDGES, int(FEWEST_PART * len(fine)))  # else they are corners of others
     of_direction = [direction == d for d in range(DIRECTIONS)]
@@ -88,6 +87,22 @@ def _blur(grey: Grey) -> float:
     blurs = sorted(_blur_of(fine[own], coarse[own]) for own in chosen)
     # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
     return blurs[min(1, len(blurs) - 1)] if blurs else 0.0
+
+
+def _edges(grey: Grey) -> tuple[Grey, Grey, Grey]:
+    """Return slopes of edges in their middle, fine and coarse, and their directions [rad]."""
+    height, width = (2 * (size // 2) for size in grey.shape)
+    slope = cv2.magnitude(*_slopes(grey[:height, :width]))
+    rows = np.maximum(slope[::2], slope[1::2])
+    fine = np.maximum(rows[:, ::2], rows[:, 1::2])  # the greatest of four pixels
+    half = cv2.GaussianBlur(reduce(grey, 2), (0, 0), _BLUR_OF_HALF)
+    x, y = _slopes(np.asarray(half, dtype=np.float32))
+    coarse = cv2.magnitude(x, y)
+    # Beside the middle of an edge the ratio says nothing.
+    edge = fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))
+    edge &= coarse >= np.percentile(coarse[::SPARSE, ::SPARSE], WEAK)
+    coarse = np.maximum(0.5 * coarse[edge], np.float32(1e-3))  # by pixels of the whole image
+    return fine[edge], coarse, np.arctan2(y[edge], x[edge])
 
 
 def _blur_of(fine: Grey, coarse: Grey) -> float:
@@ -101,10 +116,9 @@ def _blur_of(fine: Grey, coarse: Grey) -> float:
     return float(np.sqrt(np.clip(squared, 0.0, LARGEST_BLUR**2)))
 
 
-def _slopes(grey: Grey, sigma: float) -> tuple[Grey, Grey]:
-    """Return both slopes of an image that is blurred besides."""
-    smooth = np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma), dtype=np.float32)
-    x, y = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+def _slopes(grey: Grey) -> tuple[Grey, Grey]:
+    """Return both slopes of an image, a little blurred."""
+    x, y = (cv2.Sobel(grey, cv2.CV_32F, i, 1 - i, ksize=5) for i in (1, 0))
     return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)
 
 

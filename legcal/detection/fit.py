@@ -6,7 +6,6 @@ variance from the noise of the block. All blocks of all outlines of an image are
 The line through the blocks of one outline is fitted robustly; two or three rounds suffice.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,17 +35,37 @@ class BlockFit:
         Its variance by the noise of the block [px^2]; infinite where nothing is seen.
     noise : (n,) array
         Mean square residual of the block [grey levels^2].
-    contrast : (n,) array
-        Step from the background to the leg, a pixel and a half inside [grey levels].
-    sharp : (n,) array
-        How much chi^2 falls by there being a step or a limb, and not only a bend of the shading.
+    freedom : (n,) array
+        Samples of the block beyond what is fitted, at least one.
+    amplitude : (n, 5) array
+        Of the functions of the limb model [grey levels].
+    normal, right, power : (n, 5, 5), (n, 5) and (n,) array
+        Products of these functions, of them with the grey levels, and of grey levels.
     """
 
     shift: Array
     variance: Array
     noise: Array
-    contrast: Array
-    sharp: Array
+    freedom: Array
+    amplitude: Array
+    normal: Array
+    right: Array
+    power: Array
+
+    def contrast(self, half_width: Samples, blur: float) -> Array:
+        """Return the steps (n,) to the leg, a pixel and a half inside [grey levels]."""
+        reference = np.full((len(half_width), 1), 1.5 + blur, dtype=np.float32)
+        at, _ = basis(reference, half_width, blur)
+        return np.asarray(np.sum(at[:, 2:, 0] * self.amplitude[:, 2:], axis=1))
+
+    def sharpness(self) -> Array:
+        """Return how much chi^2 (n,) falls by there being more than a bend of the shading."""
+        kept = list(BEND)
+        part = self.normal[:, kept][:, :, kept] + 1e-3 * np.eye(len(kept))
+        right = self.right[:, kept]
+        explained = np.sum(right * np.linalg.solve(part, right[..., None])[..., 0], axis=1)
+        share = (self.power - explained) / np.maximum(self.noise, 1e-9)
+        return np.asarray(share - self.freedom)
 
 
 def fit_blocks(
@@ -65,50 +84,55 @@ def fit_blocks(
     blur : float or (n, 1) array of float32
         Standard deviation of the blur [px].
     """
-    values, slopes = basis(d, half_width, blur)
+    X, slopes = basis(d, half_width, blur)
     n_samples = np.count_nonzero(weight, axis=1).astype(np.float64)
-    level = np.einsum("nm,nm->n", grey, weight) / np.maximum(weight.sum(axis=1), 1e-3)
-    y = (grey - level[:, None]) * weight
-    X = values * weight[:, None, :]
-    Xt = X.swapaxes(1, 2)
-    normal = (X @ Xt).astype(np.float64)
-    right = (X @ y[..., None]).astype(np.float64)
-    inverse = _regularised_inverse(normal, right, y, n_samples)
-    amplitude = inverse @ right
-    residual = y - (Xt @ amplitude.astype(np.float32))[..., 0]
+    level = _products(grey, weight) / np.maximum(weight.sum(axis=1), 1e-3)
+    y = (grey - level.astype(np.float32)[:, None]) * weight
+    X *= weight[:, None, :]
+    normal = (X @ X.swapaxes(1, 2)).astype(np.float64)
+    right, power = _with(X, y), _products(y, y)
+    inverse = _regularised_inverse(normal, right, power, n_samples)
+    amplitude = _applied(inverse, right)
+    residual = y - _sum(X, amplitude)
     # The outline at distance s further inside lowers d by s.
-    change = -(slopes.swapaxes(1, 2) @ amplitude.astype(np.float32))[..., 0] * weight
-    eliminated = inverse @ (X @ change[..., None]).astype(np.float64)
-    change -= (Xt @ eliminated.astype(np.float32))[..., 0]
-    information = np.einsum("nm,nm->n", change, change).astype(np.float64)
-    gradient = np.einsum("nm,nm->n", change, residual).astype(np.float64)
-    noise = np.einsum("nm,nm->n", residual, residual).astype(np.float64)
+    change = _sum(slopes, -amplitude) * weight
+    change -= _sum(X, _applied(inverse, _with(X, change)))
+    information, gradient = _products(change, change), _products(change, residual)
     freedom = np.maximum(n_samples - N_BASIS - 1.0, 1.0)
     seen = (information > 1e-9) & (n_samples > 4 * N_BASIS)
     safe = np.where(seen, information, 1.0)
-    shift = np.where(seen, np.clip(gradient / safe, -STEP, STEP), 0.0)
-    noise = np.maximum(noise - np.where(seen, gradient**2 / safe, 0.0), 0.0) / freedom
-    reference = np.broadcast_to(np.asarray(1.5 + blur, dtype=np.float32), (len(d), 1))
-    at, _ = basis(reference, half_width, blur)
-    contrast = np.sum(at[:, 2:, 0] * amplitude[:, 2:, 0], axis=1)
-    sharp = _without(normal, right, y, BEND) / np.maximum(noise, 1e-9) - freedom
-    return BlockFit(shift, np.where(seen, noise / safe, np.inf), noise, contrast, sharp)
+    step = np.where(seen, gradient / safe, 0.0)
+    noise = np.maximum(_products(residual, residual) - step * gradient, 0.0) / freedom
+    variance = np.where(seen, noise / safe, np.inf)
+    shift = np.clip(step, -STEP, STEP)
+    return BlockFit(shift, variance, noise, freedom, amplitude, normal, right, power)
 
 
-def _without(normal: Array, right: Array, y: Samples, kept: Sequence[int]) -> Array:
-    """Return the sum of squares that some of the functions of the model leave unexplained."""
-    some = list(kept)
-    part = normal[:, some][:, :, some] + 1e-3 * np.eye(len(some))
-    explained = np.sum(right[:, some] * np.linalg.solve(part, right[:, some]), axis=(1, 2))
-    return np.asarray(np.einsum("nm,nm->n", y, y).astype(np.float64) - explained)
+def _products(one: Samples, other: Samples) -> Array:
+    """Return the sums of products (n,) in each block."""
+    return np.asarray(np.einsum("nm,nm->n", one, other).astype(np.float64))
 
 
-def _regularised_inverse(normal: Array, right: Array, y: Samples, n_samples: Array) -> Array:
+def _with(functions: Samples, values: Samples) -> Array:
+    """Return the sums of products (n, 5) of functions (n, 5, m) with values (n, m)."""
+    return np.asarray((functions @ values[..., None])[..., 0].astype(np.float64))
+
+
+def _sum(functions: Samples, amplitude: Array) -> Samples:
+    """Return functions (n, 5, m) with amplitudes (n, 5), added up, (n, m)."""
+    return np.asarray((amplitude.astype(np.float32)[:, None] @ functions)[:, 0])
+
+
+def _applied(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _regularised_inverse(normal: Array, right: Array, power: Array, n_samples: Array) -> Array:
     """Invert normal matrices, drawing amplitudes that the noise of a block leaves open to zero."""
     count = np.maximum(n_samples, 1.0)
-    power = np.einsum("nm,nm->n", y, y).astype(np.float64) / count + 1e-3
-    free = np.linalg.solve(normal + 1e-3 * np.eye(N_BASIS), right)
-    unexplained = power - np.sum(right * free, axis=(1, 2)) / count
+    power = power / count + 1e-3
+    free = np.linalg.solve(normal + 1e-3 * np.eye(N_BASIS), right[..., None])[..., 0]
+    unexplained = power - np.sum(right * free, axis=1) / count
     prior = np.clip(unexplained / power, 1e-4, 1.0)[:, None] * RIDGE
     return np.asarray(np.linalg.inv(normal + prior[:, :, None] * np.eye(N_BASIS)))
 

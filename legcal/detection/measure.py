@@ -1,7 +1,8 @@
 """Sub-pixel lines of all outlines of an image, from edges known to about a pixel.
 
-A first round with a wide blur and a few blocks pulls the lines in; then the blur of the
-image is estimated from its best blocks, and lines settle robustly on blocks that are fitted apart.
+First rounds on a few blocks pull the lines in, with a wide blur and then with that of the image as
+its best blocks show it: where it is wrong, lines lie beside their outlines, and where they do, the
+blur seems wide. Then lines settle robustly on blocks that are fitted apart.
 At last all blocks of an outline that lie on its line are fitted together, and the blur to all
 outlines. Pixels are used as far as the blurred outline reaches and little farther, since the
 further inside, the less the shading is that of a limb.
@@ -27,7 +28,7 @@ __all__ = ["Edge", "MeasuredEdge", "measure_edges"]
 FIRST_BLUR = 1.0  # [px]
 LEAST_GAIN = 30  # in chi^2, by which a block shows an edge at all
 FIRST_BLOCKS = 12  # of an outline
-FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # at most
+FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # the last ones at most
 TRIALS, SIMILAR = 3, 0.25  # of the blur, until its logarithm changes by less than this
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
@@ -104,8 +105,10 @@ def measure_edges(
         blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, FIRST_BLOCKS)
         if len(blocks.moved) == 0:
             return [None] * len(edges), FIRST_BLUR
-        blocks.settle(FIRST_BLUR, FIRST_ROUNDS)
-        blur = estimate_blur(*blocks.samples(slice(None)), blocks.merit())
+        blur = FIRST_BLUR
+        for _ in range(FIRST_ROUNDS):
+            blocks.settle(blur, 1)
+            blur = estimate_blur(*blocks.samples(slice(None)), blocks.merit())
         v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     for _ in range(TRIALS):
         tried = blur

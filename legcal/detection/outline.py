@@ -17,7 +17,7 @@ from legcal.detection.picture import Grey
 from legcal.detection.pieces import Piece
 from legcal.detection.prediction import PredictedLeg, hidden_by
 from legcal.detection.verdict import LEAST_LENGTH, qualities, verdict
-from legcal.geometry.types import Array, BoolArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 
@@ -209,21 +209,30 @@ def find_parts(
         if not wanted[leg.leg]:
             continue
         for piece, h in zip(leg.pieces, leg.outlines, strict=True):
-            one = _seek(camera, legs, names, leg, piece, h)
+            one = _seek(camera, leg, piece, h)
             if isinstance(one, str):
                 rejected.append(_rejected(leg, piece, one))
             else:
                 sought.append(one)
-    searches = [
-        PairSearch(one.band, one.predicted, one.hidden, float(window[one.leg.leg]))
-        for one in sought
-    ]
+    searches: list[PairSearch] = []
+    free: list[_Sought] = []
+    for one, front in zip(sought, _in_front(legs, sought), strict=True):
+        hidden = np.any(front >= 0, axis=0)
+        if np.mean(~hidden) * one.band.length < one.least:
+            values, counts = np.unique(front[front >= 0], return_counts=True)
+            why = f"{HIDDEN} {names[values[np.argmax(counts)]]}"
+            rejected.append(_rejected(one.leg, one.piece, why))
+            continue
+        free.append(one)
+        searches.append(PairSearch(one.band, one.predicted, hidden, float(window[one.leg.leg])))
     parts: list[FoundPart] = []
-    for one, pair in zip(sought, find_pairs(grey, camera, searches), strict=True):
+    pairs = find_pairs(grey, camera, searches)
+    for one, search, pair in zip(free, searches, pairs, strict=True):
         if pair is None:
             rejected.append(_rejected(one.leg, one.piece, "no convincing pair of edges"))
         else:
-            parts.append(FoundPart(one.leg, one.piece, one.band, one.predicted, one.hidden, pair))
+            hidden = search.hidden
+            parts.append(FoundPart(one.leg, one.piece, one.band, one.predicted, hidden, pair))
     return parts, rejected
 
 
@@ -233,50 +242,52 @@ class _Sought:
 
     leg: PredictedLeg
     piece: Piece
+    h: Array  # (2, 3) its predicted outlines
     band: Band
     predicted: Array
-    hidden: BoolArray
+
+    @property
+    def width(self) -> float:
+        """Predicted width in the middle of the band [px]."""
+        return float(np.mean(self.predicted[1] - self.predicted[0]))
+
+    @property
+    def least(self) -> float:
+        """How much of the part must be seen [px]."""
+        return max(LEAST_LENGTH[0], LEAST_LENGTH[1] * self.width)
 
 
-def _seek(
-    camera: Camera,
-    legs: Sequence[PredictedLeg],
-    names: Sequence[str],
-    leg: PredictedLeg,
-    piece: Piece,
-    h: Array,
-) -> _Sought | str:
+def _seek(camera: Camera, leg: PredictedLeg, piece: Piece, h: Array) -> _Sought | str:
     """Return where a part should be, or say why it cannot be found."""
     band: Band | None = leg.band
     if len(leg.pieces) > 1:
         band = band_of_leg(camera, leg.A_camera, leg.B_camera, piece.start, piece.end)
     if band is None:
         return OUTSIDE
-    predicted = band.offsets(h[:, None, :], np.array([0.0, band.length]))
-    width = float(np.mean(predicted[1] - predicted[0]))
-    least = max(LEAST_LENGTH[0], LEAST_LENGTH[1] * width)
-    if width < NARROWEST:
-        return f"too narrow, {width:.1f} px wide"
-    if band.length < least:
+    one = _Sought(leg, piece, h, band, band.offsets(h[:, None, :], np.array([0.0, band.length])))
+    if one.width < NARROWEST:
+        return f"too narrow, {one.width:.1f} px wide"
+    if band.length < one.least:
         return f"too short, {band.length:.0f} px in the image"
-    front = _in_front(legs, leg, h, band, block_positions(band))
-    free = np.all(front < 0, axis=0)
-    if np.mean(free) * band.length < least:
-        values, counts = np.unique(front[front >= 0], return_counts=True)
-        return f"{HIDDEN} {names[values[np.argmax(counts)]]}"
-    return _Sought(leg, piece, band, predicted, ~free)
+    return one
 
 
-def _in_front(
-    legs: Sequence[PredictedLeg], leg: PredictedLeg, h: Array, band: Band, t: Array
-) -> Array:
-    """Return which leg hides each outline (2, n_t) at t [px] of a band, -1 where it is free."""
-    s = leg.distance_along(band, t)
-    axis = leg.A_camera + s[:, None] * leg.u
-    radius = EPSILON * (h @ leg.A_camera)
-    lines = axis - (EPSILON * radius)[:, None, None] * h[:, None]
-    front = hidden_by(leg, legs, lines.reshape(-1, 3), MARGIN / band.scale)
-    return np.asarray(front.reshape(2, -1))
+def _in_front(legs: Sequence[PredictedLeg], sought: Sequence[_Sought]) -> list[IntArray]:
+    """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free."""
+    if not sought:
+        return []
+    points = []
+    for one in sought:
+        leg, h = one.leg, one.h
+        s = leg.distance_along(one.band, block_positions(one.band))
+        axis = leg.A_camera + s[:, None] * leg.u
+        radius = EPSILON * (h @ leg.A_camera)
+        points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
+    n = [len(of_part) for of_part in points]
+    own = np.repeat([one.leg.leg for one in sought], n)
+    margin = np.repeat([MARGIN / one.band.scale for one in sought], n)
+    front = hidden_by(legs, own, np.concatenate(points), margin)
+    return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
 
 
 def _measure(

@@ -193,16 +193,19 @@ def _edge_lines(
 
 def _lines(votes: Array, half: int) -> tuple[Array, Array]:
     """Add votes (n_blocks, 2 half + 1) along lines; return shifts and scores of separate maxima."""
-    differences = np.arange(-half, half + 1)
-    padded = np.pad(votes, ((0, 0), (half // 2 + 1, half // 2 + 1)))
-    score = padded.ravel()[_along_lines(len(votes), half)].sum(axis=1)
+    n_columns, reach = 2 * half + 1, half // 2 + 1
+    padded = np.zeros((len(votes), n_columns + 2 * reach), dtype=votes.dtype)
+    padded[:, reach:-reach] = votes
+    score = padded.take(_along_lines(len(votes), half)).sum(axis=1)
     shifts, scores = [], []
     for _ in range(KEPT):
-        i, j = divmod(int(np.argmax(score)), score.shape[1])
-        if score[i, j] <= 0.0:
+        i, j = divmod(int(score.argmax()), n_columns)
+        best = float(score[i, j])
+        if best <= 0.0:
             break
-        shifts.append((j - half - 0.5 * differences[i], j - half + 0.5 * differences[i]))
-        scores.append(float(score[i, j]))
+        middle, tilt = j - half, 0.5 * (i - half)
+        shifts.append((middle - tilt, middle + tilt))
+        scores.append(best)
         score[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3] = 0.0
     return np.array(shifts, dtype=np.float64).reshape(-1, 2), np.array(scores)
 

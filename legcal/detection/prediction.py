@@ -89,31 +89,37 @@ def predict_legs(
     pieces = [visible_pieces(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
     ends = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in pieces]
     bands = bands_of_legs(camera, A_camera, B_camera, *np.array(ends).reshape(-1, 2).T)
-    legs = []
-    for leg, (some, band) in enumerate(zip(pieces, bands, strict=True)):
-        radii = np.array([piece.radius for piece in some])
-        A = A_camera[leg]
-        if band is None or np.linalg.norm(A - u[leg] * (u[leg] @ A)) <= 1.01 * radii.max():
-            continue
-        outlines = outlines_of_axis(u[leg : leg + 1], A[None], radii)
-        legs.append(PredictedLeg(row, leg, A, B_camera[leg], some, outlines, band))
-    return legs
+    radius = np.array([max((piece.radius for piece in some), default=0.0) for some in pieces])
+    distance = np.linalg.norm(A_camera - u * np.sum(u * A_camera, axis=1, keepdims=True), axis=1)
+    seen = {
+        leg: band
+        for leg, band in enumerate(bands)
+        if band is not None and distance[leg] > 1.01 * radius[leg]
+    }
+    axes = [leg for leg in seen for _ in pieces[leg]]
+    radii = np.array([piece.radius for leg in seen for piece in pieces[leg]])
+    outlines = outlines_of_axis(u[axes], A_camera[axes], radii)
+    of_leg = np.split(outlines, np.cumsum([len(pieces[leg]) for leg in seen])[:-1])
+    return [
+        PredictedLeg(row, leg, A_camera[leg], B_camera[leg], pieces[leg], own, band)
+        for (leg, band), own in zip(seen.items(), of_leg, strict=False)
+    ]
 
 
 def hidden_by(
-    leg: PredictedLeg, others: Sequence[PredictedLeg], P_camera: Array, margin: float
+    legs: Sequence[PredictedLeg], own: IntArray, P_camera: Array, margin: Array
 ) -> IntArray:
-    """Return which other leg stands in front of points of a leg.
+    """Return which other leg stands in front of points of legs.
 
     Parameters
     ----------
-    leg : PredictedLeg
-        The leg.
-    others : sequence of PredictedLeg
-        The legs of the same image.
+    legs : sequence of PredictedLeg
+        The legs of one image.
+    own : (n,) array of int
+        The leg to whose outline each point belongs.
     P_camera : (n, 3) array
-        Points of the leg's outline [m].
-    margin : float
+        The points [m].
+    margin : (n,) array
         Points this near to another leg's outline count as hidden, as an angle [rad].
 
     Returns
@@ -121,25 +127,22 @@ def hidden_by(
     (n,) array of int
         Index of the leg in front, -1 where the view is free.
     """
-    others = [other for other in others if other.leg != leg.leg]
-    front = np.full(len(P_camera), -1, dtype=np.intp)
-    if not others:
-        return front
     distance = np.linalg.norm(P_camera, axis=1)
     ray = P_camera / distance[:, None]
     u, A, B = (
-        np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in others), strict=True)
+        np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in legs), strict=True)
     )
     length = np.linalg.norm(B - A, axis=1)
-    radius = np.array([max(piece.radius for piece in other.pieces) for other in others])
-    # The points of other legs' axes nearest to the viewing rays, and the rays' nearest points.
-    c, to_A = ray @ u.T, ray @ A.T  # (n, n_others)
+    radius = np.array([max(piece.radius for piece in other.pieces) for other in legs])
+    # The points of the legs' axes nearest to the viewing rays, and the rays' nearest points.
+    c, to_A = ray @ u.T, ray @ A.T  # (n, n_legs)
     sine2 = np.maximum(1.0 - c**2, 1e-12)
     along = np.clip((c * to_A - np.sum(u * A, axis=1)) / sine2, 0.0, length)
     depth = to_A + along * c
     nearest = A + along[..., None] * u
     gap = np.linalg.norm(nearest - depth[..., None] * ray[:, None], axis=-1)
-    is_hidden = (gap < radius + margin * depth) & (depth < distance[:, None])
-    for k, other in enumerate(others):
-        front[is_hidden[:, k]] = other.leg
+    hides = (gap < radius + margin[:, None] * depth) & (depth < distance[:, None])
+    front = np.full(len(P_camera), -1, dtype=np.intp)
+    for k, other in enumerate(legs):
+        front[hides[:, k] & (own != other.leg)] = other.leg
     return front

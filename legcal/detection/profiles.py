@@ -253,13 +253,18 @@ def _unsaturated(d: Samples, grey: Grey, inside: BoolArray) -> tuple[Samples, Sa
     Clipped, a background ends the blurred step too early, and the outline would seem to lie where
     the rest of the step does. One whose noise alone reaches saturation is not clipped.
     """
+    first, last = (np.full(len(d), at, dtype=np.float32) for at in (-np.inf, np.inf))
     bright = inside & (grey >= SATURATED)
+    some = np.flatnonzero(np.count_nonzero(bright, axis=1) > FEW)
+    if len(some) == 0:
+        return first, last
+    d, bright, inside = d[some], bright[some], inside[some]
     behind = np.partition(np.where(bright & (d < 0.0), d, -np.inf), -1 - FEW, axis=1)[:, -1 - FEW]
     beyond = inside & (d <= behind[:, None])
     n_bright = np.count_nonzero(beyond & bright, axis=1)
     clipped = (n_bright > MOSTLY * np.count_nonzero(beyond, axis=1))[:, None]
     # The line may be off: what is bright near it is the background, where that is clipped.
     near = np.where(clipped, np.float32(ROUGHLY), np.float32(0.0))
-    first = np.max(np.where(bright & clipped & (d < near), d, -np.inf), axis=1)
-    last = np.partition(np.where(bright & (d > near), d, np.inf), FEW, axis=1)[:, FEW]
+    first[some] = np.max(np.where(bright & clipped & (d < near), d, -np.inf), axis=1)
+    last[some] = np.partition(np.where(bright & (d > near), d, np.inf), FEW, axis=1)[:, FEW]
     return first, last

@@ -5,6 +5,7 @@ highlight or noise cut an edge into several; pieces that continue each other are
 are taken to the undistorted sensor plane before, where edges of legs are straight.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -26,6 +27,7 @@ TURN = np.deg2rad(4.0)  # between pieces of one edge
 GAP = 3.0  # between them, in lengths of the shorter one
 DARK = 1.0 / 30.0  # part of the brightest light
 MOST = 400  # pieces of a picture, longest first
+STEEPNESSES = 64  # that are told apart in the order of pixels: each one takes time
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,8 @@ def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> Seg
 def _pieces(small: Grey) -> Array:
     """Return pieces of edges (n, 2, 2) in a reduced picture [px]."""
     levels = _stretched(small)
-    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, 1.0)  # reduced enough already
+    # Reduced enough already. Whether steep pixels come first matters, not in which order.
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, 1.0, n_bins=STEEPNESSES)
     lines = detector.detect(levels)[0]
     if lines is None:
         return np.zeros((0, 2, 2))
@@ -94,8 +97,8 @@ def _stretched(small: Grey) -> NDArray[np.uint8]:
     What is darker than ``DARK`` of the brightest is mostly noise and keeps its distances.
     """
     top = max(float(np.percentile(small[::4, ::4], 99.5)), 1.0)
-    levels = np.log1p(np.clip(small / top, 0.0, 1.0) / DARK) / np.log1p(1.0 / DARK)
-    return np.asarray(255.0 * levels, dtype=np.uint8)
+    light = 1.0 + np.clip(small, 0.0, top) / np.float32(DARK * top)
+    return np.asarray((255.0 / math.log1p(1.0 / DARK)) * cv2.log(light), dtype=np.uint8)
 
 
 def _join(ends: Array) -> tuple[Array, Array]:
@@ -116,35 +119,41 @@ def _join(ends: Array) -> tuple[Array, Array]:
     near = (gap <= GAP * length[j]) & (aside <= np.minimum(allowed, 2 * ASIDE))
     i, j = i[near], j[near]
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
-    _, label = connected_components(graph, directed=False)
-    lines, covered = [], []
-    for group in _groups(np.asarray(label, dtype=np.intp)):
-        for line, share in _fitted(ends[group], length[group]):
-            lines.append(line)
-            covered.append(share)
-    found = np.array(lines).reshape(-1, 2, 2)
-    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= LEAST_LENGTH
-    return found[long], np.array(covered)[long]
-
-
-def _groups(label: IntArray) -> list[IntArray]:
+    label: IntArray = np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
     order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+    found, covered = _fitted(ends[order], length[order], label[order])
+    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= LEAST_LENGTH
+    return found[long], covered[long]
 
 
-def _fitted(pieces: Array, length: Array) -> list[tuple[Array, float]]:
-    """Return one line through pieces, or the pieces as they are if they bend."""
-    if len(pieces) == 1:
-        return [(pieces[0], 1.0)]
-    weight = np.repeat(length, 2)
-    points = pieces.reshape(-1, 2)
-    centre = np.average(points, axis=0, weights=weight)
-    spread = (points - centre) * np.sqrt(weight)[:, None]
-    direction = np.linalg.svd(spread, full_matrices=False)[2][0]
-    direction = direction * np.sign(direction @ (pieces[0, 1] - pieces[0, 0]))
-    place = (points - centre) @ direction
-    aside = (points - centre) @ np.array([-direction[1], direction[0]])
-    if np.abs(aside).max() > 1.5 * ASIDE:
-        return [(piece, 1.0) for piece in pieces]
-    line = centre + np.array([[place.min()], [place.max()]]) * direction
-    return [(line, float(min(1.0, length.sum() / (place.max() - place.min()))))]
+def _fitted(pieces: Array, length: Array, label: IntArray) -> tuple[Array, Array]:
+    """Return one line through the pieces of each label, or the pieces as they are if they bend.
+
+    Pieces (n, 2, 2) and their lengths (n,) come label by label, from 0 without gaps, the longest
+    first; lines as well, with the share of each that its pieces cover.
+    """
+    first = np.flatnonzero(np.diff(label, prepend=-1))
+    total = np.add.reduceat(length, first)
+    centre = np.add.reduceat(pieces.mean(axis=1) * length[:, None], first) / total[:, None]
+    away = pieces - centre[label, None]
+    xx, xy, yy = (
+        np.add.reduceat(np.sum(away[..., i] * away[..., j], axis=1) * length, first)
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    turn = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    direction = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    longest = pieces[first, 1] - pieces[first, 0]
+    direction *= np.sign(np.sum(direction * longest, axis=1))[:, None]
+    x, y = direction[label].T[..., None]
+    place, aside = away[..., 0] * x + away[..., 1] * y, away[..., 1] * x - away[..., 0] * y
+    start = np.minimum.reduceat(place.min(axis=1), first)
+    stop = np.maximum.reduceat(place.max(axis=1), first)
+    lines = centre[:, None] + np.stack([start, stop], axis=1)[..., None] * direction[:, None]
+    straight = np.maximum.reduceat(np.abs(aside).max(axis=1), first) <= 1.5 * ASIDE
+    bent = ~straight[label]
+    order = np.argsort(np.concatenate([np.flatnonzero(straight), label[bent]]), kind="stable")
+    share = np.minimum(total / (stop - start), 1.0)
+    return (
+        np.concatenate([lines[straight], pieces[bent]])[order],
+        np.concatenate([share[straight], np.ones(np.count_nonzero(bent))])[order],
+    )
