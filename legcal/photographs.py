@@ -164,6 +164,16 @@ class Photographs:
         kept = ~np.isin(outlines.row, rows) | is_edited(outlines)
         return replace(self, detect=rows, keep=choose_outlines(outlines, kept))
 
+    def with_gammas(self, gammas: Mapping[str, float]) -> Photographs:
+        """Return the same images, read with other gammas of some views, by their names."""
+        views = tuple(
+            replace(view, camera=replace(view.camera, gamma=gammas[view.name]))
+            if view.name in gammas
+            else view
+            for view in self.measurements.views
+        )
+        return replace(self, measurements=replace(self.measurements, views=views))
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:

@@ -113,8 +113,7 @@ def write_session(
         entry: dict[str, Any] = {"camera": camera}
         if groups:
             entry["hand_held"] = True
-        if view.camera.gamma != 1.0:
-            entry["gamma"] = view.camera.gamma
+        entry["gamma"] = view.camera.gamma
         if view.T_base_camera is not None:
             entry["T_base_camera"] = _rounded(view.T_base_camera)
         if view.legs is not None:
