@@ -28,7 +28,6 @@ from legcal.detection.outline import outline_parts
 from legcal.disagreeing import disagreeing_images
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.examining import Observed, observe
-from legcal.gamma_search import ROUNDS, next_gammas
 from legcal.geometry.types import IntArray
 from legcal.identify.check import check_identifiable
 from legcal.observations.canonical_order import inverse
@@ -45,6 +44,7 @@ from legcal.photographs import (
 )
 from legcal.progress import Report
 from legcal.recognition.hints import hint_notes
+from legcal.refinement.gamma_search import ROUNDS, next_gammas
 from legcal.refinement.gammas import EstimatedGamma
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution

@@ -19,7 +19,7 @@ from legcal.refinement.state import State
 
 # What limbs do to outlines that looks like another gamma, as in rendered photographs of machines
 # with a known one: standard deviation of its logarithm.
-FEIGNED = 0.15
+FEIGNED = 0.17
 _VAGUE = 0.25  # the same from where on outlines hardly tell a gamma
 
 
