@@ -52,6 +52,7 @@ _DECIDING = (
     "disagreeing.py",
     "fitting.py",
     "board_views.py",
+    "refinement/gamma_search.py",
 )
 
 

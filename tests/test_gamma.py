@@ -68,7 +68,8 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: Session) -> None:
     (gamma,) = found.gammas
     assert gamma.views == ("c1", "c2", "c3")
     assert gamma.measured_with == 1.0
-    assert FEIGNED < gamma.sigma < FEIGNED + 0.02
+    assert gamma.fitted_sigma < 0.02
+    assert gamma.sigma == pytest.approx(np.hypot(gamma.fitted_sigma, FEIGNED))
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
     assert any("The gamma of the camera of views c1, c2, c3 is not told" in n for n in found.notes)
     assert not any("gamma" in name for name in found.biases)
@@ -85,8 +86,7 @@ def test_pull_of_a_gamma_is_that_of_its_sigma(session: Session) -> None:
     start, pulls = disturbed_start(session, joints=0.0, camera=0.0, angle=0.0), []
     for seed in range(6):
         found = refine(session.legs, measurements, encoded(session, seed=seed), start).gammas[0]
-        own = np.sqrt(found.sigma**2 - FEIGNED**2)
-        pulls.append((np.log(found.gamma) - LOG_GAMMA) / own)
+        pulls.append((np.log(found.gamma) - LOG_GAMMA) / found.fitted_sigma)
     assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.8
 
 
@@ -153,7 +153,7 @@ def test_search_comes_to_rest_near_the_gamma_at_which_fits_see_nothing(
     read, found = 1.0, list[tuple[EstimatedGamma, ...]]()
     for _ in range(4):
         seen = share * np.log(true / read)
-        found.append((EstimatedGamma(("c1", "c2"), read * float(np.exp(seen)), 0.2, read),))
+        found.append((EstimatedGamma(("c1", "c2"), read * float(np.exp(seen)), 0.05, read),))
         gammas = next_gammas(found)
         if not gammas:
             break
@@ -163,6 +163,11 @@ def test_search_comes_to_rest_near_the_gamma_at_which_fits_see_nothing(
         read = gammas["c1"]
     assert gammas == {}
     assert abs(np.log(true / read)) <= SETTLED / share + 1e-12
+
+
+def test_gamma_that_may_be_chance_is_not_followed() -> None:
+    assert next_gammas([(EstimatedGamma(("c1",), 1.3, 0.2, 1.0),)]) == {}
+    assert next_gammas([(EstimatedGamma(("c1",), 1.3, 0.1, 1.0),)]) != {}
 
 
 def test_dataset_says_whether_gamma_is_told(folder: Folder) -> None:

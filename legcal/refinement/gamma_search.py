@@ -16,6 +16,7 @@ from legcal.refinement.gammas import EstimatedGamma
 
 ROUNDS = 2  # of measuring outlines with another gamma, at most
 SETTLED = 0.12  # what a fit sees, in the logarithm: no more than limbs feign
+SIGNIFICANT = 2.0  # standard deviations of the fit: less may be chance
 SEEN = 0.5  # of how far a gamma is off, before two of them have told
 SEEN_SHARES = (0.25, 1.2)  # what is believed when they have
 LARGEST_STEP = 0.7  # of the logarithm
@@ -35,7 +36,7 @@ def next_gammas(found: Sequence[Sequence[EstimatedGamma]]) -> dict[str, float]:
         of_camera = [other for fit in found for other in fit if other.views == one.views]
         read = np.log([other.measured_with for other in of_camera])
         seen = np.log([other.gamma for other in of_camera]) - read
-        if abs(seen[-1]) > SETTLED:
+        if abs(seen[-1]) > max(SETTLED, SIGNIFICANT * one.fitted_sigma):
             step = np.clip(seen[-1] / _share(read, seen), -LARGEST_STEP, LARGEST_STEP)
             other = float(np.clip(np.exp(read[-1] + step), *RANGE))
             gammas |= dict.fromkeys(one.views, other)

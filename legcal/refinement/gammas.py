@@ -32,16 +32,21 @@ class EstimatedGamma:
     views : tuple of str
         The views of the camera.
     gamma : float
-    sigma : float
-        Standard deviation of its logarithm, with what limbs may feign.
+    fitted_sigma : float
+        Standard deviation of its logarithm, by the fit.
     measured_with : float
         The gamma with which the outlines were measured.
     """
 
     views: tuple[str, ...]
     gamma: float
-    sigma: float
+    fitted_sigma: float
     measured_with: float
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of its logarithm, with what limbs may feign."""
+        return float(np.hypot(self.fitted_sigma, FEIGNED))
 
     def __str__(self) -> str:
         several = len(self.views) > 1
@@ -86,6 +91,6 @@ def estimated_gammas(
         measured_with = float(outlines.gamma[o.index[moved]][0])
         views = tuple(name for name, own in zip(o.views, of_camera, strict=True) if own)
         gamma = measured_with * float(np.exp(state.biases[k]))
-        sigma = float(np.hypot(np.sqrt(covariance[position, position]), FEIGNED))
+        sigma = float(np.sqrt(covariance[position, position]))
         found.append(EstimatedGamma(views, gamma, sigma, measured_with))
     return tuple(found)
