@@ -165,6 +165,13 @@ def test_search_comes_to_rest_near_the_gamma_at_which_fits_see_nothing(
     assert abs(np.log(true / read)) <= SETTLED / share + 1e-12
 
 
+def test_note_says_where_gamma_is_hardly_told_and_names_few_views() -> None:
+    clear = str(EstimatedGamma(("c1",), 2.1, 0.05, 2.0))
+    assert clear.startswith("The gamma of the camera of view c1 is not told: found 2.10 +- 0.37 by")
+    vague = str(EstimatedGamma(tuple(f"c{k}" for k in range(8)), 1.2, 0.4, 1.0))
+    assert "of views c0, c1, c2, c3, c4 and 3 more is not told, and its outlines hardly" in vague
+
+
 def test_gamma_that_may_be_chance_is_not_followed() -> None:
     assert next_gammas([(EstimatedGamma(("c1",), 1.3, 0.2, 1.0),)]) == {}
     assert next_gammas([(EstimatedGamma(("c1",), 1.3, 0.1, 1.0),)]) != {}

@@ -21,6 +21,7 @@ from legcal.refinement.state import State
 # with a known one: standard deviation of its logarithm.
 FEIGNED = 0.17
 _VAGUE = 0.25  # the same from where on outlines hardly tell a gamma
+_NAMED = 5  # views, in a note
 
 
 @dataclass(frozen=True)
@@ -49,18 +50,14 @@ class EstimatedGamma:
         return float(np.hypot(self.fitted_sigma, FEIGNED))
 
     def __str__(self) -> str:
-        several = len(self.views) > 1
-        name = f"view{'s' * several} {', '.join(self.views)}"
-        found = f"{self.gamma:.2f} +- {self.gamma * self.sigma:.2f}"
-        if self.sigma > _VAGUE:
-            return (
-                f"The gamma of the camera of {name} is not told, and the outlines hardly tell it: "
-                f"found {found}, which the uncertainty of the result takes into account; write "
-                "gamma of the views in dataset.yaml."
-            )
+        named, more = self.views[:_NAMED], len(self.views) - _NAMED
+        views = f"view{'s' * (len(self.views) > 1)} {', '.join(named)}"
+        views += f" and {more} more" * (more > 0)
+        hardly = ", and its outlines hardly tell it" * (self.sigma > _VAGUE)
         return (
-            f"The gamma of the camera of {name} is not told: found {found} by its outlines, which "
-            "the uncertainty of the result takes into account; write gamma of the views in "
+            f"The gamma of the camera of {views} is not told{hardly}: found {self.gamma:.2f} +- "
+            f"{self.gamma * self.sigma:.2f} by outlines measured with {self.measured_with:.2f}, "
+            "which the uncertainty of the result takes into account; write gamma of the views in "
             "dataset.yaml if you know it."
         )
 
