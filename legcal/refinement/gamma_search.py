@@ -20,7 +20,7 @@ SIGNIFICANT = 2.0  # standard deviations of the fit: less may be chance
 SEEN = 0.5  # of how far a gamma is off, before two of them have told
 SEEN_SHARES = (0.25, 1.2)  # what is believed when they have
 LARGEST_STEP = 0.7  # of the logarithm
-RANGE = (0.4, 3.5)  # of gammas that are tried
+RANGE = (1.0, 3.0)  # of gammas that are tried: photographs are linear, or encoded for screens
 
 
 def next_gammas(found: Sequence[Sequence[EstimatedGamma]]) -> dict[str, float]:
@@ -39,7 +39,8 @@ def next_gammas(found: Sequence[Sequence[EstimatedGamma]]) -> dict[str, float]:
         if abs(seen[-1]) > max(SETTLED, SIGNIFICANT * one.fitted_sigma):
             step = np.clip(seen[-1] / _share(read, seen), -LARGEST_STEP, LARGEST_STEP)
             other = float(np.clip(np.exp(read[-1] + step), *RANGE))
-            gammas |= dict.fromkeys(one.views, other)
+            if abs(np.log(other) - read[-1]) > SETTLED:
+                gammas |= dict.fromkeys(one.views, other)
     return gammas
 
 
