@@ -18,12 +18,13 @@ from legcal.observations.canonical_order import reorder_corners
 from legcal.observations.corners import Corners
 from legcal.observations.parts import corners_at
 from legcal.progress import Report
+from legcal.recognition.hints import FAR_OFF
 from legcal.refinement.observed_board import SeenBoard
 from legcal.refinement.solution import Solution
 from legcal.vision.board import Board
 from legcal.workpiece import Workpiece
 
-_FAR, _TURNED = 0.05, float(np.radians(5.0))  # [m], [rad]: hints are good to less
+_FAR, _TURNED = FAR_OFF
 
 
 @dataclass(frozen=True, eq=False)

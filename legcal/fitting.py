@@ -30,6 +30,8 @@ from legcal.errors import NotIdentifiable, NotVisible
 from legcal.examining import Observed, observe
 from legcal.geometry.types import IntArray
 from legcal.identify.check import check_identifiable
+from legcal.mechanism.leg import Cylinder
+from legcal.mechanism.model import Mechanism
 from legcal.observations.canonical_order import inverse
 from legcal.observations.corners import Corners
 from legcal.observations.outlines import Outlines
@@ -145,6 +147,8 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
         first = disagreeing_images(part.measurements, part.mechanism, found.solution)
         scene = _fitted_scene(work, found.solution, scene)
         again = observed.photographs.narrowed(shown, found.outlines)
+        cylinders = _fitted_cylinders(again.mechanism, found.solution)
+        again = replace(again, mechanism=again.mechanism.with_cylinders(cylinders))
         methods = [
             outline_parts if np.isnan(blur) else partial(outline_parts, blur=blur)
             for blur in observed.blur
@@ -274,6 +278,22 @@ def _refuse_unseen_legs(work: Workpiece, outlines: Outlines) -> None:
             f"{', '.join(unseen)} in any image, needed some of every leg; add images that show it, "
             "or name the legs of each view in dataset.yaml to leave it to the readings."
         )
+
+
+def _fitted_cylinders(mechanism: Mechanism, solution: Solution) -> list[list[Cylinder]]:
+    """Return what is seen of all legs with the radii of a fit.
+
+    Cylinders of a leg that were equally thick stay so: they look like one.
+    """
+    found = []
+    for j, leg in enumerate(mechanism.legs):
+        fitted = {
+            c.radius: solution.radii[j, c.link]
+            for c in leg.cylinders
+            if (j, c.link) in solution.radii
+        }
+        found.append([replace(c, radius=fitted.get(c.radius, c.radius)) for c in leg.cylinders])
+    return found
 
 
 def _fitted_scene(work: Workpiece, solution: Solution, before: Scene) -> Scene:

@@ -178,6 +178,13 @@ def test_rows_that_nothing_repeats_are_left_out(spoiled: RepeatedImages) -> None
     assert legs[1]["psi"] is None
 
 
+def test_what_is_wrong_with_the_cameras_is_said(spoiled: RepeatedImages) -> None:
+    pose = spoiled.entry["views"]["c1"]["T_base_camera"]
+    pose["xyz"] = [value + 0.3 for value in pose["xyz"]]
+    notes = measure_noise(spoiled.write()).notes
+    assert any(note.startswith("view c1: its T_base_camera is wrong: found") for note in notes)
+
+
 def test_a_leg_along_the_image_x_axis_is_said_to_have_no_M_LS(tmp_path: Path) -> None:
     made = repeated_images(tmp_path / "level", "3-rps", n_poses=1, level_leg=1)
     noise = measure_noise(made.write())

@@ -28,6 +28,7 @@ HALF_WIDTH, DEPTH = 15.0, 3.5
 BRIGHT = np.array([20.0, 0.0, 120.0, 90.0, -60.0, 0.0, 0.0])
 DARK = np.array([180.0, 5.0, 30.0, -20.0, 60.0, 10.0, 0.0])
 GLINT = np.array([20.0, 0.0, 60.0, 60.0, -120.0, 40.0, 0.0])
+LIMB = np.array([20.0, 0.0, 20.0, 0.0, 150.0, 0.0, 0.0])
 
 
 def single(value: float, n: int) -> Array:
@@ -216,3 +217,15 @@ def test_outlines_of_which_nothing_is_seen_know_no_gamma() -> None:
     blocks = outline(BRIGHT, (0.0, 0.0), 0.6)
     nothing = np.zeros(40, dtype=np.bool_)
     assert np.isnan(fit_together(blocks, nothing, 0.6, DEPTH).by_gamma).all()
+
+
+def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
+    """Blocks by themselves hardly know where it is, and together no better than they say."""
+    blocks = outline(LIMB, (0.0, 0.0), 0.55, noise=1.0)
+    blocks.settle(0.55, 2)
+    assert blocks.lines[0] is not None
+    assert np.abs(blocks.lines[0].ends).max() > 0.1
+    blocks.unmove()
+    np.testing.assert_array_equal(blocks.lines[0].ends, [0.0, 0.0])
+    found = fit_together(blocks, blocks.kept(), 0.55, DEPTH)
+    assert np.all(np.abs(found.ends[0]) < 3.0 * np.sqrt(np.diag(found.covariance[0])))

@@ -46,6 +46,28 @@ def test_two_edges_at_the_distance_of_the_radius_are_used() -> None:
     assert found.bias == 0.0
 
 
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_after_a_fit_the_edge_away_from_its_prediction_is_not_the_outline(wrong: int) -> None:
+    """A pixel of width passes while the radius is hardly known, and not near a fit."""
+    predicted = np.stack([np.zeros(2), WIDTH])
+    v = predicted.copy()
+    v[wrong] += 1.0 if wrong == 0 else -1.0
+    edges = _edge(v[0]), _edge(v[1])
+    pair = Pair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
+    assert verdict(pair, WIDTH, LENGTH, edges).reasons == ("", "")
+    found = verdict(pair, WIDTH, LENGTH, edges, predicted)
+    assert found.reasons[1 - wrong] == ""
+    assert found.reasons[wrong].startswith(WRONG_WIDTH)
+
+
+def test_after_a_fit_two_edges_that_both_err_are_not_used() -> None:
+    predicted = np.stack([np.zeros(2), WIDTH])
+    edges = _edge(np.full(2, 0.6)), _edge(WIDTH - 0.6)
+    pair = Pair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
+    found = verdict(pair, WIDTH, LENGTH, edges, predicted)
+    assert all(reason.startswith(WRONG_WIDTH) for reason in found.reasons)
+
+
 @pytest.mark.parametrize("surer", [0, 1])
 def test_of_two_edges_too_near_to_each_other_the_surer_is_the_outline(surer: int) -> None:
     sigma = [0.3, 0.3]

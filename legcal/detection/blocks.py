@@ -4,7 +4,7 @@ In turns each block is fitted by itself, and a straight line robustly to the blo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -120,6 +120,17 @@ class Blocks:
     def sharpness(self) -> list[Array]:
         """Return how clearly the blocks of each edge show a step and not a bend [chi^2]."""
         return np.split(self.sharp, self.bounds[1:-1])
+
+    def unmove(self) -> None:
+        """Put lines back to where they were read; blocks that lay on them stay kept.
+
+        Blocks by themselves hardly tell where a limb is that rises from the level of the
+        background: lines that were near the outline must not settle elsewhere.
+        """
+        self.moved[:] = 0.0
+        self.lines = [
+            None if line is None else replace(line, ends=np.zeros(2)) for line in self.lines
+        ]
 
     def settle(self, blur: float, n_rounds: int) -> None:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""

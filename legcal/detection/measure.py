@@ -103,6 +103,7 @@ def measure_edges(
         Standard deviation of the blur of the image [px].
     """
     v = [edge.v for edge in edges]
+    near = blur is not None
     if blur is None:
         blocks = Blocks.read(grey, camera, edges, v, FIRST_BLUR, FIRST_BLOCKS)
         if len(blocks.moved) == 0:
@@ -118,6 +119,8 @@ def measure_edges(
         blocks.settle(tried, LAST_ROUNDS)
         if not together:
             return _roughly(edges, v, blocks, tried), tried
+        if near:
+            blocks.unmove()
         kept = blocks.kept()
         blocks.even_noise(kept, tried)
         joint = fit_together(blocks, kept, tried, depth_for_blur(tried))

@@ -109,9 +109,12 @@ class FoundPart:
 
     @property
     def near(self) -> Array:
-        """Offsets as predicted where an edge was found no farther than it is known, (2, 2) [px]."""
-        is_near = np.abs(self.pair.v - self.predicted).max() <= NEAR_PREDICTION
-        return self.predicted if is_near else self.pair.v
+        """Offsets as predicted if an edge was found no farther than it is known, (2, 2) [px].
+
+        One is enough: the width says where the other outline is, which shading hides.
+        """
+        is_near = np.abs(self.pair.v - self.predicted).max(axis=1) <= NEAR_PREDICTION
+        return self.predicted if np.any(is_near & self.pair.found) else self.pair.v
 
     def outlines(
         self, camera: Camera, lines: Sequence[tuple[Array, Array, Array] | None]
@@ -287,23 +290,30 @@ def _measure(
     blur: float | None,
 ) -> list[PartOutlines]:
     """Measure and judge the outlines of parts whose edges are known to a pixel."""
+    near = blur is not None
     edges = [
         Edge(part.band, v, float(epsilon), part.half_width, part.hidden)
         for part in parts
-        for v, epsilon in zip(part.pair.v if blur is None else part.near, EPSILON, strict=True)
+        for v, epsilon in zip(part.near if near else part.pair.v, EPSILON, strict=True)
     ]
     measured, blur = measure_edges(grey, camera, edges, together, blur)
     return [
-        replace(_judge(camera, part, one, two), blur=blur)
+        replace(_judge(camera, part, one, two, near=near), blur=blur)
         for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True)
     ]
 
 
 def _judge(
-    camera: Camera, part: FoundPart, one: MeasuredEdge | None, two: MeasuredEdge | None
+    camera: Camera,
+    part: FoundPart,
+    one: MeasuredEdge | None,
+    two: MeasuredEdge | None,
+    *,
+    near: bool,
 ) -> PartOutlines:
     """Turn the measured edges of a part into outlines with verdicts."""
-    judged = verdict(part.pair, part.width, part.band.length, (one, two))
+    predicted = part.predicted if near else None
+    judged = verdict(part.pair, part.width, part.band.length, (one, two), predicted)
     lines = [
         None
         if edge is None

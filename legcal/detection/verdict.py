@@ -19,6 +19,7 @@ LARGEST_SIGMA = 1.0  # [px]
 STEP_END = 1.5  # depth up to which the blurred step reaches [blurs]
 LEAST_STEP = 1.15  # of it that a saturated background must leave [px]
 WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
+NEAR_TOLERANCE = (0.2, 3.0)  # the same where both are predicted well: [px], standard deviations
 WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of a reason
 SURER = 0.75  # by which factor an outline must be surer than the edge of a shade
 NARROW_BIAS = 0.15  # of such an outline, in what the width is too small
@@ -45,6 +46,7 @@ def verdict(
     expected: Array,
     length: float,
     measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
+    predicted: Array | None = None,
 ) -> Verdict:
     """Judge both edges of a part.
 
@@ -63,6 +65,8 @@ def verdict(
         Length of the band [px].
     measured : tuple of two MeasuredEdge or None
         Edge 1 and edge 2; None where no straight line fits.
+    predicted : (2, 2) array, optional
+        Offsets of edge 1 and edge 2 at both ends of the band by a fit of everything [px].
     """
     width = float(np.mean(pair.v[1] - pair.v[0]))
     reasons = [
@@ -71,7 +75,7 @@ def verdict(
     ]
     one, two = measured
     if one is not None and two is not None and not any(reasons):
-        return _by_width(one, two, expected)
+        return _by_width(one, two, expected, predicted)
     vouched = pair.suits(expected)
     stands = [
         bool(may or vouched) and edge is not None and _is_clear_step(edge)
@@ -84,15 +88,25 @@ def verdict(
     return Verdict((first, second))
 
 
-def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array) -> Verdict:
+def _by_width(
+    one: MeasuredEdge, two: MeasuredEdge, expected: Array, predicted: Array | None
+) -> Verdict:
     """Judge two edges that may be trusted but for their distance."""
     widths = two.v - one.v
-    mismatch = np.abs(widths - expected) / (WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected)
+    sigma_one, sigma_two = _sigma(one), _sigma(two)
+    tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected
+    if predicted is not None:
+        near = NEAR_TOLERANCE[0] + NEAR_TOLERANCE[1] * math.hypot(sigma_one, sigma_two)
+        tolerance = np.minimum(tolerance, near)
+    mismatch = np.abs(widths - expected) / tolerance
     if mismatch.max() <= 1.0:
         return Verdict(("", ""))
     i = int(np.argmax(mismatch))
     reason = f"{WRONG_WIDTH}, {widths[i]:.1f} px for {expected[i]:.1f} px"
-    sigma_one, sigma_two = _sigma(one), _sigma(two)
+    if predicted is not None:
+        off = [float(np.abs(e.v - v).max()) for e, v in zip((one, two), predicted, strict=True)]
+        reasons = tuple("" if o < 0.5 * max(off) else reason for o in off)
+        return Verdict((reasons[0], reasons[1]))
     surer, ratio = (
         (one, sigma_one / sigma_two) if sigma_one < sigma_two else (two, sigma_two / sigma_one)
     )

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from legcal.errors import UsageError
-from legcal.geometry.types import Array
 from legcal.identify.board import judge_board
 from legcal.identify.conditions import (
     Condition,
@@ -16,6 +15,7 @@ from legcal.identify.conditions import (
     two_directions,
 )
 from legcal.identify.identifiability import Identifiability, Paper
+from legcal.identify.intrinsics import judge_intrinsics
 from legcal.identify.known import known_rows
 from legcal.identify.planned import THIN, planned_session
 from legcal.identify.ranks import Analysis
@@ -91,7 +91,7 @@ def identifiability(
         lambda more: planned_session(mechanism, legs, more, board=board),
         lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
     )
-    return _judge(mechanism, session, recommendation, replanning)
+    return _judge(mechanism, Analysis(session), recommendation, replanning)
 
 
 def _judge_hand_held(
@@ -106,7 +106,8 @@ def _judge_hand_held(
             "that the images show; give --board and --view."
         )
     each = tuple(view for view in legs for _ in range(images))
-    return _judge(mechanism, planned_session(mechanism, each, 1, board=True), None, None)
+    session = planned_session(mechanism, each, 1, board=True)
+    return _judge(mechanism, Analysis(session), None, None)
 
 
 def identifiability_of_dataset(dataset: Dataset, choices: Choices = NO_CHOICES) -> Identifiability:
@@ -124,11 +125,15 @@ def identifiability_of_dataset(dataset: Dataset, choices: Choices = NO_CHOICES) 
     DidNotConverge
         If the readings do not lead to closed poses.
     """
-    from legcal.identify.recorded import recorded_session
+    from legcal.identify.recorded import cameras_of, orientations_of, recorded_session
 
     twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
     session = recorded_session(dataset, twists=twists)
-    report = _judge(dataset.mechanism, session, None, None, known_rows(session, choices))
+    analysis = Analysis(session, known=known_rows(session, choices))
+    report = _judge(dataset.mechanism, analysis, None, None)
+    if dataset.axes is None:
+        found = judge_intrinsics(analysis, orientations_of(dataset, session), cameras_of(dataset))
+        report = replace(report, intrinsics=found)
     if dataset.mechanism.is_determined:
         return report
     note = "The readings do not give the poses of the images: random ones stand for them."
@@ -137,13 +142,12 @@ def identifiability_of_dataset(dataset: Dataset, choices: Choices = NO_CHOICES) 
 
 def _judge(
     mechanism: Mechanism,
-    session: Session,
+    analysis: Analysis,
     recommendation: tuple[Recommendation, ...] | None,
     replanning: Replanning | None,
-    known: Array | None = None,
 ) -> Identifiability:
     """Return the report on a session."""
-    analysis = Analysis(session, known=known)
+    session = analysis.session
     conditions = conditions_of(mechanism, session)
     board = judge_board(
         analysis,

@@ -112,11 +112,11 @@ def by_cameras(session: Session, images: Array, demands: WhitenedDemands) -> Arr
     session : Session
         The observations.
     images : (n_images, n_legs, 4, f + 6 + p) array
-        What :func:`image_rows` says of them.
+        What :func:`image_rows` says of them; other unknowns may follow the parameters.
     demands : WhitenedDemands
-        What :func:`demands_of` says of them.
+        What :func:`demands_of` says of them, and of these others.
     """
-    n_f, n_p = len(freedoms(session.frame_legs)), len(session.parametrization)
+    n_f, n_p = len(freedoms(session.frame_legs)), demands.by_parameters.shape[2]
     seen = images.reshape(len(session.view), -1, n_f + 6 + n_p)
     n_cameras = 6 * session.n_frames
     wide = np.zeros((*seen.shape[:2], n_f + n_cameras + n_p))

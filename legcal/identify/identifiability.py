@@ -8,6 +8,7 @@ from typing import Any
 
 from legcal.identify.board import BoardReport
 from legcal.identify.conditions import Condition
+from legcal.identify.intrinsics import CameraIntrinsics
 from legcal.identify.ranks import StepRank
 from legcal.identify.recommend import Recommendation
 from legcal.identify.remedies import Remedy
@@ -66,6 +67,8 @@ class Identifiability:
         The smallest sets of views, fewest first; None where views were given.
     notes : tuple of str
         What the reader should know.
+    intrinsics : tuple of CameraIntrinsics
+        What the legs tell of the cameras of a dataset with images; empty without them.
     """
 
     spatial: bool
@@ -87,6 +90,7 @@ class Identifiability:
     remedies: tuple[Remedy, ...]
     recommendation: tuple[Recommendation, ...] | None
     notes: tuple[str, ...]
+    intrinsics: tuple[CameraIntrinsics, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """Return the report as plain JSON types; see the documentation of the files."""

@@ -7,12 +7,14 @@ import numpy as np
 from legcal.dataset.folder import Dataset
 from legcal.geometry.types import Array, BoolArray
 from legcal.identify.cameras import default_cameras
+from legcal.identify.intrinsics import looking_at
 from legcal.identify.planned import REACHED, joints_at, machine_near, radii, travel_of
 from legcal.identify.poses import random_poses
 from legcal.identify.session import Session
 from legcal.mechanism.parametrization import parametrization_of
 from legcal.refinement.nominal_poses import nominal_poses
 from legcal.refinement.state import components
+from legcal.vision.intrinsics import shared_cameras
 
 
 def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
@@ -82,6 +84,26 @@ def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
         sigma_q=m.sigma_q,
         board=_with_board(dataset)[used],
     )
+
+
+def orientations_of(dataset: Dataset, session: Session) -> Array:
+    """Return R of the camera of every used view in R_b, (n_views, 3, 3).
+
+    Cameras whose place the dataset does not give look at the legs.
+    """
+    to_Rb, views = dataset.mechanism.T_base_Rb.inv(), dataset.measurements.views
+    found = looking_at(session)
+    for v, view in enumerate(views[i] for i in np.unique(dataset.measurements.view).tolist()):
+        if view.T_base_camera is not None:
+            found[v] = (to_Rb * view.T_base_camera).rotation.as_matrix()
+    return found
+
+
+def cameras_of(dataset: Dataset) -> tuple[str, ...]:
+    """Return the name of the camera of every used view: that of the first view that has it."""
+    m = dataset.measurements
+    owners = shared_cameras([view.name for view in m.views], [view.camera for view in m.views])
+    return tuple(owners[v] for v in np.unique(m.view).tolist())
 
 
 def _with_board(dataset: Dataset) -> BoolArray:

@@ -24,10 +24,12 @@ from legcal.geometry.types import IntArray
 from legcal.mechanism.kinematics import forward_kinematics_many
 from legcal.mechanism.model import Mechanism
 from legcal.observations.canonical_order import canonical_order, reorder_measurements
+from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import no_outlines
-from legcal.photographs import Photographs, detect, place, scene_at_poses
+from legcal.photographs import Photographs, Placement, detect, place, scene_at_poses
 from legcal.progress import Report, no_progress
+from legcal.recognition.hints import BEFORE_FIT, hint_notes
 from legcal.repeatability.canny import canny_parts
 from legcal.repeatability.difference import outline_differences
 from legcal.repeatability.notes import noise_notes
@@ -81,7 +83,7 @@ def measure_noise(
         every = Photographs(
             mechanism, measurements, load, run, np.flatnonzero(has_image), no_outlines()
         )
-        outlines = _search(every, repeats, progress)
+        placement, outlines = _search(every, repeats, progress)
     methods = []
     for name, found in outlines.items():
         orientations = leg_orientations(found, measurements, mechanism.legs, repeats)
@@ -102,14 +104,19 @@ def measure_noise(
                 mechanism.leg_names,
             )
         ),
-        notes=(*dataset.notes, *noise_notes(measurements, methods)),
+        notes=(
+            *dataset.notes,
+            *placement.all_notes,
+            *_hint_notes(measurements, placement),
+            *noise_notes(measurements, methods),
+        ),
     )
 
 
 def _search(
     every: Photographs, repeats: Sequence[Repeats], progress: Report
-) -> dict[str, Outlines]:
-    """Return the outlines that each method finds in all repeated images."""
+) -> tuple[Placement, dict[str, Outlines]]:
+    """Place the cameras; return the outlines that each method finds in all repeated images."""
     measurements = every.measurements
     q = measurements.q[measurements.first_rows]
     poses = forward_kinematics_many(every.mechanism, q)
@@ -119,10 +126,19 @@ def _search(
     placement.require_one()
     scene = placement.scene
     repeated = replace(every, detect=np.sort(np.concatenate([group.rows for group in repeats])))
-    return {
+    found = {
         name: detect(repeated, scene, progress, method=method, stage=stage)
         for name, (method, stage) in METHODS.items()
     }
+    return placement, found
+
+
+def _hint_notes(measurements: Measurements, placement: Placement) -> list[str]:
+    """Return what is to be said of rough camera poses that are wrong."""
+    views = measurements.views
+    hints = [view.T_base_camera for view in views]
+    cameras = placement.scene.T_base_camera
+    return hint_notes([view.name for view in views], hints, cameras, BEFORE_FIT)
 
 
 def _rows_to_align(every: Photographs, repeats: Sequence[Repeats]) -> IntArray:

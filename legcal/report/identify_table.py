@@ -11,6 +11,7 @@ from rich.text import Text
 
 from legcal.identify.board import BoardReport
 from legcal.identify.identifiability import Identifiability
+from legcal.identify.intrinsics import CameraIntrinsics
 from legcal.identify.weak import Ranks, WeakDirection
 from legcal.identify.words import legs_in_words, views_in_words
 from legcal.mechanism.parameter_words import joined, leg_labels
@@ -60,6 +61,7 @@ def identify_table(report: Identifiability) -> RenderableType:
     if report.remedies:
         parts += [Text(), _remedies(report)]
     parts += [Text(), Text(_board(report.board, report.full.of))]
+    parts += [Text(_intrinsics(camera)) for camera in report.intrinsics]
     return Group(*parts, Text(), *_verdict(report))
 
 
@@ -186,6 +188,17 @@ def _board(board: BoardReport, of: int) -> str:
     if len(board.mends) > _MOST_MENDED:
         shown.append(f"{len(board.mends) - _MOST_MENDED} more (see --json)")
     return f"{text}, and mends: {'; '.join(shown)}."
+
+
+def _intrinsics(found: CameraIntrinsics) -> str:
+    """Return what the legs tell of a camera."""
+    camera = f"Camera of {found.camera}: the legs"
+    known = {name: sigma for name, sigma in found.sigma.items() if sigma is not None}
+    if not found.determined:
+        open_ = joined([name for name in found.sigma if name not in known])
+        return f"{camera} do not determine {open_}; calibrate it with legcal camera."
+    sigmas = ", ".join(f"{name} {_two_digits(sigma)}" for name, sigma in known.items())
+    return f"{camera} determine its intrinsics too (sigma to expect: {sigmas} px)."
 
 
 def _remedies(report: Identifiability) -> Table:
