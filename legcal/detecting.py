@@ -160,8 +160,20 @@ def _observed(work: Workpiece, progress: Report) -> _Observed:
         scene,
         observed.photographs.cylinders,
         placement.unplaced,
-        (*notes, *placement.notes),
+        (*notes, *placement.notes, *_untold_gammas(work)),
     )
+
+
+def _untold_gammas(work: Workpiece) -> list[str]:
+    """Return what is to be said of cameras of which nobody told how they encode light."""
+    views = [view.name for view in work.measurements.views if not view.camera.gamma_is_told]
+    if not views:
+        return []
+    return [
+        f"The gamma of view{'s' * (len(views) > 1)} {', '.join(views)} is not told and was taken "
+        "as 1: outlines of a camera that encodes light lie off by up to half of the blur; write "
+        "gamma of the views in dataset.yaml, or let legcal calibrate look for it."
+    ]
 
 
 def _in_file_order(work: Workpiece, images: IntArray, found: _Observed) -> Detection:

@@ -55,6 +55,7 @@ _DECIDING = (
     "disagreeing.py",
     "fitting.py",
     "board_views.py",
+    "refinement/gamma_search.py",
 )
 
 
@@ -166,6 +167,16 @@ class Photographs:
         """Return the search of some rows again; edited and other rows' outlines are kept."""
         kept = ~np.isin(outlines.row, rows) | is_edited(outlines)
         return replace(self, detect=rows, keep=choose_outlines(outlines, kept))
+
+    def with_gammas(self, gammas: Mapping[str, float]) -> Photographs:
+        """Return the same images, read with other gammas of some views, by their names."""
+        views = tuple(
+            replace(view, camera=replace(view.camera, gamma=gammas[view.name]))
+            if view.name in gammas
+            else view
+            for view in self.measurements.views
+        )
+        return replace(self, measurements=replace(self.measurements, views=views))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import Cylinder, Leg, LegKind
 from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import QUALITY, Outlines
+from legcal.observations.outlines import ENCODING, QUALITY, Outlines
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -88,9 +88,10 @@ def outlines_of(
     used = rng.uniform(size=len(places)) > rejected
     lost = ~used & (rng.uniform(size=len(places)) < 0.5)
     quality = rng.uniform(0.0, [100.0, 500.0, 1.0], size=(len(places), 3))
+    encoding = np.stack([np.full(len(places), 2.2), rng.normal(size=len(places))], axis=1)
     if source == "edited":
-        quality[:] = np.nan
-    for numbers in (h, ends, covariance, quality):
+        quality[:] = encoding[:] = np.nan
+    for numbers in (h, ends, covariance, quality, encoding):
         numbers[lost] = np.nan
     return Outlines(
         row=row,
@@ -106,12 +107,14 @@ def outlines_of(
         contrast=quality[:, 0],
         length=quality[:, 1],
         residual=quality[:, 2],
+        gamma=encoding[:, 0],
+        by_gamma=encoding[:, 1],
     )
 
 
 def assert_same(found: Outlines, expected: Outlines) -> None:
     """Fail unless both tables are the same to the last bit."""
-    for name in ("row", "leg", "edge", "h", "ends", "covariance", "used", *QUALITY):
+    for name in ("row", "leg", "edge", "h", "ends", "covariance", "used", *QUALITY, *ENCODING):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
     assert found.part == expected.part
     assert found.reason == expected.reason

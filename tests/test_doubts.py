@@ -29,6 +29,7 @@ from legcal.refinement.rejections import DISAGREES
 from legcal.workers import in_turn
 from legcal.workpiece import Workpiece, workpiece
 
+UNTOLD = "The gamma of "  # a note on the cameras of the example
 N = 6
 
 
@@ -153,7 +154,8 @@ def test_legs_that_a_view_leaves_out_although_it_shows_them_are_named(detected: 
 def test_nothing_else_is_said_and_the_other_images_are_used(
     bad: Spoiled, detected: Detection
 ) -> None:
-    assert len(detected.notes) == len(CHANGED) + 2 * len(SWAPPED) + 1
+    notes = [note for note in detected.notes if not note.startswith(UNTOLD)]
+    assert len(notes) == len(CHANGED) + 2 * len(SWAPPED) + 1
     assert detected.unplaced == {}
     named = "".join(detected.notes)
     for k, row in enumerate(bad.rows):
@@ -239,7 +241,7 @@ def test_a_mirrored_view_and_exchanged_hints_are_named(tmp_path: Path) -> None:
     found = detect(made.write())
     assert list(found.unplaced) == ["c1"]
     assert "images show the legs if left and right are exchanged" in found.unplaced["c1"]
-    assert len(found.notes) == 2
+    assert len([note for note in found.notes if not note.startswith(UNTOLD)]) == 2
     assert re.match(r"view c2: its T_base_camera is wrong: .*it suits view c3", found.notes[0])
     assert re.match(r"view c3: its T_base_camera is wrong: .*it suits view c2", found.notes[1])
 
@@ -347,7 +349,7 @@ def test_a_reading_that_the_outlines_contradict_is_named(
 
 def test_good_photographs_are_not_doubted(example_run: Run) -> None:
     notes = example_run.calibration.notes
-    assert [note for note in notes if not note.startswith("The start ")] == []
+    assert [note for note in notes if not note.startswith(("The start ", UNTOLD))] == []
 
 
 @pytest.mark.slow
@@ -373,7 +375,7 @@ def test_without_hints_good_photographs_are_not_doubted(tmp_path: Path) -> None:
     for view in made.entry["views"].values():
         del view["T_base_camera"]
     notes = calibrate(made.write()).notes
-    assert [note for note in notes if not note.startswith("The start ")] == []
+    assert [note for note in notes if not note.startswith(("The start ", UNTOLD))] == []
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
 from legcal.errors import DatasetError
 from legcal.observations.measurements import View
-from legcal.observations.outlines import QUALITY, Outlines
+from legcal.observations.outlines import ENCODING, QUALITY, Outlines
 from legcal.observations.row import COLUMNS
 from legcal.observations.sets import no_outlines, reject_unused_legs
 from legcal.observations.table import read_observations, row_names, write_observations
@@ -56,7 +56,7 @@ def test_header_is_that_of_the_contract(tmp_path: Path) -> None:
     header = written(tmp_path, no_outlines()).read_text().strip()
     assert header == (
         "view,image,leg,part,edge,a,b,c,u0,v0,u1,v1,s00,s01,s11,verdict,reason,source,"
-        "contrast,length,residual"
+        "contrast,length,residual,gamma,by_gamma"
     )
 
 
@@ -68,10 +68,11 @@ def test_table_without_quality_is_read(tmp_path: Path) -> None:
     with path.open("w", newline="") as file:
         csv.writer(file).writerows(lines)
     found = read(path)
-    for name in QUALITY:
+    for name in (*QUALITY, *ENCODING):
         assert np.isnan(getattr(found, name)).all()
-    unknown = np.full(len(outlines), np.nan)
-    assert_same(found, replace(outlines, contrast=unknown, length=unknown, residual=unknown))
+    no = np.full(len(outlines), np.nan)
+    bare = replace(outlines, contrast=no, length=no, residual=no, gamma=no, by_gamma=no)
+    assert_same(found, bare)
 
 
 def test_edited_row_has_no_quality(tmp_path: Path) -> None:
@@ -85,6 +86,28 @@ def test_quality_that_is_no_number_is_refused(tmp_path: Path, cell: str) -> None
     path = edit(written(tmp_path, outlines_of(3, rejected=0.0)), 2, residual=cell)
     with pytest.raises(DatasetError, match=f"row 2 .*, column residual: .*found '{cell}', needed"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        ({"gamma": "0"}, "column gamma: .*found '0', needed a number above 0"),
+        ({"by_gamma": "nan"}, "column by_gamma: .*found 'nan', needed a finite number"),
+        ({"by_gamma": ""}, "columns gamma, by_gamma: .*found one of them, needed both or none"),
+    ],
+)
+def test_gamma_that_cannot_be_is_refused(tmp_path: Path, cells: dict[str, str], words: str) -> None:
+    path = edit(written(tmp_path, outlines_of(3, rejected=0.0)), 2, **cells)
+    with pytest.raises(DatasetError, match=f"row 2 .*, {words}") as refused:
+        read(path)
+    assert len(refused.value.problems) == 1
+
+
+def test_edited_row_does_not_move_with_gamma(tmp_path: Path) -> None:
+    found = read(edit(written(tmp_path, outlines_of(6, rejected=0.0)), 3, source="edited"))
+    for name in ENCODING:
+        assert np.isnan(getattr(found, name)[2])
+        assert np.isfinite(getattr(found, name)[[0, 1, 3]]).all()
 
 
 def test_empty_table_is_read_as_empty(tmp_path: Path) -> None:
@@ -223,7 +246,7 @@ def test_rows_of_another_length_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path, outlines_of(11))
     path.write_text(path.read_text() + "right,i/2.png\n")
     with pytest.raises(
-        DatasetError, match="found 2 cells, needed 21 as in the header; complete or remove"
+        DatasetError, match="found 2 cells, needed 23 as in the header; complete or remove"
     ):
         read(path)
 

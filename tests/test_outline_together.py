@@ -20,6 +20,7 @@ from legcal.detection.powers import (
     THREE_HALVES,
     powers,
 )
+from legcal.detection.response import to_light
 from legcal.detection.shading import N_AMPLITUDES, profile_functions
 from legcal.geometry.types import Array
 
@@ -178,6 +179,44 @@ def test_outlines_that_have_settled_do_not_depend_on_others() -> None:
     )  # fmt: skip
     found = fit_together(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)
+
+
+def read_with(blocks: Blocks, gamma: float) -> Blocks:
+    """Return the same blocks as a camera of gamma 2.2 encodes them, read with a gamma."""
+    encoded = (255.0 * (np.maximum(blocks.grey, 0.0) / 255.0) ** (1.0 / 2.2)).astype(np.float32)
+    light, weight = to_light(encoded, blocks.weight > 0.0, gamma)
+    return replace(blocks, grey=light, weight=weight)
+
+
+@pytest.mark.parametrize("amplitude", [BRIGHT, DARK], ids=["bright", "dark"])
+@pytest.mark.parametrize(("gamma", "tolerance"), [(1.0, 0.4), (1.6, 0.4), (2.2, 0.15)])
+def test_outlines_know_how_far_they_move_with_gamma(
+    amplitude: Array, gamma: float, tolerance: float
+) -> None:
+    blocks, every = outline(amplitude, (0.1, 0.1), 0.6, noise=0.2), np.ones(40, dtype=np.bool_)
+    less, here, more = (
+        fit_together(read_with(blocks, gamma * np.exp(step)), every, 0.6, DEPTH)
+        for step in (-0.1, 0.0, 0.1)
+    )
+    moved = float(more.ends.mean() - less.ends.mean()) / 0.2
+    assert abs(moved) > 0.05
+    assert here.by_gamma[0] == pytest.approx(moved, rel=tolerance)
+
+
+def test_bright_and_dark_legs_move_to_opposite_sides_with_gamma() -> None:
+    every = np.ones(40, dtype=np.bool_)
+    bright, dark = (
+        fit_together(outline(amplitude, (0.0, 0.0), 0.6, noise=0.2), every, 0.6, DEPTH).by_gamma[0]
+        for amplitude in (BRIGHT, DARK)
+    )
+    assert bright > 0.05
+    assert dark < -0.05
+
+
+def test_outlines_of_which_nothing_is_seen_know_no_gamma() -> None:
+    blocks = outline(BRIGHT, (0.0, 0.0), 0.6)
+    nothing = np.zeros(40, dtype=np.bool_)
+    assert np.isnan(fit_together(blocks, nothing, 0.6, DEPTH).by_gamma).all()
 
 
 def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:

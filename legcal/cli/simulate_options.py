@@ -156,6 +156,15 @@ HintsOption = Annotated[
         rich_help_panel=_CAMERAS,
     ),
 ]
+TellGammaOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--gamma/--no-gamma",
+        help="Tell how the cameras encode light.",
+        rich_help_panel=_LOOK,
+        show_default="gamma",
+    ),
+]
 PixelNoiseOption = Annotated[
     str | None,
     typer.Option(

@@ -18,7 +18,7 @@ class ViewEntry(FileSchema):
     """One camera position."""
 
     camera: str
-    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] = 1.0
+    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # not known
     T_base_camera: MotionEntry | None = None
     hand_held: Annotated[bool, Strict()] = False
     legs: Annotated[list[str], Field(min_length=1)] | None = None

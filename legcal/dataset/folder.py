@@ -181,7 +181,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
     """Return a view of the measurements."""
     return View(
         name=name,
-        camera=camera if entry.gamma == 1.0 else replace(camera, gamma=entry.gamma),
+        camera=replace(camera, gamma=entry.gamma or 1.0, gamma_is_told=entry.gamma is not None),
         T_base_camera=entry.T_base_camera.motion() if entry.T_base_camera else None,
         legs=tuple(entry.legs) if entry.legs else None,
     )

@@ -102,7 +102,7 @@ def detect_outlines(
             blur_of_row[row] = blurs[0]  # that of the image
         if progress is not None:
             progress(row)
-    return _table(rows, found)
+    return _table(rows, found, measurements)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,10 +167,15 @@ def _unsearched(leg: int, cylinders: Sequence[Cylinder], reason: str) -> PartOut
     return PartOutlines(leg, longest.link, h, square, square, (reason, reason))
 
 
-def _table(rows: Sequence[int], found: Sequence[Sequence[PartOutlines]]) -> Outlines:
+def _table(
+    rows: Sequence[int], found: Sequence[Sequence[PartOutlines]], measurements: Measurements
+) -> Outlines:
     """Put the outlines of all images into one table."""
+    gamma = [view.camera.gamma for view in measurements.views]
     items = [(row, part) for row, parts in zip(rows, found, strict=True) for part in parts]
     pairs = [(row, part, edge) for row, part in items for edge in (0, 1)]
+    by_gamma = np.array([part.by_gamma[edge] for _, part, edge in pairs])
+    of_row = np.array([gamma[measurements.view[row]] for row, _, _ in pairs])
     return Outlines(
         row=np.array([row for row, _, _ in pairs], dtype=np.intp),
         leg=np.array([part.leg for _, part, _ in pairs], dtype=np.intp),
@@ -185,4 +190,6 @@ def _table(rows: Sequence[int], found: Sequence[Sequence[PartOutlines]]) -> Outl
         contrast=np.array([part.contrast[edge] for _, part, edge in pairs]),
         length=np.array([part.length[edge] for _, part, edge in pairs]),
         residual=np.array([part.residual[edge] for _, part, edge in pairs]),
+        gamma=np.where(np.isnan(by_gamma), np.nan, of_row),
+        by_gamma=by_gamma,
     )

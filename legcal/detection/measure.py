@@ -57,6 +57,9 @@ class MeasuredEdge:
     covariance : (2, 2) array
         Of the offsets at both ends of the used piece [px^2]: that of the line, and what shading
         that the model leaves out does to an outline of this contrast.
+    by_gamma : float
+        How far it moves towards the inside with the logarithm of the gamma that is taken for the
+        camera's [px]; NaN where that is not known.
     """
 
     v: Array
@@ -66,6 +69,7 @@ class MeasuredEdge:
     blur: float
     covariance: Array
     clipped: float = -math.inf
+    by_gamma: float = math.nan
 
 
 def measure_edges(
@@ -132,8 +136,9 @@ def measure_edges(
         else replace(
             _measured(_moved(edge, at, line), edge.epsilon, line, step, sharp, blur, ends, spread),
             clipped=(float(np.median(clipped[line.kept])) - float(ends.mean())) / blur,
+            by_gamma=shift,
         )
-        for edge, at, line, step, sharp, clipped, ends, spread in zip(
+        for edge, at, line, step, sharp, clipped, ends, spread, shift in zip(
             edges,
             v,
             blocks.lines,
@@ -142,6 +147,7 @@ def measure_edges(
             blocks.clipping(),
             joint.ends,
             joint.covariance,
+            joint.by_gamma.tolist(),
             strict=True,
         )
     ], blur

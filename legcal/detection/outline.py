@@ -55,6 +55,8 @@ class PartOutlines:
         px, px]; NaN where nothing was found.
     blur : float
         Standard deviation of the blur of the image [px]; NaN if it was not measured.
+    by_gamma : (2,) array
+        How far each moves towards the inside with ln gamma [px]; NaN where that is not known.
     """
 
     leg: int
@@ -67,6 +69,7 @@ class PartOutlines:
     length: Array = field(default_factory=_unknown)
     residual: Array = field(default_factory=_unknown)
     blur: float = math.nan
+    by_gamma: Array = field(default_factory=_unknown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,6 +344,7 @@ def _judge(
         contrast=contrast,
         length=length,
         residual=residual,
+        by_gamma=np.array([math.nan if e is None else e.by_gamma for e in (one, two)]),
     )
 
 

@@ -8,7 +8,7 @@ depths, summed over each block. Slopes and widenings of profiles are sums of the
 these products tell of places and blurs nearby as well.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,8 @@ NEARBY = (0.08, 0.05)  # the same up to which products of powers tell of a place
 SETTLED = 0.01  # step of a line below which its rounds end [px]
 ODD = (1.5, 4.0)  # noise in that of a typical block from where on one counts less, and not at all
 LEAST_NOISE = 0.05  # [grey levels^2]
+DARKEST = 1e-3  # of the mean light of a block
+ANYTHING = 1e3  # standard deviation of what is not known
 
 ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
@@ -84,6 +86,7 @@ class Pixels:
     along: Array  # (n, N_ALONG) polynomials at the blocks
     edge: IntArray  # (n,)
     joined: IntArray  # (n,) the block of the pool to which each belongs
+    level: Array  # (n_edges,) mean light of each edge
 
     def products(self, line: Array, log_blur: Array, edges: BoolArray) -> Array:
         """Return the products of powers and light, summed over blocks of some edges.
@@ -99,6 +102,17 @@ class Pixels:
         U[..., -1] = self.light[some]
         first = np.flatnonzero(np.diff(self.joined[some], prepend=-1))
         return np.asarray(np.add.reduceat(U.swapaxes(1, 2) @ U, first, axis=0))
+
+    def changed_by_gamma(self) -> "Pixels":
+        """Return how the light of these pixels changes with ln gamma, in place of it."""
+        light, weight = self.light + self.level[self.edge][:, None] * self.weight, self.weight
+        of_block = np.maximum(light.sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9), 1e-9)
+        part = light / np.maximum(weight * of_block[:, None], 1e-9)
+        change = light * np.log(np.maximum(part, DARKEST))
+        totals = (np.bincount(self.edge, x.sum(axis=1), len(self.level)) for x in (change, weight))
+        total, weights = totals
+        mean = total / np.maximum(weights, 1e-9)
+        return replace(self, light=change - mean[self.edge][:, None] * weight)
 
 
 @dataclass(eq=False)
@@ -142,7 +156,7 @@ class Pool:
         rise = 2.0 * blocks.position[usable] - 1.0
         along = np.stack([np.ones_like(rise), rise, 1.5 * rise**2 - 0.5], axis=1)
         joined = _joined(np.bincount(edge, minlength=n_edges))
-        pixels = Pixels(d, weight, light, blocks.gain[usable], along, edge, joined)
+        pixels = Pixels(d, weight, light, blocks.gain[usable], along, edge, joined, level)
         first = np.flatnonzero(np.diff(joined, prepend=-1))
         n_joined = np.diff(first, append=len(joined))
 
@@ -245,15 +259,11 @@ class Pool:
         fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
         noise, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
         known = _eliminated(normal, right, free, own)
-        sums = self._of_edges(known, self.along[:, ONE] * self.along[:, OTHER] * weight[:, None])
-        n = len(self.half_width)
-        system = np.empty((n, N_ALONG, N_UNKNOWNS, N_ALONG, N_UNKNOWNS))
-        for k, (i, j) in enumerate(zip(ONE, OTHER, strict=True)):
-            system[:, i, :, j] = system[:, j, :, i] = sums[:, k, :, :-1]
-        target = sums[:, :N_ALONG, :, -1]
+        system, target = self._in_common(known, weight)
         precision, pull = self._known_before(at, log_blur, sigma)
+        n = len(self.half_width)
         shape = n, N_ALONG * N_UNKNOWNS
-        whole = system.reshape(*shape, -1) + _diagonal(precision.reshape(shape))
+        whole = system + _diagonal(precision.reshape(shape))
         inverse = np.linalg.inv(whole)
         step = (inverse @ (target + pull).reshape(*shape, 1)).reshape(n, N_ALONG, N_UNKNOWNS)
         largest = LARGEST_STEP[0] * np.exp(at.log_blur)[:, None]
@@ -268,6 +278,41 @@ class Pool:
             noise,
             np.asarray(inverse),
         )
+
+    def response_to_gamma(self, at: Round) -> tuple[Array, Array]:
+        """Return the equations of what a change of ln gamma does to all edges, where they are.
+
+        Normal matrices (n_edges, k, k), with what is known beforehand of all unknowns but the blur,
+        and right sides (n_edges, k), for the unknowns of N_ALONG polynomials one after the other.
+        """
+        every = np.ones(len(self.half_width), dtype=np.bool_)
+        self._know(at, every)
+        normal, right, expected = self._blocks(at)
+        products = self.pixels.changed_by_gamma().products(self.at_line, self.at_log_blur, every)
+        _, change, _ = replace(self, products=products)._blocks(at)
+        noise = at.noise[self.edge]
+        normal, own = normal / noise[:, None, None], self._own_precision()
+        right, change = right / noise[:, None], change / noise[:, None]
+        free = np.asarray(np.linalg.inv(normal[:, :BLUR, :BLUR] + _diagonal(own)), np.float64)
+        fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
+        _, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
+        system, target = self._in_common(_eliminated(normal, change, free, own), weight)
+        precision, _ = self._known_before(at, 0.0, ANYTHING)
+        shape = len(every), N_ALONG * N_UNKNOWNS
+        return system + _diagonal(precision.reshape(shape)), target.reshape(shape)
+
+    def _in_common(self, known: Array, weight: Array) -> tuple[Array, Array]:
+        """Return what blocks (n, N_UNKNOWNS, N_UNKNOWNS + 1) that count by a weight say of edges.
+
+        Normal matrices (n_edges, k, k) and right sides (n_edges, N_ALONG, N_UNKNOWNS).
+        """
+        sums = self._of_edges(known, self.along[:, ONE] * self.along[:, OTHER] * weight[:, None])
+        n = len(self.half_width)
+        system = np.empty((n, N_ALONG, N_UNKNOWNS, N_ALONG, N_UNKNOWNS))
+        for k, (i, j) in enumerate(zip(ONE, OTHER, strict=True)):
+            system[:, i, :, j] = system[:, j, :, i] = sums[:, k, :, :-1]
+        side = N_ALONG * N_UNKNOWNS
+        return system.reshape(n, side, side), sums[:, :N_ALONG, :, -1]
 
     def _blocks(self, at: Round) -> tuple[Array, Array, Array]:
         """Return the normal equations of all blocks, and the unknowns that are expected."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.detection.blocks import Blocks
+from legcal.detection.encoding import shifts_by_gamma
 from legcal.detection.pool import BLUR, N_ALONG, N_UNKNOWNS, SHIFT, Pool, Round
 from legcal.detection.shading import N_AMPLITUDES
 from legcal.geometry.types import Array, BoolArray
@@ -36,11 +37,14 @@ class Together:
         Of these [px^2], by noise and by what shading may be.
     blur : float
         Standard deviation of the blur of the image [px].
+    by_gamma : (n_edges,) array
+        How far each line moves towards the inside with ln gamma [px]; NaN where nothing is seen.
     """
 
     ends: Array
     covariance: Array
     blur: float
+    by_gamma: Array
 
 
 def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> Together:
@@ -60,7 +64,8 @@ def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> 
     pool = Pool.of(blocks, kept, depth)
     n = len(pool.half_width)
     if n == 0 or not np.any(pool.seen):
-        return Together(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur)
+        nothing = np.full(n, np.nan)
+        return Together(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
     start = Round(
         np.zeros((n, N_ALONG, N_AMPLITUDES)),
         np.zeros((n, 2)),
@@ -71,11 +76,13 @@ def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> 
     found = pool.rounds(pool.first_amplitudes(start), np.log(blur), OPEN_BLUR, FIRST_ROUNDS)
     even, sigma = _even_blur(found, pool.seen)
     found = replace(found, log_blur=np.full(n, even))
-    found = pool.rounds(found, even, float(np.hypot(sigma, EVEN_BLUR)), LAST_ROUNDS)
+    sigma = float(np.hypot(sigma, EVEN_BLUR))
+    found = pool.rounds(found, even, sigma, LAST_ROUNDS)
     at_ends = np.array([[1.0, -1.0], [1.0, 1.0]])
     line = [SHIFT, N_UNKNOWNS + SHIFT]
     covariance = at_ends @ found.inverse[:, line][:, :, line] @ at_ends.T
-    return Together(found.line @ at_ends.T, covariance, float(np.exp(even)))
+    by_gamma = shifts_by_gamma(pool, found, sigma)
+    return Together(found.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
 
 
 def _even_blur(found: Round, seen: BoolArray) -> tuple[float, float]:

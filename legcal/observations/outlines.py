@@ -9,6 +9,7 @@ import numpy as np
 from legcal.geometry.types import Array, BoolArray, IntArray
 
 QUALITY = ("contrast", "length", "residual")  # what tells how well an outline was seen
+ENCODING = ("gamma", "by_gamma")  # what tells how an outline depends on the gamma of the camera
 
 
 def _unknown() -> Array:
@@ -51,6 +52,11 @@ class Outlines:
         How much of the used piece was seen on its line, without gaps [px].
     residual : (n,) array
         Robust standard deviation of its edge about the line [px].
+    gamma : (n,) array
+        The gamma of the camera with which it was measured. This and the next one are NaN where
+        nothing was found and for outlines that were given or edited; they may be left out.
+    by_gamma : (n,) array
+        How far it moves towards the inside of the leg with the logarithm of that gamma [px].
     """
 
     row: IntArray
@@ -66,9 +72,11 @@ class Outlines:
     contrast: Array = field(default_factory=_unknown)
     length: Array = field(default_factory=_unknown)
     residual: Array = field(default_factory=_unknown)
+    gamma: Array = field(default_factory=_unknown)
+    by_gamma: Array = field(default_factory=_unknown)
 
     def __post_init__(self) -> None:
-        for name in QUALITY:
+        for name in (*QUALITY, *ENCODING):
             if len(getattr(self, name)) == 0:
                 object.__setattr__(self, name, np.full(len(self.row), np.nan))
 

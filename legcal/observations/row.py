@@ -8,7 +8,7 @@ import numpy as np
 
 from legcal.files.schema import closest, describe
 from legcal.mechanism.leg import Leg
-from legcal.observations.outlines import QUALITY, Outlines
+from legcal.observations.outlines import ENCODING, QUALITY, Outlines
 
 NUMBERS = ("a", "b", "c", "u0", "v0", "u1", "v1", "s00", "s01", "s11")
 COLUMNS = ("view", "image", "leg", "part", "edge", *NUMBERS, "verdict", "reason", "source")
@@ -33,6 +33,7 @@ class OutlineRow:
     reason: str
     source: str
     quality: tuple[float, ...]  # as QUALITY, NaN where unknown
+    encoding: tuple[float, ...] = (math.nan,) * len(ENCODING)  # the same
 
     @property
     def key(self) -> tuple[int, int, str, int]:
@@ -129,8 +130,10 @@ def parse_row(
         for name, x in zip(QUALITY, quality, strict=True)
         if cells.get(name) and not (math.isfinite(x) and x >= 0.0)
     ]
+    encoding = [number_in(cells.get(name, "")) for name in ENCODING]
+    wrong += _encoding_problems(where, cells, encoding)
     if cells["source"] == "edited":  # they tell of what detection found
-        quality = [math.nan] * len(QUALITY)
+        quality, encoding = [math.nan] * len(QUALITY), [math.nan] * len(ENCODING)
     problems += wrong
     if wrong:
         return None
@@ -147,7 +150,30 @@ def parse_row(
         cells["reason"],
         cells["source"],
         tuple(quality),
+        tuple(encoding),
     )
+
+
+def _encoding_problems(
+    where: str, cells: Mapping[str, str], encoding: Sequence[float]
+) -> list[str]:
+    """Return what is wrong with the cells that tell of the gamma of the camera."""
+    gamma, by_gamma = encoding
+    problems = [
+        f"{where}, column {name}: the outline could not be used: found {describe(cells[name])}, "
+        f"needed {needed}, or an empty cell; correct it or leave it empty."
+        for name, is_good, needed in (
+            ("gamma", math.isfinite(gamma) and gamma > 0.0, "a number above 0"),
+            ("by_gamma", math.isfinite(by_gamma), "a finite number"),
+        )
+        if cells.get(name) and not is_good
+    ]
+    if not problems and bool(cells.get("gamma")) != bool(cells.get("by_gamma")):
+        problems.append(
+            f"{where}, columns gamma, by_gamma: the outline could not be used: found one of them, "
+            "needed both or none; correct them."
+        )
+    return problems
 
 
 def number_in(text: str) -> float:
@@ -187,6 +213,7 @@ def rows_to_outlines(found: Sequence[OutlineRow]) -> Outlines:
     """Return parsed rows as arrays."""
     numbers = np.array([o.numbers for o in found], dtype=np.float64).reshape(-1, len(NUMBERS))
     quality = np.array([o.quality for o in found], dtype=np.float64).reshape(-1, len(QUALITY))
+    encoding = np.array([o.encoding for o in found], dtype=np.float64).reshape(-1, len(ENCODING))
     return Outlines(
         row=np.array([o.row for o in found], dtype=np.intp),
         leg=np.array([o.leg for o in found], dtype=np.intp),
@@ -201,4 +228,6 @@ def rows_to_outlines(found: Sequence[OutlineRow]) -> Outlines:
         contrast=quality[:, 0],
         length=quality[:, 1],
         residual=quality[:, 2],
+        gamma=encoding[:, 0],
+        by_gamma=encoding[:, 1],
     )

@@ -67,6 +67,8 @@ def choose_outlines(outlines: Outlines, chosen: BoolArray | IntArray) -> Outline
         contrast=outlines.contrast[index],
         length=outlines.length[index],
         residual=outlines.residual[index],
+        gamma=outlines.gamma[index],
+        by_gamma=outlines.by_gamma[index],
     )
 
 
@@ -87,6 +89,8 @@ def join_outlines(tables: Sequence[Outlines]) -> Outlines:
         contrast=np.concatenate([t.contrast for t in tables]),
         length=np.concatenate([t.length for t in tables]),
         residual=np.concatenate([t.residual for t in tables]),
+        gamma=np.concatenate([t.gamma for t in tables]),
+        by_gamma=np.concatenate([t.by_gamma for t in tables]),
     )
     return sort_outlines(joined)
 

@@ -20,7 +20,7 @@ from legcal.files.csv_file import read_named_rows
 from legcal.geometry.types import Array
 from legcal.mechanism.leg import Leg
 from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import QUALITY, Outlines
+from legcal.observations.outlines import ENCODING, QUALITY, Outlines
 from legcal.observations.row import (
     COLUMNS,
     VERDICTS,
@@ -95,10 +95,10 @@ def format_observations(
     names = row_names(measurements)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*COLUMNS, *QUALITY])
+    writer.writerow([*COLUMNS, *QUALITY, *ENCODING])
     for i in range(len(outlines)):
         row, covariance = outlines.row[i], outlines.covariance[i]
-        quality = [float(getattr(outlines, name)[i]) for name in QUALITY]
+        told = [float(getattr(outlines, name)[i]) for name in (*QUALITY, *ENCODING)]
         numbers = [
             *outlines.h[i].tolist(),
             *outlines.ends[i].ravel().tolist(),
@@ -115,7 +115,7 @@ def format_observations(
                 VERDICTS[0 if outlines.used[i] else 1],
                 outlines.reason[i],
                 outlines.source[i],
-                *map(_cell, quality),
+                *map(_cell, told),
             ]
         )
     return text.getvalue()
@@ -165,8 +165,9 @@ def read_observations(
     found: list[OutlineRow] = []
     first: dict[tuple[int, int, str, int], str] = {}
     remedy = "delete the file to have it written again"
+    optional = (*QUALITY, *ENCODING)
     rows = read_named_rows(
-        path, "table of observations", COLUMNS, remedy, problems, optional=QUALITY
+        path, "table of observations", COLUMNS, remedy, problems, optional=optional
     )
     for where, cells in rows:
         place, unknown = place_of(where, cells, places, legs)

@@ -7,11 +7,13 @@ import numpy as np
 from legcal.geometry.types import Array, BoolArray
 from legcal.mechanism.parameters import radius_name
 from legcal.observations.outlines import Outlines
+from legcal.refinement.biases import GAMMA_SUFFIX
 from legcal.refinement.contradictions import refuse_contradicted_priors
 from legcal.refinement.covariance import named_covariance, worst_directions
 from legcal.refinement.determinacy import Held, named_units
 from legcal.refinement.focal_length import focal_lengths
 from legcal.refinement.foretold import Posterior
+from legcal.refinement.gammas import estimated_gammas
 from legcal.refinement.held_spread import held_spread
 from legcal.refinement.judged_corners import corner_notes
 from legcal.refinement.linearize import Linearization, linearize, offsets_of
@@ -71,6 +73,7 @@ def assemble_solution(
     )
     focal = focal_lengths(problem, state, linear, whitening)
     doubtful = [f for f in focal if f.is_doubtful]
+    gammas = estimated_gammas(problem, state, kept, outlines)
     return Solution(
         legs=state.legs,
         T_camera_Rb=state.T_camera_Rb,
@@ -101,6 +104,7 @@ def assemble_solution(
         T_Rb_board=state.T_Rb_board if len(problem.board) else None,
         rms_corners_px=_rms(linear.corners.r * problem.board.sigma[:, None]),
         noise=fit.noise,
+        gammas=gammas,
         biases=_biases(problem, state),
         shared_px=fit.shifts.sizes,
         sensitivities=sensitivities(problem, state, linear, normal, whitening, k),
@@ -114,6 +118,7 @@ def assemble_solution(
             *fit.notes,
             *rejected_notes(problem, fit.accepted),
             *corner_notes(problem),
+            *map(str, gammas),
             *scale_notes(problem, state, settings),
             *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
             *(str(f) for f in doubtful),
@@ -169,7 +174,8 @@ def _held_values(problem: FitProblem, held: Held) -> Array:
 
 def _biases(problem: FitProblem, state: State) -> dict[str, float]:
     names = [problem.named[i] for i in problem.layout.bias]
-    return dict(zip(names, state.biases.tolist(), strict=True))
+    biases = zip(names, state.biases.tolist(), strict=True)
+    return {name: value for name, value in biases if not name.endswith(GAMMA_SUFFIX)}
 
 
 def _rms(values: Array) -> float | None:

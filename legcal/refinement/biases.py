@@ -10,6 +10,10 @@ them up. Those that move a leg sideways hardly show, since the fit follows, and 
 joints. What shows must therefore say how large both are. If edges erred independently, both
 variances would be equal; light from one side makes one edge of a leg brighter and the other
 darker, and sideways shifts count twice (:data:`SIDEWAYS`).
+
+Where the gamma of a camera is not told, its outlines move together, each by its own amount, with
+the logarithm of that gamma over the one with which they were measured
+(:mod:`legcal.refinement.gammas`). How far that may be off is known beforehand.
 """
 
 from __future__ import annotations
@@ -31,7 +35,9 @@ KINDS = (
     "change of that bias over the image",
     "change of that tilt over the image",
 )
-N_KINDS = len(KINDS)
+GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the end of the names of its shifts
+N_KINDS = len(KINDS) + 1
+GAMMA_SIGMA = 0.5  # of the logarithm: photographs are linear, or near 2.2
 SIDEWAYS = np.sqrt(2.0)  # standard deviation of sideways shifts, those inwards being one
 _LEAST_GAIN = 25.0  # of white residuals, one set in 20,000 gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
@@ -46,15 +52,17 @@ class SharedShifts:
     names : tuple of str, length b
         ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
         ``c1.leg1.rod.inward.bias`` of both edges of a part in a view, ``c1.leg1.rod.sideways.bias``
-        and, for how it changes along x of the image, ``c1.leg1.rod.sideways.bias_x``.
+        and, for how it changes along x of the image, ``c1.leg1.rod.sideways.bias_x``; ``c1.gamma``
+        of a camera whose gamma is not told.
     kind : (b,) array of int
-        What they are; it counts in ``KINDS``.
+        What they are; it counts in ``KINDS``, and ``GAMMA`` comes after these.
     sigma : (N_KINDS,) array
-        Standard deviation of each kind [px].
+        Standard deviation of each kind [px], and of the logarithm of a gamma.
     index : (n, c) array of int
         Which of them each outline has a part in.
     shift : (n, c, 2) array
-        How far one unit of each moves both ends along the normal of the line [px].
+        How far one unit of each moves both ends along the normal of the line [px]: one pixel, or
+        one of the logarithm.
     """
 
     names: tuple[str, ...]
@@ -65,13 +73,19 @@ class SharedShifts:
 
     @property
     def sigmas(self) -> Array:
-        """Standard deviation of each shift [px], (b,)."""
+        """Standard deviation of each shift [px, or none], (b,)."""
         return np.asarray(self.sigma[self.kind])
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each, ``px`` or none, b of them."""
+        return tuple("" if kind == GAMMA else "px" for kind in self.kind.tolist())
+
+    @property
     def sizes(self) -> dict[str, float]:
-        """Standard deviation of each kind [px], by its name; empty if there are no shifts."""
-        return dict(zip(KINDS, self.sigma.tolist(), strict=True)) if len(self) else {}
+        """Standard deviation of each of ``KINDS`` [px], by its name; empty without such shifts."""
+        sigma = self.sigma[: len(KINDS)].tolist()
+        return dict(zip(KINDS, sigma, strict=True)) if np.any(self.kind != GAMMA) else {}
 
     def __len__(self) -> int:
         return len(self.names)
@@ -95,7 +109,7 @@ def possible_shifts(
     leg_names: Sequence[str],
     fitted: ObservedOutlines | None = None,
 ) -> SharedShifts:
-    """Return all shifts that outlines may share, with a standard deviation of one pixel.
+    """Return all shifts that outlines may share, with a standard deviation of one unit.
 
     Shifts of many edges are inward; those of one part in a view are inward and sideways and
     change along x and y of the image, by one unit over the spread of places in all groups.
@@ -137,6 +151,14 @@ def possible_shifts(
             shift.append(weight[:, None] * np.array(ends))
             names += [f"{owner}.{name}{suffix}" for owner in owners]
             kind += [first_kind + mode] * len(owners)
+    cameras = sorted({o.cameras[v] for v in o.view[o.by_gamma != 0.0].tolist()})
+    if cameras:
+        of_view = np.array([cameras.index(c) if c in cameras else 0 for c in o.cameras])
+        index.append(of_view[o.view] + len(names))
+        # Outlines that were measured with too small a gamma lie off by what a greater one moves.
+        shift.append(np.repeat((-o.epsilon * o.by_gamma)[:, None], 2, axis=1))
+        names += [f"{camera}{GAMMA_SUFFIX}" for camera in cameras]
+        kind += [GAMMA] * len(cameras)
     return SharedShifts(
         tuple(names),
         np.array(kind),
@@ -159,9 +181,20 @@ def estimated_shifts(
         has them [1/px, 1/px^2].
     least : (N_KINDS,) array
         Standard deviations that are known from elsewhere, where the residuals show less [px].
+
+    Notes
+    -----
+    That of a gamma is known, whatever the residuals show.
     """
+    sigma = np.zeros(N_KINDS)
     variances, _ = estimate_variances(Effects(z, K, possible.kind), _LEAST_GAIN)
-    return possible.of_sizes(np.maximum(np.sqrt(variances), least))
+    sigma[: len(variances)] = np.sqrt(variances)
+    return possible.of_sizes(with_gamma(np.maximum(sigma, least)))
+
+
+def with_gamma(sigma: Array) -> Array:
+    """Return standard deviations (N_KINDS,) with that of the logarithm of a gamma."""
+    return np.append(sigma[:GAMMA], GAMMA_SIGMA)
 
 
 def _places_in_groups(outlines: ObservedOutlines, others: ObservedOutlines) -> Array:

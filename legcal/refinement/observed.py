@@ -11,6 +11,7 @@ from legcal.mechanism.leg import LegKind
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
 from legcal.refinement.legs import FittedLegs
+from legcal.refinement.unknown_gammas import cameras_of, mixed_gammas, movements_by_gamma
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
 from legcal.vision.intrinsics import shared_cameras
@@ -42,6 +43,11 @@ class ObservedOutlines:
     series : (n_views,) array of int
         The view that stands for each: the first of those that show one image each with the same
         camera, as one that is held in the hand does; else itself.
+    cameras : tuple of str
+        The view that stands for the camera of each view.
+    by_gamma : (n,) array
+        How far each moves towards the inside with the logarithm of the gamma of its camera [px];
+        zero where that gamma is told, or nothing is known of it.
     bias_index : (n, c) array of int
         The shared shifts that each outline has a part in.
     bias_shift : (n, c, 2) array
@@ -60,6 +66,8 @@ class ObservedOutlines:
     parts: tuple[tuple[int, str], ...]
     views: tuple[str, ...]
     series: IntArray
+    cameras: tuple[str, ...]
+    by_gamma: Array
     bias_index: IntArray
     bias_shift: Array
 
@@ -104,7 +112,7 @@ def observed_outlines(
     ------
     DatasetError
         If an outline has a covariance that is not positive definite, or shows a part that the
-        mechanism does not have.
+        mechanism does not have, or outlines of a camera were measured with several gammas.
     """
     index = np.flatnonzero(outlines.used)
     row, leg = outlines.row[index], outlines.leg[index]
@@ -112,7 +120,9 @@ def observed_outlines(
     keys = [(int(j), outlines.part[i]) for i, j in zip(index, leg, strict=True)]
     parts = tuple(sorted(set(keys)))
     covariance = outlines.covariance[index]
+    cameras, by_gamma = cameras_of(measurements), movements_by_gamma(outlines, measurements)[index]
     problems = [
+        *mixed_gammas(by_gamma, outlines.gamma[index], [cameras[v] for v in view.tolist()]),
         *_bad_covariances(covariance, row, leg, measurements, legs),
         *(
             f"The outlines of {legs.names[j]}.{part} could not be used: the mechanism has no such "
@@ -146,6 +156,8 @@ def observed_outlines(
         parts,
         tuple(view.name for view in measurements.views),
         _series(measurements),
+        cameras,
+        by_gamma,
         np.zeros((len(index), 0), dtype=np.intp),
         np.zeros((len(index), 0, 2)),
     )

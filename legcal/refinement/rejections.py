@@ -68,6 +68,7 @@ def _distances_from_edges(
         pixels=o.pixels[outline],
         constants=constants,
         covariance=o.covariance[outline],
+        by_gamma=o.by_gamma[outline],
         bias_index=np.zeros((len(outline), 0), dtype=np.intp),
         bias_shift=np.zeros((len(outline), 0, 2)),
     )

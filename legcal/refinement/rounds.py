@@ -13,6 +13,7 @@ from legcal.refinement.biases import (
     SharedShifts,
     estimated_shifts,
     possible_shifts,
+    with_gamma,
 )
 from legcal.refinement.influence import explained_share
 from legcal.refinement.judged_corners import with_judged_corners
@@ -112,8 +113,10 @@ def fit_in_rounds(
     claimed, noise = problem.outlines.covariance, NoiseModel()
     accepted = np.ones(len(claimed), dtype=np.bool_)
     possible = possible_shifts(problem.outlines, problem.legs.names)
-    least = np.array([problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS])
-    state, shifts = first, possible.of_sizes(np.zeros(N_KINDS))
+    least = np.zeros(N_KINDS)
+    least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
+    shifts = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
+    problem, state = with_shifts(problem, first, shifts)
 
     def solved(near_enough: float = 0.0) -> Minimum:
         whitening = noise.whitening(claimed, accepted)

@@ -8,7 +8,7 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
-from legcal.refinement.biases import SharedShifts
+from legcal.refinement.biases import KINDS, SharedShifts
 from legcal.refinement.noise import NoiseModel
 from legcal.refinement.settings import RefinementSettings
 
@@ -47,7 +47,7 @@ NO_CHANGES = Changes(np.zeros(0), np.zeros(0), 0, 0)
 
 def sizes(noise: NoiseModel, shifts: SharedShifts) -> Array:
     """Return all standard deviations of errors in one vector: a factor, the others [px]."""
-    return np.array([noise.scale, noise.bias_px, noise.tilt_px, *shifts.sigma])
+    return np.array([noise.scale, noise.bias_px, noise.tilt_px, *shifts.sigma[: len(KINDS)]])
 
 
 def unsettled(changes: Changes, claimed: Array, settings: RefinementSettings) -> tuple[str, ...]:

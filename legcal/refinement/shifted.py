@@ -95,7 +95,7 @@ def with_biases(problem: FitProblem, biases: SharedShifts) -> FitProblem:
             np.concatenate([priors.sigma[known], biases.sigmas]),
         ),
         named=_inserted(problem.named, biases.names, first, n_old),
-        named_units=_inserted(problem.named_units, ("px",) * n_new, first, n_old),
+        named_units=_inserted(problem.named_units, biases.units, first, n_old),
         held=held,
         couplings=couple(layout, outlines, problem.readings, problem.axes, problem.board),
     )

@@ -17,6 +17,7 @@ from legcal.mechanism.parametrization import Parametrization
 from legcal.observations.outlines import Outlines
 from legcal.refinement.covariance import WeakDirection
 from legcal.refinement.foretold import Posterior
+from legcal.refinement.gammas import EstimatedGamma
 from legcal.refinement.noise import NoiseModel
 from legcal.vision.camera import Camera
 
@@ -111,6 +112,8 @@ class Solution:
         The calibration board in R_b; None if no image shows one.
     noise : NoiseModel
         The estimated errors of outlines; ``noise.bias_px`` is tau.
+    gammas : tuple of EstimatedGamma
+        Of the cameras whose gamma is not told and whose outlines move with it.
     biases : mapping
         Shifts of outlines that several share, by name [px]: those that the residuals show.
     shared_px : mapping
@@ -162,6 +165,7 @@ class Solution:
     rejected_corners: tuple[tuple[str, int], ...]
     T_Rb_board: RigidTransform | None
     noise: NoiseModel
+    gammas: tuple[EstimatedGamma, ...]
     biases: Mapping[str, float]
     shared_px: Mapping[str, float]
     sensitivities: tuple[Sensitivity, ...]

@@ -58,6 +58,10 @@ def result_document(calibration: Calibration) -> dict[str, Any]:
         "held": list(solution.held),
         "views": _views(calibration),
         "cameras": _cameras(calibration),
+        "gammas": [
+            {"views": list(one.views), "gamma": one.gamma, "sigma": one.gamma * one.sigma}
+            for one in solution.gammas
+        ],
         "stages": {"staged": _steps(calibration)},
         "residuals": {
             "chi2": solution.chi2,

@@ -113,7 +113,7 @@ def write_session(
         entry: dict[str, Any] = {"camera": camera}
         if groups:
             entry["hand_held"] = True
-        if view.camera.gamma != 1.0:
+        if view.camera.gamma_is_told:
             entry["gamma"] = view.camera.gamma
         if view.T_base_camera is not None:
             entry["T_base_camera"] = _rounded(view.T_base_camera)

@@ -105,7 +105,7 @@ def image_machine(
     )  # fmt: skip
     views = viewing.views
     if settings.level is Level.PHOTOGRAPHS:
-        views = _encoding(views, settings.appearance.gamma)
+        views = _encoding(views, settings.appearance.gamma, settings.tell_gamma)
     in_hand = len(viewing.groups) > 0
     images = take_images(
         truth.legs, viewing.machines, views, settings.images,
@@ -138,7 +138,9 @@ def _cameras(
     return cameras, {name: T for name, (_, T) in given.items()}
 
 
-def _encoding(views: tuple[Viewpoint, ...], gamma: float) -> tuple[Viewpoint, ...]:
-    """Return views whose cameras encode light in their grey levels, as their makers say."""
-    cameras = {id(view.camera): replace(view.camera, gamma=gamma) for view in views}
+def _encoding(views: tuple[Viewpoint, ...], gamma: float, is_told: bool) -> tuple[Viewpoint, ...]:
+    """Return views whose cameras encode light in their grey levels, as their makers say or not."""
+    cameras = {
+        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_told=is_told) for view in views
+    }
     return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)

@@ -43,6 +43,7 @@ _OF_LEVEL = {
     "clutter": ("--clutter", "photographs"),
     "bits": ("--bits", "photographs"),
     "colour": ("--colour or --grey", "photographs"),
+    "tell_gamma": ("--gamma or --no-gamma", "photographs"),
 }
 _NUMBER = re.compile(r"[-+]?[\d.]+")
 
@@ -66,6 +67,8 @@ class Request:
     sampling, shared_poses, images, views, cameras, camera, board, board_pose, hand_held, hints
         As in :class:`legcal.simulation.settings.SimulationSettings`; at most one of ``views`` and
         the file ``cameras``.
+    tell_gamma : bool or None
+        The same; None for True.
     pixel_noise, table_noise, encoder_noise : str
         ``0.1px``; ``degrees`` or ``radians``; ``2um`` or ``2um:uniform``.
     appearance : Path or None
@@ -89,6 +92,7 @@ class Request:
     board_pose: bool = False
     hand_held: bool = False
     hints: bool = True
+    tell_gamma: bool | None = None
     pixel_noise: str | None = None
     table_noise: str | None = None
     encoder_noise: str = "2um"
@@ -131,6 +135,7 @@ def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
         board_pose=request.board_pose,
         hand_held=request.hand_held,
         hints=request.hints,
+        tell_gamma=request.tell_gamma is not False,
         sigma_px=parse_quantity(noise, PIXELS, "--pixel-noise"),
         table=TableNoise.in_radians() if request.table_noise == "radians" else TableNoise(),
         readings=_spread(request.encoder_noise, LENGTH, Distribution.NORMAL, "--encoder-noise"),

@@ -67,6 +67,8 @@ class SimulationSettings:
         slight distortion.
     hints : bool
         Say roughly where the cameras stand, and which legs each view shows well.
+    tell_gamma : bool
+        Say how the cameras encode light.
     sigma_px : float
         Standard deviation of each edge point of outlines [px].
     table : TableNoise
@@ -100,6 +102,7 @@ class SimulationSettings:
     views: int | Path = 3
     camera: Path | None = None
     hints: bool = True
+    tell_gamma: bool = True
     sigma_px: float = 0.1
     table: TableNoise = field(default_factory=TableNoise)
     readings: Spread = DEFAULT_READINGS

@@ -38,6 +38,9 @@ class Camera:
     gamma : float
         Grey levels are light to the power 1 / gamma; 1 for a camera whose levels are proportional
         to light.
+    gamma_is_told : bool
+        False if nobody said so: outlines are then measured with ``gamma`` for a start, and a fit
+        looks for the true one.
     sigma : mapping
         Standard deviations of its numbers, by the names of
         :func:`legcal.vision.intrinsics.intrinsic_names` [px; distortion without unit]; those that
@@ -50,6 +53,7 @@ class Camera:
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     model: DistortionModel = "plumb_bob"
     gamma: float = 1.0
+    gamma_is_told: bool = True
     sigma: Mapping[str, float] = field(default_factory=dict)
 
     @property
