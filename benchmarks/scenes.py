@@ -38,7 +38,8 @@ from legcal.observations.outlines import Outlines
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import Bars, find_bars
 from legcal.recognition.place import JOINT_ERROR, place_camera, refined, supports
-from legcal.recognition.recognise import Recognised, Search, recognise, shifted
+from legcal.recognition.recognise import Recognised, recognise, shifted
+from legcal.recognition.searching import Search
 from legcal.recognition.segments import find_segments
 from legcal.recognition.starts import joined
 from legcal.recognition.targets import targets_of

@@ -39,7 +39,8 @@ from legcal.observations.sets import (
 )
 from legcal.progress import Report
 from legcal.recognition.radii import Part, radius_notes
-from legcal.recognition.recognise import Recognised, Search, recognise, shifted
+from legcal.recognition.recognise import Recognised, recognise, shifted
+from legcal.recognition.searching import Search
 from legcal.workers import Run
 
 Joined = Sequence[RigidTransform | None] | None

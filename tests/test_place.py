@@ -7,7 +7,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
-from legcal.recognition.place import Placed, _reversed, place_camera, place_near
+from legcal.recognition.place import _reversed, place_camera, place_near
+from legcal.recognition.placed import Placed
 
 HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
 

@@ -15,8 +15,10 @@ from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements, View
 from legcal.recognition.agreement import Picture, Poses, agreement, improved
 from legcal.recognition.bars import Bars, find_bars
-from legcal.recognition.place import Placed, place_camera, place_near
-from legcal.recognition.recognise import Recognised, Search, recognise
+from legcal.recognition.place import place_camera, place_near
+from legcal.recognition.placed import Placed
+from legcal.recognition.recognise import Recognised, recognise
+from legcal.recognition.searching import Search
 from legcal.recognition.segments import Segments, find_segments
 from legcal.recognition.starts import pose_starts
 from legcal.recognition.targets import Targets, targets_of

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from legcal.recognition.place import Placed
+from legcal.recognition.placed import Placed
 
 
 def named(names: Sequence[str]) -> str:
