@@ -37,6 +37,8 @@ from legcal.geometry.types import Array, Image
 from legcal.observations.outlines import Outlines
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import Bars, find_bars
+from legcal.recognition.closer import look_closer
+from legcal.recognition.groups import group_views
 from legcal.recognition.place import JOINT_ERROR, place_camera, refined, supports
 from legcal.recognition.recognise import Recognised, recognise, shifted
 from legcal.recognition.searching import Search
@@ -71,14 +73,19 @@ def find(given: Given) -> Found:
         lambda row: given.images[row], m, given.A_base, given.B_base, given.cylinders, wanted
     )
     begin = time.process_time()
-    found = recognise(search, np.arange(len(given.images)), [None])
+    rows = np.arange(len(given.images))
+    found = recognise(search, rows, [None])
     middle = time.process_time()
     A, B = shifted(found, m.view, given.A_base, given.B_base)
     outlines = detect_outlines(
-        lambda row: given.images[row], m, A, B, given.cylinders, found.T_base_camera,
+        search.load, m, A, B, given.cylinders, found.T_base_camera,
         wanted, given.leg_names, joint_error=found.joint_error,
     )  # fmt: skip
-    return Found(found, outlines, (middle - begin, time.process_time() - middle))
+    closer = look_closer(
+        search, group_views(m, rows, [None], None), found, outlines, given.leg_names
+    )
+    seconds = middle - begin, time.process_time() - middle
+    return Found(closer.recognised, closer.outlines, seconds)
 
 
 def judge(scene: Scene, found: Found) -> dict[str, Any]:

@@ -49,6 +49,7 @@ NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 _DECIDING = (
     "photographs.py",
     "examining.py",
+    "closer_look.py",
     "image_notes.py",
     "disagreeing.py",
     "fitting.py",

@@ -21,6 +21,7 @@ LEAST_STEP = 1.15  # of it that a saturated background must leave [px]
 WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
 WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of a reason
 SURER = 0.75  # by which factor an outline must be surer than the edge of a shade
+NEAR, NEARER = 0.5, 0.5  # of an outline that needs no partner: part of the window, of its distance
 NARROW_BIAS = 0.15  # of such an outline, in what the width is too small
 
 
@@ -42,9 +43,10 @@ class Verdict:
 
 def verdict(
     pair: Pair,
-    expected: Array,
+    predicted: Array,
     length: float,
     measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
+    window: float | None = None,
 ) -> Verdict:
     """Judge both edges of a part.
 
@@ -57,13 +59,17 @@ def verdict(
     ----------
     pair : Pair
         How the edges were found.
-    expected : (2,) array
-        The width of the part at both ends of the band, by its radius [px].
+    predicted : (2, 2) array
+        Predicted offsets of edge 1 and 2 at both ends of the band [px]: their distance is the width
+        of the part, by its radius.
     length : float
         Length of the band [px].
     measured : tuple of two MeasuredEdge or None
         Edge 1 and edge 2; None where no straight line fits.
+    window : float or None
+        How far the outlines are from there at most, where other legs vouch for it [px].
     """
+    expected = predicted[1] - predicted[0]
     width = float(np.mean(pair.v[1] - pair.v[0]))
     reasons = [
         _reason(edge, length, width) if seen else "no convincing edge"
@@ -71,11 +77,16 @@ def verdict(
     ]
     one, two = measured
     if one is not None and two is not None and not any(reasons):
-        return _by_width(one, two, expected)
+        by_width = _by_width(one, two, expected)
+        if window is None or not all(by_width.reasons):
+            return by_width
+        return _by_place((one, two), predicted, window, by_width)
     vouched = pair.suits(expected)
     stands = [
-        bool(may or vouched) and edge is not None and _is_clear_step(edge)
-        for edge, may in zip(measured, pair.alone, strict=True)
+        edge is not None
+        and _is_clear_step(edge)
+        and bool(may or vouched or (window is not None and _off(edge, at) <= NEAR * window))
+        for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
     ]
     first, second = (
         reason or ("" if alone else f"its other outline: {partner}")
@@ -100,6 +111,22 @@ def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array) -> Verdict:
         return Verdict((reason, reason))
     bias = NARROW_BIAS * float(np.abs(widths - expected).max())
     return Verdict(("", reason) if surer is one else (reason, ""), bias)
+
+
+def _by_place(
+    measured: tuple[MeasuredEdge, MeasuredEdge], predicted: Array, window: float, judged: Verdict
+) -> Verdict:
+    """Judge two edges at a wrong distance, one of which is where an outline should be."""
+    off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
+    near = int(np.argmin(off))
+    if off[near] > min(NEAR * window, NEARER * off[1 - near]) or not _is_clear_step(measured[near]):
+        return judged
+    return Verdict((judged.reasons[0] if near else "", "" if near else judged.reasons[1]))
+
+
+def _off(edge: MeasuredEdge, predicted: Array) -> float:
+    """Return how far an edge is from its prediction (2,) at the worse end [px]."""
+    return float(np.abs(edge.v - predicted).max())
 
 
 def _is_clear_step(edge: MeasuredEdge) -> bool:

@@ -1,0 +1,194 @@
+"""Legs that were not found at first, searched for once more near a fit of their view.
+
+Bars place a camera so well that outlines must be looked for some way around. A fit to those that
+were found tells where the missing ones are, and how well that is known: near enough, one outline of
+a leg is enough. What does not agree with the fit is searched for again as well.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from legcal.detection.detect import NOT_PLACED, detect_outlines
+from legcal.detection.outline import OUTSIDE, outline_parts
+from legcal.geometry.types import Array, BoolArray
+from legcal.observations.outlines import Outlines
+from legcal.observations.sets import choose_outlines, is_edited, join_outlines
+from legcal.recognition.groups import Group
+from legcal.recognition.recognise import Recognised, shifted
+from legcal.recognition.searching import Search
+from legcal.recognition.view_fit import ViewFit, fit_view, sideways_sigmas
+from legcal.workers import Run, in_turn
+
+DISAGREES = "disagrees with the other legs of its view"  # a reason
+MISFIT = 3.5  # standard deviations from the fit
+WINDOW = 2.0, 3.0  # around a fit: [px], standard deviations
+WIDEST = 40.0  # [px]
+Legs = set[tuple[int, int]]  # in images: row and leg
+
+
+@dataclass(frozen=True, eq=False)
+class Closer:
+    """What a closer look gave.
+
+    Attributes
+    ----------
+    recognised : Recognised
+        Cameras and joints by the outlines.
+    A_base, B_base : (n_rows, n_legs, 3) array
+        Joint centres where the images see them [m].
+    outlines : Outlines
+        Those that agree with them; what was searched for and not found keeps its reason.
+    """
+
+    recognised: Recognised
+    A_base: Array
+    B_base: Array
+    outlines: Outlines
+
+
+def look_closer(
+    search: Search,
+    groups: Sequence[Group],
+    found: Recognised,
+    outlines: Outlines,
+    leg_names: Sequence[str],
+    *,
+    together: bool = True,
+    run: Run = in_turn,
+    progress: Callable[[int], None] | None = None,
+) -> Closer:
+    """Fit all views to their outlines, and look for the legs that are missing near that.
+
+    Parameters
+    ----------
+    search : Search
+        The images and the model.
+    groups : sequence of Group
+        Views that are placed together.
+    found : Recognised
+        Where the legs and the cameras are.
+    outlines : Outlines
+        Measured near there.
+    leg_names : sequence of str
+        Names of the legs.
+    together : bool
+        As for :func:`legcal.detection.outline.outline_parts`.
+    run : callable
+        How images are searched.
+    progress : callable, optional
+        Called with the row of each image that was searched again.
+    """
+    fits = _fits(search, groups, found, outlines)
+    outlines = _without_misfits(outlines, fits)
+    window = _windows(search, groups, fits, outlines)
+    found = _fitted(groups, found, fits)
+    A, B = _joints(search, groups, found, fits)
+    again = detect_outlines(
+        search.load,
+        search.measurements,
+        A,
+        B,
+        search.cylinders,
+        found.T_base_camera,
+        search.wanted,
+        leg_names,
+        window=window,
+        progress=progress,
+        run=run,
+        method=partial(outline_parts, together=together, foretold=True),
+    )
+    outlines = _merged(outlines, again)
+    fits = _fits(search, groups, found, outlines)
+    found = _fitted(groups, found, fits)
+    return Closer(found, *_joints(search, groups, found, fits), _without_misfits(outlines, fits))
+
+
+def _fits(
+    search: Search, groups: Sequence[Group], found: Recognised, outlines: Outlines
+) -> list[ViewFit | None]:
+    """Return the fit of each group; None where it was not placed or has no outlines."""
+    fits: list[ViewFit | None] = []
+    for group in groups:
+        v = group.views[0]
+        T = found.T_base_camera[v]
+        if T is None:
+            fits.append(None)
+            continue
+        T_base_group = T * group.T_group_camera[v].inv()
+        fits.append(fit_view(search, group, T_base_group, found.shift[v], outlines))
+    return fits
+
+
+def _without_misfits(outlines: Outlines, fits: Sequence[ViewFit | None]) -> Outlines:
+    """Return outlines without those of legs that do not fit; what people edited stays."""
+    wrong = {
+        (int(row), int(leg))
+        for fit in fits
+        if fit is not None
+        for row, leg in zip(
+            fit.row[fit.distance > MISFIT], fit.leg[fit.distance > MISFIT], strict=True
+        )
+    }
+    out = outlines.used & _among(outlines, wrong) & ~is_edited(outlines)
+    reason = tuple(
+        DISAGREES if is_out else why
+        for is_out, why in zip(out.tolist(), outlines.reason, strict=True)
+    )
+    return replace(outlines, used=outlines.used & ~out, reason=reason)
+
+
+def _windows(
+    search: Search, groups: Sequence[Group], fits: Sequence[ViewFit | None], outlines: Outlines
+) -> Array:
+    """Return how far missing legs may be from a fit (n_rows, n_legs) [px]; NaN for others."""
+    missing = np.zeros((search.measurements.n_rows, search.n_legs), dtype=np.bool_)
+    visible = [not why.startswith((OUTSIDE, NOT_PLACED)) for why in outlines.reason]
+    missing[outlines.row[visible], outlines.leg[visible]] = True
+    missing[outlines.row[outlines.used], outlines.leg[outlines.used]] = False
+    window = np.full(missing.shape, np.nan)
+    for group, fit in zip(groups, fits, strict=True):
+        if fit is not None and missing[group.rows].any():
+            sigma = sideways_sigmas(search, group, fit)[group.rows]
+            near = np.minimum(WINDOW[0] + WINDOW[1] * sigma, WIDEST)
+            window[group.rows] = np.where(missing[group.rows], near, np.nan)
+    return window
+
+
+def _merged(outlines: Outlines, again: Outlines) -> Outlines:
+    """Return outlines with those of legs that were found again in their place."""
+    found = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
+    kept, new = choose_outlines(outlines, ~_among(outlines, found)), _among(again, found)
+    return join_outlines([kept, choose_outlines(again, new)])
+
+
+def _among(outlines: Outlines, legs: Legs) -> BoolArray:
+    """Return which outlines are of some legs."""
+    own = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)
+    return np.array([one in legs for one in own], dtype=np.bool_)
+
+
+def _fitted(
+    groups: Sequence[Group], found: Recognised, fits: Sequence[ViewFit | None]
+) -> Recognised:
+    """Return cameras and shifts by the fits."""
+    T, shift = list(found.T_base_camera), found.shift.copy()
+    for group, fit in zip(groups, fits, strict=True):
+        if fit is not None:
+            for v in group.views:
+                T[v], shift[v] = fit.T_base_group * group.T_group_camera[v], fit.shift
+    return replace(found, T_base_camera=T, shift=shift)
+
+
+def _joints(
+    search: Search, groups: Sequence[Group], found: Recognised, fits: Sequence[ViewFit | None]
+) -> tuple[Array, Array]:
+    """Return joint centres (n_rows, n_legs, 3) by the fits, elsewhere as they were recognised."""
+    A, B = shifted(found, search.measurements.view, search.A_base, search.B_base)
+    for group, fit in zip(groups, fits, strict=True):
+        if fit is not None:
+            by_fit = fit.joints(search.A_base, search.B_base)
+            A[group.rows], B[group.rows] = (X[group.rows] for X in by_fit)
+    return A, B
