@@ -23,7 +23,8 @@ from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
-from legcal.recognition.recognise import recognise, shifted
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import shifted
 from legcal.recognition.searching import Search
 from legcal.vision.cylinder import EPSILON
 

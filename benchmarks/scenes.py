@@ -40,7 +40,8 @@ from legcal.recognition.bars import Bars, find_bars
 from legcal.recognition.closer import look_closer
 from legcal.recognition.groups import group_views
 from legcal.recognition.place import JOINT_ERROR, place_camera, refined, supports
-from legcal.recognition.recognise import Recognised, recognise, shifted
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import Recognised, shifted
 from legcal.recognition.searching import Search
 from legcal.recognition.segments import find_segments
 from legcal.recognition.starts import joined

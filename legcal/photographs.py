@@ -39,7 +39,8 @@ from legcal.observations.sets import (
 )
 from legcal.progress import Report
 from legcal.recognition.radii import Part, radius_notes
-from legcal.recognition.recognise import Recognised, recognise, shifted
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import Recognised, shifted
 from legcal.recognition.searching import Search
 from legcal.workers import Run
 

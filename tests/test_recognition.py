@@ -17,7 +17,8 @@ from legcal.recognition.agreement import Picture, Poses, agreement, improved
 from legcal.recognition.bars import Bars, find_bars
 from legcal.recognition.place import place_camera, place_near
 from legcal.recognition.placed import Placed
-from legcal.recognition.recognise import Recognised, recognise
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import Recognised
 from legcal.recognition.searching import Search
 from legcal.recognition.segments import Segments, find_segments
 from legcal.recognition.starts import pose_starts

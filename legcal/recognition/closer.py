@@ -17,7 +17,7 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import choose_outlines, is_edited, join_outlines
 from legcal.recognition.groups import Group
-from legcal.recognition.recognise import Recognised, shifted
+from legcal.recognition.recognised import Recognised, shifted
 from legcal.recognition.searching import Search
 from legcal.recognition.view_fit import ViewFit, fit_view, sideways_sigmas
 from legcal.workers import Run, in_turn
@@ -41,12 +41,15 @@ class Closer:
         Joint centres where the images see them [m].
     outlines : Outlines
         Those that agree with them; what was searched for and not found keeps its reason.
+    fits : tuple of ViewFit or None
+        The fit of each group; None where it was not placed or has no outlines.
     """
 
     recognised: Recognised
     A_base: Array
     B_base: Array
     outlines: Outlines
+    fits: tuple[ViewFit | None, ...]
 
 
 def look_closer(
@@ -102,8 +105,8 @@ def look_closer(
     )
     outlines = _merged(outlines, again)
     fits = _fits(search, groups, found, outlines)
-    found = _fitted(groups, found, fits)
-    return Closer(found, *_joints(search, groups, found, fits), _without_misfits(outlines, fits))
+    found, outlines = _fitted(groups, found, fits), _without_misfits(outlines, fits)
+    return Closer(found, *_joints(search, groups, found, fits), outlines, tuple(fits))
 
 
 def _fits(

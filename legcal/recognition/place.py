@@ -141,6 +141,19 @@ def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_leg
     return replace(found, hinted=True)
 
 
+def with_first(placed: Placed, i: int, pose: Poses, pictures: Sequence[Picture]) -> Placed:
+    """Return poses with the i-th one first, where outlines put it."""
+    order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
+    return replace(
+        placed,
+        poses=joined([pose, placed.poses.take(order[1:])]),
+        support=placed.support[order],
+        expected=placed.expected[order],
+        score=placed.score[order],
+        leg_error=_leg_error(pictures, pose),
+    )
+
+
 def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
     """Return poses with their support, best first, without those that say the same."""
     n_legs = poses.shift.shape[1]
@@ -218,6 +231,9 @@ def _starts(picture: Picture, n_legs: int) -> Poses:
     poses = pose_starts(picture, n_legs)
     if len(poses) == 0:
         return poses
+    # From the frame of the picture to that of the poses.
+    back = picture.R.T
+    poses = Poses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
     poses = poses.take(_best(supports([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
     poses = refined([picture], poses, TOLERANCES[:3])
     score = supports([picture], poses, TOLERANCES[2])[0].sum(axis=1)

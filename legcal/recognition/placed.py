@@ -36,6 +36,9 @@ class Placed:
         legs without any.
     hinted : bool
         Whether the pose was searched for near a rough one only.
+    by_outlines : bool or None
+        Whether outlines that were measured at the poses speak for the first one; None where bars
+        left no doubt.
     """
 
     poses: Poses
@@ -44,6 +47,7 @@ class Placed:
     score: Array
     leg_error: Array
     hinted: bool = False
+    by_outlines: bool | None = None
 
     @property
     def needed(self) -> float:
@@ -67,14 +71,21 @@ class Placed:
         return float(self.score[0] - self.score[1])
 
     @property
+    def leads(self) -> bool:
+        """Whether bars tell the first pose from the second one."""
+        return self._leads(ENOUGH_LEAD, ENOUGH_PART)
+
+    @property
     def is_convincing(self) -> bool:
         """Whether the first pose is to be believed."""
-        return self.is_enough and (self.hinted or self._leads(ENOUGH_LEAD, ENOUGH_PART))
+        if self.by_outlines is not None:
+            return self.by_outlines
+        return self.is_enough and (self.hinted or self.leads)
 
     @property
     def is_clear(self) -> bool:
         """Whether the first pose leaves no doubt, so that no further search is needed."""
-        if not self.is_enough:
+        if not self.is_enough or self.by_outlines is False:
             return False
         if self.hinted:
             return self.share >= HINTED_SUPPORT

@@ -6,13 +6,13 @@ a pose that they agree on elsewhere is used and said.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import IntArray
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.groups import Group, group_views
 from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
@@ -26,7 +26,9 @@ from legcal.recognition.radii import (
     Part,
     other_radii,
 )
+from legcal.recognition.recognised import Recognised
 from legcal.recognition.searching import Search
+from legcal.recognition.second_look import look_again
 from legcal.recognition.sentences import named, placing_problem
 from legcal.workers import Run, in_turn
 
@@ -35,31 +37,6 @@ SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
-
-
-@dataclass(frozen=True, eq=False)
-class Recognised:
-    """Where the legs and the cameras are.
-
-    Attributes
-    ----------
-    T_base_camera : list of RigidTransform or None, for each view
-        None where a view could not be placed, or has no images.
-    shift : (n_views, n_legs, 2, 3) array
-        Where each view sees A and B of the legs, against the model, in the base link [m].
-    joint_error : (n_views, n_legs) array
-        How far the legs may still be from there [m].
-    unplaced : dict of str
-        Why views could not be placed, by view: one sentence for each.
-    radii : OtherRadii
-        Radii that the images contradict: the cameras were placed with those that they show.
-    """
-
-    T_base_camera: list[RigidTransform | None]
-    shift: Array
-    joint_error: Array
-    unplaced: dict[int, str]
-    radii: OtherRadii
 
 
 def recognise(
@@ -120,6 +97,8 @@ def recognise(
         of_group = groups[g].pictures(pictures, groups[g].rows)
         found[g] = _better(place_near(of_group, hint, search.n_legs), anywhere)
     placed = [one for one in found if one is not None]
+    looking = partial(_look, search, groups, placed, pictures)
+    placed = list(run(looking, range(len(groups))))
     radii = NO_OTHER_RADII
     if doubtful:
         radii = _radii(search, groups, placed, pictures, run).only(doubtful)
@@ -165,6 +144,18 @@ def _place(
     groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], group: int
 ) -> Placed:
     return place_camera(groups[group], n_legs, starts)
+
+
+def _look(
+    search: Search,
+    groups: Sequence[Group],
+    placed: Sequence[Placed],
+    pictures: dict[int, Picture],
+    g: int,
+) -> Placed:
+    """Return the poses of a group, judged by outlines where bars leave a doubt."""
+    of_group = groups[g].pictures(pictures, [r for r in groups[g].rows if r in pictures])
+    return look_again(search, groups[g], placed[g], of_group)
 
 
 def _radii(
@@ -273,8 +264,3 @@ def _flipped(group: Group, placed: Placed, pictures: dict[int, Picture]) -> list
     """Return the pictures by which a group was placed, with left and right exchanged."""
     few = placed.hinted and placed.support.shape[1] == len(group.some)
     return mirrored(group.pictures(pictures, group.some if few else group.rows))
-
-
-def shifted(found: Recognised, view: IntArray, A: Array, B: Array) -> tuple[Array, Array]:
-    """Return joint centres (n_rows, n_legs, 3) where the view of each row sees them [m]."""
-    return A + found.shift[view][:, :, 0], B + found.shift[view][:, :, 1]

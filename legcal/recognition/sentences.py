@@ -36,6 +36,13 @@ def placing_problem(name: str, placed: Placed, hinted: bool, *, is_mirrored: boo
             "readings, that they are no mirror images, the camera file, and the legs of the view "
             "if dataset.yaml names them."
         )
+    if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):
+        return (
+            f"view {name}: its camera could not be placed: found too few outlines at the pose "
+            f"{where} at which its images show {legs:.1f} of {n:.0f} legs an image, needed more "
+            "than other edges in the images make as well; add images at other readings, in "
+            "better light, or a rough T_base_camera."
+        )
     other = placed.pose(1)
     apart = placed.pose().inv() * other
     return (

@@ -28,6 +28,7 @@ TURN_SIGMA, PLACE_SIGMA = 0.3, 0.15  # of the pose that was recognised: angle, p
 STEPS, FIXED_STEPS = 8, 2  # of Gauss-Newton, and those before the images' own part is estimated
 ROBUST = 2.0  # standard deviations from which on a leg of an image counts less
 MOST_TURN, MOST_PLACE = 0.2, 0.1  # of a step: angle, part of the distance
+WORTH, MOST_OUTLINES = 2.0, 4  # of an outline as evidence: half a square, of a leg in an image
 NUDGE = 1e-6  # of finite differences [m]
 
 
@@ -54,6 +55,9 @@ class ViewFit:
         How far their outlines are from the fit, in standard deviations.
     middle : (3,) array
         The middle of the machine in the base link [m].
+    evidence : float
+        How much its outlines speak for the fit: what it is worth that each was found near where the
+        fit has it, less half of the squares of how far they are off and of the shifts.
     """
 
     T_base_group: RigidTransform
@@ -65,6 +69,7 @@ class ViewFit:
     own: Array
     distance: Array
     middle: Array
+    evidence: float
 
     def joints(self, A_base: Array, B_base: Array) -> tuple[Array, Array]:
         """Return joint centres (n_rows, n_legs, 3) where the images of the group see them [m]."""
@@ -137,6 +142,7 @@ def fit_view(
         state.own,
         np.sqrt(square / lines.size),
         middle,
+        _evidence(lines, equations, state),
     )
 
 
@@ -390,6 +396,14 @@ def _moved(state: _State, normal: _Normal, lines: _Lines, middle: Array) -> _Sta
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     t = turn @ (state.t - centre) + centre + step[3:6]
     return _State(turn @ state.R, t, state.shift + shifts.reshape(state.shift.shape), own)
+
+
+def _evidence(lines: _Lines, equations: tuple[Array, Array], state: _State) -> float:
+    """Return how much outlines speak for a state, each leg of an image by itself."""
+    square, _ = _distances(lines, equations, state, IMAGE_SIGMA)
+    found = np.minimum(0.5 * lines.size, MOST_OUTLINES)
+    of_legs = np.maximum(WORTH * found - 0.5 * square, 0.0).sum()
+    return float(of_legs - 0.5 * np.sum(state.shift**2) / JOINT_SIGMA**2)
 
 
 def _distances(
