@@ -85,7 +85,7 @@ def verdict(
     stands = [
         edge is not None
         and _is_clear_step(edge)
-        and bool(may or vouched or (window is not None and _off(edge, at) <= NEAR * window))
+        and bool(vouched or (may if window is None else _off(edge, at) <= NEAR * window))
         for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
     ]
     first, second = (

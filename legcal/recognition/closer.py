@@ -23,7 +23,6 @@ from legcal.recognition.view_fit import ViewFit, fit_view, sideways_sigmas
 from legcal.workers import Run, in_turn
 
 DISAGREES = "disagrees with the other legs of its view"  # a reason
-MISFIT = 3.5  # standard deviations from the fit
 WINDOW = 2.0, 3.0  # around a fit: [px], standard deviations
 WIDEST = 40.0  # [px]
 Legs = set[tuple[int, int]]  # in images: row and leg
@@ -84,8 +83,7 @@ def look_closer(
     progress : callable, optional
         Called with the row of each image that was searched again.
     """
-    fits = _fits(search, groups, found, outlines)
-    outlines = _without_misfits(outlines, fits)
+    outlines, fits = _agreeing(search, groups, found, outlines)
     window = _windows(search, groups, fits, outlines)
     found = _fitted(groups, found, fits)
     A, B = _joints(search, groups, found, fits)
@@ -103,10 +101,20 @@ def look_closer(
         run=run,
         method=partial(outline_parts, together=together, foretold=True),
     )
-    outlines = _merged(outlines, again)
-    fits = _fits(search, groups, found, outlines)
-    found, outlines = _fitted(groups, found, fits), _without_misfits(outlines, fits)
+    outlines, fits = _agreeing(search, groups, found, _merged(outlines, again))
+    found = _fitted(groups, found, fits)
     return Closer(found, *_joints(search, groups, found, fits), outlines, tuple(fits))
+
+
+def _agreeing(
+    search: Search, groups: Sequence[Group], found: Recognised, outlines: Outlines
+) -> tuple[Outlines, list[ViewFit | None]]:
+    """Return outlines without misfits, and the fits to the others."""
+    fits = _fits(search, groups, found, outlines)
+    if any(fit is not None and fit.misfits.any() for fit in fits):
+        outlines = _without_misfits(outlines, fits)
+        fits = _fits(search, groups, found, outlines)
+    return outlines, fits
 
 
 def _fits(
@@ -127,14 +135,12 @@ def _fits(
 
 def _without_misfits(outlines: Outlines, fits: Sequence[ViewFit | None]) -> Outlines:
     """Return outlines without those of legs that do not fit; what people edited stays."""
-    wrong = {
-        (int(row), int(leg))
-        for fit in fits
-        if fit is not None
-        for row, leg in zip(
-            fit.row[fit.distance > MISFIT], fit.leg[fit.distance > MISFIT], strict=True
-        )
-    }
+    wrong: Legs = set()
+    for fit in fits:
+        if fit is not None:
+            wrong.update(
+                zip(fit.row[fit.misfits].tolist(), fit.leg[fit.misfits].tolist(), strict=True)
+            )
     out = outlines.used & _among(outlines, wrong) & ~is_edited(outlines)
     reason = tuple(
         DISAGREES if is_out else why

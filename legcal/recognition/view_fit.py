@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotVisible
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.mechanism.leg import main_cylinders
 from legcal.observations.outlines import Outlines
 from legcal.recognition.agreement import NEAREST
@@ -20,7 +20,8 @@ from legcal.recognition.searching import Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
-JOINT_SIGMA = 6e-3  # of the joint centres of the nominal model, the same in all images [m]
+JOINT_SIGMA = 6e-3  # of the joint centres of the nominal model in all images, at first [m]
+JOINT_SIGMAS = 1.5e-3, 12e-3  # the least and the largest that legs may show
 IMAGE_SIGMA = 2e-3  # of the platform joints in an image besides, at first [m]
 IMAGE_SIGMAS = 0.7e-3, 12e-3  # the least and the largest that images may show
 EDGE_SIGMA = 0.3  # of an outline: what its covariance does not know, as a wrong gamma [px]
@@ -29,6 +30,11 @@ STEPS, FIXED_STEPS = 8, 2  # of Gauss-Newton, and those before the images' own p
 ROBUST = 2.0  # standard deviations from which on a leg of an image counts less
 MOST_TURN, MOST_PLACE = 0.2, 0.1  # of a step: angle, part of the distance
 WORTH, MOST_OUTLINES = 2.0, 4  # of an outline as evidence: half a square, of a leg in an image
+MISFIT = 3.5  # standard deviations from the fit, of a leg in an image
+LARGEST_SHIFT, LONE_SHIFT = (
+    4.0,
+    2.5,
+)  # of a leg, and of one of which only single outlines were found
 NUDGE = 1e-6  # of finite differences [m]
 
 
@@ -45,10 +51,14 @@ class ViewFit:
     covariance : (6 + 6 n_legs, 6 + 6 n_legs) array
         Of the motion of the machine about its middle in the frame of the group, rotation vector
         and displacement, and of the shifts [rad, m].
+    joint_sigma : float
+        Standard deviation of the joint centres of the model, as the legs show it [m].
     image_sigma : float
         Standard deviation of the platform joints in an image besides [m].
     row, leg : (n,) array of int
         Legs in images that have outlines.
+    n_outlines : (n,) array of int
+        How many of each.
     own : (n, 3) array
         What their images add to B [m].
     distance : (n,) array
@@ -63,13 +73,24 @@ class ViewFit:
     T_base_group: RigidTransform
     shift: Array
     covariance: Array
+    joint_sigma: float
     image_sigma: float
     row: IntArray
     leg: IntArray
+    n_outlines: IntArray
     own: Array
     distance: Array
     middle: Array
     evidence: float
+
+    @property
+    def misfits(self) -> BoolArray:
+        """Legs in images that are too far from where the other legs have them, (n,)."""
+        shift = np.abs(self.shift).max(axis=(1, 2)) / self.joint_sigma
+        alone = np.ones(len(self.shift), dtype=np.bool_)
+        alone[self.leg[self.n_outlines > 1]] = False
+        far = shift > np.where(alone, LONE_SHIFT, LARGEST_SHIFT)
+        return np.asarray((self.distance > MISFIT) | far[self.leg])
 
     def joints(self, A_base: Array, B_base: Array) -> tuple[Array, Array]:
         """Return joint centres (n_rows, n_legs, 3) where the images of the group see them [m]."""
@@ -116,29 +137,30 @@ def fit_view(
     middle = np.concatenate([lines.A, lines.B]).mean(axis=0)
     T = T_base_group.inv()
     begin = _State(T.rotation.as_matrix(), T.translation, shift, np.zeros((lines.n_items, 3)))
-    state, sigma, weight = begin, IMAGE_SIGMA, np.ones(lines.n_items)
+    state, spread, weight = begin, _Spread(JOINT_SIGMA, IMAGE_SIGMA), np.ones(lines.n_items)
     try:
         equations = _equations(group, lines, state, middle)
         for step in range(STEPS):
-            normal = _normal(lines, equations, state, begin, weight, sigma, middle)
+            normal = _normal(lines, equations, state, begin, weight, spread, middle)
             state = _moved(state, normal, lines, middle)
             equations = _equations(group, lines, state, middle)
-            square, own_square = _distances(lines, equations, state, sigma)
+            square, own_square = _distances(lines, equations, state, spread.image)
             weight = 1.0 / (1.0 + square / (lines.size * ROBUST**2))
             if step >= FIXED_STEPS:
-                spread = float(np.sum(weight * own_square) / (3.0 * weight.sum()))
-                sigma = float(np.clip(np.sqrt(spread), *IMAGE_SIGMAS))
+                spread = _spread(lines, normal, state, weight, own_square)
     except NotVisible:
         return None
-    normal = _normal(lines, equations, state, begin, weight, sigma, middle)
+    normal = _normal(lines, equations, state, begin, weight, spread, middle)
     pose = RigidTransform.from_components(state.t, Rotation.from_matrix(state.R)).inv()
     return ViewFit(
         pose,
         state.shift,
         np.asarray(np.linalg.inv(normal.H), dtype=np.float64),
-        sigma,
+        spread.joint,
+        spread.image,
         lines.item_row,
         lines.item_leg,
+        lines.size // 2,
         state.own,
         np.sqrt(square / lines.size),
         middle,
@@ -215,6 +237,14 @@ class _State:
     t: Array
     shift: Array
     own: Array
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """Standard deviations of the model's joint centres, and of what images add to B [m]."""
+
+    joint: float
+    image: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,13 +372,13 @@ def _normal(
     state: _State,
     begin: _State,
     weight: Array,
-    sigma: float,
+    spread: "_Spread",
     middle: Array,
 ) -> _Normal:
     """Return the normal equations without the images' own parts."""
     M, b = _by_item(lines, *equations)
-    M[:, 12:, 12:] += np.eye(3) / sigma**2
-    b[:, 12:] -= state.own / sigma**2
+    M[:, 12:, 12:] += np.eye(3) / spread.image**2
+    b[:, 12:] -= state.own / spread.image**2
     solved = np.linalg.solve(M[:, 12:, 12:], np.concatenate([M[:, 12:, :12], b[:, 12:, None]], -1))
     back, start = solved[..., :12], solved[..., 12]
     S = (M[:, :12, :12] - M[:, :12, 12:] @ back) * weight[:, None, None]
@@ -367,8 +397,8 @@ def _normal(
     H[np.arange(6), np.arange(6)] += known
     g[:6] -= known * np.concatenate([turned, centre - before])
     joints = np.arange(6, n)
-    H[joints, joints] += JOINT_SIGMA**-2
-    g[6:] -= state.shift.ravel() / JOINT_SIGMA**2
+    H[joints, joints] += spread.joint**-2
+    g[6:] -= state.shift.ravel() / spread.joint**2
     return _Normal(H, g, back, start)
 
 
@@ -396,6 +426,19 @@ def _moved(state: _State, normal: _Normal, lines: _Lines, middle: Array) -> _Sta
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     t = turn @ (state.t - centre) + centre + step[3:6]
     return _State(turn @ state.R, t, state.shift + shifts.reshape(state.shift.shape), own)
+
+
+def _spread(
+    lines: _Lines, normal: _Normal, state: _State, weight: Array, own_square: Array
+) -> _Spread:
+    """Return the standard deviations that the legs show, most of them alike."""
+    variance = np.diag(np.linalg.inv(normal.H))[6:].reshape(state.shift.shape)
+    of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]
+    of_image = np.sum(weight * own_square) / (3.0 * weight.sum())
+    return _Spread(
+        float(np.clip(np.sqrt(np.median(of_leg)), *JOINT_SIGMAS)),
+        float(np.clip(np.sqrt(of_image), *IMAGE_SIGMAS)),
+    )
 
 
 def _evidence(lines: _Lines, equations: tuple[Array, Array], state: _State) -> float:
