@@ -71,6 +71,11 @@ class Placed:
         return float(self.score[0] - self.score[1])
 
     @property
+    def leads_clearly(self) -> bool:
+        """Whether bars leave no doubt that the first pose is better than the second one."""
+        return self._leads(CLEAR_LEAD, CLEAR_PART)
+
+    @property
     def leads(self) -> bool:
         """Whether bars tell the first pose from the second one."""
         return self._leads(ENOUGH_LEAD, ENOUGH_PART)
@@ -89,7 +94,7 @@ class Placed:
             return False
         if self.hinted:
             return self.share >= HINTED_SUPPORT
-        return self.share >= CLEAR_SUPPORT and self._leads(CLEAR_LEAD, CLEAR_PART)
+        return self.share >= CLEAR_SUPPORT and self.leads_clearly
 
     @property
     def share(self) -> float:

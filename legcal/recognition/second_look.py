@@ -64,24 +64,39 @@ def look_again(search: Search, group: Group, placed: Placed, pictures: Sequence[
     if len(placed.poses) == 0 or near or placed.is_clear:
         return placed
     few = replace(group, rows=group.some)
-    looks = [_look(search, few, placed, i) for i in range(min(N_POSES, len(placed.poses)))]
-    for i in np.argsort([-look.evidence for look in looks], kind="stable")[:N_CLOSER].tolist():
-        looks[i] = _look_closer(search, few, looks[i])
-    best = int(np.argmax([look.evidence for look in looks]))
+    looks = [_look(search, few, placed, 0)]
+    if not (placed.leads_clearly and _is_decided(looks, placed, few)):
+        looks += [_look(search, few, placed, i) for i in range(1, min(N_POSES, len(placed.poses)))]
+        if not _is_decided(looks, placed, few):
+            order = np.argsort([-look.evidence for look in looks], kind="stable")
+            for i in order[:N_CLOSER].tolist():
+                looks[i] = _look_closer(search, few, looks[i])
+    best = _best(looks)
     fit = looks[best].fit
-    others = [
-        look.evidence
-        for look in looks
-        if look is not looks[best] and not _same(look.outlines, looks[best].outlines)
-    ]
-    least, times = (LEAST, TIMES) if len(few.rows) > 1 else (LEAST_ALONE, TIMES_ALONE)
-    if best == 0 and placed.is_convincing:
-        least, times = LEAST_AGREED, TIMES_AGREED
-    if fit is None or fit.evidence < max(least, times * max(others, default=0.0)):
+    if fit is None or not _is_decided(looks, placed, few):
         return replace(placed, by_outlines=False)
     T = fit.T_base_group.inv()
     pose = Poses(T.rotation.as_matrix()[None], T.translation[None], fit.shift[None])
     return replace(with_first(placed, best, pose, pictures), by_outlines=True)
+
+
+def _best(looks: Sequence[_Look]) -> int:
+    """Return the pose that outlines speak for most."""
+    return int(np.argmax([look.evidence for look in looks]))
+
+
+def _is_decided(looks: Sequence[_Look], placed: Placed, group: Group) -> bool:
+    """Say whether outlines speak for one pose, and not nearly as much for another one."""
+    best = _best(looks)
+    others = [
+        look.evidence
+        for i, look in enumerate(looks)
+        if i != best and not _same(look.outlines, looks[best].outlines)
+    ]
+    least, times = (LEAST, TIMES) if len(group.rows) > 1 else (LEAST_ALONE, TIMES_ALONE)
+    if best == 0 and placed.is_convincing:
+        least, times = LEAST_AGREED, TIMES_AGREED
+    return looks[best].evidence >= max(least, times * max(others, default=0.0))
 
 
 def _look(search: Search, group: Group, placed: Placed, i: int) -> _Look:
