@@ -41,7 +41,9 @@ def closer_look(
         As for :func:`legcal.detection.outline.outline_parts`.
     """
     search, found, scene = placement.search, placement.recognised, placement.scene
-    groups = group_views(search.measurements, photographs.detect, found.T_base_camera, joined)
+    views = search.measurements.views
+    hints = [view.T_base_camera for view in views]
+    groups = group_views(search.measurements, photographs.detect, hints, joined)
     is_own = np.isin(outlines.row, photographs.detect)
     own, others = choose_outlines(outlines, is_own), choose_outlines(outlines, ~is_own)
     closer = look_closer(
@@ -57,9 +59,12 @@ def closer_look(
     searched = np.zeros(search.measurements.n_rows, dtype=np.bool_)
     searched[photographs.detect] = True
     rows = searched[:, None, None]
+    seen = set(search.measurements.view[photographs.detect].tolist())
     cameras = tuple(
-        rough if T is None else T
-        for T, rough in zip(closer.recognised.T_base_camera, scene.T_base_camera, strict=True)
+        T if v in seen else rough
+        for v, (T, rough) in enumerate(
+            zip(closer.recognised.T_base_camera, scene.T_base_camera, strict=True)
+        )
     )
     scene = replace(
         scene,
@@ -67,5 +72,11 @@ def closer_look(
         B_base=np.where(rows, closer.B_base, scene.B_base),
         T_base_camera=cameras,
     )
-    placement = replace(placement, scene=scene, recognised=closer.recognised)
+    unplaced = {views[v].name: why for v, why in closer.recognised.unplaced.items()}
+    placement = replace(
+        placement,
+        scene=scene,
+        recognised=closer.recognised,
+        unplaced={**placement.unplaced, **unplaced},
+    )
     return placement, join_outlines([merge_edited(closer.outlines, own), others])

@@ -19,12 +19,20 @@ from legcal.observations.sets import choose_outlines, is_edited, join_outlines
 from legcal.recognition.groups import Group
 from legcal.recognition.recognised import Recognised, shifted
 from legcal.recognition.searching import Search
-from legcal.recognition.view_fit import ViewFit, fit_view, sideways_sigmas
+from legcal.recognition.sentences import few_outlines, named
+from legcal.recognition.view_fit import (
+    ViewFit,
+    fit_view,
+    least_evidence,
+    reversed_pose,
+    sideways_sigmas,
+)
 from legcal.workers import Run, in_turn
 
 DISAGREES = "disagrees with the other legs of its view"  # a reason
 WINDOW = 2.0, 3.0  # around a fit: [px], standard deviations
 WIDEST = 40.0  # [px]
+CLEAR = 0.7  # of the evidence that a doubtful pose must have, where bars leave no doubt
 Legs = set[tuple[int, int]]  # in images: row and leg
 
 
@@ -83,6 +91,7 @@ def look_closer(
     progress : callable, optional
         Called with the row of each image that was searched again.
     """
+    found = _turned_over(search, groups, found, outlines)
     outlines, fits = _agreeing(search, groups, found, outlines)
     window = _windows(search, groups, fits, outlines)
     found = _fitted(groups, found, fits)
@@ -102,7 +111,9 @@ def look_closer(
         method=partial(outline_parts, together=together, foretold=True),
     )
     outlines, fits = _agreeing(search, groups, found, _merged(outlines, again))
-    found = _fitted(groups, found, fits)
+    found = _believed(search, groups, _fitted(groups, found, fits), fits)
+    placed = np.array([T is not None for T in found.T_base_camera])
+    outlines = _rejected(outlines, ~placed[search.measurements.view[outlines.row]], NOT_PLACED)
     return Closer(found, *_joints(search, groups, found, fits), outlines, tuple(fits))
 
 
@@ -133,6 +144,22 @@ def _fits(
     return fits
 
 
+def _turned_over(
+    search: Search, groups: Sequence[Group], found: Recognised, outlines: Outlines
+) -> Recognised:
+    """Return cameras with near and far exchanged where outlines suit that better."""
+    T, shift = list(found.T_base_camera), found.shift.copy()
+    for group, fit in zip(groups, _fits(search, groups, found, outlines), strict=True):
+        if fit is None or len(group.views) > 1:
+            continue
+        other = reversed_pose(search, group, fit.T_base_group)
+        over = fit_view(search, group, other, np.zeros_like(fit.shift), outlines)
+        if over is not None and over.evidence > fit.evidence:
+            v = group.views[0]
+            T[v], shift[v] = over.T_base_group * group.T_group_camera[v], over.shift
+    return replace(found, T_base_camera=T, shift=shift)
+
+
 def _without_misfits(outlines: Outlines, fits: Sequence[ViewFit | None]) -> Outlines:
     """Return outlines without those of legs that do not fit; what people edited stays."""
     wrong: Legs = set()
@@ -141,12 +168,34 @@ def _without_misfits(outlines: Outlines, fits: Sequence[ViewFit | None]) -> Outl
             wrong.update(
                 zip(fit.row[fit.misfits].tolist(), fit.leg[fit.misfits].tolist(), strict=True)
             )
-    out = outlines.used & _among(outlines, wrong) & ~is_edited(outlines)
+    return _rejected(outlines, _among(outlines, wrong), DISAGREES)
+
+
+def _rejected(outlines: Outlines, wrong: BoolArray, why: str) -> Outlines:
+    """Return outlines without some of those that were used."""
+    out = outlines.used & wrong & ~is_edited(outlines)
     reason = tuple(
-        DISAGREES if is_out else why
-        for is_out, why in zip(out.tolist(), outlines.reason, strict=True)
+        why if is_out else reason
+        for is_out, reason in zip(out.tolist(), outlines.reason, strict=True)
     )
     return replace(outlines, used=outlines.used & ~out, reason=reason)
+
+
+def _believed(
+    search: Search, groups: Sequence[Group], found: Recognised, fits: Sequence[ViewFit | None]
+) -> Recognised:
+    """Return cameras without those for which hardly an outline speaks, near no rough pose."""
+    T, unplaced = list(found.T_base_camera), dict(found.unplaced)
+    for group, fit in zip(groups, fits, strict=True):
+        evidence = 0.0 if fit is None else fit.evidence
+        is_placed = T[group.views[0]] is not None
+        if group.hint is not None or not is_placed or evidence >= CLEAR * least_evidence(group):
+            continue
+        name = named([search.measurements.views[v].name for v in group.views])
+        n = 0 if fit is None else int(fit.n_outlines.sum())
+        for v in group.views:
+            T[v], unplaced[v] = None, few_outlines(name, n, len(group.rows))
+    return replace(found, T_base_camera=T, unplaced=unplaced)
 
 
 def _windows(

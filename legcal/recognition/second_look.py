@@ -22,12 +22,13 @@ from legcal.recognition.placed import Placed
 from legcal.recognition.radii import NO_OTHER_RADII
 from legcal.recognition.recognised import Recognised
 from legcal.recognition.searching import Search
-from legcal.recognition.view_fit import ViewFit, fit_view
+from legcal.recognition.view_fit import ViewFit, fit_view, least_evidence
 
 N_POSES, N_CLOSER = 4, 2  # that are looked at, and at the best of which missing legs are sought
-LEAST, TIMES = 13.0, 1.6  # evidence for a pose, and how many times that for any other one
-LEAST_AGREED, TIMES_AGREED = 9.0, 1.5  # the same where bars are convincing by themselves
-LEAST_ALONE, TIMES_ALONE = 16.0, 2.5  # the same of a single image
+# How many times the evidence for any other pose one needs, and how much more than the least.
+TIMES, MORE = 1.6, 3.0
+TIMES_AGREED, MORE_AGREED = 1.5, 0.0  # the same where bars are convincing by themselves
+TIMES_ALONE, MORE_ALONE = 2.5, 6.0  # and of a single image
 JOINT_ERROR = 3e-3  # of the legs as a pose has them [m]
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
 
@@ -93,9 +94,10 @@ def _is_decided(looks: Sequence[_Look], placed: Placed, group: Group) -> bool:
         for i, look in enumerate(looks)
         if i != best and not _same(look.outlines, looks[best].outlines)
     ]
-    least, times = (LEAST, TIMES) if len(group.rows) > 1 else (LEAST_ALONE, TIMES_ALONE)
+    more, times = (MORE, TIMES) if len(group.rows) > 1 else (MORE_ALONE, TIMES_ALONE)
     if best == 0 and placed.is_convincing:
-        least, times = LEAST_AGREED, TIMES_AGREED
+        more, times = MORE_AGREED, TIMES_AGREED
+    least = least_evidence(group) + more
     return looks[best].evidence >= max(least, times * max(others, default=0.0))
 
 

@@ -12,6 +12,15 @@ def named(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
+def few_outlines(name: str, n_outlines: int, n_images: int) -> str:
+    """Say that hardly an outline was found at the pose that bars suggest."""
+    return (
+        f"view {name}: its camera could not be placed: found only {n_outlines} outlines that "
+        f"agree in its {n_images} image{'s' * (n_images != 1)}, needed more than other edges give "
+        "by chance; add images at other readings, in better light, or a rough T_base_camera."
+    )
+
+
 def placing_problem(name: str, placed: Placed, hinted: bool, *, is_mirrored: bool) -> str:
     """Say why a view could not be placed."""
     if is_mirrored:

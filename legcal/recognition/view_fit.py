@@ -35,6 +35,8 @@ LARGEST_SHIFT, LONE_SHIFT = (
     4.0,
     2.5,
 )  # of a leg, and of one of which only single outlines were found
+SHIFT_COST = 0.25  # of shifts, less than half a square: some are the pose's
+LEAST_EVIDENCE = 8.0, 1.2  # and for each image
 NUDGE = 1e-6  # of finite differences [m]
 
 
@@ -164,8 +166,30 @@ def fit_view(
         state.own,
         np.sqrt(square / lines.size),
         middle,
-        _evidence(lines, equations, state),
+        _evidence(lines, equations, state, spread),
     )
+
+
+def least_evidence(group: Group) -> float:
+    """Return how much evidence outlines must give: more images show more that suits by chance."""
+    return LEAST_EVIDENCE[0] + LEAST_EVIDENCE[1] * len(group.rows)
+
+
+def reversed_pose(search: Search, group: Group, T_base_group: RigidTransform) -> RigidTransform:
+    """Return the pose at which a flat machine looks alike from far: near and far exchanged.
+
+    The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
+    through its middle that faces the camera.
+    """
+    X = np.concatenate([search.A_base[group.rows], search.B_base[group.rows]]).reshape(-1, 3)
+    middle = X.mean(axis=0)
+    normal = np.linalg.svd(X - middle, full_matrices=False)[2][2]
+    T = T_base_group.inv()
+    at = T.apply(middle)
+    facing = at / np.linalg.norm(at)
+    in_depth, in_plane = (np.eye(3) - 2.0 * np.outer(x, x) for x in (facing, normal))
+    R = in_depth @ T.rotation.as_matrix() @ in_plane
+    return RigidTransform.from_components(at - R @ middle, Rotation.from_matrix(R)).inv()
 
 
 def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
@@ -441,12 +465,15 @@ def _spread(
     )
 
 
-def _evidence(lines: _Lines, equations: tuple[Array, Array], state: _State) -> float:
+def _evidence(
+    lines: _Lines, equations: tuple[Array, Array], state: _State, spread: _Spread
+) -> float:
     """Return how much outlines speak for a state, each leg of an image by itself."""
     square, _ = _distances(lines, equations, state, IMAGE_SIGMA)
     found = np.minimum(0.5 * lines.size, MOST_OUTLINES)
     of_legs = np.maximum(WORTH * found - 0.5 * square, 0.0).sum()
-    return float(of_legs - 0.5 * np.sum(state.shift**2) / JOINT_SIGMA**2)
+    joint = max(JOINT_SIGMA, spread.joint)
+    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)
 
 
 def _distances(
