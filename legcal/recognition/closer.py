@@ -91,8 +91,9 @@ def look_closer(
     progress : callable, optional
         Called with the row of each image that was searched again.
     """
-    found = _turned_over(search, groups, found, outlines)
-    outlines, fits = _agreeing(search, groups, found, outlines)
+    fits = _turned_over(search, groups, found, outlines)
+    found = _fitted(groups, found, fits)
+    outlines, fits = _agreeing(search, groups, found, outlines, fits)
     window = _windows(search, groups, fits, outlines)
     found = _fitted(groups, found, fits)
     A, B = _joints(search, groups, found, fits)
@@ -110,7 +111,9 @@ def look_closer(
         run=run,
         method=partial(outline_parts, together=together, foretold=True),
     )
-    outlines, fits = _agreeing(search, groups, found, _merged(outlines, again))
+    outlines = _merged(outlines, again)
+    fits = _fits(search, groups, found, outlines)
+    outlines, fits = _agreeing(search, groups, found, outlines, fits)
     found = _believed(search, groups, _fitted(groups, found, fits), fits)
     placed = np.array([T is not None for T in found.T_base_camera])
     outlines = _rejected(outlines, ~placed[search.measurements.view[outlines.row]], NOT_PLACED)
@@ -118,14 +121,17 @@ def look_closer(
 
 
 def _agreeing(
-    search: Search, groups: Sequence[Group], found: Recognised, outlines: Outlines
+    search: Search,
+    groups: Sequence[Group],
+    found: Recognised,
+    outlines: Outlines,
+    fits: list[ViewFit | None],
 ) -> tuple[Outlines, list[ViewFit | None]]:
     """Return outlines without misfits, and the fits to the others."""
-    fits = _fits(search, groups, found, outlines)
-    if any(fit is not None and fit.misfits.any() for fit in fits):
-        outlines = _without_misfits(outlines, fits)
-        fits = _fits(search, groups, found, outlines)
-    return outlines, fits
+    if not any(fit is not None and fit.misfits.any() for fit in fits):
+        return outlines, fits
+    outlines = _without_misfits(outlines, fits)
+    return outlines, _fits(search, groups, found, outlines)
 
 
 def _fits(
@@ -146,18 +152,17 @@ def _fits(
 
 def _turned_over(
     search: Search, groups: Sequence[Group], found: Recognised, outlines: Outlines
-) -> Recognised:
-    """Return cameras with near and far exchanged where outlines suit that better."""
-    T, shift = list(found.T_base_camera), found.shift.copy()
-    for group, fit in zip(groups, _fits(search, groups, found, outlines), strict=True):
-        if fit is None or len(group.views) > 1:
+) -> list[ViewFit | None]:
+    """Return fits, with near and far exchanged where outlines suit that better."""
+    fits = _fits(search, groups, found, outlines)
+    for g, (group, fit) in enumerate(zip(groups, fits, strict=True)):
+        if fit is None or len(group.views) > 1 or fit.suits:
             continue
         other = reversed_pose(search, group, fit.T_base_group)
         over = fit_view(search, group, other, np.zeros_like(fit.shift), outlines)
         if over is not None and over.evidence > fit.evidence:
-            v = group.views[0]
-            T[v], shift[v] = over.T_base_group * group.T_group_camera[v], over.shift
-    return replace(found, T_base_camera=T, shift=shift)
+            fits[g] = over
+    return fits
 
 
 def _without_misfits(outlines: Outlines, fits: Sequence[ViewFit | None]) -> Outlines:

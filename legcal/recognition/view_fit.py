@@ -35,6 +35,7 @@ LARGEST_SHIFT, LONE_SHIFT = (
     4.0,
     2.5,
 )  # of a leg, and of one of which only single outlines were found
+SUITS = 0.85  # of the most evidence that outlines can give
 SHIFT_COST = 0.25  # of shifts, less than half a square: some are the pose's
 LEAST_EVIDENCE = 8.0, 1.2  # and for each image
 NUDGE = 1e-6  # of finite differences [m]
@@ -84,6 +85,12 @@ class ViewFit:
     distance: Array
     middle: Array
     evidence: float
+
+    @property
+    def suits(self) -> bool:
+        """Whether nearly all outlines suit the fit as well as they can."""
+        most = WORTH * np.minimum(self.n_outlines, MOST_OUTLINES).sum()
+        return self.evidence >= SUITS * float(most)
 
     @property
     def misfits(self) -> BoolArray:
