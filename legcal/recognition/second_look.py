@@ -24,10 +24,11 @@ from legcal.recognition.recognised import Recognised
 from legcal.recognition.searching import Search
 from legcal.recognition.view_fit import ViewFit, fit_view, least_evidence
 
-N_POSES, N_CLOSER = 4, 2  # that are looked at, and at the best of which missing legs are sought
+N_POSES, N_CLOSER = 4, 3  # that are looked at, and at the best of which missing legs are sought
 # How many times the evidence for any other pose one needs, and how much more than the least.
 TIMES, MORE = 1.6, 3.0
 TIMES_AGREED, MORE_AGREED = 1.5, 0.0  # the same where bars are convincing by themselves
+WITHOUT_RIVAL = 4.0  # times the evidence for others, from which on no more is needed either
 TIMES_ALONE, MORE_ALONE = 2.5, 6.0  # and of a single image
 JOINT_ERROR = 3e-3  # of the legs as a pose has them [m]
 SAME_PX, SAME_PART = 3.0, 0.7  # of outlines that two poses share: how near, how many of them
@@ -69,8 +70,8 @@ def look_again(search: Search, group: Group, placed: Placed, pictures: Sequence[
     if not (placed.leads_clearly and _is_decided(looks, placed, few)):
         looks += [_look(search, few, placed, i) for i in range(1, min(N_POSES, len(placed.poses)))]
         if not _is_decided(looks, placed, few):
-            order = np.argsort([-look.evidence for look in looks], kind="stable")
-            for i in order[:N_CLOSER].tolist():
+            by_both = placed.score[: len(looks)] + [look.evidence for look in looks]
+            for i in np.argsort(-by_both, kind="stable")[:N_CLOSER].tolist():
                 looks[i] = _look_closer(search, few, looks[i])
     best = _best(looks)
     fit = looks[best].fit
@@ -95,10 +96,12 @@ def _is_decided(looks: Sequence[_Look], placed: Placed, group: Group) -> bool:
         if i != best and not _same(look.outlines, looks[best].outlines)
     ]
     more, times = (MORE, TIMES) if len(group.rows) > 1 else (MORE_ALONE, TIMES_ALONE)
+    evidence, other = looks[best].evidence, max(others, default=0.0)
     if best == 0 and placed.is_convincing:
         more, times = MORE_AGREED, TIMES_AGREED
-    least = least_evidence(group) + more
-    return looks[best].evidence >= max(least, times * max(others, default=0.0))
+    elif len(group.rows) > 1 and evidence >= WITHOUT_RIVAL * other:
+        more = MORE_AGREED
+    return evidence >= max(least_evidence(group) + more, times * other)
 
 
 def _look(search: Search, group: Group, placed: Placed, i: int) -> _Look:
