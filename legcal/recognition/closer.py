@@ -17,16 +17,11 @@ from legcal.geometry.types import Array, BoolArray
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import choose_outlines, is_edited, join_outlines
 from legcal.recognition.groups import Group
+from legcal.recognition.near_fit import reversed_pose, sideways_sigmas
 from legcal.recognition.recognised import Recognised, shifted
 from legcal.recognition.searching import Search
 from legcal.recognition.sentences import few_outlines, named
-from legcal.recognition.view_fit import (
-    ViewFit,
-    fit_view,
-    least_evidence,
-    reversed_pose,
-    sideways_sigmas,
-)
+from legcal.recognition.view_fit import ViewFit, fit_view, least_evidence
 from legcal.workers import Run, in_turn
 
 DISAGREES = "disagrees with the other legs of its view"  # a reason
