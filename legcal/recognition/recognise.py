@@ -97,8 +97,6 @@ def recognise(
         of_group = groups[g].pictures(pictures, groups[g].rows)
         found[g] = _better(place_near(of_group, hint, search.n_legs), anywhere)
     placed = [one for one in found if one is not None]
-    looking = partial(_look, search, groups, placed, pictures)
-    placed = list(run(looking, range(len(groups))))
     radii = NO_OTHER_RADII
     if doubtful:
         radii = _radii(search, groups, placed, pictures, run).only(doubtful)
@@ -114,6 +112,8 @@ def recognise(
         radii = radii.then(step)
     if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[1]):
         (search, placed, pictures), radii = as_given, NO_OTHER_RADII  # the scale is not known well
+    looking = partial(_look, search, groups, placed, pictures)
+    placed = list(run(looking, range(len(groups))))
     return _gathered(search, groups, placed, pictures, radii, run)
 
 
