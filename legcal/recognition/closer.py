@@ -187,9 +187,9 @@ def _believed(
     """Return cameras without those for which hardly an outline speaks, near no rough pose."""
     T, unplaced = list(found.T_base_camera), dict(found.unplaced)
     for group, fit in zip(groups, fits, strict=True):
-        evidence = 0.0 if fit is None else fit.evidence
-        is_placed = T[group.views[0]] is not None
-        if group.hint is not None or not is_placed or evidence >= CLEAR * least_evidence(group):
+        least = CLEAR * least_evidence(group)
+        is_sure = fit is not None and fit.is_determined and fit.evidence >= least
+        if group.hint is not None or T[group.views[0]] is None or is_sure:
             continue
         name = named([search.measurements.views[v].name for v in group.views])
         n = 0 if fit is None else int(fit.n_outlines.sum())

@@ -69,7 +69,7 @@ def look_again(search: Search, group: Group, placed: Placed, pictures: Sequence[
     looks = [_look(search, few, placed, 0)]
     if not (placed.leads_clearly and _is_decided(looks, placed, few)):
         looks += [_look(search, few, placed, i) for i in range(1, min(N_POSES, len(placed.poses)))]
-        if not _is_decided(looks, placed, few):
+        if not (placed.is_convincing and _is_decided(looks, placed, few)):
             by_both = placed.score[: len(looks)] + [look.evidence for look in looks]
             for i in np.argsort(-by_both, kind="stable")[:N_CLOSER].tolist():
                 looks[i] = _look_closer(search, few, looks[i])
@@ -96,12 +96,14 @@ def _is_decided(looks: Sequence[_Look], placed: Placed, group: Group) -> bool:
         if i != best and not _same(look.outlines, looks[best].outlines)
     ]
     more, times = (MORE, TIMES) if len(group.rows) > 1 else (MORE_ALONE, TIMES_ALONE)
-    evidence, other = looks[best].evidence, max(others, default=0.0)
+    fit, other = looks[best].fit, max(others, default=0.0)
+    if fit is None or not fit.is_determined:
+        return False
     if best == 0 and placed.is_convincing:
         more, times = MORE_AGREED, TIMES_AGREED
-    elif len(group.rows) > 1 and evidence >= WITHOUT_RIVAL * other:
+    elif len(group.rows) > 1 and fit.evidence >= WITHOUT_RIVAL * other:
         more = MORE_AGREED
-    return evidence >= max(least_evidence(group) + more, times * other)
+    return fit.evidence >= max(least_evidence(group) + more, times * other)
 
 
 def _look(search: Search, group: Group, placed: Placed, i: int) -> _Look:

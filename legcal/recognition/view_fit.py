@@ -34,6 +34,7 @@ WORTH, MOST_OUTLINES = 2.0, 4  # of an outline as evidence: half a square, of a 
 MISFIT = 3.5  # standard deviations from the fit, of a leg in an image
 LARGEST_SHIFT = 4.0  # of a leg, in standard deviations
 LONE_SHIFT = 2.5  # the same of a leg of which only single outlines were found
+MOST_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
 SUITS = 0.85  # of the most evidence that outlines can give
 SHIFT_COST = 0.25  # of shifts, less than half a square: some are the pose's
 LEAST_EVIDENCE = 8.0, 1.2  # and for each image
@@ -104,6 +105,11 @@ class ViewFit:
         B = B_base + self.shift[:, 1]
         B[self.row, self.leg] += self.own
         return A_base + self.shift[:, 0], B
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the outlines tell the pose from those around it: else legs may be others."""
+        return bool(self.turn_sigma <= MOST_TURN_SIGMA)
 
     @property
     def turn_sigma(self) -> float:
