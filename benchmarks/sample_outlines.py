@@ -23,7 +23,9 @@ from legcal.mechanism.kinematics import forward_kinematics
 from legcal.mechanism.model import Mechanism
 from legcal.observations.measurements import Measurements
 from legcal.observations.outlines import Outlines
-from legcal.recognition.recognise import Search, recognise, shifted
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import shifted
+from legcal.recognition.searching import Search
 from legcal.vision.cylinder import EPSILON
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -10,10 +10,11 @@ scene; scenes that the file has already are not made again. ``--only`` writes th
 scene with all true outlines (thin), the bars (grey), and the outlines that were used (thick,
 one colour a leg).
 
-Columns of the table: views placed right, refused as ambiguous (of these: where ideal edges of what
-is visible leave a doubt as well), refused for want of legs, placed wrong; legs visible over half
-their length in one piece, and the share of them with a used outline: of all, and of those in views
-without an inherent doubt; used outlines, and how many of them are not on their leg's edge.
+Columns of the table: views placed right, refused as ambiguous or for want of legs (of both: where
+ideal edges of what is visible leave a doubt as well), placed wrong; legs visible over half their
+length in one piece, and the share of them with a used outline: of all, of those in views that were
+not refused for an inherent doubt, and of those in views placed right; used outlines, and how many
+of them are not on their leg's edge.
 """
 
 import argparse
@@ -37,8 +38,12 @@ from legcal.geometry.types import Array, Image
 from legcal.observations.outlines import Outlines
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.bars import Bars, find_bars
+from legcal.recognition.closer import look_closer
+from legcal.recognition.groups import group_views
 from legcal.recognition.place import JOINT_ERROR, place_camera, refined, supports
-from legcal.recognition.recognise import Recognised, Search, recognise, shifted
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import Recognised, shifted
+from legcal.recognition.searching import Search
 from legcal.recognition.segments import find_segments
 from legcal.recognition.starts import joined
 from legcal.recognition.targets import targets_of
@@ -70,14 +75,19 @@ def find(given: Given) -> Found:
         lambda row: given.images[row], m, given.A_base, given.B_base, given.cylinders, wanted
     )
     begin = time.process_time()
-    found = recognise(search, np.arange(len(given.images)), [None])
+    rows = np.arange(len(given.images))
+    found = recognise(search, rows, [None])
     middle = time.process_time()
     A, B = shifted(found, m.view, given.A_base, given.B_base)
     outlines = detect_outlines(
-        lambda row: given.images[row], m, A, B, given.cylinders, found.T_base_camera,
+        search.load, m, A, B, given.cylinders, found.T_base_camera,
         wanted, given.leg_names, joint_error=found.joint_error,
     )  # fmt: skip
-    return Found(found, outlines, (middle - begin, time.process_time() - middle))
+    closer = look_closer(
+        search, group_views(m, rows, [None], None), found, outlines, given.leg_names
+    )
+    seconds = middle - begin, time.process_time() - middle
+    return Found(closer.recognised, closer.outlines, seconds)
 
 
 def judge(scene: Scene, found: Found) -> dict[str, Any]:
@@ -212,27 +222,25 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
     groups: list[tuple[str, str, Any]] = [("all", "", None)]
     for key in ("machine", "images", "errors", "size", "occluders"):
         groups += [(key, key, value) for value in sorted({line[key] for line in lines}, key=str)]
-    head = f"{'':26}{'scenes':>7}{'right':>7}{'ambig.':>7}{'(real)':>7}{'none':>6}{'wrong':>6}"
-    head += f"{'legs':>8}{'found':>8}{'no doubt':>9}{'outlines':>9}{'wrong':>6}{'ms/image':>15}"
+    head = f"{'':26}{'scenes':>7}{'right':>7}{'ambig.':>7}{'none':>6}{'(real)':>7}{'wrong':>6}"
+    head += f"{'legs':>8}{'found':>8}{'no doubt':>9}{'placed':>8}"
+    head += f"{'outlines':>9}{'wrong':>6}{'ms/image':>15}"
     rows = [head]
     for title, key, value in groups:
         some = [line for line in lines if not key or line[key] == value]
         verdicts = [line["verdict"] for line in some]
         legs = sum(sum(line["visible"]) for line in some)
-        found = sum(line["found"] for line in some)
-        # Views with an inherent doubt are left out here.
-        sure = [line for line in some if not (line["doubt"] and line["verdict"] == "ambiguous")]
-        sure_legs, sure_found = (
-            sum(sum(line["visible"]) for line in sure), sum(line["found"] for line in sure),
-        )  # fmt: skip
+        refused = [line for line in some if line["verdict"] in ("ambiguous", "not found")]
+        real = sum(line["doubt"] for line in refused)
+        sure = [line for line in some if line not in refused or not line["doubt"]]
+        placed = [line for line in some if line["verdict"] == "right"]
         images = sum(line["images"] for line in some)
         times = [1e3 * sum(line["seconds"][i] for line in some) / images for i in (0, 1)]
-        real = sum(line["doubt"] and line["verdict"] == "ambiguous" for line in some)
         rows.append(
             f"{title + ' ' + str(value) if key else title:26}{len(some):7d}"
-            f"{verdicts.count('right'):7d}{verdicts.count('ambiguous'):7d}{real:7d}"
-            f"{verdicts.count('not found'):6d}{verdicts.count('wrong'):6d}{legs:8d}"
-            f"{100.0 * found / max(legs, 1):7.1f}%{100.0 * sure_found / max(sure_legs, 1):8.1f}%"
+            f"{verdicts.count('right'):7d}{verdicts.count('ambiguous'):7d}"
+            f"{verdicts.count('not found'):6d}{real:7d}{verdicts.count('wrong'):6d}{legs:8d}"
+            f"{_share_found(some):7.1f}%{_share_found(sure):8.1f}%{_share_found(placed):7.1f}%"
             f"{sum(line['used'] for line in some):9d}{sum(line['wrong'] for line in some):6d}"
             f"{times[0]:8.0f} +{times[1]:4.0f}"
         )
@@ -244,6 +252,12 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
     off = [str(line["seed"]) for line in lines if line["wrong"] and line["verdict"] == "right"]
     rows.append(f"outlines wrong in views placed right: {' '.join(off) or 'none'}")
     return "\n".join(rows)
+
+
+def _share_found(lines: Sequence[dict[str, Any]]) -> float:
+    """Return how many of the visible legs were found [%]."""
+    legs = sum(sum(line["visible"]) for line in lines)
+    return float(100.0 * sum(line["found"] for line in lines) / max(legs, 1))
 
 
 def look(seed: int, folder: Path) -> dict[str, Any]:

@@ -4,10 +4,11 @@
 
 The images of the sample dataset (1024 x 768, six legs) are decoded beforehand. Times are those of
 the processor, for one image: what is seen of exposure and blur; legs recognised and cameras placed,
-near rough camera poses or without any; the brief measurement of all outlines near there, and the
-one with all care near a fit. Of these images/s, "measured once" is what a first measurement asks,
-recognition included, and "calibrate" is all that a calibration does with an image. Peak memory is
-that of processes which measure N and 3 N images that they read one by one.
+near rough camera poses or without any; the brief measurement of all outlines near there, the fit of
+views to them with the search for missing legs, and the measurement with all care near a fit. Of
+these images/s, "measured once" is what a first measurement asks, recognition included, and
+"calibrate" is all that a calibration does with an image. Peak memory is that of processes which
+measure N and 3 N images that they read one by one.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.closer_look import closer_look
 from legcal.dataset.folder import load_dataset
 from legcal.detection.exposure import expose
 from legcal.detection.outline import outline_parts
@@ -93,9 +95,13 @@ def measure_speed() -> None:
     watch("recognition without", lambda: place(photographs, without_poses(scene), no_progress))
     blurs: dict[int, float] = {}
     brief = partial(outline_parts, together=False)
-    watch(
+    once = watch(
         "outlines in brief",
         lambda: detect(photographs, near.scene, no_progress, method=brief, blur_of_row=blurs),
+    )
+    watch(
+        "views fitted, and missing legs",
+        lambda: closer_look(photographs, near, once, no_progress, together=False),
     )
     watch("outlines with all care", lambda: detect(photographs, near.scene, no_progress))
     methods = [partial(outline_parts, blur=blur) for blur in usual_blur(photographs, blurs)]
@@ -105,7 +111,12 @@ def measure_speed() -> None:
         lambda: detect(photographs, fitted, no_progress, near_fit=True, method=methods),
     )
     for words in ("near poses", "without"):
-        begins = "exposure and blur", f"recognition {words}", "outlines in brief"
+        begins = (
+            "exposure and blur",
+            f"recognition {words}",
+            "outlines in brief",
+            "views fitted, and missing legs",
+        )
         watch.rate(f"measured once, {words}", *begins)
         watch.rate(f"calibrate, {words}", *begins, "outlines with all care near a fit")
 

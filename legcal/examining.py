@@ -13,7 +13,8 @@ from functools import partial
 
 import numpy as np
 
-from legcal.detection.detect import NOT_PLACED, Method
+from legcal.closer_look import closer_look
+from legcal.detection.detect import NOT_PLACED
 from legcal.detection.exposure import Exposure, expose, image_defects
 from legcal.detection.outline import HIDDEN, OUTSIDE, outline_parts
 from legcal.detection.picture import to_grey
@@ -46,7 +47,7 @@ from legcal.recognition.bars import Bars
 from legcal.recognition.doubts import Explanation, explain, share_shown
 from legcal.recognition.groups import group_views
 from legcal.recognition.radii import Part
-from legcal.recognition.recognise import Search
+from legcal.recognition.searching import Search
 from legcal.vision.intrinsics import camera_numbers
 
 USUALLY = 0.3  # the least that images of a view must find to be compared with
@@ -85,7 +86,8 @@ def observe(
     scene: Scene,
     report: Report,
     joined: Joined = None,
-    method: Method = outline_parts,
+    *,
+    together: bool = True,
 ) -> Observed:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
@@ -99,8 +101,8 @@ def observe(
         Called as ``report(stage, done, total)``.
     joined : sequence of RigidTransform or None, for each view
         As :func:`legcal.photographs.place` has it.
-    method : callable
-        How outlines are measured.
+    together : bool
+        As for :func:`legcal.detection.outline.outline_parts`.
     """
     defects, bars = _looked_at(photographs, scene, report, joined)
     rows = photographs.detect
@@ -108,6 +110,7 @@ def observe(
     searched = replace(photographs, detect=usable)
     placement = place(searched, scene, report, joined, known=bars)
     blurs: dict[int, float] = {}
+    method = partial(outline_parts, together=together)
     measure = partial(detect, report=report, method=method, blur_of_row=blurs)
     outlines = measure(photographs, placement.scene)
     doubtful = _parts_not_found(photographs, outlines)
@@ -119,6 +122,9 @@ def observe(
             again = measure(corrected, other.scene)
             if again.used.sum() > outlines.used.sum():
                 photographs, placement, outlines = corrected, other, again
+    placement, outlines = closer_look(
+        replace(photographs, detect=usable), placement, outlines, report, joined, together=together
+    )
     placement = _without_images(photographs, placement, usable, defects)
     view = photographs.measurements.view
     placed = [row for row in rows.tolist() if placement.scene.T_base_camera[view[row]] is not None]

@@ -131,7 +131,7 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
         outlines = given_outlines(photographs)
         return _noted(_fit(part, fitted, outlines, scene, board, progress), work.plan.notes)
     joined = None if board is None else board.T_board_camera
-    observed = observe(photographs, scene, progress, joined, partial(outline_parts, together=False))
+    observed = observe(photographs, scene, progress, joined, together=False)
     placement = observed.placement
     placement.require_one()
     other_radii = bool(placement.recognised.radii.factor)

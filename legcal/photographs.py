@@ -42,7 +42,9 @@ from legcal.progress import Report
 from legcal.recognition.bars import Bars
 from legcal.recognition.looked_at import LookedAt
 from legcal.recognition.radii import Part, radius_notes
-from legcal.recognition.recognise import Recognised, Search, recognise, shifted
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import Recognised, shifted
+from legcal.recognition.searching import Search
 from legcal.workers import Run
 
 Joined = Sequence[RigidTransform | None] | None
@@ -51,6 +53,7 @@ NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 _DECIDING = (
     "photographs.py",
     "examining.py",
+    "closer_look.py",
     "image_notes.py",
     "disagreeing.py",
     "fitting.py",

@@ -188,7 +188,9 @@ def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: 
     observed = observe(replace(photographs, load=load), scene, no_progress)
     assert observed.placement.unplaced == {}
     rows = photographs.detect.tolist()
-    assert read == [*rows, *rows]
+    assert read[: 2 * len(rows)] == [*rows, *rows]
+    missing = read[2 * len(rows) :]  # legs are looked for once more where some were not found
+    assert len(set(missing)) == len(missing) < len(rows)
 
 
 def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(

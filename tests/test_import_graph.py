@@ -17,6 +17,7 @@ LAYERS = (
     "detection",
     "recognition",
     "photographs",
+    "closer_look",
     "image_notes",
     "examining",
     "dataset",

@@ -17,7 +17,9 @@ from legcal.geometry.types import Array, Image
 from legcal.mechanism.leg import Cylinder
 from legcal.observations.measurements import Measurements, View
 from legcal.observations.outlines import Outlines
-from legcal.recognition.recognise import Search, recognise, shifted
+from legcal.recognition.recognise import recognise
+from legcal.recognition.recognised import shifted
+from legcal.recognition.searching import Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 

@@ -1,5 +1,7 @@
 """The camera pose on which pictures of a view agree, from edges of known legs."""
 
+from dataclasses import replace
+
 import leg_pictures as lp
 import numpy as np
 import pytest
@@ -7,7 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.recognition.agreement import Picture, Poses
 from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
-from legcal.recognition.place import Placed, _reversed, place_camera, place_near
+from legcal.recognition.place import _reversed, place_camera, place_near
+from legcal.recognition.placed import Placed
 
 HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
 
@@ -58,6 +61,24 @@ def test_a_model_that_is_wrong_by_ten_millimetres_suffices() -> None:
     away, angle = lp.apart(T, placed.pose())
     assert angle < np.deg2rad(6.0)
     assert away < 0.15
+
+
+def test_views_that_know_how_they_stand_to_each_other_are_placed_together() -> None:
+    rng = np.random.default_rng(5)
+    made, joined = lp.machine(6, rng), []
+    T_base_board = RigidTransform.from_components(
+        [0.3, 0.4, 0.0], Rotation.from_rotvec([3.0, 0.2, 0.1])
+    )
+    for _ in range(4):  # one image each
+        T = lp.camera(rng)
+        [picture] = lp.pictures(made, T, [lp.platform(rng)], rng, joint_error=2e-3, noise=0.4)
+        T_camera_board = T.inv() * T_base_board
+        joined.append(
+            replace(picture, R=T_camera_board.rotation.as_matrix(), t=T_camera_board.translation)
+        )
+    placed = place_camera(joined, 6)
+    assert placed.is_convincing
+    assert _is_right(placed, T_base_board)
 
 
 def test_mirrored_pictures_are_refused() -> None:

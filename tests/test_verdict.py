@@ -25,12 +25,17 @@ def _edge(v: Array, *, sigma: float = 0.1, kept: float = 1.0, is_step: bool = Tr
 
 
 def _judged(
-    off: float, one: MeasuredEdge | None, two: MeasuredEdge | None, *, alone: bool = False
+    off: float,
+    one: MeasuredEdge | None,
+    two: MeasuredEdge | None,
+    *,
+    alone: bool = False,
+    window: float | None = None,
 ) -> Verdict:
     """Judge edges whose pair was found at a distance that is off [px]."""
     v = np.stack([np.zeros(2), WIDTH + off])
     pair = Pair(v, np.ones(2, dtype=np.bool_), np.full(2, alone))
-    return verdict(pair, WIDTH, LENGTH, (one, two))
+    return verdict(pair, np.stack([np.zeros(2), WIDTH]), LENGTH, (one, two), window)
 
 
 def test_an_outline_before_a_saturated_background_needs_some_of_its_step() -> None:
@@ -54,8 +59,8 @@ def test_after_a_fit_the_edge_away_from_its_prediction_is_not_the_outline(wrong:
     v[wrong] += 1.0 if wrong == 0 else -1.0
     edges = _edge(v[0]), _edge(v[1])
     pair = Pair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
-    assert verdict(pair, WIDTH, LENGTH, edges).reasons == ("", "")
-    found = verdict(pair, WIDTH, LENGTH, edges, predicted)
+    assert verdict(pair, predicted, LENGTH, edges).reasons == ("", "")
+    found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
     assert found.reasons[1 - wrong] == ""
     assert found.reasons[wrong].startswith(WRONG_WIDTH)
 
@@ -64,7 +69,7 @@ def test_after_a_fit_two_edges_that_both_err_are_not_used() -> None:
     predicted = np.stack([np.zeros(2), WIDTH])
     edges = _edge(np.full(2, 0.6)), _edge(WIDTH - 0.6)
     pair = Pair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
-    found = verdict(pair, WIDTH, LENGTH, edges, predicted)
+    found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
     assert all(reason.startswith(WRONG_WIDTH) for reason in found.reasons)
 
 
@@ -104,3 +109,12 @@ def test_an_edge_whose_partner_was_found_but_not_measured(
     found = _judged(off, _edge(np.zeros(2), kept=kept), None, alone=alone)
     expected = "" if used else "its other outline: edge hardly visible"
     assert found.reasons == (expected, "edge hardly visible")
+
+
+@pytest.mark.parametrize(("beside", "used"), [(0.5, True), (3.0, False)])
+def test_an_edge_where_other_legs_foretell_it_needs_no_partner(beside: float, used: bool) -> None:
+    found = _judged(6.0, _edge(np.full(2, beside)), _edge(WIDTH + 6.0), window=5.0)
+    assert (found.reasons[0] == "") is used
+    assert found.reasons[1].startswith(WRONG_WIDTH)
+    lone = _judged(6.0, _edge(np.full(2, beside)), None, alone=True, window=5.0)
+    assert (lone.reasons[0] == "") is used

@@ -46,6 +46,7 @@ def detect_outlines(
     *,
     joint_error: float | Array = JOINT_ERROR,
     pixel_error: float = PIXEL_ERROR,
+    window: Array | None = None,
     progress: Progress | None = None,
     run: Run = in_turn,
     method: Method | Sequence[Method] = outline_parts,
@@ -73,6 +74,9 @@ def detect_outlines(
         How far the predicted joint centres may be off [m]; 0 after a fit.
     pixel_error : float
         How far outlines may be off besides [px].
+    window : (n_rows, n_legs) array, optional
+        Instead of both: how far outlines may be off in each image [px]; NaN for legs that are not
+        searched for in it.
     progress : callable, optional
         Called with the row of each image when it has been searched.
     run : callable
@@ -90,10 +94,14 @@ def detect_outlines(
         platform; what was not found or cannot be trusted is rejected with the reason.
     """
     error = np.broadcast_to(np.asarray(joint_error, dtype=np.float64), np.shape(wanted))
-    guide = _Guide(load, measurements, A_base, B_base, cylinders, T_base_camera, wanted, error)
+    guide = _Guide(
+        load, measurements, A_base, B_base, cylinders, T_base_camera, wanted, error, window
+    )
     methods = (method,) * len(measurements.views) if callable(method) else tuple(method)
     search = partial(_search_outlines, guide, methods, tuple(leg_names), pixel_error)
     rows = _rows_with_images(measurements)
+    if window is not None:
+        rows = [row for row in rows if not np.isnan(window[row]).all()]
     found = []
     for row, parts in zip(rows, run(search, rows), strict=True):
         found.append(parts)
@@ -117,6 +125,7 @@ class _Guide:
     T_base_camera: Sequence[RigidTransform | None]
     wanted: BoolArray
     joint_error: Array
+    window: Array | None
 
     def legs(self, row: int, T_base_camera: RigidTransform) -> tuple[Camera, list[PredictedLeg]]:
         """Return the camera of a row, and the legs that should be in the image."""
@@ -141,8 +150,13 @@ def _search_outlines(
         return [_unsearched(leg, cylinders[leg], NOT_PLACED) for leg in legs]
     camera, predicted = guide.legs(row, T)
     window = np.zeros(len(leg_names))
-    for leg in predicted:
-        window[leg.leg] = pixel_error + guide.joint_error[view, leg.leg] * _pixels_per_metre(leg)
+    if guide.window is not None:
+        wanted = wanted & ~np.isnan(guide.window[row])
+        window = np.where(wanted, guide.window[row], 0.0)
+    else:
+        for leg in predicted:
+            error = guide.joint_error[view, leg.leg] * _pixels_per_metre(leg)
+            window[leg.leg] = pixel_error + error
     grey = to_grey(guide.load(row))
     found = methods[view](grey, camera, predicted, leg_names, wanted, window)
     missing = set(np.flatnonzero(wanted).tolist()) - {leg.leg for leg in predicted}

@@ -25,6 +25,7 @@ OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one
 MARGIN = 4.0  # beside a leg in front [px]
 NARROWEST = 5.0  # [px]
+NARROW = 0.8  # of the width, up to which a window tells both outlines apart
 NEAR_PREDICTION = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
 
 
@@ -88,6 +89,8 @@ class FoundPart:
         Which of the :func:`legcal.detection.pairs.block_positions` other legs hide.
     pair : Pair
         The edges.
+    window : float or None
+        How far the outlines are from their prediction at most, where other legs vouch for it [px].
     """
 
     leg: PredictedLeg
@@ -96,6 +99,7 @@ class FoundPart:
     predicted: Array
     hidden: BoolArray
     pair: Pair
+    window: float | None = None
 
     @property
     def width(self) -> Array:
@@ -152,6 +156,7 @@ def outline_parts(
     *,
     together: bool = True,
     blur: float | None = None,
+    foretold: bool = False,
 ) -> list[PartOutlines]:
     """Find and measure the outlines of all parts in one image.
 
@@ -172,13 +177,15 @@ def outline_parts(
     together, blur
         As for :func:`legcal.detection.measure.measure_edges`; with a blur that is known, outlines
         are taken to be where they are predicted, where an edge is seen there.
+    foretold : bool
+        Whether other legs vouch for the predictions: then one edge near its own is enough.
 
     Returns
     -------
     list of PartOutlines
         One for every part of every wanted leg, found or not, from base to platform.
     """
-    parts, results = find_parts(grey, camera, legs, names, wanted, window)
+    parts, results = find_parts(grey, camera, legs, names, wanted, window, foretold=foretold)
     if parts:
         results.extend(_measure(grey, camera, parts, together, blur))
     return sorted(results, key=lambda result: result.leg)
@@ -191,12 +198,14 @@ def find_parts(
     names: Sequence[str],
     wanted: BoolArray,
     window: Array,
+    *,
+    foretold: bool = False,
 ) -> tuple[list[FoundPart], list[PartOutlines]]:
     """Find the edges of all parts in one image to about a pixel.
 
     Parameters
     ----------
-    grey, camera, legs, names, wanted, window
+    grey, camera, legs, names, wanted, window, foretold
         As for :func:`outline_parts`.
 
     Returns
@@ -226,16 +235,19 @@ def find_parts(
             why = f"{HIDDEN} {names[values[np.argmax(counts)]]}"
             rejected.append(_rejected(one.leg, one.piece, why))
             continue
+        reach = float(window[one.leg.leg])
+        vouched = foretold and reach <= NARROW * one.width
         free.append(one)
-        searches.append(PairSearch(one.band, one.predicted, hidden, float(window[one.leg.leg])))
+        searches.append(PairSearch(one.band, one.predicted, hidden, reach, vouched))
     parts: list[FoundPart] = []
     pairs = find_pairs(grey, camera, searches)
     for one, search, pair in zip(free, searches, pairs, strict=True):
         if pair is None:
             rejected.append(_rejected(one.leg, one.piece, "no convincing pair of edges"))
-        else:
-            hidden = search.hidden
-            parts.append(FoundPart(one.leg, one.piece, one.band, one.predicted, hidden, pair))
+            continue
+        near = search.window if search.foretold else None
+        hidden = search.hidden
+        parts.append(FoundPart(one.leg, one.piece, one.band, one.predicted, hidden, pair, near))
     return parts, rejected
 
 
@@ -323,8 +335,9 @@ def _judge(
     near: bool,
 ) -> PartOutlines:
     """Turn the measured edges of a part into outlines with verdicts."""
-    predicted = part.predicted if near else None
-    judged = verdict(part.pair, part.width, part.band.length, (one, two), predicted)
+    judged = verdict(
+        part.pair, part.predicted, part.band.length, (one, two), part.window, near_fit=near
+    )
     lines = [
         None
         if edge is None

@@ -27,6 +27,7 @@ KEPT = 8
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
 LEAST_SCORE = 0.15
 LONE_SCORE = 0.5  # of an edge that may stand alone
+LONE_FORETOLD = 0.35  # the same where other legs say where it is
 RIVAL = 0.6  # of its score, which no other line may reach
 RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
 
@@ -70,12 +71,15 @@ class PairSearch:
         Which of the :func:`block_positions` other legs hide.
     window : float
         Largest distance of an edge from its prediction, at either end [px].
+    foretold : bool
+        Whether other legs vouch for the prediction, so that one edge near it is enough.
     """
 
     band: Band
     predicted: Array
     hidden: BoolArray
     window: float
+    foretold: bool = False
 
 
 def find_pairs(grey: Grey, camera: Camera, searches: Sequence[PairSearch]) -> list[Pair | None]:
@@ -105,7 +109,10 @@ def _pair(search: PairSearch, *lines: tuple[Array, Array]) -> Pair | None:
     """Return the two outlines of a part among lines near each of them."""
     predicted = search.predicted
     together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], search.window)
-    lone = [_alone(*candidates) for candidates in lines]
+    lone = [
+        _alone(*candidates, LONE_FORETOLD if search.foretold else LONE_SCORE)
+        for candidates in lines
+    ]
     if together is not None:
         shifts = np.stack([lines[edge][0][i] for edge, i in enumerate(together)])
         alone = np.array([i == k for i, k in zip(together, lone, strict=True)])
@@ -113,7 +120,8 @@ def _pair(search: PairSearch, *lines: tuple[Array, Array]) -> Pair | None:
     scores = [0.0 if i is None else lines[edge][1][i] for edge, i in enumerate(lone)]
     edge = int(np.argmax(scores))
     i = lone[edge]
-    if i is None or max(lines[1 - edge][1], default=0.0) >= LONE_SCORE:
+    rivalled = max(lines[1 - edge][1], default=0.0) >= LONE_SCORE
+    if i is None or (rivalled and not search.foretold):
         return None  # two clear edges at another distance are not those of this part
     found = np.arange(2) == edge
     return Pair(predicted + lines[edge][0][i], found, found)
@@ -139,9 +147,9 @@ def _best_pair(
     return int(i), int(j)
 
 
-def _alone(shift: Array, score: Array) -> int | None:
+def _alone(shift: Array, score: Array, least: float) -> int | None:
     """Return the best line near an edge if it has no rival."""
-    if not len(score) or score[0] < LONE_SCORE:
+    if not len(score) or score[0] < least:
         return None
     middle = shift.mean(axis=1)
     other = np.abs(middle - middle[0]) > RIVAL_DISTANCE

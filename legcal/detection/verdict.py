@@ -22,6 +22,7 @@ WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
 NEAR_TOLERANCE = (0.2, 3.0)  # the same where both are predicted well: [px], standard deviations
 WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of a reason
 SURER = 0.75  # by which factor an outline must be surer than the edge of a shade
+NEAR, NEARER = 0.5, 0.5  # of an outline that needs no partner: part of the window, of its distance
 NARROW_BIAS = 0.15  # of such an outline, in what the width is too small
 
 
@@ -43,10 +44,12 @@ class Verdict:
 
 def verdict(
     pair: Pair,
-    expected: Array,
+    predicted: Array,
     length: float,
     measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
-    predicted: Array | None = None,
+    window: float | None = None,
+    *,
+    near_fit: bool = False,
 ) -> Verdict:
     """Judge both edges of a part.
 
@@ -59,15 +62,19 @@ def verdict(
     ----------
     pair : Pair
         How the edges were found.
-    expected : (2,) array
-        The width of the part at both ends of the band, by its radius [px].
+    predicted : (2, 2) array
+        Predicted offsets of edge 1 and 2 at both ends of the band [px]: their distance is the width
+        of the part, by its radius.
     length : float
         Length of the band [px].
     measured : tuple of two MeasuredEdge or None
         Edge 1 and edge 2; None where no straight line fits.
-    predicted : (2, 2) array, optional
-        Offsets of edge 1 and edge 2 at both ends of the band by a fit of everything [px].
+    window : float or None
+        How far the outlines are from there at most, where other legs vouch for it [px].
+    near_fit : bool
+        Whether a fit of everything has them there, so that their distance is known well.
     """
+    expected = predicted[1] - predicted[0]
     width = float(np.mean(pair.v[1] - pair.v[0]))
     reasons = [
         _reason(edge, length, width) if seen else "no convincing edge"
@@ -75,11 +82,17 @@ def verdict(
     ]
     one, two = measured
     if one is not None and two is not None and not any(reasons):
-        return _by_width(one, two, expected, predicted)
+        by_width = _by_width(one, two, expected, near_fit=near_fit)
+        reach = math.inf if near_fit else window
+        if reach is None or not all(by_width.reasons):
+            return by_width
+        return _by_place((one, two), predicted, reach, by_width)
     vouched = pair.suits(expected)
     stands = [
-        bool(may or vouched) and edge is not None and _is_clear_step(edge)
-        for edge, may in zip(measured, pair.alone, strict=True)
+        edge is not None
+        and _is_clear_step(edge)
+        and bool(vouched or (may if window is None else _off(edge, at) <= NEAR * window))
+        for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
     ]
     first, second = (
         reason or ("" if alone else f"its other outline: {partner}")
@@ -88,14 +101,12 @@ def verdict(
     return Verdict((first, second))
 
 
-def _by_width(
-    one: MeasuredEdge, two: MeasuredEdge, expected: Array, predicted: Array | None
-) -> Verdict:
+def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array, *, near_fit: bool) -> Verdict:
     """Judge two edges that may be trusted but for their distance."""
     widths = two.v - one.v
     sigma_one, sigma_two = _sigma(one), _sigma(two)
     tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * expected
-    if predicted is not None:
+    if near_fit:
         near = NEAR_TOLERANCE[0] + NEAR_TOLERANCE[1] * math.hypot(sigma_one, sigma_two)
         tolerance = np.minimum(tolerance, near)
     mismatch = np.abs(widths - expected) / tolerance
@@ -103,17 +114,29 @@ def _by_width(
         return Verdict(("", ""))
     i = int(np.argmax(mismatch))
     reason = f"{WRONG_WIDTH}, {widths[i]:.1f} px for {expected[i]:.1f} px"
-    if predicted is not None:
-        off = [float(np.abs(e.v - v).max()) for e, v in zip((one, two), predicted, strict=True)]
-        reasons = tuple("" if o < 0.5 * max(off) else reason for o in off)
-        return Verdict((reasons[0], reasons[1]))
     surer, ratio = (
         (one, sigma_one / sigma_two) if sigma_one < sigma_two else (two, sigma_two / sigma_one)
     )
-    if np.any(widths >= expected) or ratio > SURER or not _is_clear_step(surer):
+    if near_fit or np.any(widths >= expected) or ratio > SURER or not _is_clear_step(surer):
         return Verdict((reason, reason))
     bias = NARROW_BIAS * float(np.abs(widths - expected).max())
     return Verdict(("", reason) if surer is one else (reason, ""), bias)
+
+
+def _by_place(
+    measured: tuple[MeasuredEdge, MeasuredEdge], predicted: Array, window: float, judged: Verdict
+) -> Verdict:
+    """Judge two edges at a wrong distance, one of which is where an outline should be."""
+    off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
+    near = int(np.argmin(off))
+    if off[near] > min(NEAR * window, NEARER * off[1 - near]) or not _is_clear_step(measured[near]):
+        return judged
+    return Verdict((judged.reasons[0] if near else "", "" if near else judged.reasons[1]))
+
+
+def _off(edge: MeasuredEdge, predicted: Array) -> float:
+    """Return how far an edge is from its prediction (2,) at the worse end [px]."""
+    return float(np.abs(edge.v - predicted).max())
 
 
 def _is_clear_step(edge: MeasuredEdge) -> bool:

@@ -13,7 +13,8 @@ from legcal.geometry.types import IntArray
 from legcal.recognition.agreement import Picture, Poses, agreement
 from legcal.recognition.bars import Bars
 from legcal.recognition.mirror import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
-from legcal.recognition.recognise import Recognised, Search, corners_of
+from legcal.recognition.recognised import Recognised
+from legcal.recognition.searching import Search, corners_of
 from legcal.recognition.targets import targets_of
 
 TOLERANCE = 0.006  # of an axis from its bar [m]

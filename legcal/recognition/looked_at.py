@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from legcal.recognition.bars import Bars
-from legcal.recognition.recognise import Search
+from legcal.recognition.searching import Search
 
 
 @dataclass(frozen=True, eq=False)

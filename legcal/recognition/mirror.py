@@ -13,7 +13,7 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.recognition.agreement import Picture
 from legcal.recognition.bars import Bars
-from legcal.recognition.place import Placed
+from legcal.recognition.placed import Placed
 
 LEFT_RIGHT = np.array([-1.0, 1.0])
 UP_DOWN = np.array([1.0, -1.0])

@@ -1,7 +1,7 @@
 """The camera pose on which all pictures of a view agree, and what comes close to it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.recognition.agreement import Agreement, Picture, Poses, agreement, distances, improved
 from legcal.recognition.bars import Bars
+from legcal.recognition.placed import Placed
 from legcal.recognition.starts import joined, pose_starts
 
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
@@ -28,94 +29,8 @@ SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in wi
 MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
 JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
 SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
-# Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
-# lead over the next pose in legs of all images together, and as a part.
-CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
-ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
-FEW_SUPPORT, FEW_LEAD, FEW_PART = 0.12, 0.9, 0.3  # of one that shows few legs and has no rival
-HINTED_SUPPORT = 0.6  # share near a rough pose that leaves no doubt
-LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
-HINTED_LEAST = 1.6  # the same near a rough pose
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
 FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """Poses of a camera, best first, each far from the better ones or with legs on other bars.
-
-    Attributes
-    ----------
-    poses : Poses
-        T_camera_base.
-    support : (n, n_pictures) array
-        How many legs agree in each picture, weighted by how well and how much of them.
-    expected : (n, n_pictures) array
-        How many legs each picture would show.
-    score : (n,) array
-        The support in all pictures together, less what the shifts of the joints cost: legs.
-    leg_error : (n_legs,) array
-        Root mean square distance of the legs from their bars at the first pose [m]; infinite for
-        legs without any.
-    hinted : bool
-        Whether the pose was searched for near a rough one only.
-    """
-
-    poses: Poses
-    support: Array
-    expected: Array
-    score: Array
-    leg_error: Array
-    hinted: bool = False
-
-    @property
-    def needed(self) -> float:
-        """How many legs must agree in a picture on average for a pose to be believed."""
-        n = self.support.shape[1]
-        alone = not self.hinted and self._leads(FEW_LEAD, FEW_PART)
-        share = FEW_SUPPORT if alone else ENOUGH_SUPPORT
-        least = HINTED_LEAST if self.hinted else LEAST_SUPPORT
-        return float(max(share * self.expected[0].mean(), least / n))
-
-    @property
-    def is_enough(self) -> bool:
-        """Whether enough legs agree with the first pose."""
-        return len(self.poses) > 0 and float(self.support[0].mean()) >= self.needed
-
-    @property
-    def lead(self) -> float:
-        """Score of the first pose beyond that of the second one, in legs."""
-        if len(self.poses) < 2:
-            return float("inf")
-        return float(self.score[0] - self.score[1])
-
-    @property
-    def is_convincing(self) -> bool:
-        """Whether the first pose is to be believed."""
-        return self.is_enough and (self.hinted or self._leads(ENOUGH_LEAD, ENOUGH_PART))
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the first pose leaves no doubt, so that no further search is needed."""
-        if not self.is_enough:
-            return False
-        if self.hinted:
-            return self.share >= HINTED_SUPPORT
-        return self.share >= CLEAR_SUPPORT and self._leads(CLEAR_LEAD, CLEAR_PART)
-
-    @property
-    def share(self) -> float:
-        """Share of the expected legs that agree with the first pose."""
-        return float(self.support[0].sum() / self.expected[0].sum()) if len(self.poses) else 0.0
-
-    def _leads(self, legs: float, part: float) -> bool:
-        """Say whether the first pose leads by so many legs and such a part of its score."""
-        return self.lead >= max(legs, part * float(self.score[0]))
-
-    def pose(self, i: int = 0) -> RigidTransform:
-        """Return T_base_camera of a pose."""
-        R = Rotation.from_matrix(self.poses.R[i])
-        return RigidTransform.from_components(self.poses.t[i], R).inv()
 
 
 def place_camera(
@@ -226,6 +141,19 @@ def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_leg
     return replace(found, hinted=True)
 
 
+def with_first(placed: Placed, i: int, pose: Poses, pictures: Sequence[Picture]) -> Placed:
+    """Return poses with the i-th one first, where outlines put it."""
+    order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
+    return replace(
+        placed,
+        poses=joined([pose, placed.poses.take(order[1:])]),
+        support=placed.support[order],
+        expected=placed.expected[order],
+        score=placed.score[order],
+        leg_error=_leg_error(pictures, pose),
+    )
+
+
 def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
     """Return poses with their support, best first, without those that say the same."""
     n_legs = poses.shift.shape[1]
@@ -303,6 +231,9 @@ def _starts(picture: Picture, n_legs: int) -> Poses:
     poses = pose_starts(picture, n_legs)
     if len(poses) == 0:
         return poses
+    # From the frame of the picture to that of the poses.
+    back = picture.R.T
+    poses = Poses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
     poses = poses.take(_best(supports([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
     poses = refined([picture], poses, TOLERANCES[:3])
     score = supports([picture], poses, TOLERANCES[2])[0].sum(axis=1)

@@ -6,21 +6,18 @@ a pose that they agree on elsewhere is used and said.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.picture import to_grey
-from legcal.geometry.types import Array, BoolArray, Image, IntArray
-from legcal.mechanism.leg import Cylinder
-from legcal.observations.measurements import Measurements
+from legcal.geometry.types import IntArray
 from legcal.recognition.agreement import Picture, Poses
-from legcal.recognition.bars import Bars, find_bars
 from legcal.recognition.groups import Group, group_views
 from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
-from legcal.recognition.place import START_PICTURES, Placed, place_camera, place_near
+from legcal.recognition.place import START_PICTURES, place_camera, place_near
+from legcal.recognition.placed import Placed
 from legcal.recognition.radii import (
     LEFT,
     MOST_TURNS,
@@ -29,94 +26,17 @@ from legcal.recognition.radii import (
     Part,
     other_radii,
 )
-from legcal.recognition.segments import find_segments
+from legcal.recognition.recognised import Recognised
+from legcal.recognition.searching import Search
+from legcal.recognition.second_look import look_again
 from legcal.recognition.sentences import named, placing_problem
-from legcal.recognition.targets import Targets, targets_of
-from legcal.vision.camera import Camera
 from legcal.workers import Run, in_turn
 
-Load = Callable[[int], Image]
 RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
 UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
 LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
-
-
-@dataclass(frozen=True, eq=False)
-class Recognised:
-    """Where the legs and the cameras are.
-
-    Attributes
-    ----------
-    T_base_camera : list of RigidTransform or None, for each view
-        None where a view could not be placed, or has no images.
-    shift : (n_views, n_legs, 2, 3) array
-        Where each view sees A and B of the legs, against the model, in the base link [m].
-    joint_error : (n_views, n_legs) array
-        How far the legs may still be from there [m].
-    unplaced : dict of str
-        Why views could not be placed, by view: one sentence for each.
-    radii : OtherRadii
-        Radii that the images contradict: the cameras were placed with those that they show.
-    """
-
-    T_base_camera: list[RigidTransform | None]
-    shift: Array
-    joint_error: Array
-    unplaced: dict[int, str]
-    radii: OtherRadii
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """What is searched for; it travels to worker processes.
-
-    Attributes
-    ----------
-    load : callable
-        Returns the image of a row.
-    measurements : Measurements
-        All rows.
-    A_base, B_base : (n_rows, n_legs, 3) array
-        Joint centres of every row by the model, in the base link [m].
-    cylinders : sequence, for each leg a sequence of Cylinder
-        What can be seen of the legs.
-    wanted : (n_views, n_legs) array of bool
-        Legs that each view is said to show.
-    """
-
-    load: Load
-    measurements: Measurements
-    A_base: Array
-    B_base: Array
-    cylinders: Sequence[Sequence[Cylinder]]
-    wanted: BoolArray
-
-    @property
-    def n_legs(self) -> int:
-        """Number of legs."""
-        return len(self.cylinders)
-
-    def picture(self, row: int) -> Picture:
-        """Return what the image of a row shows, and what it should."""
-        view = int(self.measurements.view[row])
-        camera = self.measurements.views[view].camera
-        return Picture(self.bars(row, view), self.targets(row, view), corners_of(camera))
-
-    def bars(self, row: int, view: int) -> Bars:
-        """Return the bars of an image as if the camera of a view had taken it."""
-        camera = self.measurements.views[view].camera
-        return find_bars(find_segments(to_grey(self.load(row)), camera))
-
-    def targets(self, row: int, view: int) -> Targets:
-        """Return the legs at the reading of a row that a view is said to show."""
-        legs = np.flatnonzero(self.wanted[view])
-        return targets_of(self.A_base[row], self.B_base[row], self.cylinders, legs)
-
-    def retargeted(self, row: int, picture: Picture) -> Picture:
-        """Return what an image shows with what it should show by other cylinders."""
-        return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
 
 
 def recognise(
@@ -192,6 +112,8 @@ def recognise(
         radii = radii.then(step)
     if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[1]):
         (search, placed, pictures), radii = as_given, NO_OTHER_RADII  # the scale is not known well
+    looking = partial(_look, search, groups, placed, pictures)
+    placed = list(run(looking, range(len(groups))))
     return _gathered(search, groups, placed, pictures, radii, run)
 
 
@@ -222,6 +144,18 @@ def _place(
     groups: Sequence[Sequence[Picture]], n_legs: int, starts: Sequence[int], group: int
 ) -> Placed:
     return place_camera(groups[group], n_legs, starts)
+
+
+def _look(
+    search: Search,
+    groups: Sequence[Group],
+    placed: Sequence[Placed],
+    pictures: dict[int, Picture],
+    g: int,
+) -> Placed:
+    """Return the poses of a group, judged by outlines where bars leave a doubt."""
+    of_group = groups[g].pictures(pictures, [r for r in groups[g].rows if r in pictures])
+    return look_again(search, groups[g], placed[g], of_group)
 
 
 def _radii(
@@ -330,18 +264,3 @@ def _flipped(group: Group, placed: Placed, pictures: dict[int, Picture]) -> list
     """Return the pictures by which a group was placed, with left and right exchanged."""
     few = placed.hinted and placed.support.shape[1] == len(group.some)
     return mirrored(group.pictures(pictures, group.some if few else group.rows))
-
-
-def corners_of(camera: Camera) -> Array:
-    """Return the least and the greatest x and y (2, 2) of the sensor plane that an image shows."""
-    x, y = camera.width - 1.0, camera.height - 1.0
-    border = np.array(
-        [[0, 0], [x, 0], [0, y], [x, y], [x / 2, 0], [0, y / 2], [x / 2, y], [x, y / 2]]
-    )
-    xy = camera.undistort(border)
-    return np.array([xy.min(axis=0), xy.max(axis=0)])
-
-
-def shifted(found: Recognised, view: IntArray, A: Array, B: Array) -> tuple[Array, Array]:
-    """Return joint centres (n_rows, n_legs, 3) where the view of each row sees them [m]."""
-    return A + found.shift[view][:, :, 0], B + found.shift[view][:, :, 1]

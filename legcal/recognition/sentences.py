@@ -4,12 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from legcal.recognition.place import Placed
+from legcal.recognition.placed import Placed
 
 
 def named(names: Sequence[str]) -> str:
     """Return the name of a view, or of a group."""
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def few_outlines(name: str, n_outlines: int, n_images: int) -> str:
+    """Say that hardly an outline was found at the pose that bars suggest."""
+    return (
+        f"view {name}: its camera could not be placed: found only {n_outlines} outlines that "
+        f"agree in its {n_images} image{'s' * (n_images != 1)}, needed more than other edges give "
+        "by chance; add images at other readings, in better light, or a rough T_base_camera."
+    )
 
 
 def placing_problem(name: str, placed: Placed, hinted: bool, *, is_mirrored: bool) -> str:
@@ -35,6 +44,13 @@ def placing_problem(name: str, placed: Placed, hinted: bool, *, is_mirrored: boo
             f"{placed.needed:.1f}; check that the images belong to this machine and to their "
             "readings, that they are no mirror images, the camera file, and the legs of the view "
             "if dataset.yaml names them."
+        )
+    if len(placed.poses) == 1 or (placed.by_outlines is False and placed.leads):
+        return (
+            f"view {name}: its camera could not be placed: found too few outlines at the pose "
+            f"{where} at which its images show {legs:.1f} of {n:.0f} legs an image, needed more "
+            "than other edges in the images make as well; add images at other readings, in "
+            "better light, or a rough T_base_camera."
         )
     other = placed.pose(1)
     apart = placed.pose().inv() * other
