@@ -5,6 +5,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.recognition.agreement import NEAREST
+from legcal.recognition.exchange import exchanged
 from legcal.recognition.fitted_lines import derivatives_by, metric_of, offsets_of
 from legcal.recognition.groups import Group
 from legcal.recognition.searching import Search
@@ -46,17 +47,8 @@ def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
 
 
 def reversed_pose(search: Search, group: Group, T_base_group: RigidTransform) -> RigidTransform:
-    """Return the pose at which a flat machine looks alike from far: near and far exchanged.
-
-    The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
-    through its middle that faces the camera.
-    """
+    """Return the pose at which a flat machine looks alike from far: near and far exchanged."""
     X = np.concatenate([search.A_base[group.rows], search.B_base[group.rows]]).reshape(-1, 3)
-    middle = X.mean(axis=0)
-    normal = np.linalg.svd(X - middle, full_matrices=False)[2][2]
     T = T_base_group.inv()
-    at = T.apply(middle)
-    facing = at / np.linalg.norm(at)
-    in_depth, in_plane = (np.eye(3) - 2.0 * np.outer(x, x) for x in (facing, normal))
-    R = in_depth @ T.rotation.as_matrix() @ in_plane
-    return RigidTransform.from_components(at - R @ middle, Rotation.from_matrix(R)).inv()
+    R, t = exchanged(T.rotation.as_matrix()[None], T.translation[None], X)
+    return RigidTransform.from_components(t[0], Rotation.from_matrix(R[0])).inv()

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array, BoolArray, IntArray
 from legcal.recognition.agreement import Agreement, Picture, Poses, agreement, distances, improved
 from legcal.recognition.bars import Bars
+from legcal.recognition.exchange import exchanged
 from legcal.recognition.placed import Placed
 from legcal.recognition.starts import joined, pose_starts
 
@@ -91,22 +92,11 @@ def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
 
 
 def _reversed(pictures: Sequence[Picture], poses: Poses) -> Poses:
-    """Return the poses that show a flat machine alike from far: near and far exchanged.
-
-    The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
-    through its middle that faces the camera.
-    """
+    """Return the poses that show a flat machine alike from far: near and far exchanged."""
     ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
     if len(ends) == 0:
         return poses
-    middle = ends.mean(axis=0)
-    normal = np.linalg.svd(ends - middle, full_matrices=False)[2][2]
-    at = poses.R @ middle + poses.t
-    facing = at / np.linalg.norm(at, axis=1, keepdims=True)
-    in_plane = np.eye(3) - 2.0 * np.outer(normal, normal)
-    in_depth = np.eye(3) - 2.0 * facing[:, :, None] * facing[:, None, :]
-    R = in_depth @ poses.R @ in_plane
-    return Poses.rigid(R, at - R @ middle, poses.shift.shape[1])
+    return Poses.rigid(*exchanged(poses.R, poses.t, ends), poses.shift.shape[1])
 
 
 def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Poses:
