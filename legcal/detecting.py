@@ -21,6 +21,7 @@ from legcal.mechanism.leg import Cylinder
 from legcal.observations.canonical_order import inverse, restore_outlines
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import choose_outlines, reject_unused_legs
+from legcal.observations.view_names import few_views
 from legcal.overlays.detected import Detection
 from legcal.overlays.folder import DETECTION, check_detection_destination, write_detection
 from legcal.photographs import Scene, given_outlines, scene_at_poses
@@ -170,7 +171,7 @@ def _untold_gammas(work: Workpiece) -> list[str]:
     if not views:
         return []
     return [
-        f"The gamma of view{'s' * (len(views) > 1)} {', '.join(views)} is not told and was taken "
+        f"The gamma of {few_views(views)} is not told and was taken "
         "as 1: outlines of a camera that encodes light lie off by up to half of the blur; write "
         "gamma of the views in dataset.yaml, or let legcal calibrate look for it."
     ]

@@ -23,6 +23,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.board_views import BoardViews, base_of_board, observe_board
 from legcal.calibration import Steps
+from legcal.dataset.cache import plan_dataset
 from legcal.dataset.holdout import dataset_at
 from legcal.detection.outline import outline_parts
 from legcal.disagreeing import disagreeing_images
@@ -50,6 +51,7 @@ from legcal.refinement.gamma_search import ROUNDS, next_gammas
 from legcal.refinement.gammas import EstimatedGamma
 from legcal.refinement.refine import refine_from_best
 from legcal.refinement.solution import Solution
+from legcal.refinement.unknown_gammas import known_gammas
 from legcal.starting import four_steps, starts_of_fit
 from legcal.workpiece import Workpiece
 
@@ -120,7 +122,21 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
     NotVisible, NotIdentifiable, DidNotConverge
         As the steps of the work.
     """
+    try:
+        return _observe_and_fit(work, rows, progress)
+    except NotIdentifiable:
+        if not work.plan.is_cached:
+            raise
+    # Outlines that an earlier run left do not always tell where the cameras are; images do.
+    anew = replace(work, plan=plan_dataset(work.dataset, ""))
+    return _observe_and_fit(anew, rows, progress)
+
+
+def _observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
+    """Measure the outlines of all images that have none yet, and fit everything to some."""
     photographs, part = work.photographs, work.part(rows)
+    # Outlines that are kept were measured with some gamma: others of their camera must be as well.
+    photographs = photographs.with_gammas(known_gammas(photographs.keep, photographs.measurements))
     fitted = inverse(work.order.rows)[rows[part.order.rows]]
     scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
     board = observe_board(work, progress)
@@ -158,7 +174,8 @@ def observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found:
             outlines = detect(again, scene, progress, near_fit=True, method=methods)
             found = _fit(part, fitted, outlines, scene, board, progress)
             gammas.append(found.solution.gammas)
-            others = next_gammas(gammas)
+            given = known_gammas(again.keep, again.measurements)
+            others = {view: g for view, g in next_gammas(gammas).items() if view not in given}
             if not others:
                 break
             again = again.with_gammas(others)

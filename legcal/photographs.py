@@ -58,7 +58,10 @@ _DECIDING = (
     "disagreeing.py",
     "fitting.py",
     "board_views.py",
+    "refinement/biases.py",
     "refinement/gamma_search.py",
+    "refinement/gammas.py",
+    "refinement/unknown_gammas.py",
 )
 
 

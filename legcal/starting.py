@@ -14,14 +14,13 @@ from legcal.mechanism.parametrization import geometries
 from legcal.observations.leg_axes import axes_from_outlines
 from legcal.observations.one_camera import in_one_camera
 from legcal.observations.outlines import Outlines
+from legcal.observations.view_names import few_views
 from legcal.photographs import Scene
 from legcal.progress import Report
 from legcal.refinement.start import Start, start_from
 from legcal.stages.nominal import nominal_mechanism
 from legcal.stages.run import run_base_steps, run_platform_steps
 from legcal.workpiece import Workpiece
-
-_NAMED = 5  # views, in a message
 
 
 def four_steps(
@@ -115,10 +114,8 @@ def _cameras(
         if v in needed and cameras[v] is None
     ]
     if unknown:
-        many = len(unknown) > _NAMED
-        names = ", ".join(unknown[:_NAMED]) + f" and {len(unknown) - _NAMED} more" * many
         raise NotIdentifiable(
-            f"view{'s' * (len(unknown) > 1)} {names}: no camera could be placed: found no "
+            f"{few_views(unknown)}: no camera could be placed: found no "
             "T_base_camera, and the four steps do not locate it "
             f"({steps.failure or 'fewer than three base joints are seen'}); needed one of them; "
             "add a rough T_base_camera to dataset.yaml"

@@ -62,12 +62,15 @@ class DetectionPlan:
         Rows whose outlines the user gave.
     notes : tuple of str
         What was to be said of the images when they were searched, if none is searched again.
+    is_cached : bool
+        Whether all outlines are those that an earlier run left.
     """
 
     detect: IntArray
     keep: Outlines
     given: BoolArray
     notes: tuple[str, ...] = ()
+    is_cached: bool = False
 
 
 def plan_detection(
@@ -131,7 +134,7 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
     plan = plan_detection(dataset.observations, has_image, recorded, current, given)
     if entry is None or recorded != current or len(plan.detect):
         return plan
-    return replace(plan, notes=entry.notes)
+    return replace(plan, notes=entry.notes, is_cached=True)
 
 
 def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:

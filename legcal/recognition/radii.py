@@ -160,9 +160,11 @@ def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
     asked = [np.array(values) for values in views if len(values) >= FEWEST]
     for values in asked:
         values = values[np.abs(values - _densest(values)) <= CONSISTENT]
+        if len(values) < FEWEST:
+            continue
         middle = float(np.median(values))
         spread = 1.48 * float(np.median(np.abs(values - middle)))
-        if len(values) >= FEWEST and spread < TIGHT:
+        if spread < TIGHT:
             middles.append(middle)
     if not middles or 2 * len(middles) < len(asked) or np.ptp(middles) > CONSISTENT:
         return None

@@ -2,7 +2,8 @@
 
 Outlines that were measured with a wrong gamma lie off, and a fit sees by how much, but less than
 all of it: how far each of them moves is known roughly, and shifts that they share take some. It
-sees nothing where the gamma is right all the same, and that is found by secants.
+sees nothing where the gamma is right all the same, and that is found by secants. Where outlines
+tell little, it may see nothing where the gamma is wrong as well: what is found is stated so.
 """
 
 from __future__ import annotations
@@ -12,12 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.refinement.gammas import EstimatedGamma
+from legcal.refinement.gammas import SEEN_SHARE, EstimatedGamma
 
 ROUNDS = 2  # of measuring outlines with another gamma, at most
 SETTLED = 0.12  # what a fit sees, in the logarithm: no more than limbs feign
 SIGNIFICANT = 2.0  # standard deviations of the fit: less may be chance
-SEEN = 0.5  # of how far a gamma is off, before two of them have told
 SEEN_SHARES = (0.25, 1.2)  # what is believed when they have
 LARGEST_STEP = 0.7  # of the logarithm
 RANGE = (1.0, 3.0)  # of gammas that are tried: photographs are linear, or encoded for screens
@@ -47,6 +47,6 @@ def next_gammas(found: Sequence[Sequence[EstimatedGamma]]) -> dict[str, float]:
 def _share(read: Array, seen: Array) -> float:
     """Return which share of a wrong gamma fits see, by the last two of them."""
     if len(read) < 2 or abs(read[-1] - read[-2]) < SETTLED:
-        return SEEN
+        return SEEN_SHARE
     share = -(seen[-1] - seen[-2]) / (read[-1] - read[-2])
     return float(np.clip(share, *SEEN_SHARES))

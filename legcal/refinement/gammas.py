@@ -13,15 +13,16 @@ import numpy as np
 
 from legcal.geometry.types import Array
 from legcal.observations.outlines import Outlines
+from legcal.observations.view_names import few_views
 from legcal.refinement.biases import GAMMA_SUFFIX
 from legcal.refinement.problem import FitProblem
 from legcal.refinement.state import State
 
+SEEN_SHARE = 0.5  # of how far a gamma is off that a fit sees, about
 # What limbs do to outlines that looks like another gamma, as in rendered photographs of machines
 # with a known one: standard deviation of its logarithm.
 FEIGNED = 0.17
 _VAGUE = 0.25  # the same from where on outlines hardly tell a gamma
-_NAMED = 5  # views, in a note
 
 
 @dataclass(frozen=True)
@@ -46,17 +47,16 @@ class EstimatedGamma:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of its logarithm, with what limbs may feign."""
-        return float(np.hypot(self.fitted_sigma, FEIGNED))
+        """Standard deviation of its logarithm: fits see a share of it, and limbs feign some."""
+        unseen = (1.0 / SEEN_SHARE - 1.0) * np.log(self.gamma / self.measured_with)
+        return float(np.sqrt((self.fitted_sigma / SEEN_SHARE) ** 2 + unseen**2 + FEIGNED**2))
 
     def __str__(self) -> str:
-        named, more = self.views[:_NAMED], len(self.views) - _NAMED
-        views = f"view{'s' * (len(self.views) > 1)} {', '.join(named)}"
-        views += f" and {more} more" * (more > 0)
         hardly = ", and its outlines hardly tell it" * (self.sigma > _VAGUE)
         return (
-            f"The gamma of the camera of {views} is not told{hardly}: found {self.gamma:.2f} +- "
-            f"{self.gamma * self.sigma:.2f} by outlines measured with {self.measured_with:.2f}, "
+            f"The gamma of the camera of {few_views(self.views)} is not told{hardly}: found "
+            f"{self.gamma:.2f} +- {self.gamma * self.sigma:.2f} by outlines measured with "
+            f"{self.measured_with:.2f}, "
             "which the uncertainty of the result takes into account; write gamma of the views in "
             "dataset.yaml if you know it."
         )

@@ -15,9 +15,15 @@ _ALIKE = 1e-6  # gammas that differ by less, relatively, are one
 
 
 def cameras_of(measurements: Measurements) -> tuple[str, ...]:
-    """Return the name of the view that stands for the camera of each view."""
+    """Return the name of the view that stands for the camera of each view.
+
+    A view whose gamma is told stands for itself: nothing is to be found of its camera's.
+    """
     views = measurements.views
-    return shared_cameras([view.name for view in views], [view.camera for view in views])
+    unknown = [view for view in views if not view.camera.gamma_is_told]
+    shared = shared_cameras([view.name for view in unknown], [view.camera for view in unknown])
+    stands_for = dict(zip((view.name for view in unknown), shared, strict=True))
+    return tuple(stands_for.get(view.name, view.name) for view in views)
 
 
 def movements_by_gamma(outlines: Outlines, measurements: Measurements) -> Array:
@@ -53,3 +59,15 @@ def mixed_gammas(moved: Array, gamma: Array, camera: Sequence[str]) -> list[str]
         for name, values in sorted(found.items())
         if max(values) / min(values) > 1.0 + _ALIKE
     ]
+
+
+def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, float]:
+    """Return with which gamma used outlines of cameras were measured that nobody told, by view."""
+    moved = outlines.used & (movements_by_gamma(outlines, measurements) != 0.0)
+    cameras = cameras_of(measurements)
+    view = measurements.view[outlines.row[moved]].tolist()
+    known = {
+        cameras[v]: gamma for v, gamma in zip(view, outlines.gamma[moved].tolist(), strict=True)
+    }
+    names = [view.name for view in measurements.views]
+    return {n: known[c] for n, c in zip(names, cameras, strict=True) if c in known}

@@ -26,7 +26,7 @@ _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATI
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
-_DEPTHS = (10, 12, 14, 16)  # bits of the data in files of 16
+_DEEP, _FULL = 12, 16  # bits of the data in files of 16
 _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
 _TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # others have one
 
@@ -60,8 +60,8 @@ def read_image(path: Path, camera: Camera, where: str = "") -> Image:
     -------
     (height, width) array of float32
         Grey levels on the scale 0 to 255, with fractions where the file has 16 bits or
-        colours. Files of 16 bits often hold data of 10, 12 or 14: the least depth that holds all
-        levels of the image counts, so that saturated ones are 255.
+        colours. Files of 16 bits often hold data of 12, and do where no level of the image needs
+        more: saturated ones are 255 then.
 
     Raises
     ------
@@ -88,11 +88,12 @@ def read_image(path: Path, camera: Camera, where: str = "") -> Image:
 def _depth(pixels: Image) -> int:
     """Return how many bits the data of a file of 16 bits have.
 
-    Data that are moved to the upper bits leave the lower ones empty and have all 16.
+    Data that are moved to the upper bits leave the lower ones empty and have all 16. An image of 16
+    bits that needs no more than 12 is nearly black.
     """
     used = int(np.bitwise_or.reduce(pixels, axis=None))
-    is_moved = used % 2 ** (_DEPTHS[-1] - _DEPTHS[-2]) == 0
-    return _DEPTHS[-1] if is_moved else next(n for n in _DEPTHS if used < 2**n)
+    is_moved = used % 2 ** (_FULL - _DEEP) == 0
+    return _FULL if is_moved or used >= 2**_DEEP else _DEEP
 
 
 def image_problem(path: Path, camera: Camera, where: str = "") -> str | None:
