@@ -306,5 +306,7 @@ def _explained(
     rows: Sequence[int],
 ) -> dict[int, Explanation]:
     """Return what images show, by row."""
-    task = partial(explain, placement.search, placement.recognised, dict(usual))
+    task = partial(
+        explain, placement.search, placement.recognised, dict(usual), doubted=frozenset(rows)
+    )
     return dict(zip(rows, photographs.run(task, rows), strict=True))

@@ -22,7 +22,7 @@ from legcal.image_notes import NOTHING_LIKE, OutlineCount, judged
 from legcal.overlays.detected import Detection
 from legcal.photographs import Placement, scene_at_poses
 from legcal.progress import no_progress
-from legcal.recognition.doubts import Explanation
+from legcal.recognition.doubts import Explanation, _best
 from legcal.recognition.hints import hint_notes
 from legcal.refinement.choices import Choices
 from legcal.refinement.rejections import DISAGREES
@@ -392,3 +392,12 @@ def test_a_focal_length_that_is_wrong_by_a_twentieth_is_named(tmp_path: Path, hi
     assert not found.verdict.trustworthy
     assert any(note.startswith("The focal length of c1 does not agree") for note in found.notes)
     assert any("camera_info.yaml" in note for note in found.notes)
+
+
+def test_a_reading_whose_own_image_is_right_does_not_rival_an_exchange() -> None:
+    readings = [(0.80, 7), (0.76, 3), (0.2, 5)]
+    assert _best(readings, ()) == []
+    assert _best(readings, (7, 1)) == [(0.80, 7)]
+    assert _best(readings, (7, 3)) == []
+    assert _best([(0.9, 7), (0.5, 3)], ()) == [(0.9, 7)]
+    assert _best([], (1,)) == []

@@ -4,7 +4,7 @@ The bars of the image are judged once more: with the readings of all other image
 of the other views, and mirrored. An explanation must be clearly better than the reading itself.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,7 +70,14 @@ def share_shown(
     return _share(picture, found, view, TOLERANCE if legs is None else UNPLACED)
 
 
-def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: int) -> Explanation:
+def explain(
+    search: Search,
+    found: Recognised,
+    usual: Mapping[int, float],
+    row: int,
+    *,
+    doubted: Collection[int] = (),
+) -> Explanation:
     """Return what an image shows whose legs are not where its reading has them.
 
     Parameters
@@ -83,6 +90,8 @@ def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: 
         The share of the legs that good images of each view show, by :func:`share_shown`.
     row : int
         An image of a view that was placed.
+    doubted : collection of int
+        All images in doubt: readings that other images show are hardly those of this one.
     """
     measurements = search.measurements
     view = int(measurements.view[row])
@@ -96,7 +105,7 @@ def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: 
     tried = [(share, why, "replace it by the original") for share, why in others]
     rows = _other_readings(search, row)
     readings = [(_share(_picture(search, bars, other, view), found, view), other) for other in rows]
-    for share, other in _best(readings):
+    for share, other in _best(readings, doubted):
         why = f"it shows the reading given for image {measurements.image[other]}"
         tried.append((share, why, "check which image belongs to which row"))
     for w, other_view in enumerate(measurements.views):
@@ -106,7 +115,7 @@ def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: 
         seen = bars if same else search.bars(row, w)
         there = [row, *(other for other in rows if measurements.view[other] == w)]
         readings = [(_share(_picture(search, seen, other, w), found, w), other) for other in there]
-        for share, other in _best(readings):
+        for share, other in _best(readings, doubted):
             at = (
                 ""
                 if other == row
@@ -120,9 +129,16 @@ def explain(search: Search, found: Recognised, usual: Mapping[int, float], row: 
     return Explanation(own, why, remedy) if share >= least else Explanation(own)
 
 
-def _best(readings: Sequence[tuple[float, int]]) -> list[tuple[float, int]]:
-    """Return the reading that suits best, if no other one suits about as well."""
+def _best(
+    readings: Sequence[tuple[float, int]], doubted: Collection[int]
+) -> list[tuple[float, int]]:
+    """Return the reading that suits best, if no other one suits about as well.
+
+    Where its own image is in doubt, images were exchanged: then only readings of such are rivals.
+    """
     ranked = sorted(readings, key=lambda one: -one[0])
+    if ranked and ranked[0][1] in doubted:
+        ranked = [one for one in ranked if one[1] in doubted]
     if len(ranked) > 1 and ranked[1][0] > ALIKE * ranked[0][0]:
         return []
     return ranked[:1]
