@@ -212,6 +212,7 @@ def test_dataset_says_whether_gamma_is_told(folder: Folder) -> None:
     assert all(camera.gamma == 1.0 for camera in cameras.values())
 
 
+@pytest.mark.slow
 def test_photographs_without_a_gamma_are_read_with_the_one_they_show(tmp_path: Path) -> None:
     session = settings(level="photographs", poses=5, views=3, seed=1, tell_gamma=False)
     data = simulate_folder("hexapod", tmp_path / "data", session).folder
