@@ -8,7 +8,7 @@ import numpy as np
 
 from legcal.observations.outlines import Outlines
 from legcal.observations.sets import choose_outlines, join_outlines, merge_edited
-from legcal.photographs import Joined, Photographs, Placement, counted
+from legcal.photographs import Joined, Photographs, Placement, counted, placed_cameras
 from legcal.progress import Report
 from legcal.recognition.closer import look_closer
 from legcal.recognition.groups import group_views
@@ -41,8 +41,7 @@ def closer_look(
         As for :func:`legcal.detection.outline.outline_parts`.
     """
     search, found, scene = placement.search, placement.recognised, placement.scene
-    views = search.measurements.views
-    hints = [view.T_base_camera for view in views]
+    hints = [view.T_base_camera for view in search.measurements.views]
     groups = group_views(search.measurements, photographs.detect, hints, joined)
     is_own = np.isin(outlines.row, photographs.detect)
     own, others = choose_outlines(outlines, is_own), choose_outlines(outlines, ~is_own)
@@ -59,20 +58,13 @@ def closer_look(
     searched = np.zeros(search.measurements.n_rows, dtype=np.bool_)
     searched[photographs.detect] = True
     rows = searched[:, None, None]
-    seen = set(search.measurements.view[photographs.detect].tolist())
-    cameras = tuple(
-        T if v in seen else rough
-        for v, (T, rough) in enumerate(
-            zip(closer.recognised.T_base_camera, scene.T_base_camera, strict=True)
-        )
-    )
+    cameras, unplaced = placed_cameras(photographs, scene, closer.recognised)
     scene = replace(
         scene,
         A_base=np.where(rows, closer.A_base, scene.A_base),
         B_base=np.where(rows, closer.B_base, scene.B_base),
         T_base_camera=cameras,
     )
-    unplaced = {views[v].name: why for v, why in closer.recognised.unplaced.items()}
     placement = replace(
         placement,
         scene=scene,

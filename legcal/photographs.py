@@ -277,17 +277,27 @@ def place(
         run=photographs.run,
         progress=counted(report, "Recognising legs", len(photographs.detect)),
     )
-    views = photographs.measurements.views
     A, B = shifted(found, photographs.measurements.view, scene.A_base, scene.B_base)
-    searched = set(photographs.measurements.view[photographs.detect].tolist())
+    cameras, unplaced = placed_cameras(photographs, scene, found)
+    notes = tuple(radius_notes(found.radii, photographs.mechanism.leg_names))
+    search = replace(search, cylinders=found.radii.corrected(search.cylinders))
+    return Placement(Scene(A, B, cameras, found.joint_error), unplaced, notes, search, found)
+
+
+def placed_cameras(
+    photographs: Photographs, scene: Scene, found: Recognised
+) -> tuple[tuple[RigidTransform | None, ...], dict[str, str]]:
+    """Return the cameras of all views, those of searched ones as found, and why some have none.
+
+    The reasons are by the names of the views.
+    """
+    measurements = photographs.measurements
+    searched = set(measurements.view[photographs.detect].tolist())
     cameras = tuple(
         T if v in searched else rough
         for v, (T, rough) in enumerate(zip(found.T_base_camera, scene.T_base_camera, strict=True))
     )
-    unplaced = {views[v].name: why for v, why in found.unplaced.items()}
-    notes = tuple(radius_notes(found.radii, photographs.mechanism.leg_names))
-    search = replace(search, cylinders=found.radii.corrected(search.cylinders))
-    return Placement(Scene(A, B, cameras, found.joint_error), unplaced, notes, search, found)
+    return cameras, {measurements.views[v].name: why for v, why in found.unplaced.items()}
 
 
 def detect(
