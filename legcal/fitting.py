@@ -169,12 +169,12 @@ def _observe_and_fit(work: Workpiece, rows: IntArray, progress: Report) -> Found
             outline_parts if np.isnan(blur) else partial(outline_parts, blur=blur)
             for blur in observed.blur
         ]
+        given = known_gammas(again.keep, again.measurements)
         gammas: list[tuple[EstimatedGamma, ...]] = []
         for _ in range(1 + ROUNDS):
             outlines = detect(again, scene, progress, near_fit=True, method=methods)
             found = _fit(part, fitted, outlines, scene, board, progress)
             gammas.append(found.solution.gammas)
-            given = known_gammas(again.keep, again.measurements)
             others = {view: g for view, g in next_gammas(gammas).items() if view not in given}
             if not others:
                 break

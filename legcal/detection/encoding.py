@@ -8,10 +8,8 @@ like a shift.
 
 import numpy as np
 
-from legcal.detection.pool import BLUR, SHIFT, Pool, Round
+from legcal.detection.pool import BLUR, OPEN_BLUR, SHIFT, UNEQUAL_BLUR, Pool, Round
 from legcal.geometry.types import Array
-
-OPEN_BLUR, UNEQUAL_BLUR = 0.7, 0.05  # of the logarithm of the blur, as in pooled.py
 
 
 def shifts_by_gamma(pool: Pool, at: Round, even_blur: float) -> Array:

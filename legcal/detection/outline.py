@@ -102,11 +102,6 @@ class FoundPart:
     window: float | None = None
 
     @property
-    def width(self) -> Array:
-        """Predicted width at both ends of the band [px], (2,)."""
-        return np.asarray(self.predicted[1] - self.predicted[0])
-
-    @property
     def half_width(self) -> float:
         """Half of the width that the edges have in the middle [px]."""
         return float(0.5 * np.mean(self.pair.v[1] - self.pair.v[0]))

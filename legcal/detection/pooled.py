@@ -15,12 +15,20 @@ import numpy as np
 
 from legcal.detection.blocks import Blocks
 from legcal.detection.encoding import shifts_by_gamma
-from legcal.detection.pool import BLUR, N_ALONG, N_UNKNOWNS, SHIFT, Pool, Round
+from legcal.detection.pool import (
+    BLUR,
+    N_ALONG,
+    N_UNKNOWNS,
+    OPEN_BLUR,
+    SHIFT,
+    UNEQUAL_BLUR,
+    Pool,
+    Round,
+)
 from legcal.detection.shading import N_AMPLITUDES
 from legcal.geometry.types import Array, BoolArray
 
-OPEN_BLUR, EVEN_BLUR = 0.7, 0.03  # of the logarithm of the blur, first and from edge to edge
-UNEQUAL_BLUR = 0.05  # that outlines of one image seem to have, in its logarithm
+EVEN_BLUR = 0.03  # of the logarithm of the blur, from edge to edge
 FIRST_ROUNDS, LAST_ROUNDS = 2, 8  # at most
 
 

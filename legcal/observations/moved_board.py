@@ -8,13 +8,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from legcal.geometry.types import Array
+from legcal.observations.view_names import few
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.plane_pose import PlanePose
 
 LEAST_PX = 0.15  # by which corners must shift together
 SIGNIFICANCE = 1e-6  # of a motion, for each pair of images
-_MOST_NAMED = 5
 
 
 def moved_board(
@@ -64,8 +64,7 @@ def moved_board(
     middle = board.points.mean(axis=0)
     far = max(float(np.linalg.norm(T.apply(middle) - middle)) for T in moves)
     turn = max(float(T.rotation.magnitude()) for T in moves)
-    told = ", ".join(names[row] for row in others[:_MOST_NAMED])
-    told += f" and {len(others) - _MOST_NAMED} more" * (len(others) > _MOST_NAMED)
+    told = few([names[row] for row in others])
     return (
         f"view {name}: its camera could not be placed: found the board elsewhere in {told} than in "
         f"{names[rows[most]]}, by up to {1e3 * far:.2g} mm and {np.rad2deg(turn):.2g} degrees, "
