@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 from rendered_cylinders import Photographed, interpolated
 
-from legcal.detection.measure import Edge, measure_edges
-from legcal.detection.picture import Grey
+from legcal.calibration.canny import edge_points
 from legcal.geometry.types import Array
-from legcal.repeatability.canny import edge_points
+from legcal.perception.limb_fit import measure_edges
+from legcal.perception.picture import Grey
+from legcal.perception.profiles import Edge
 from legcal.vision.cylinder import EPSILON
 
 REACH = 2.5  # from the start, of a point that belongs to an outline [px]

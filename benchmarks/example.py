@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from legcal import calibrate, load_dataset, load_mechanism
-from legcal.calibration import Calibration
-from legcal.mechanism.leg_geometry import point_like_legs
-from legcal.mechanism.parameters import KinematicParameters, to_vector
-from legcal.mechanism.platform import pose_differences
-from legcal.observations.leg_axes import axes_from_outlines
-from legcal.refinement.start import platform_poses
-from legcal.stages.nominal import nominal_mechanism
-from legcal.stages.run import run_steps
+from legcal.calibration.verdict import Calibration
+from legcal.data.axes import axes_from_outlines
+from legcal.estimation.constraints import platform_poses
+from legcal.machine.kinematics import pose_differences
+from legcal.machine.leg import KinematicParameters, point_like_legs, to_vector
+from legcal.paper.four_steps import run_steps
+from legcal.paper.nominal import nominal_mechanism
 
 ROOT = Path(__file__).parents[1]
 TRUTH = ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"

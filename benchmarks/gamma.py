@@ -19,9 +19,9 @@ from tempfile import TemporaryDirectory
 from honesty import honesty
 
 from legcal import Appearance, LegcalError, calibrate, load_dataset, load_mechanism
-from legcal.dataset.dataset import Dataset
+from legcal.data.dataset import Dataset
+from legcal.simulation.session import simulate
 from legcal.simulation.settings import SimulationSettings
-from legcal.simulation.simulate import simulate
 
 ENCODED = 2.2
 HEADER = (

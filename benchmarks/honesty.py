@@ -21,15 +21,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import calibrate, load_mechanism
-from legcal.calibration import Calibration
+from legcal.calibration.verdict import Calibration
+from legcal.estimation.biases import KINDS
+from legcal.estimation.state import components
 from legcal.geometry.types import Array
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries, vector_of
-from legcal.mechanism.sensitivity import pose_sensitivity
-from legcal.refinement.biases import KINDS
-from legcal.refinement.state import components
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries, vector_of
+from legcal.machine.sensitivity import pose_sensitivity
+from legcal.simulation.session import simulate
 from legcal.simulation.settings import SimulationSettings
-from legcal.simulation.simulate import simulate
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples/hexapod", ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"

@@ -18,11 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.kinematics import Follower, forward_kinematics, inverse_kinematics
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.singularity import singularity
+from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import random_configurations, singularity
 
 MODELS = Path(__file__).parents[1] / "models"
 STEP = 0.01  # of the travel

@@ -24,8 +24,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Location, ToolPoses, load_mechanism, locate
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.model import Mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import random_configurations
 
 POSES = 20
 SIGMA_POSITION = 0.02e-3  # [m]

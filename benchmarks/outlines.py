@@ -31,8 +31,8 @@ from rendered_cylinders import (
     photograph,
 )
 
-from legcal.detection.picture import to_grey
 from legcal.geometry.types import Array
+from legcal.perception.picture import to_grey
 from legcal.vision.cylinder import EPSILON
 
 START = 0.4  # how far the start is off at each end [px]

@@ -20,13 +20,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.simulation.dressing import dressed
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import random_configurations
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import prepare_scene
-from legcal.simulation.solids import PlacedSolid, link_poses, placed
+from legcal.simulation.solids import PlacedSolid, dressed, link_poses, placed
 from legcal.vision.camera import Camera
 
 MODELS = Path(__file__).parents[1] / "models"

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.sparse import coo_array, csr_array
 
+from legcal.estimation.problem import FitProblem
+from legcal.estimation.state import State
 from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.parameters import free_coordinates
-from legcal.refinement.problem import FitProblem
-from legcal.refinement.state import State
+from legcal.machine.leg import free_coordinates
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,24 +11,28 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.calibration.workpiece import nominal_poses
+from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, BoolArray, Image
-from legcal.mechanism.leg import Cylinder as Visible
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.observations.measurements import Measurements, View
-from legcal.refinement.nominal_poses import nominal_poses
+from legcal.machine.leg import Cylinder as Visible
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
 from legcal.simulation.cameras import look_at
-from legcal.simulation.commanded_poses import commanded_poses
-from legcal.simulation.dressing import dressed
-from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import ParameterErrors, Spread
-from legcal.simulation.posed_machine import PosedMachine, pose_machine
+from legcal.simulation.poses import Sampling, commanded_poses
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.scene import prepare_scene
-from legcal.simulation.shapes import Box, Cylinder
-from legcal.simulation.solids import Material, PlacedSolid, Solid
-from legcal.simulation.truth import write_true_model
+from legcal.simulation.solids import (
+    Box,
+    Cylinder,
+    Material,
+    PlacedSolid,
+    PosedMachine,
+    Solid,
+    dressed,
+    pose_machine,
+)
+from legcal.simulation.truth import ParameterErrors, Spread, write_true_model
 from legcal.simulation.visibility import LegView, legs_in_image
 from legcal.vision.camera import Camera
 

@@ -10,18 +10,15 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.detection.band import Band, band_of_leg
-from legcal.detection.picture import Grey, to_grey
 from legcal.geometry.types import Array, Image
+from legcal.perception.picture import Grey, to_grey
 from legcal.simulation.rendering.appearance import Appearance, Light
-from legcal.simulation.rendering.paint import Canvas
-from legcal.simulation.rendering.scene import prepare_scene
-from legcal.simulation.rendering.sensor import develop
-from legcal.simulation.rendering.solid_in_view import in_view
-from legcal.simulation.shapes import Cylinder
-from legcal.simulation.solids import Material, PlacedSolid, Solid
+from legcal.simulation.rendering.rays import in_view
+from legcal.simulation.rendering.scene import Canvas, develop, prepare_scene
+from legcal.simulation.solids import Cylinder, Material, PlacedSolid, Solid
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
+from legcal.vision.in_view import Band, band_of_leg
 
 PHOTOGRAPHS = 3  # of every scene
 FINE = 3  # times as many pixels are rendered in every row, so that the lens blurs before they count

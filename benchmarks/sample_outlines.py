@@ -16,16 +16,15 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.dataset.folder import load_dataset
-from legcal.detection.detect import detect_outlines
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.mechanism.kinematics import forward_kinematics
-from legcal.mechanism.model import Mechanism
-from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import Outlines
-from legcal.recognition.recognise import recognise
-from legcal.recognition.recognised import shifted
-from legcal.recognition.searching import Search
+from legcal.machine.kinematics import forward_kinematics
+from legcal.machine.model import Mechanism
+from legcal.perception.detection import detect_outlines
+from legcal.perception.recognise import recognise, shifted
+from legcal.perception.search import Search
 from legcal.vision.cylinder import EPSILON
 
 ROOT = Path(__file__).resolve().parents[1]

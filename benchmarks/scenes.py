@@ -32,23 +32,16 @@ from numpy.typing import NDArray
 from random_scenes import Given, Scene, Truth, draw
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.detection.detect import detect_outlines
-from legcal.detection.picture import to_grey
+from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.observations.outlines import Outlines
-from legcal.recognition.agreement import Picture, Poses
-from legcal.recognition.bars import Bars, find_bars
-from legcal.recognition.closer import look_closer
-from legcal.recognition.groups import group_views
-from legcal.recognition.place import JOINT_ERROR, place_camera, refined, supports
-from legcal.recognition.recognise import recognise
-from legcal.recognition.recognised import Recognised, shifted
-from legcal.recognition.searching import Search
-from legcal.recognition.segments import find_segments
-from legcal.recognition.starts import joined
-from legcal.recognition.targets import targets_of
-from legcal.simulation.silhouette import silhouette
-from legcal.simulation.visibility import field_of_view
+from legcal.perception.agreement import Picture, Poses, targets_of
+from legcal.perception.bars import Bars, find_bars, find_segments
+from legcal.perception.camera_search import JOINT_ERROR, joined, place_camera, refined, supports
+from legcal.perception.detection import detect_outlines
+from legcal.perception.picture import to_grey
+from legcal.perception.recognise import Recognised, look_closer, recognise, shifted
+from legcal.perception.search import Search, group_views
+from legcal.simulation.visibility import field_of_view, silhouette
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
 SAME_TURN, SAME_PLACE = np.deg2rad(10.0), 0.15  # of one camera: angle, part of the distance

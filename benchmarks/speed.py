@@ -24,15 +24,15 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.closer_look import closer_look
-from legcal.dataset.folder import load_dataset
-from legcal.detection.exposure import expose
-from legcal.detection.outline import outline_parts
-from legcal.detection.picture import to_grey
+from legcal.data.dataset import load_dataset
+from legcal.data.outlines import no_outlines
 from legcal.geometry.types import Image
-from legcal.mechanism.kinematics import forward_kinematics
-from legcal.observations.sets import no_outlines
-from legcal.photographs import Photographs, Placement, Scene, detect, place, usual_blur
+from legcal.machine.kinematics import forward_kinematics
+from legcal.perception.examine import closer_look
+from legcal.perception.exposure import expose
+from legcal.perception.outline import outline_parts
+from legcal.perception.photographs import Photographs, Placement, Scene, detect, place, usual_blur
+from legcal.perception.picture import to_grey
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 

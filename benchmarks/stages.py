@@ -16,17 +16,14 @@ from time import perf_counter
 import numpy as np
 
 from legcal.errors import LegcalError
-from legcal.mechanism.parameters import KinematicParameters
+from legcal.machine.leg import KinematicParameters
+from legcal.paper.four_steps import run_steps
+from legcal.paper.nominal import Criteria
 from legcal.simulation.cameras import cameras_around
-from legcal.simulation.machine import Machine, hexapod, perturb
+from legcal.simulation.machine import Machine, extreme_poses, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.poses import extreme_poses
+from legcal.simulation.studies.paper import nominal_of, platform_errors, simulate_session
 from legcal.simulation.table_noise import TableNoise
-from legcal.stages.nominal import Criteria
-from legcal.stages.run import run_steps
-from legcal.studies.eq20 import platform_errors
-from legcal.studies.estimators import nominal_of
-from legcal.studies.session import simulate_session
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
     "outlines, 0.001 px a point, 300 points": OutlineNoise(1e-3, 300),

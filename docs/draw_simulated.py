@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from legcal.simulation.session import simulate
 from legcal.simulation.settings import SimulationSettings
-from legcal.simulation.simulate import simulate
 
 MODELS = ("hexapod", "3-upu-tilted", "3-rpr", "tricept")
 SIZE = (512, 384)

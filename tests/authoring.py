@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legcal.authoring.create import create_model
-from legcal.authoring.machine import Description
-from legcal.authoring.table import read_table
-from legcal.mechanism.leg import LegKind, main_cylinders
-from legcal.mechanism.model import Mechanism
+from legcal.machine.assembly import create_model
+from legcal.machine.description import Description
+from legcal.machine.description_table import read_table
+from legcal.machine.leg import LegKind, main_cylinders
+from legcal.machine.model import Mechanism
 
 ROOT = Path(__file__).parents[1]
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))

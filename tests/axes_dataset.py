@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legcal.geometry.frames import motion_to_xyz_quat
-from legcal.mechanism.load import load_mechanism
-from legcal.observations.axes_file import write_axes
-from legcal.observations.measurements import Measurements
+from legcal.data.axes import write_axes
+from legcal.data.measurements import Measurements
+from legcal.geometry.motions import motion_to_xyz_quat
+from legcal.machine.load import load_mechanism
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
+from legcal.simulation.studies.paper import simulate_session
 from legcal.simulation.table_noise import TableNoise
-from legcal.studies.session import simulate_session
 
 ROOT = Path(__file__).parents[1]
 MODEL = ROOT / "models" / "hexapod.yaml"

@@ -5,19 +5,17 @@ from functools import cache
 
 import numpy as np
 
+from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
+from legcal.data.measurements import Measurements
+from legcal.estimation.constraints import Start, start_from
+from legcal.estimation.solution import joints_of
+from legcal.estimation.state import FittedLegs
 from legcal.geometry.types import Array
-from legcal.mechanism.leg_geometry import point_like_legs
-from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
-from legcal.observations.leg_axes import LegAxes
-from legcal.observations.measurements import Measurements
-from legcal.observations.table_axes import axes_of_table, table_of_axes
-from legcal.refinement.legs import FittedLegs
-from legcal.refinement.solution import joints_of
-from legcal.refinement.start import Start, start_from
+from legcal.machine.leg import KinematicParameters, from_vector, point_like_legs, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import hexapod, perturb
+from legcal.simulation.studies.paper import simulate_session
 from legcal.simulation.table_noise import TableNoise
-from legcal.studies.session import simulate_session
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,10 @@ import numpy as np
 from machine_session import MachineSession
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data.corners import Corners, found_corners
+from legcal.estimation.constraints import Start
+from legcal.estimation.observations import SeenBoard
 from legcal.geometry.types import Array
-from legcal.observations.corners import Corners, found_corners
-from legcal.refinement.observed_board import SeenBoard
-from legcal.refinement.start import Start
 from legcal.vision.board import Board
 
 BOARD = Board("chessboard", 7, 6, 0.025)

@@ -6,13 +6,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
-from legcal.simulation.placed_board import PlacedBoard
+from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import render
-from legcal.simulation.shapes import Box
-from legcal.simulation.solids import Material, PlacedSolid, Solid
-from legcal.vision.board import Board
-from legcal.vision.board_dictionaries import APRIL_TAGS
+from legcal.simulation.solids import Box, Material, PlacedSolid, Solid
+from legcal.vision.board import APRIL_TAGS, Board
 from legcal.vision.camera import Camera
 
 CHESSBOARD = Board("chessboard", 7, 6, 0.03)

@@ -7,9 +7,9 @@ import numpy as np
 from boards import before
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.camera_calibration.adjustment import SeenCorners
+from legcal.calibration.camera import SeenCorners
 from legcal.geometry.types import Array
-from legcal.simulation.placed_board import PlacedBoard
+from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import render
 from legcal.vision.board import Board

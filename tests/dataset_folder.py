@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"
@@ -67,7 +67,7 @@ class Folder:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Folder:
     """Two views with two images each; reading the mechanism again is spared."""
-    monkeypatch.setattr("legcal.dataset.folder.load_mechanism", lambda path: hexapod())
+    monkeypatch.setattr("legcal.data.dataset.load_mechanism", lambda path: hexapod())
     (tmp_path / "set" / "images").mkdir(parents=True)
     rows: list[dict[str, Any]] = []
     for seed, (view, number) in enumerate([("c1", 1), ("c1", 2), ("c2", 1), ("c2", 2)]):

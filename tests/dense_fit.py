@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import null_space
 
+from legcal.estimation.constraints import on_constraints, pose_rows
+from legcal.estimation.problem import FitProblem, Linearization, linearize
+from legcal.estimation.residuals import Places, Rows
+from legcal.estimation.state import State
 from legcal.geometry.types import Array
-from legcal.refinement.constraints import on_constraints, pose_rows
-from legcal.refinement.linearize import Linearization, linearize
-from legcal.refinement.problem import FitProblem
-from legcal.refinement.rows import Places, Rows
-from legcal.refinement.state import State
 
 STEP = 1e-6
 

@@ -4,7 +4,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from legcal.calibration import Calibration
+from legcal.calibration.verdict import Calibration
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod"

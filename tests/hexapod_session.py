@@ -5,19 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
+from legcal.estimation.constraints import Start
+from legcal.estimation.state import FittedLegs
 from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.parameters import (
+from legcal.machine.leg import (
     KinematicParameters,
+    LegGeometry,
+    LegKind,
     free_coordinates,
     from_vector,
     to_vector,
 )
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
-from legcal.refinement.legs import FittedLegs
-from legcal.refinement.start import Start
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 

@@ -7,11 +7,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import Cylinder
-from legcal.recognition.agreement import Picture
-from legcal.recognition.bars import find_bars
-from legcal.recognition.segments import Segments
-from legcal.recognition.targets import Targets, targets_of
+from legcal.machine.leg import Cylinder
+from legcal.perception.agreement import Picture, Targets, targets_of
+from legcal.perception.bars import Segments, find_bars
 from legcal.vision.cylinder import outlines_of_axis
 
 PIXEL = 1.0 / 600.0  # of the pictures, on the sensor plane

@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.calibration.location.model import Frames, PosePairs, ToolPoses, predicted, turned
 from legcal.geometry.types import Array
-from legcal.location.pose_pairs import Frames, PosePairs, predicted, turned
-from legcal.location.tool_poses import ToolPoses
-from legcal.mechanism.configurations import Configurations, random_configurations
-from legcal.mechanism.kinematics import inverse_kinematics
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.kinematics import inverse_kinematics
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import Configurations, random_configurations
 
 SIGMA_POSITION = 0.02e-3
 SIGMA_ANGLE = float(np.radians(0.01))

@@ -9,22 +9,19 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
+from legcal.estimation.constraints import Start, start_from
+from legcal.estimation.state import FittedLegs, components, fitted_legs, motions
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import moved_legs
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries
-from legcal.mechanism.platform import platform_in_base
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
-from legcal.refinement.legs import FittedLegs, fitted_legs
-from legcal.refinement.start import Start, start_from
-from legcal.refinement.state import components, motions
+from legcal.machine.kinematics import platform_in_base
+from legcal.machine.leg import LegGeometry, LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries, moved_legs
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.silhouette import silhouette
-from legcal.studies.closed_poses import closed_poses, moved_poses
+from legcal.simulation.studies.paper import closed_poses, moved_poses
+from legcal.simulation.visibility import silhouette
 from legcal.vision.camera import Camera
 
 K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])

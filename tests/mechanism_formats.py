@@ -8,9 +8,9 @@ import yaml
 from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.sources.tree_text import origin
-from legcal.mechanism.urdf import UrdfJoint
+from legcal.machine.model import Mechanism
+from legcal.machine.tree import origin
+from legcal.machine.urdf import UrdfJoint
 
 FORMATS = (
     "mjcf bodies",

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import ENCODING, QUALITY, Outlines
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import Cylinder, Leg, LegKind
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import ENCODING, QUALITY, Outlines
+from legcal.machine.leg import Cylinder, Leg, LegKind
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 

@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import footed, moved_legs
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parameters import KinematicParameters
-from legcal.mechanism.parametrization import Parametrization, geometries
-from legcal.report.urdf import write_calibrated_yaml, write_urdf
+from legcal.machine.leg import KinematicParameters, LegGeometry
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import Parametrization, footed, geometries, moved_legs
+from legcal.machine.written import write_calibrated_yaml, write_urdf
 
 
 def random_covariance(

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.mechanism.equations import linearize
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.machine.equations import linearize
+from legcal.machine.leg import LegGeometry, LegKind
 
 
 def leg_and_pose(joints: str, seed: int) -> tuple[LegGeometry, Array, Array]:

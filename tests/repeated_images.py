@@ -12,14 +12,14 @@ import yaml
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.pieces import visible_pieces
-from legcal.geometry.frames import motion_to_xyz_quat
+from legcal.geometry.motions import motion_to_xyz_quat
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import random_configurations
 from legcal.simulation.cameras import look_at
 from legcal.vision.camera import Camera
+from legcal.vision.in_view import visible_pieces
 
 SIZE = (512, 384)
 NOISE = 3.0  # grey levels

@@ -8,7 +8,7 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.simulation.settings import Level, SimulationSettings
 from legcal.vision.camera import Camera
-from legcal.vision.camera_writer import camera_info
+from legcal.vision.camera_file import camera_info
 
 SMALL = SimulationSettings(level=Level.OUTLINES, poses=3, views=2, seed=5)
 

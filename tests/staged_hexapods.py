@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
+from legcal.machine.leg import KinematicParameters, from_vector, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
+from legcal.simulation.studies.paper import SimulatedSession, simulate_session
 from legcal.simulation.table_noise import TableNoise
-from legcal.studies.session import SimulatedSession, simulate_session
 
 
 @cache

@@ -7,24 +7,22 @@ import numpy as np
 from machine_session import PINHOLE, MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.calibration.identify.session import Session, at_base_joints, at_platform_joints
+from legcal.data.axes import LegAxes, axes_from_outlines
+from legcal.data.measurements import Measurements, View
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.identify.observed import at_base_joints, at_platform_joints
-from legcal.identify.session import Session
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import moved_legs
-from legcal.observations.leg_axes import LegAxes, axes_from_outlines
-from legcal.observations.measurements import Measurements, View
-from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
-from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.stages.leg_directions import (
+from legcal.machine.leg import LegGeometry, LegKind
+from legcal.machine.parameters import moved_legs
+from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
+from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
+from legcal.paper.leg_directions import (
     LegDirections,
     directions_through_joints,
     observed_directions,
 )
-from legcal.stages.nominal import Criteria, NominalMechanism
-from legcal.stages.offsets import Offsets, identify_offsets
+from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.offsets import Offsets, identify_offsets
 
 
 @dataclass(frozen=True, eq=False)

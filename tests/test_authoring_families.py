@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 from authoring import check_same
 
-from legcal.authoring.assembled import assemble
-from legcal.authoring.create import create_model
-from legcal.authoring.families import Family, describe_family
-from legcal.authoring.writer import urdf_text, yaml_text
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.singularity import singularity
+from legcal.machine.assembly import (
+    Family,
+    assemble,
+    create_model,
+    describe_family,
+    urdf_text,
+    yaml_text,
+)
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import singularity
 
 GOUGH = Family("6-UPS", "mm", 300.0, 150.0, 400.0)
 

@@ -12,16 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.authoring.assembled import assemble
-from legcal.authoring.create import create_model
-from legcal.authoring.table import read_table
-from legcal.authoring.writer import urdf_text, yaml_text
-from legcal.geometry.frames import roll_pitch_yaw
-from legcal.mechanism.files import shipped_names
-from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.singularity import singularity
+from legcal.geometry.motions import roll_pitch_yaw
+from legcal.machine.assembly import assemble, create_model, urdf_text, yaml_text
+from legcal.machine.description_table import read_table
+from legcal.machine.files import shipped_names
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.poses import singularity
 
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
 NUMBER = re.compile(r"(?<![\w.-])-?\d+\.\d+(?:e[-+]\d+)?")

@@ -6,13 +6,11 @@ from typing import Any
 import pytest
 from authoring import described, made, write_table
 
-from legcal.authoring import create
-from legcal.authoring.assembled import assemble
-from legcal.authoring.create import create_model
-from legcal.authoring.families import Family, describe_family
-from legcal.authoring.request import described as asked
-from legcal.authoring.table import read_table
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
+from legcal.machine import assembly as create
+from legcal.machine.assembly import Family, assemble, create_model, describe_family
+from legcal.machine.assembly import described as asked
+from legcal.machine.description_table import read_table
 
 SPS = {"type": "SPS"}
 ROD = {"type": None, "types": ["SPU", "SPU", "SS"]}

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from outline_tables import LEG_NAMES, recorded
 
+from legcal.data.axes import COLUMNS, LegAxes, axes_of_table, read_axes, write_axes
 from legcal.errors import DatasetError
-from legcal.observations.axes_file import COLUMNS, read_axes, write_axes
-from legcal.observations.leg_axes import LegAxes
-from legcal.observations.table_axes import axes_of_table
 
 MEASUREMENTS = recorded(labels=["", "", "a", "b"])
 

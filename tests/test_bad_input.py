@@ -12,12 +12,11 @@ import pytest
 from dataset_folder import HEXAPOD, Folder, folder
 
 from legcal import cli
-from legcal.dataset.folder import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
+from legcal.files.folder import check_destination, result_folder
 from legcal.files.schema import closest, parse_yaml
-from legcal.mechanism.load import load_mechanism
-from legcal.report.destination import check_destination
-from legcal.report.files import result_folder
+from legcal.machine.load import load_mechanism
 
 __all__ = ["folder"]
 
@@ -45,7 +44,7 @@ def test_a_path_that_is_too_long_is_no_such_file(
     key: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("legcal.dataset.folder.load_mechanism", load_mechanism)
+    monkeypatch.setattr("legcal.data.dataset.load_mechanism", load_mechanism)
     folder.entry[key] = LONG
     with pytest.raises((DatasetError, ModelError), match="found no such file"):
         load_dataset(folder.write())

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from legcal.geometry.types import Array
-from legcal.recognition.bars import LEAST_OVERLAP, NARROWEST, WIDEST, find_bars
+from legcal.perception.bars import LEAST_OVERLAP, NARROWEST, WIDEST, find_bars
 
 
 def _edges(width: float, length: float, *, turn: float = 0.0, same_way: bool = False) -> Array:

@@ -10,11 +10,9 @@ from boards import APRILGRID, BOARDS, CHARUCO, CHESSBOARD
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from legcal.dataset.board_entry import board_document, described_board, read_board
 from legcal.errors import DatasetError
-from legcal.simulation.board_print import INK, BoardPrint
-from legcal.vision.board import Board
-from legcal.vision.board_objects import charuco_board
+from legcal.simulation.board import INK, BoardPrint
+from legcal.vision.board import Board, board_document, charuco_board, described_board, read_board
 
 PATH = Path("dataset.yaml")
 CHESS = {"kind": "chessboard", "squares_x": 9, "squares_y": 6, "square": 0.03}

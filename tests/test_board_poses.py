@@ -7,11 +7,11 @@ import pytest
 from boards import APRILGRID, CHARUCO, CHESSBOARD, LENS, before, seen_at
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data.corners import Corners, choose_corners, found_corners, join_corners
+from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.types import Array
-from legcal.observations.board_poses import BoardPoses, camera_poses
-from legcal.observations.corners import Corners, choose_corners, found_corners, join_corners
-from legcal.observations.measurements import Measurements, View
+from legcal.perception.boards import BoardPoses, camera_poses
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 from legcal.vision.plane_pose import plane_poses

@@ -17,14 +17,12 @@ from boards import (
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.detection.board_corners import detect_corners, require_board
+from legcal.data.measurements import Measurements, View
 from legcal.errors import NotVisible
-from legcal.observations.measurements import Measurements, View
+from legcal.perception.detection import detect_corners, require_board
 from legcal.progress import no_progress
 from legcal.vision.board import Board
-from legcal.vision.corner_search import find_corners
-from legcal.vision.other_boards import described
-from legcal.vision.tag_search import quarter_turns
+from legcal.vision.corners import described, find_corners, quarter_turns
 from legcal.workers import in_turn
 
 KINDS = tuple(board.kind for board in BOARDS)

@@ -14,9 +14,9 @@ from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 from thinned import thinned
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset, load_mechanism
+from legcal.calibration.identify.analysis import check_identifiable
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.identify.check import check_identifiable
-from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
+from legcal.machine.parameters import geometries, parametrization_of, vector_of
 
 
 def _table(folder: Path) -> list[list[str]]:
@@ -270,7 +270,7 @@ def test_an_interrupted_run_leaves_nothing_behind(
     def interrupted(*args: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("legcal.report.result.write_observations", interrupted)
+    monkeypatch.setattr("legcal.calibration.result.write_observations", interrupted)
     with pytest.raises(KeyboardInterrupt):
         calibrate(example_run.folder, output=tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

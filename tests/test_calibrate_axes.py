@@ -13,12 +13,11 @@ from axes_dataset import MODEL, write_axes_dataset
 from rich.console import Console
 
 from legcal import calibrate, load_dataset, load_mechanism
-from legcal.calibration import Calibration
+from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
+from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.identify.analysis import identifiability_of_dataset
-from legcal.identify.recorded import recorded_session
-from legcal.mechanism.parameters import to_vector
-from legcal.report.summary import summary
+from legcal.machine.leg import to_vector
+from legcal.report.calibrate_table import summary
 from legcal.simulation.cameras import PAPER_VIEWS
 from legcal.simulation.machine import Machine
 

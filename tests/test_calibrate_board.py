@@ -13,13 +13,13 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
-from legcal.board_views import BoardViews, base_of_board, board_notes, observe_board
-from legcal.calibration import Calibration
+from legcal.calibration.starts import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.verdict import Calibration
+from legcal.data.corners import found_corners
+from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.mechanism.parametrization import geometries, vector_of
-from legcal.observations.corners import found_corners
-from legcal.observations.measurements import Measurements, View
-from legcal.refinement.known_parameters import BOARD_SCALE
+from legcal.estimation.parameters import BOARD_SCALE
+from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.settings import Level
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera

@@ -11,11 +11,11 @@ from simulated import settings
 
 from legcal import calibrate, evaluate
 from legcal.errors import LegcalError, NotIdentifiable, NotVisible
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parametrization import geometries
-from legcal.mechanism.platform import pose_differences
-from legcal.refinement.platform_accuracy import poses_at_readings
-from legcal.simulation.simulate import simulate
+from legcal.estimation.platform import poses_at_readings
+from legcal.machine.kinematics import pose_differences
+from legcal.machine.load import load_mechanism
+from legcal.machine.parameters import geometries
+from legcal.simulation.session import simulate
 
 Row = dict[str, str]
 

@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 from camera_sessions import CAMERAS, NOISE_PX, SIZE, seen_corners
 
-from legcal.camera_calibration.adjustment import SeenCorners
-from legcal.camera_calibration.judgement import refuse_undetermined, warnings
-from legcal.camera_calibration.rounds import Agreed, agreed
+from legcal.calibration.camera import Agreed, SeenCorners, agreed, refuse_undetermined, warnings
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.vision.camera import DistortionModel
-from legcal.vision.intrinsics import intrinsic_values
+from legcal.vision.camera import DistortionModel, intrinsic_values
 
 MODELS: tuple[DistortionModel, ...] = ("plumb_bob", "rational_polynomial", "equidistant")
 

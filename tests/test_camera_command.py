@@ -13,21 +13,18 @@ from camera_sessions import CAMERAS, PINHOLE, drawings, photographs
 from numpy.typing import NDArray
 
 from legcal import calibrate_camera, cli
-from legcal.camera_calibration.board_spec import board_of
-from legcal.camera_calibration.result import CameraCalibration
-from legcal.dataset.wishes import wishes_of_call
+from legcal.calibration.camera import CameraCalibration
+from legcal.data.dataset import wishes_of_call
+from legcal.data.measurements import View
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
+from legcal.estimation.choices import Prior
+from legcal.estimation.parameters import known_parameters, resolve
 from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.load import load_mechanism
-from legcal.observations.measurements import View
-from legcal.refinement.choices import Prior
-from legcal.refinement.known_parameters import known_parameters
-from legcal.refinement.resolution import resolve
-from legcal.vision.board import Board
-from legcal.vision.camera import DistortionModel
+from legcal.machine.load import load_mechanism
+from legcal.vision.board import Board, board_of
+from legcal.vision.camera import DistortionModel, intrinsic_values
 from legcal.vision.camera_file import read_camera
-from legcal.vision.corner_search import find_corners
-from legcal.vision.intrinsics import intrinsic_values
+from legcal.vision.corners import find_corners
 
 SPEC = "chessboard:9x6:30mm"
 CHARUCO = Board("charuco", 7, 5, 0.04, marker=0.029, dictionary="DICT_4X4_50")
@@ -59,7 +56,7 @@ def search_once(monkeypatch: pytest.MonkeyPatch) -> None:
             SEARCHED[key] = find_corners(board, image)
         return SEARCHED[key]
 
-    monkeypatch.setattr("legcal.camera_calibration.calibrate.find_corners", search)
+    monkeypatch.setattr("legcal.calibration.camera.find_corners", search)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:

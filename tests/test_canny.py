@@ -6,13 +6,13 @@ import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.detect import detect_outlines
-from legcal.detection.outline import outline_parts
+from legcal.calibration.canny import canny_parts, edge_points
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import Cylinder
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
-from legcal.repeatability.canny import canny_parts, edge_points
+from legcal.machine.leg import Cylinder
+from legcal.perception.detection import detect_outlines
+from legcal.perception.outline import outline_parts
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 

@@ -14,14 +14,13 @@ from simulated import settings
 from typer.testing import CliRunner
 
 from legcal import calibrate, check
+from legcal.calibration.fitting import Found, observe_and_fit
 from legcal.cli.app import app
 from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
-from legcal.fitting import Found, observe_and_fit
-from legcal.mechanism.leg_steps import moved_legs
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
-from legcal.report.axis_turns import turns_between
-from legcal.simulation.simulate import simulate
+from legcal.machine.load import load_mechanism
+from legcal.machine.parameters import geometries, moved_legs, parametrization_of, vector_of
+from legcal.machine.written import turns_between
+from legcal.simulation.session import simulate
 
 MODEL = "3-rpr"
 
@@ -268,7 +267,7 @@ def test_what_is_said_of_the_images_is_passed_on(
     def noted(*arguments: Any) -> Found:
         return replace(observe_and_fit(*arguments), notes=(left_out, doubt), doubts=(doubt,))
 
-    monkeypatch.setattr("legcal.checking.observe_and_fit", noted)
+    monkeypatch.setattr("legcal.calibration.checking.observe_and_fit", noted)
     found = check(images, result)
     assert [note for note in found.notes if "view c1, image" in note] == [left_out, doubt]
     assert set(found.document()["notes"]) >= {left_out, doubt, *found.solution.notes}

@@ -9,14 +9,14 @@ from machine_session import machine_session
 from simulated import settings
 
 from legcal import calibrate, check
-from legcal.dataset.folder import Dataset, load_dataset
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import choose_outlines
 from legcal.errors import NotIdentifiable
+from legcal.estimation.joint_fit import refine
 from legcal.geometry.types import Array, IntArray
-from legcal.observations.measurements import Measurements
-from legcal.observations.sets import choose_outlines
-from legcal.refinement.refine import refine
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.simulate import simulate
+from legcal.simulation.session import simulate
 
 EXACT = 1e-4  # [px]: errors of the outlines on which others are put
 NOISE = OutlineNoise(0.1, 150)

@@ -7,10 +7,10 @@ import pytest
 from chosen import HEXAPOD, choose, known
 
 from legcal import load_mechanism
-from legcal.dataset.wishes import wishes_of_call
-from legcal.mechanism.parametrization import parametrization_of
-from legcal.refinement.choices import NO_CHOICES, Prior
-from legcal.refinement.resolution import resolve
+from legcal.data.dataset import wishes_of_call
+from legcal.estimation.choices import NO_CHOICES, Prior
+from legcal.estimation.parameters import resolve
+from legcal.machine.parameters import parametrization_of
 
 
 @pytest.mark.parametrize("model", ["hexapod", "hexapod-rod", "3-upu-tilted", "3-rpr", "tricept"])

@@ -9,12 +9,10 @@ import pytest
 from dataset_folder import Folder, folder
 
 from legcal import calibrate, cli
-from legcal.dataset.folder import load_dataset
-from legcal.dataset.wishes import wishes_of_call
+from legcal.data.dataset import load_dataset, wishes_of_call
 from legcal.errors import DatasetError, UsageError
-from legcal.refinement.choices import Choices, Prior
-from legcal.refinement.known_parameters import known_parameters
-from legcal.refinement.resolution import resolve
+from legcal.estimation.choices import Choices, Prior
+from legcal.estimation.parameters import known_parameters, resolve
 
 __all__ = ["folder"]
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from chosen import HEXAPOD, choose, known
 
-from legcal.dataset.wishes import wishes_of_call
+from legcal.data.dataset import wishes_of_call
 from legcal.errors import DatasetError, UsageError
-from legcal.refinement.resolution import resolve
+from legcal.estimation.parameters import resolve
 
 
 @pytest.mark.parametrize(

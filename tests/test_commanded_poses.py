@@ -8,10 +8,9 @@ from simulated import settings
 
 import legcal
 from legcal.errors import DidNotConverge
-from legcal.mechanism.model import Mechanism
-from legcal.simulation import commanded_poses as module
-from legcal.simulation.commanded_poses import commanded_poses
-from legcal.simulation.motion import Sampling, draw_poses
+from legcal.machine.model import Mechanism
+from legcal.simulation import poses as module
+from legcal.simulation.poses import Sampling, commanded_poses, draw_poses
 from legcal.simulation.truth import write_true_model
 
 

@@ -12,12 +12,12 @@ from thinned import thinned
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
-from legcal.mechanism.closing import leg_vectors
-from legcal.mechanism.configurations import Configurations, random_configurations
-from legcal.mechanism.kinematics import forward_kinematics
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.closing import leg_vectors
+from legcal.machine.kinematics import forward_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import Configurations, random_configurations
 
 
 def _lines(mechanism: Mechanism, T: RigidTransform) -> float:

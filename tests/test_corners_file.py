@@ -9,17 +9,19 @@ from boards import CHARUCO, LENS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legcal.errors import DatasetError
-from legcal.observations.canonical_order import canonical_order, reorder_corners, restore_corners
-from legcal.observations.corners import Corners, choose_corners, found_corners, join_corners
-from legcal.observations.corners_file import (
+from legcal.data.corners import (
     COLUMNS,
+    Corners,
+    choose_corners,
     format_corners,
+    found_corners,
+    join_corners,
     read_corners,
     write_corners,
 )
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.parts import corners_at
+from legcal.data.measurements import Measurements, View
+from legcal.data.order import canonical_order, corners_at, reorder_corners, restore_corners
+from legcal.errors import DatasetError
 
 HEAD = ",".join(COLUMNS)
 MEASUREMENTS = Measurements(

@@ -12,12 +12,7 @@ from scipy.spatial.transform import Rotation
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line, moment
 from legcal.geometry.types import Array
-from legcal.vision.cylinder import (
-    EPSILON,
-    axis_of_outlines,
-    outlines_of_axis,
-    point_with_zero_y,
-)
+from legcal.vision.cylinder import EPSILON, axis_of_outlines, outlines_of_axis, point_with_zero_y
 
 FAST = settings(deadline=None, max_examples=50)
 SEEDS = st.integers(0, 2**32 - 1)

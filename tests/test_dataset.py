@@ -9,9 +9,9 @@ import yaml
 from dataset_folder import HEXAPOD, ROOT, SIZE, Folder, folder, hexapod
 from scipy.spatial.transform import RigidTransform
 
-from legcal.dataset.folder import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, ModelError
-from legcal.mechanism.model import Mechanism
+from legcal.machine.model import Mechanism
 
 __all__ = ["folder"]
 
@@ -94,8 +94,8 @@ def test_mechanism_is_a_path_before_it_is_a_shipped_name(
         asked.append(path)
         return hexapod()
 
-    monkeypatch.setattr("legcal.dataset.folder.load_mechanism", load)
-    monkeypatch.setattr("legcal.dataset.folder.shipped_names", lambda: ["shipped"])
+    monkeypatch.setattr("legcal.data.dataset.load_mechanism", load)
+    monkeypatch.setattr("legcal.data.dataset.shipped_names", lambda: ["shipped"])
     for named in ("model", "shipped", "../elsewhere/model.yaml"):
         (folder.path / "model").touch()
         folder.entry["mechanism"] = named

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from dataset_folder import SIZE, Folder, folder
 
-from legcal.dataset.folder import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError
 from legcal.geometry.types import Image
 from legcal.vision.camera import Camera

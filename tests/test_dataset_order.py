@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, assert_same, outlines_of, recorded
 
-from legcal.observations.canonical_order import (
+from legcal.data.measurements import Measurements
+from legcal.data.order import (
     Order,
     canonical_order,
     inverse,
@@ -16,8 +17,7 @@ from legcal.observations.canonical_order import (
     restore_outlines,
     sort_rows,
 )
-from legcal.observations.measurements import Measurements
-from legcal.observations.sets import sort_outlines
+from legcal.data.outlines import sort_outlines
 
 FAST = settings(deadline=None, max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from dataset_folder import JOINTS, Folder, folder, readings
 
-from legcal.dataset.folder import load_dataset
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import Measurements
 from legcal.errors import DatasetError
-from legcal.observations.measurements import Measurements
 
 __all__ = ["folder"]
 

@@ -15,10 +15,10 @@ from simulated import settings
 
 import legcal
 from legcal import calibrate, simulate
-from legcal.calibration import Calibration
+from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.mechanism.model import Mechanism
-from legcal.refinement.known_parameters import known_parameters
+from legcal.estimation.parameters import known_parameters
+from legcal.machine.model import Mechanism
 
 LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
 SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]

@@ -16,14 +16,13 @@ from outline_tables import assert_same
 from repeated_images import SIZE, RepeatedImages, repeated_images
 
 from legcal import cli, detect, load_dataset
+from legcal.data.order import canonical_order
+from legcal.data.outlines import QUALITY, read_observations
 from legcal.errors import DatasetError, UsageError
-from legcal.examining import Observed, observe
-from legcal.observations.canonical_order import canonical_order
-from legcal.observations.outlines import QUALITY
-from legcal.observations.table import read_observations
-from legcal.overlays.detected import Detection
-from legcal.overlays.folder import _caption, picture_names
-from legcal.photographs import Photographs
+from legcal.perception.drawing import Detection
+from legcal.perception.examine import Observed, observe
+from legcal.perception.overview import _caption, picture_names
+from legcal.perception.photographs import Photographs
 
 BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
 
@@ -149,7 +148,7 @@ def test_legs_are_drawn_by_the_radii_that_were_searched_by(
         wrong = replace(photographs, mechanism=photographs.mechanism.with_cylinders(cylinders))
         return replace(observe(photographs, *others), photographs=wrong)
 
-    monkeypatch.setattr("legcal.detecting.observe", thicker)
+    monkeypatch.setattr("legcal.calibration.detecting.observe", thicker)
     found = detect(one_image.path)
     legs = {leg.leg: leg for leg in found.predicted(0)}
     assert len(legs) == 6

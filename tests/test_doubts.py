@@ -13,21 +13,20 @@ from hexapod_example import Run
 from spoiled import Picture, Spoiled, spoiled
 
 from legcal import calibrate, detect, load_dataset
-from legcal.detection.exposure import Exposure, expose, image_defects
-from legcal.detection.picture import to_grey
-from legcal.disagreeing import disagreeing_images
+from legcal.calibration.fitting import disagreeing_images
+from legcal.calibration.workpiece import Workpiece, workpiece
 from legcal.errors import NotIdentifiable
-from legcal.examining import _usual, observe, rejected
-from legcal.image_notes import NOTHING_LIKE, OutlineCount, judged
-from legcal.overlays.detected import Detection
-from legcal.photographs import Placement, scene_at_poses
+from legcal.estimation.choices import Choices
+from legcal.estimation.rounds import DISAGREES
+from legcal.perception.doubts import Explanation, _best
+from legcal.perception.drawing import Detection
+from legcal.perception.examine import NOTHING_LIKE, OutlineCount, _usual, judged, observe, rejected
+from legcal.perception.exposure import Exposure, expose, image_defects
+from legcal.perception.hints import hint_notes
+from legcal.perception.photographs import Placement, scene_at_poses
+from legcal.perception.picture import to_grey
 from legcal.progress import no_progress
-from legcal.recognition.doubts import Explanation, _best
-from legcal.recognition.hints import hint_notes
-from legcal.refinement.choices import Choices
-from legcal.refinement.rejections import DISAGREES
 from legcal.workers import in_turn
-from legcal.workpiece import Workpiece, workpiece
 
 UNTOLD = "The gamma of "  # a note on the cameras of the example
 N = 6

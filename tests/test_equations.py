@@ -11,8 +11,8 @@ from random_legs import changed, leg_and_pose, twist_of
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
-from legcal.mechanism.equations import linearize
-from legcal.mechanism.leg_geometry import Demand
+from legcal.machine.equations import linearize
+from legcal.machine.leg import Demand
 
 FAST = settings(deadline=None, max_examples=20)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -13,9 +13,7 @@ from typing import Any
 import pytest
 
 from legcal.errors import UsageError
-from legcal.files.atomic import write_atomically
-from legcal.report.destination import check_destination, output_path
-from legcal.report.files import result_folder
+from legcal.files.folder import check_destination, output_path, result_folder, write_atomically
 
 RESULT = '{"legcal_result": 1}'
 

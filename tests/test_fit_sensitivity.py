@@ -8,13 +8,12 @@ from hexapod_session import LENS, RADIUS, Session, disturbed_start, moved_outlin
 from machine_session import LENS as LENS_OF_MACHINES
 from machine_session import machine_session
 
+from legcal.estimation.choices import NO_CHOICES, Choices, Prior
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.solution import Solution
 from legcal.geometry.types import Array
-from legcal.mechanism.leg_steps import moved_legs
-from legcal.refinement import refine
-from legcal.refinement.choices import NO_CHOICES, Choices, Prior
-from legcal.refinement.solution import Solution
-from legcal.vision.camera import Camera
-from legcal.vision.intrinsics import with_intrinsics
+from legcal.machine.parameters import moved_legs
+from legcal.vision.camera import Camera, with_intrinsics
 
 PART = 1e-3  # of the mistakes that are told
 RADII = [f"leg{j}.radius.rod" for j in range(1, 7)]

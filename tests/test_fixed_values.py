@@ -8,8 +8,9 @@ from machine_session import MachineSession, machine_session, shifted
 from thinned import thinned
 
 from legcal.errors import DidNotConverge
-from legcal.refinement import Solution, refine
-from legcal.refinement.choices import NO_CHOICES, Choices, Prior
+from legcal.estimation.choices import NO_CHOICES, Choices, Prior
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.solution import Solution
 
 
 @pytest.fixture(scope="module")

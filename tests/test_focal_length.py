@@ -14,13 +14,12 @@ from hexapod_session import (
     simulate,
 )
 
-from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import Outlines
-from legcal.refinement.choices import Choices
-from legcal.refinement.refine import refine
-from legcal.refinement.solution import Solution
-from legcal.vision.camera import Camera
-from legcal.vision.intrinsics import with_intrinsics
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.estimation.choices import Choices
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.solution import Solution
+from legcal.vision.camera import Camera, with_intrinsics
 
 
 def scaled(camera: Camera, factor: float) -> Camera:

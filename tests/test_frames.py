@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.frames import (
+from legcal.geometry.motions import (
     frame_on_points,
     motion_from_xyz_quat,
     motion_of,

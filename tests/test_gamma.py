@@ -19,16 +19,23 @@ from hexapod_session import (
 from simulated import settings
 
 import legcal
-from legcal.dataset.folder import load_dataset
-from legcal.detecting import detect
+from legcal.calibration.detecting import detect
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError
-from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import Outlines
-from legcal.refinement.gamma_search import LARGEST_STEP, RANGE, SETTLED, next_gammas
-from legcal.refinement.gammas import FEIGNED, SEEN_SHARE, EstimatedGamma
-from legcal.refinement.refine import refine
-from legcal.refinement.unknown_gammas import known_gammas
-from legcal.simulation.simulate import simulate as simulate_folder
+from legcal.estimation.gammas import (
+    FEIGNED,
+    LARGEST_STEP,
+    RANGE,
+    SEEN_SHARE,
+    SETTLED,
+    EstimatedGamma,
+    next_gammas,
+)
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.observations import known_gammas
+from legcal.simulation.session import simulate as simulate_folder
 from legcal.vision.cylinder import EPSILON
 
 __all__ = ["folder"]

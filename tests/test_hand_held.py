@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from dataset_folder import Folder, folder
 
-from legcal.dataset.folder import load_dataset
+from legcal.data.corners import COLUMNS
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError
-from legcal.observations.corners_file import COLUMNS
 
 __all__ = ["folder"]
 BOARD = {"kind": "charuco", "squares_x": 4, "squares_y": 3, "square": 0.03, "marker": 0.02,

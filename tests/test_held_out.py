@@ -9,21 +9,23 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import Outlines
-from legcal.refinement import pose_by_outlines
-from legcal.refinement.biases import N_KINDS, possible_shifts
-from legcal.refinement.build import build_fit
-from legcal.refinement.foretold import Posterior
-from legcal.refinement.held_out import HeldOut, compare_held_out
-from legcal.refinement.legs import FittedLegs
-from legcal.refinement.noise import NoiseModel
-from legcal.refinement.pose_by_outlines import ShownPoses, poses_by_outlines
-from legcal.refinement.start import Start
-from legcal.refinement.state import motions
-from legcal.studies.outline_design import design_of
-from legcal.studies.outline_session import Noise, StartErrors, draw_session
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.estimation import held_out as pose_by_outlines
+from legcal.estimation.biases import N_KINDS, possible_shifts
+from legcal.estimation.build import build_fit
+from legcal.estimation.constraints import Start
+from legcal.estimation.held_out import (
+    HeldOut,
+    Posterior,
+    ShownPoses,
+    compare_held_out,
+    poses_by_outlines,
+)
+from legcal.estimation.noise import NoiseModel
+from legcal.estimation.state import FittedLegs, motions
+from legcal.machine.leg import LegGeometry
+from legcal.simulation.studies.outlines import Noise, StartErrors, design_of, draw_session
 
 MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")
 

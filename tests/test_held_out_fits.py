@@ -16,13 +16,13 @@ from hexapod_session import (
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
+from legcal.data.measurements import Measurements
+from legcal.data.order import outlines_at
+from legcal.data.outlines import Outlines
+from legcal.estimation.constraints import start_from
+from legcal.estimation.held_out import HeldOut, compare_held_out
+from legcal.estimation.joint_fit import refine
 from legcal.geometry.types import Array, IntArray
-from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import Outlines
-from legcal.observations.parts import outlines_at
-from legcal.refinement.held_out import HeldOut, compare_held_out
-from legcal.refinement.refine import refine
-from legcal.refinement.start import start_from
 
 N_SEEDS = 4
 

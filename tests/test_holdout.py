@@ -8,13 +8,12 @@ import pytest
 from hexapod_example import HEXAPOD
 from outline_tables import outlines_of
 
-from legcal.dataset.folder import Dataset, load_dataset
-from legcal.dataset.holdout import dataset_at, split_images
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.holdout import dataset_at, split_images
+from legcal.data.measurements import Measurements
+from legcal.data.order import Order, measurements_at, outlines_at, reorder_measurements
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry.types import IntArray
-from legcal.observations.canonical_order import Order, reorder_measurements
-from legcal.observations.measurements import Measurements
-from legcal.observations.parts import measurements_at, outlines_at
 
 
 @cache

@@ -12,18 +12,12 @@ from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 from legcal.errors import DidNotConverge, ModelError
-from legcal.mechanism.closing import close_at, close_near, platform_pose, readings_at
-from legcal.mechanism.demands import (
-    constraints_at,
-    demands_at,
-    is_constrained,
-    leg_scale,
-    moved,
-)
-from legcal.mechanism.home import closed_home, find_home, settle, settle_home
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.closing import close_at, close_near, platform_pose, readings_at
+from legcal.machine.equations import constraints_at, demands_at, is_constrained, leg_scale, moved
+from legcal.machine.home import closed_home, find_home, settle, settle_home
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 CARRIED = Layout((LegLayout(cut="carry"), *[LegLayout(sphere=k % 2 == 0) for k in range(6)]))
@@ -137,7 +131,7 @@ def test_small_machines_close_from_far_joint_angles(types: list[str], tmp_path: 
 
 
 def test_no_home_at_all_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("legcal.mechanism.home.TRIALS", 8)
+    monkeypatch.setattr("legcal.machine.home.TRIALS", 8)
     machine = of_types(["US"] * 6 + ["SS"])  # seven motors: their middles contradict each other
     mechanism = load_mechanism(write_machine(tmp_path, machine, Layout()))
     with pytest.raises(DidNotConverge, match=r"no home pose was found.*write legcal\.home"):

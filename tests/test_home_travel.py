@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
+from legcal.calibration.identify.analysis import identifiability
 from legcal.errors import ModelError
-from legcal.identify.analysis import identifiability
-from legcal.mechanism.home_travel import legs_outside
-from legcal.mechanism.load import load_mechanism
+from legcal.machine.home import legs_outside
+from legcal.machine.load import load_mechanism
 
 
 def _with_home(folder: Path, z: float) -> Path:

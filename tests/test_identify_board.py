@@ -13,15 +13,14 @@ from rich.console import Console
 from test_identify_command import run
 
 import legcal
+from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
+from legcal.calibration.identify.ranks import locate_joints
+from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.identify.session import planned_session
+from legcal.data.corners import found_corners
 from legcal.errors import UsageError
-from legcal.identify.analysis import identifiability_of_dataset
-from legcal.identify.identifiability import Identifiability
-from legcal.identify.planned import planned_session
-from legcal.identify.recorded import recorded_session
-from legcal.identify.steps import locate_joints
-from legcal.mechanism.model import Mechanism
-from legcal.observations.corners import found_corners
-from legcal.report.identify_table import identify_table
+from legcal.machine.model import Mechanism
+from legcal.report.identify_tables import identify_table
 from legcal.vision.board import Board
 
 LEGS = tuple(f"leg{j}" for j in range(1, 7))

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hexapod_example import HEXAPOD
 
-from legcal.dataset.folder import Dataset, load_dataset
-from legcal.dataset.holdout import dataset_at
+from legcal.calibration.identify.analysis import check_identifiable, identifiability_of_dataset
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.holdout import dataset_at
 from legcal.errors import NotIdentifiable
-from legcal.identify.analysis import identifiability_of_dataset
-from legcal.identify.check import check_identifiable
-from legcal.mechanism.parametrization import parametrization_of
-from legcal.refinement.choices import Choices, Prior
+from legcal.estimation.choices import Choices, Prior
+from legcal.machine.parameters import parametrization_of
 
 
 @cache

@@ -19,15 +19,13 @@ from thinned import thinned
 
 import legcal
 from legcal import cli
-from legcal.authoring.create import create_model
-from legcal.authoring.families import Family, describe_family
-from legcal.dataset.folder import load_dataset
+from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
+from legcal.calibration.identify.ranks import WeakDirection
+from legcal.data.dataset import load_dataset
 from legcal.errors import UsageError
-from legcal.identify.analysis import identifiability_of_dataset
-from legcal.identify.recorded import recorded_session
-from legcal.identify.weak import WeakDirection
-from legcal.mechanism.model import Mechanism
-from legcal.report.identify_table import _hidden, _two_digits
+from legcal.machine.assembly import Family, create_model, describe_family
+from legcal.machine.model import Mechanism
+from legcal.report.identify_tables import _hidden, _two_digits
 
 PAPER = ("leg1,leg2,leg3,leg4", "leg3,leg4,leg5,leg6", "leg1,leg2,leg5,leg6")
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))

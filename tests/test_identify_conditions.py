@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from random_legs import closed_leg
 from staged_hexapods import exact_session
 
-from legcal.identify.conditions import count_conditions, three_legs_at_once, two_directions
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
+from legcal.machine.leg import LegGeometry, LegKind
+from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 from legcal.simulation.cameras import PAPER_VIEWS
 
 EVERY = ((0, 1, 2),)

@@ -11,16 +11,26 @@ from hypothesis import strategies as st
 from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 
+from legcal.calibration.identify.analysis import identifiability
+from legcal.calibration.identify.ranks import (
+    SIGMA_EXACT,
+    compress,
+    demands_of,
+    eliminate,
+    image_rows,
+    information,
+)
+from legcal.calibration.identify.session import (
+    SIGMA_PX,
+    Session,
+    at_base_joints,
+    at_platform_joints,
+)
 from legcal.geometry.types import Array
-from legcal.identify.analysis import identifiability
-from legcal.identify.elimination import compress, eliminate
-from legcal.identify.full import SIGMA_EXACT, demands_of, image_rows, information
-from legcal.identify.observed import at_base_joints, at_platform_joints
-from legcal.identify.session import SIGMA_PX, Session
-from legcal.mechanism.equations import linearize
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parametrization import parametrize
+from legcal.machine.equations import linearize
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.parameters import parametrize
 
 FAST = settings(deadline=None, max_examples=10)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -9,15 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_identify_information import FAST, SEEDS, random_session
 
-from legcal.dataset.folder import load_dataset
-from legcal.dataset.holdout import dataset_at
+from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.remedies import (
+    NAMES,
+    _changes,
+    _scales,
+    judge_intrinsics,
+    looking_at,
+)
+from legcal.calibration.identify.session import at_base_joints
+from legcal.data.dataset import load_dataset
+from legcal.data.holdout import dataset_at
 from legcal.geometry.types import Array
-from legcal.identify.analysis import identifiability_of_dataset
-from legcal.identify.intrinsics import NAMES, _changes, _scales, judge_intrinsics, looking_at
-from legcal.identify.observed import at_base_joints
-from legcal.identify.ranks import Analysis
-from legcal.identify.recorded import recorded_session
-from legcal.report.identify_table import _intrinsics
+from legcal.report.identify_tables import _intrinsics
 from legcal.vision.cylinder import outlines_of_axis
 
 

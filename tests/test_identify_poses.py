@@ -9,16 +9,18 @@ from layouts import Layout, write_machine
 from machines import MACHINES, of_types, ring
 
 import legcal
+from legcal.calibration.identify.session import (
+    _Closing,
+    default_cameras,
+    planned_session,
+    random_poses,
+)
 from legcal.errors import DidNotConverge
-from legcal.identify.cameras import default_cameras
-from legcal.identify.planned import planned_session
-from legcal.identify.poses import _Closing, random_poses
-from legcal.mechanism.equations import linearize
-from legcal.mechanism.kinematics import forward_kinematics_many
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import Demand, LegGeometry
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries
+from legcal.machine.equations import linearize
+from legcal.machine.kinematics import forward_kinematics_many
+from legcal.machine.leg import Demand, LegGeometry, LegKind
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 
@@ -128,7 +130,7 @@ def test_machines_that_reach_few_drawn_poses_get_all_in_the_end(
 ) -> None:
     chance = np.random.default_rng(1)
     monkeypatch.setattr(
-        "legcal.identify.poses._Closing.is_regular",
+        "legcal.calibration.identify.session._Closing.is_regular",
         lambda _self, _R, t, _R0, _t0: chance.random(len(t)) < 0.75,  # in each of five steps
     )
     mechanism = legcal.load_mechanism("hexapod")

@@ -10,11 +10,11 @@ from authoring import made
 from thinned import thinned
 
 import legcal
-from legcal.identify.analysis import identifiability
-from legcal.identify.identifiability import Identifiability
-from legcal.identify.planned import planned_session
-from legcal.identify.ranks import Analysis
-from legcal.mechanism.model import Mechanism
+from legcal.calibration.identify.analysis import identifiability
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.identify.session import planned_session
+from legcal.machine.model import Mechanism
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 WEAK_JOINT = ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5))

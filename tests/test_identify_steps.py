@@ -9,25 +9,22 @@ import pytest
 from mechanisms import SHIPPED_YAML
 from staged_hexapods import exact_session
 
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import Session, planned_session
 from legcal.geometry.types import Array
-from legcal.identify.planned import planned_session
-from legcal.identify.ranks import Analysis
-from legcal.identify.session import Session
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.paper import joints_in_base as rigid_parts
+from legcal.paper import joints_in_base as scalar_products
+from legcal.paper import offsets
+from legcal.paper.joints_in_base import JointsInBase, register_views
+from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
+from legcal.paper.leg_directions import directions_through_joints
+from legcal.paper.platform_joints import build_mean_distances
+from legcal.paper.platform_problem import build_rigid, platform_unknowns, rigid_problem
+from legcal.paper.solver import LeastSquares, Solution, structure_jacobian
 from legcal.simulation.machine import Machine
-from legcal.stages import offsets, rigid_parts, scalar_products
-from legcal.stages.joints_in_base import JointsInBase
-from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.stages.laid_together import register_views
-from legcal.stages.least_squares import LeastSquares, structure_jacobian
-from legcal.stages.leg_directions import directions_through_joints
-from legcal.stages.platform_as_printed import build_mean_distances
-from legcal.stages.platform_unknowns import platform_unknowns
-from legcal.stages.rigid_platform import build_rigid
-from legcal.stages.rigid_problem import rigid_problem
-from legcal.stages.solution import Solution
-from legcal.studies.estimators import nominal_of
+from legcal.simulation.studies.paper import nominal_of
 
 VIEWS = [
     ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5)),

@@ -2,8 +2,8 @@
 
 import pytest
 
-from legcal.identify.words import legs_in_words, views_in_words
-from legcal.mechanism.parameter_words import describe_direction, joined, leg_labels
+from legcal.calibration.identify.session import legs_in_words, views_in_words
+from legcal.machine.parameters import describe_direction, joined, leg_labels
 
 LEGS = ("leg1", "leg2", "leg3", "leg4")
 

@@ -1,4 +1,4 @@
-"""Data flows down the layers and never up, and the method cannot see the simulated truth."""
+"""Data flows down the rooms and never up, and the method cannot see the simulated truth."""
 
 import ast
 from functools import cache
@@ -7,40 +7,21 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LAYERS = (
-    "geometry",
+ROOMS = (
     "files",
-    "mechanism",
-    "authoring",
+    "geometry",
+    "machine",
     "vision",
-    "observations",
-    "detection",
-    "recognition",
-    "photographs",
-    "closer_look",
-    "image_notes",
-    "examining",
-    "dataset",
-    "camera_calibration",
-    "stages",
-    "refinement",
-    "identify",
+    "data",
+    "estimation",
+    "perception",
+    "paper",
     "calibration",
-    "repeatability",
     "report",
-    "location",
-    "overlays",
-    "workpiece",
-    "board_views",
-    "detecting",
-    "starting",
-    "disagreeing",
-    "fitting",
-    "pipeline",
-    "checking",
     "cli",
 )
-SIMULATED = {"simulation", "studies"}  # what knows the truth
+BESIDE = "simulation"  # it knows the truth
+OUTSIDE = {"__main__", "errors", "processors", "progress", "signals", "version", "workers"}
 
 
 @cache
@@ -53,105 +34,115 @@ def _modules() -> dict[str, Path]:
 
 
 @cache
+def _handed_out(facade: str) -> dict[str, str]:
+    """Return which module each name of a façade comes from."""
+    path = _modules()[facade].with_suffix(".pyi")
+    if not path.exists():
+        return {}
+    return {
+        alias.name: f"{facade}.{node.module}"
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
+@cache
 def _imports(module: str) -> frozenset[str]:
-    """Return the modules of the package that a module names in an import, wherever it stands."""
+    """Return the modules that a module imports from, wherever it says so, seen through façades."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(_modules()[module].read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    # The root only hands out public names; every import passes through it.
+        elif isinstance(node, ast.ImportFrom) and node.module in _modules():
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                names.add(
+                    name
+                    if name in _modules()
+                    else _handed_out(node.module).get(alias.name, node.module)
+                )
     return frozenset(names & _modules().keys() - {"legcal", module})
 
 
-def _reachable(module: str) -> set[str]:
+@cache
+def _reachable(module: str) -> frozenset[str]:
     seen: set[str] = set()
     waiting = [module]
     while waiting:
         for name in _imports(waiting.pop()) - seen:
             seen.add(name)
             waiting.append(name)
-    return seen
+    return frozenset(seen)
 
 
-def _unit(module: str) -> str:
+def _room(module: str) -> str:
     return module.split(".")[1] if "." in module else module
 
 
-def test_every_part_of_the_package_has_its_place() -> None:
-    outside = {
-        "legcal",
-        "__main__",
-        "errors",
-        "processors",
-        "progress",
-        "signals",
-        "version",
-        "workers",
-    }
-    assert {_unit(module) for module in _modules()} == outside | set(LAYERS) | SIMULATED
+def _of(*rooms: str) -> list[str]:
+    return [module for module in _modules() if _room(module) in rooms]
+
+
+def test_every_module_is_in_a_room() -> None:
+    assert {_room(module) for module in _modules()} == {"legcal", BESIDE, *OUTSIDE, *ROOMS}
 
 
 def test_no_module_imports_itself_in_a_circle() -> None:
-    circles = [module for module in _modules() if module in _reachable(module)]
-    assert circles == []
+    assert [module for module in _modules() if module in _reachable(module)] == []
 
 
-@pytest.mark.parametrize("layer", LAYERS)
-def test_a_layer_reaches_only_layers_below_it(layer: str) -> None:
-    above = set(LAYERS[LAYERS.index(layer) + 1 :])
-    modules = [module for module in _modules() if _unit(module) == layer]
-    assert modules, f"the layer {layer} has no module"
-    up = {(m, other) for m in modules for other in _reachable(m) if _unit(other) in above}
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_reaches_only_rooms_below_it(room: str) -> None:
+    above = set(ROOMS[ROOMS.index(room) + 1 :])
+    up = {(m, other) for m in _of(room) for other in _reachable(m) if _room(other) in above}
     assert up == set()
 
 
-def test_steps_and_fit_do_not_know_each_other() -> None:
-    for here, there in (("stages", "refinement"), ("refinement", "stages")):
-        modules = [module for module in _modules() if _unit(module) == here]
-        assert not {other for m in modules for other in _reachable(m) if _unit(other) == there}
+def test_rooms_are_used_through_their_facades() -> None:
+    rooms = {*ROOMS, BESIDE}
+    past = set()
+    for module in _of(*rooms, *OUTSIDE):
+        for node in ast.walk(ast.parse(_modules()[module].read_text())):
+            name = node.module if isinstance(node, ast.ImportFrom) else None
+            if name and name.startswith("legcal.") and _room(name) in rooms - {_room(module)}:
+                inside = name.count(".") > 1 or any(
+                    f"{name}.{alias.name}" in _modules() for alias in node.names
+                )
+                past |= {(module, name)} if inside else set()
+    assert past == set()
+
+
+@pytest.mark.parametrize("room", [*ROOMS, BESIDE])
+def test_a_facade_hands_out_what_its_modules_define(room: str) -> None:
+    handed_out = _handed_out(f"legcal.{room}")
+    assert set(handed_out.values()) <= _modules().keys()
+    submodules = {module.split(".")[2] for module in _of(room) if module.count(".") > 1}
+    assert not handed_out.keys() & submodules  # a module would hide the name
+
+
+def test_four_steps_and_joint_fit_do_not_know_each_other() -> None:
+    for here, there in (("paper", "estimation"), ("estimation", "paper")):
+        assert not {o for m in _of(here) for o in _reachable(m) if _room(o) == there}
 
 
 def test_geometry_knows_no_robot_and_no_camera() -> None:
-    modules = [module for module in _modules() if _unit(module) == "geometry"]
-    units = {_unit(other) for module in modules for other in _reachable(module)}
-    assert units <= {"geometry"}
-
-
-def test_no_module_of_the_method_imports_the_simulation() -> None:
-    method = set(LAYERS) - {"cli"}
-    users = {
-        module
-        for module in _modules()
-        if _unit(module) in method
-        and any(_unit(other) in SIMULATED for other in _reachable(module))
+    assert {_room(other) for m in _of("geometry") for other in _reachable(m)} <= {
+        "errors",
+        "files",
+        "geometry",
     }
+
+
+def test_only_the_command_line_imports_the_simulation() -> None:
+    method = set(ROOMS) - {"cli"}
+    users = {m for m in _of(*method) if any(_room(o) == BESIDE for o in _reachable(m))}
     assert users == set()
 
 
-def test_the_simulation_does_not_reach_the_method() -> None:
-    method = {"detection", "stages", "refinement", "identify", "calibration", "repeatability"}
-    modules = [module for module in _modules() if _unit(module) == "simulation"]
-    assert modules
-    reached = {(m, other) for m in modules for other in _reachable(m) if _unit(other) in method}
+def test_the_simulation_reaches_neither_report_nor_command_line() -> None:
+    reached = {(m, o) for m in _of(BESIDE) for o in _reachable(m) if _room(o) in {"report", "cli"}}
     assert reached == set()
-
-
-def test_the_simulation_takes_only_cameras_and_tables_from_what_observes() -> None:
-    cameras = {f"vision.{name}" for name in ("camera", "camera_file", "camera_writer")}
-    boards = {f"vision.board{name}" for name in ("", "_dictionaries", "_objects")}
-    tables = {"measurements", "outlines", "table", "axes_file", "corners", "corners_file"}
-    allowed = cameras | boards | {f"observations.{name}" for name in tables}
-    modules = [module for module in _modules() if _unit(module) == "simulation"]
-    taken = {
-        (module, other)
-        for module in modules
-        for other in _imports(module)
-        if _unit(other) in {"vision", "observations"}
-        and other.removeprefix("legcal.") not in allowed
-    }
-    assert taken == set()
 
 
 def test_no_module_names_the_true_model_of_the_example() -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from legcal.vision.camera import Camera
-from legcal.vision.intrinsics import (
+from legcal.vision.camera import (
+    Camera,
     intrinsic_names,
     intrinsic_unit,
     intrinsic_values,

@@ -14,18 +14,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.chain import ClosedChain, Closure
-from legcal.mechanism.closing import close_at, leg_vectors, platform_pose
-from legcal.mechanism.kinematics import (
+from legcal.machine.chain import ClosedChain, Closure
+from legcal.machine.closing import close_at, leg_vectors, mobility, platform_pose
+from legcal.machine.kinematics import (
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
-    mobility,
     outside_travel,
 )
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
 
 
 @pytest.fixture(scope="module")

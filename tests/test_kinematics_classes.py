@@ -13,21 +13,25 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.mechanism.closing import leg_vectors, slider_columns
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.demands import constraints_at, demands_at, moved
-from legcal.mechanism.kinematics import (
+from legcal.machine.closing import (
+    free_motions,
+    freedoms,
+    generic_configurations,
+    leg_vectors,
+    mobility,
+    slider_columns,
+)
+from legcal.machine.equations import constraints_at, demands_at, moved
+from legcal.machine.kinematics import (
     Follower,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
-    mobility,
 )
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.mobility import free_motions, freedoms, generic_configurations
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.singularity import side
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import random_configurations, side
 
 MOBILITY = {
     "3-rpr": 3,
@@ -229,7 +233,7 @@ def test_without_a_determinant_a_path_is_followed_in_small_changes(
 ) -> None:
     mechanism = load_mechanism(name)
     drawn = random_configurations(mechanism, 3, 9)
-    monkeypatch.setattr("legcal.mechanism.following.side", lambda *_: 0.0)
+    monkeypatch.setattr("legcal.machine.poses.side", lambda *_: 0.0)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
         found = forward_kinematics(mechanism, q)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)

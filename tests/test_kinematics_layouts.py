@@ -8,17 +8,14 @@ from layouts import Layout, LegLayout, write_machine
 from machines import of_types
 from thinned import thinned
 
+from legcal.calibration import accuracy
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
-from legcal.mechanism.closing import slider_columns
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.following import SHORTEST, follow
-from legcal.mechanism.kinematics import forward_kinematics, forward_kinematics_many
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.pose_following import follow_pose, walk
-from legcal.mechanism.singularity import side
-from legcal.report import accuracy
+from legcal.machine.closing import slider_columns
+from legcal.machine.kinematics import forward_kinematics, forward_kinematics_many
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import SHORTEST, follow, follow_pose, random_configurations, side, walk
 
 
 def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from staged_hexapods import exact_session
 
+from legcal.data.axes import LegAxes, axes_from_outlines, join_axes, outline_derivative
+from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array
-from legcal.observations.leg_axes import LegAxes, axes_from_outlines, join_axes, outline_derivative
-from legcal.observations.outlines import Outlines
 from legcal.simulation.cameras import cameras_around, sample_camera
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.studies.session import SimulatedSession, simulate_session
+from legcal.simulation.studies.paper import SimulatedSession, simulate_session
 from legcal.vision.camera import Camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))

@@ -18,10 +18,9 @@ from located import (
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import locate
+from legcal.calibration.location.model import ToolPoses, turned
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
-from legcal.location.pose_pairs import turned
-from legcal.location.tool_poses import ToolPoses
 
 
 def near_home(name: str, steps: Array) -> list[RigidTransform]:

@@ -13,10 +13,9 @@ from located import BASE, TOOL, Located, located, machine, motion_error, write_p
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Location, cli, load_location, load_mechanism, locate, write_location
+from legcal.calibration.location.document import location_document, with_frames, write_located_model
 from legcal.errors import DatasetError, ModelError, UsageError
-from legcal.location.document import location_document
-from legcal.location.urdf_frames import with_frames, write_located_model
-from legcal.mechanism.closing import platform_pose
+from legcal.machine.closing import platform_pose
 
 
 @pytest.fixture(scope="module")

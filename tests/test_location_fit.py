@@ -20,21 +20,20 @@ from located import (
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array
-from legcal.location import closed_form
-from legcal.location.fit import Fit, fit
-from legcal.location.model_errors import PlatformMotions, motions_by_readings
-from legcal.location.noise import Noise
-from legcal.location.pose_pairs import (
+from legcal.calibration.location import fit as closed_form
+from legcal.calibration.location.fit import Fit, fit, search
+from legcal.calibration.location.model import (
     Frames,
+    Noise,
     PosePairs,
     jacobian,
     predicted,
     residuals,
     turned,
 )
-from legcal.location.search import search
-from legcal.mechanism.kinematics import forward_kinematics
+from legcal.calibration.location.problem import PlatformMotions, motions_by_readings
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import forward_kinematics
 
 STATED = (np.array([SIGMA_POSITION, SIGMA_ANGLE]), (True, True))
 UNKNOWN = (np.array([1e-3, 1e-2]), (False, False))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from located import Located, located, machine, write_poses, write_rows
 
+from legcal.calibration.location.table import read_tool_poses
 from legcal.errors import DatasetError
-from legcal.location.poses_table import read_tool_poses
 
 Rows = list[dict[str, str]]
 

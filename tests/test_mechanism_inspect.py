@@ -10,11 +10,10 @@ import pytest
 from mechanisms import Layout, write_hexapod
 from rich.console import Console
 
-from legcal.authoring.create import create_model
-from legcal.authoring.families import Family, describe_family
-from legcal.mechanism.inspect import describe
-from legcal.mechanism.load import load_mechanism
-from legcal.report.inspect_table import inspect_table
+from legcal.machine.assembly import Family, create_model, describe_family
+from legcal.machine.document import describe
+from legcal.machine.load import load_mechanism
+from legcal.report.tables import inspect_table
 
 
 def _table(description: dict[str, object]) -> str:

@@ -22,11 +22,11 @@ from machines import MACHINES, of_types
 from thinned import thinned
 
 from legcal.errors import OutOfClass
-from legcal.mechanism.closing import readings_at
-from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
-from legcal.mechanism.leg import Leg
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
+from legcal.machine.closing import readings_at
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import Leg
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
 
 LAYOUTS = {
     "hung from the base": Layout(),

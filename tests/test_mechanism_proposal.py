@@ -12,8 +12,8 @@ from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 from thinned import thinned
 
 from legcal.errors import OutOfClass
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.proposal import _leg_names
+from legcal.machine.load import load_mechanism
+from legcal.machine.topology import _leg_names
 
 LAYOUTS = {
     "hung from the base": Layout(),

@@ -21,9 +21,10 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics, mobility
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
+from legcal.machine.closing import mobility
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -339,7 +340,7 @@ def test_without_a_home_sizes_beyond_reason_are_asked_about_at_once(
     scale: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if scale > 1.0:  # no home is looked for
-        monkeypatch.delattr("legcal.mechanism.load.closed_home")
+        monkeypatch.delattr("legcal.machine.load.closed_home")
     machine = geometry()
     A, B, q0 = scale * machine.A, scale * machine.B, scale * machine.q0
     scaled = Geometry(A, B, q0, machine.home, (0.0, 0.15 * scale))

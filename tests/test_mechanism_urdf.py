@@ -7,8 +7,8 @@ import pytest
 from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
 from legcal.errors import ModelError
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.urdf import read_urdf
+from legcal.machine.load import load_mechanism
+from legcal.machine.urdf import read_urdf
 
 SHIPPED = SHIPPED_URDF.read_text()
 LIMIT = '<limit lower="-0.004" upper="0.144" effort="1000" velocity="1"/>'

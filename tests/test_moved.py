@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
+from legcal.calibration.changes import (
+    Change,
+    Movement,
+    difference,
+    judge_movement,
+    possible_changes,
+)
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parametrization import geometries, parametrization_of
-from legcal.refinement.changes import Change, possible_changes
-from legcal.refinement.moved import Movement, difference, judge_movement
+from legcal.machine.load import load_mechanism
+from legcal.machine.parameters import geometries, parametrization_of
 
 N = 6
 PRIOR = np.array([5e-3, 5e-3, 5e-3, 5e-3, 0.05, 0.05])

@@ -15,16 +15,18 @@ from repeated_images import RepeatedImages, repeated_images
 from rich.console import Console
 
 from legcal import cli
-from legcal.dataset.folder import load_dataset
+from legcal.calibration.noise import (
+    QUANTITIES,
+    Noise,
+    find_repeats,
+    measure_noise,
+    noise_document,
+    noise_notes,
+)
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
-from legcal.mechanism.load import load_mechanism
-from legcal.repeatability.document import noise_document
-from legcal.repeatability.noise import measure_noise
-from legcal.repeatability.notes import noise_notes
-from legcal.repeatability.quantities import QUANTITIES
-from legcal.repeatability.repeats import find_repeats
-from legcal.repeatability.result import Noise
-from legcal.report.noise_table import noise_table
+from legcal.machine.load import load_mechanism
+from legcal.report.tables import noise_table
 
 FLAT = "images/p1_2.png"  # shows nothing
 
@@ -55,7 +57,7 @@ def spoiled(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     """Run the command in this process, without others, and return its exit code."""
-    monkeypatch.setattr("legcal.cli.noise.MOST_WORKERS", 1)
+    monkeypatch.setattr("legcal.cli.commands.MOST_WORKERS", 1)
     monkeypatch.setattr(sys, "argv", ["legcal", "noise", *map(str, words)])
     with pytest.raises(SystemExit) as stop:
         cli.main()

@@ -10,12 +10,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
+from legcal.data.measurements import View
+from legcal.data.outlines import (
+    COLUMNS,
+    ENCODING,
+    QUALITY,
+    Outlines,
+    no_outlines,
+    read_observations,
+    reject_unused_legs,
+    row_names,
+    write_observations,
+)
 from legcal.errors import DatasetError
-from legcal.observations.measurements import View
-from legcal.observations.outlines import ENCODING, QUALITY, Outlines
-from legcal.observations.row import COLUMNS
-from legcal.observations.sets import no_outlines, reject_unused_legs
-from legcal.observations.table import read_observations, row_names, write_observations
 
 FAST = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -11,15 +11,14 @@ import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.detect import Method, detect_outlines
-from legcal.detection.outline import outline_parts
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.mechanism.leg import Cylinder
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
-from legcal.recognition.recognise import recognise
-from legcal.recognition.recognised import shifted
-from legcal.recognition.searching import Search
+from legcal.machine.leg import Cylinder
+from legcal.perception.detection import Method, detect_outlines
+from legcal.perception.outline import outline_parts
+from legcal.perception.recognise import recognise, shifted
+from legcal.perception.search import Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -330,8 +329,8 @@ def test_tube_and_rod_are_two_parts() -> None:
 
 def test_the_sample_is_detected_from_its_nominal_model() -> None:
     """Nine of the photographs; the benchmark sample_outlines.py measures all of them."""
-    from legcal.dataset.folder import load_dataset
-    from legcal.mechanism.kinematics import forward_kinematics
+    from legcal.data.dataset import load_dataset
+    from legcal.machine.kinematics import forward_kinematics
 
     folder = ROOT / "examples" / "hexapod"
     dataset = load_dataset(folder)

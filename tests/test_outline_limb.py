@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from legcal.detection.fit import estimate_blur, fit_blocks
-from legcal.detection.limb import N_BASIS, Samples, basis
+from legcal.perception.limb import N_BASIS, Samples, basis
+from legcal.perception.straight import estimate_blur, fit_blocks
 
 HALF_WIDTH = 14.0
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from legcal.detection.pieces import END_COVER, Piece, visible_pieces
-from legcal.mechanism.leg import Cylinder
+from legcal.machine.leg import Cylinder
+from legcal.vision.in_view import END_COVER, Piece, visible_pieces
 
 
 def tube(radius: float = 0.012) -> Cylinder:

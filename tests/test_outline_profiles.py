@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from legcal.detection.band import Band
-from legcal.detection.limb import Samples
-from legcal.detection.profiles import Edge, Profiles, read_profiles
+from legcal.perception.limb import Samples
+from legcal.perception.profiles import Edge, Profiles, read_profiles
 from legcal.vision.camera import Camera
+from legcal.vision.in_view import Band
 
 CAMERA = Camera(
     np.array([[500.0, 0.0, 200.0], [0.0, 500.0, 150.0], [0.0, 0.0, 1.0]]),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from legcal.detection.straight import (
+from legcal.perception.straight import (
     COMMON_BIAS,
     TILT_BIAS,
     StraightFit,

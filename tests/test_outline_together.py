@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from legcal.detection import pool
-from legcal.detection.blocks import Blocks
-from legcal.detection.limb import Samples
-from legcal.detection.pooled import fit_together
-from legcal.detection.powers import (
+from legcal.geometry.types import Array
+from legcal.perception import limb_fit as pool
+from legcal.perception.limb import (
     HALF,
     LESS_HALF,
+    N_AMPLITUDES,
     N_POWERS,
     RAMP,
     SQUARE,
     STEP,
     THREE_HALVES,
+    Samples,
     powers,
+    profile_functions,
 )
-from legcal.detection.response import to_light
-from legcal.detection.shading import N_AMPLITUDES, profile_functions
-from legcal.geometry.types import Array
+from legcal.perception.limb_fit import Blocks, fit_together
+from legcal.perception.picture import to_light
 
 HALF_WIDTH, DEPTH = 15.0, 3.5
 BRIGHT = np.array([20.0, 0.0, 120.0, 90.0, -60.0, 0.0, 0.0])

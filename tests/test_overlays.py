@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from legcal.detection.prediction import PredictedLeg, predict_legs
+from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import Cylinder
-from legcal.observations.outlines import Outlines
-from legcal.overlays.drawing import COLOURS, draw
-from legcal.overlays.figures import HIDDEN_LEG, reason_class
-from legcal.overlays.labels import LabelPlaces
-from legcal.overlays.marks import Mark, PartMarks, marks_of_image, short_reason
+from legcal.machine.leg import Cylinder
+from legcal.perception.drawing import (
+    COLOURS,
+    LabelPlaces,
+    Mark,
+    PartMarks,
+    draw,
+    marks_of_image,
+    short_reason,
+)
+from legcal.perception.overview import HIDDEN_LEG, reason_class
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
+from legcal.vision.in_view import PredictedLeg, predict_legs
 
 A, B, RADIUS = np.array([-0.30, 0.22, 0.8]), np.array([0.25, 0.21, 0.9]), 0.012
 NAMES = ("leg1",)

@@ -13,18 +13,16 @@ from scipy.spatial.transform import Rotation
 from legcal import load_mechanism
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.mechanism.equations import linearize
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.parameters import parameter_names, to_vector
-from legcal.mechanism.parametrization import (
+from legcal.machine.equations import linearize
+from legcal.machine.leg import LegGeometry, LegKind, parameter_names, to_vector
+from legcal.machine.parameters import (
     Parametrization,
     geometries,
     parametrization_of,
     parametrize,
     vector_of,
 )
-from legcal.mechanism.sensitivity import pose_equations, pose_sensitivity
+from legcal.machine.sensitivity import pose_equations, pose_sensitivity
 
 FAST = settings(deadline=None, max_examples=15)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -7,10 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.recognition.agreement import Picture, Poses
-from legcal.recognition.mirror import is_mirrored, may_be_mirrored, mirrored
-from legcal.recognition.place import _reversed, place_camera, place_near
-from legcal.recognition.placed import Placed
+from legcal.perception.agreement import Picture, Poses
+from legcal.perception.camera_search import (
+    Placed,
+    _reversed,
+    is_mirrored,
+    may_be_mirrored,
+    mirrored,
+    place_camera,
+    place_near,
+)
 
 HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
 

@@ -9,15 +9,14 @@ from parameter_steps import random_covariance, written_with
 from thinned import thinned
 
 from legcal import evaluate
+from legcal.estimation.platform import PlatformAccuracy, platform_accuracy
+from legcal.estimation.solution import Sensitivity
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.kinematics import forward_kinematics_many
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries, parametrization_of
-from legcal.mechanism.platform import platform_in_base, pose_differences
-from legcal.refinement.platform_accuracy import PlatformAccuracy, platform_accuracy
-from legcal.refinement.solution import Sensitivity
+from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries, parametrization_of
+from legcal.machine.poses import random_configurations
 
 
 def _accuracy(
@@ -88,7 +87,7 @@ def test_without_a_workspace_errors_are_told_at_the_readings(
 ) -> None:
     nominal = load_mechanism("hexapod")
     q = random_configurations(nominal, 2, 0).readings
-    monkeypatch.setattr("legcal.mechanism.configurations.NEARER", np.zeros(0))
+    monkeypatch.setattr("legcal.machine.poses.NEARER", np.zeros(0))
     accuracy = _accuracy(nominal, nominal, q, np.eye(30), Sensitivity("anything", np.ones((30, 1))))
     assert accuracy.workspace is None
     assert len(accuracy.effects[0].error.displacement) == 2

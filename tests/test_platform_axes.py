@@ -10,20 +10,18 @@ from scipy.spatial.transform import Rotation
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.mechanism.equations import linearize
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import Demand, LegGeometry
-from legcal.stages.motion import moved_points
-from legcal.stages.passive_legs import locate_passive_end
-from legcal.stages.platform_axes import fixed_direction, revolute_axis
-from legcal.stages.platform_residuals import (
+from legcal.machine.equations import linearize
+from legcal.machine.leg import Demand, LegGeometry, LegKind
+from legcal.paper.platform_joints import fixed_direction, locate_passive_end, revolute_axis
+from legcal.paper.platform_pose import (
     closure_of_leg,
     fixed_on_platform,
     length_of_leg,
     revolute_on_platform,
     twist_of_leg,
 )
-from legcal.stages.platform_unknowns import turned_axis
+from legcal.paper.platform_problem import turned_axis
+from legcal.paper.solver import moved_points
 
 KINDS = [("U", "U"), ("U", ""), ("R", "U"), ("U", "R"), ("R", "R")]
 

@@ -8,21 +8,20 @@ import pytest
 from parameter_steps import random_covariance, written_with
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array
-from legcal.mechanism.configurations import random_configurations
-from legcal.mechanism.kinematics import forward_kinematics_many
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries, parametrization_of, parametrize
-from legcal.mechanism.platform import platform_in_base
-from legcal.refinement.platform_error import (
+from legcal.estimation.platform import (
     PlatformError,
     expected_error,
     moved_by,
     platform_by_parameters,
     predict_platform_error,
 )
+from legcal.geometry.types import Array
+from legcal.machine.kinematics import forward_kinematics_many, platform_in_base
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries, parametrization_of, parametrize
+from legcal.machine.poses import random_configurations
 
 MACHINES = ("hexapod-rod", "hexapod-strut", "3-rpr", "3-rps", "3-spr", "3-upu-tilted", "tricept")
 

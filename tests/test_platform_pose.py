@@ -9,10 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
-from legcal.stages.least_squares import structure_jacobian, structure_residuals
-from legcal.stages.leg_directions import LegDirections
-from legcal.stages.motion import moved, register_groups, register_in_plane
-from legcal.stages.platform_pose import (
+from legcal.paper.leg_directions import LegDirections
+from legcal.paper.platform_pose import (
     PlatformPoses,
     build_rays,
     check_located,
@@ -20,7 +18,14 @@ from legcal.stages.platform_pose import (
     locate_platform,
     register_by_rays,
 )
-from legcal.stages.platform_unknowns import turned_axis, turns_of
+from legcal.paper.platform_problem import turned_axis, turns_of
+from legcal.paper.solver import (
+    moved,
+    register_groups,
+    register_in_plane,
+    structure_jacobian,
+    structure_residuals,
+)
 
 B_RE = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.1, 0.25, 0.0], [0.2, 0.1, 0.05]])
 N_POSES = 3

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.recognition.agreement import (
+from legcal.perception.agreement import (
     Agreement,
     Picture,
     Poses,

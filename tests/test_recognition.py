@@ -9,21 +9,16 @@ from numpy.random import Generator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import load_mechanism
+from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, Image
-from legcal.mechanism.kinematics import forward_kinematics
-from legcal.mechanism.model import Mechanism
-from legcal.observations.measurements import Measurements, View
-from legcal.recognition import recognise as recognising
-from legcal.recognition.agreement import Picture, Poses, agreement, improved
-from legcal.recognition.bars import Bars, find_bars
-from legcal.recognition.place import place_camera, place_near
-from legcal.recognition.placed import Placed
-from legcal.recognition.recognise import recognise
-from legcal.recognition.recognised import Recognised
-from legcal.recognition.searching import Search
-from legcal.recognition.segments import Segments, find_segments
-from legcal.recognition.starts import pose_starts
-from legcal.recognition.targets import Targets, targets_of
+from legcal.machine.kinematics import forward_kinematics
+from legcal.machine.model import Mechanism
+from legcal.perception import recognise as recognising
+from legcal.perception.agreement import Picture, Poses, Targets, agreement, improved, targets_of
+from legcal.perception.bars import Bars, Segments, find_bars, find_segments
+from legcal.perception.camera_search import Placed, place_camera, place_near, pose_starts
+from legcal.perception.recognise import Recognised, recognise
+from legcal.perception.search import Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

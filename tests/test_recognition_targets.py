@@ -3,8 +3,8 @@
 import leg_pictures as lp
 import numpy as np
 
-from legcal.mechanism.leg import Cylinder
-from legcal.recognition.targets import targets_of
+from legcal.machine.leg import Cylinder
+from legcal.perception.agreement import targets_of
 
 
 def test_pieces_lie_on_their_legs_and_make_up_all_that_is_seen_of_them() -> None:

@@ -8,16 +8,16 @@ from axes_session import AxesSession, axes_session
 from hexapod_session import disturbed_start, joint_errors, simulate
 from thinned import thinned
 
+from legcal.data.axes import LegAxes, axes_from_outlines, choose_axes
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.observations.leg_axes import LegAxes, axes_from_outlines, choose_axes
-from legcal.observations.measurements import Measurements
-from legcal.observations.sets import no_outlines
-from legcal.refinement import Solution, build_fit, refine
-from legcal.refinement.bound import average_images, bound
-from legcal.refinement.linearize import linearize
-from legcal.refinement.observed_axes import observed_axes
-from legcal.refinement.problem import FitProblem
-from legcal.refinement.solution import joints_of
+from legcal.estimation.build import build_fit
+from legcal.estimation.cramer_rao import average_images, bound
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.observations import observed_axes
+from legcal.estimation.problem import FitProblem, linearize
+from legcal.estimation.solution import Solution, joints_of
 
 
 @pytest.fixture(scope="module")

@@ -7,16 +7,17 @@ import pytest
 from board_session import BOARD, SIGMA_PX, corners_of, place_of_board, with_board
 from machine_session import LENS, MachineSession, machine_session
 
+from legcal.data.measurements import Measurements, View
 from legcal.errors import DidNotConverge
+from legcal.estimation.build import build_fit
+from legcal.estimation.choices import Choices, Prior
+from legcal.estimation.constraints import Start
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.parameters import BOARD_SCALE
+from legcal.estimation.problem import corner_rows
+from legcal.estimation.solution import Solution
 from legcal.geometry.types import Array
-from legcal.mechanism.parametrization import vector_of
-from legcal.observations.measurements import Measurements, View
-from legcal.refinement import build_fit, refine
-from legcal.refinement.choices import Choices, Prior
-from legcal.refinement.known_parameters import BOARD_SCALE
-from legcal.refinement.linearize import corner_rows
-from legcal.refinement.solution import Solution
-from legcal.refinement.start import Start
+from legcal.machine.parameters import vector_of
 from legcal.vision.board import Board
 
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from machine_session import LENS, MachineSession, machine_session
 
+from legcal.data.measurements import View
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.observations.measurements import View
-from legcal.refinement import Solution, refine
-from legcal.refinement.choices import NO_CHOICES, Choices, Prior
-from legcal.vision.intrinsics import with_intrinsics
+from legcal.estimation.choices import NO_CHOICES, Choices, Prior
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.solution import Solution
+from legcal.vision.camera import with_intrinsics
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,12 @@ from machine_session import MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import moved_legs
-from legcal.refinement import FittedLegs, Solution, Start, refine
+from legcal.estimation.constraints import Start
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.solution import Solution
+from legcal.estimation.state import FittedLegs
+from legcal.machine.leg import LegGeometry
+from legcal.machine.parameters import moved_legs
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
 SCALE = 2.5

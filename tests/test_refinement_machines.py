@@ -7,23 +7,23 @@ import pytest
 from dense_fit import allowed, by_differences, kept_move, residuals
 from machine_session import SHIPPED, MachineSession, machine_session
 
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import Session
+from legcal.estimation.build import build_fit
+from legcal.estimation.choices import Choices, Prior
+from legcal.estimation.constraints import with_values
+from legcal.estimation.cramer_rao import bound
+from legcal.estimation.determinacy import open_directions
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.noise import NoiseModel
+from legcal.estimation.normal import information
+from legcal.estimation.problem import linearize, named_values
+from legcal.estimation.rounds import first_minimum
+from legcal.estimation.solution import Solution
+from legcal.estimation.state import DEFAULT_SETTINGS, FittedLegs, State, components
 from legcal.geometry.types import Array
-from legcal.identify.ranks import Analysis
-from legcal.identify.session import Session
-from legcal.mechanism.parameters import radius_name
-from legcal.mechanism.parametrization import parametrize
-from legcal.refinement import FittedLegs, Solution, build_fit, refine
-from legcal.refinement.bound import bound
-from legcal.refinement.choices import Choices, Prior
-from legcal.refinement.determinacy import open_directions
-from legcal.refinement.linearize import linearize
-from legcal.refinement.noise import NoiseModel
-from legcal.refinement.normal import information
-from legcal.refinement.priors import named_values
-from legcal.refinement.rounds import first_minimum
-from legcal.refinement.settings import DEFAULT_SETTINGS
-from legcal.refinement.start import with_values
-from legcal.refinement.state import State, components
+from legcal.machine.leg import radius_name
+from legcal.machine.parameters import parametrize
 
 
 def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> Session:

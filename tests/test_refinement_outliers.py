@@ -8,8 +8,9 @@ import pytest
 from machine_session import MachineSession, machine_session, shifted
 from thinned import thinned
 
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.solution import Solution
 from legcal.geometry.types import Array, BoolArray
-from legcal.refinement import Solution, refine
 
 SHARE = 0.2
 N_SEEDS = 2

@@ -20,18 +20,13 @@ from hexapod_session import (
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.estimation.joint_fit import refine, refine_from_best
+from legcal.estimation.solution import Solution, joints_of
+from legcal.estimation.state import FittedLegs, RefinementSettings
 from legcal.geometry.types import Array
-from legcal.mechanism.parameters import KinematicParameters
-from legcal.observations.measurements import Measurements
-from legcal.observations.outlines import Outlines
-from legcal.refinement import (
-    FittedLegs,
-    RefinementSettings,
-    Solution,
-    refine,
-    refine_from_best,
-)
-from legcal.refinement.solution import joints_of
+from legcal.machine.leg import KinematicParameters
 
 
 @pytest.fixture(scope="module")

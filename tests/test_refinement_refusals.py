@@ -17,20 +17,15 @@ from hexapod_session import (
     simulate,
 )
 
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.geometry.frames import motion_from_xyz_quat
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
-from legcal.refinement import (
-    cameras_from_hints,
-    fitted_legs,
-    platform_poses,
-    refine,
-    refine_from_best,
-    start_from,
-)
+from legcal.estimation.constraints import cameras_from_hints, platform_poses, start_from
+from legcal.estimation.joint_fit import refine, refine_from_best
+from legcal.estimation.state import fitted_legs
+from legcal.geometry.motions import motion_from_xyz_quat
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
 
 
 @pytest.fixture(scope="module")

@@ -7,21 +7,20 @@ import pytest
 from hexapod_session import FRAME_LEGS, LENS, PINHOLE, Session, disturbed_start, simulate
 from scipy.spatial.transform import Rotation
 
-from legcal.geometry.types import Array
-from legcal.refinement import build_fit
-from legcal.refinement.linearize import linearize, offsets_of
-from legcal.refinement.loss import cost_of, efficiency, weights, width_to_k
-from legcal.refinement.problem import FitProblem
-from legcal.refinement.residuals import (
+from legcal.estimation.build import build_fit
+from legcal.estimation.constraints import Start
+from legcal.estimation.loss import cost_of, efficiency, weights, width_to_k
+from legcal.estimation.problem import FitProblem, linearize, offsets_of
+from legcal.estimation.residuals import (
     Residual,
+    Rows,
     axis_residual,
     encoder_residual,
     outline_residual,
     prior_residual,
 )
-from legcal.refinement.rows import Rows
-from legcal.refinement.start import Start
-from legcal.refinement.state import State, cayley, turned
+from legcal.estimation.state import State, cayley, turned
+from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

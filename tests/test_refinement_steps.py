@@ -8,21 +8,24 @@ from dense_fit import allowed, by_differences, jacobian, kept_move, residuals, v
 from machine_session import LENS, PINHOLE, MachineSession, machine_session
 from thinned import thinned
 
+from legcal.data.axes import axes_from_outlines
+from legcal.estimation import solver
+from legcal.estimation.biases import N_KINDS, SharedShifts
+from legcal.estimation.build import build_fit
+from legcal.estimation.choices import Choices, Prior
+from legcal.estimation.constraints import on_constraints, tangent
+from legcal.estimation.noise import NoiseModel
+from legcal.estimation.normal import normal_equations
+from legcal.estimation.problem import (
+    FitProblem,
+    linearize,
+    named_jacobian,
+    named_values,
+    with_biases,
+)
+from legcal.estimation.residuals import Rows
+from legcal.estimation.state import State
 from legcal.geometry.types import Array
-from legcal.observations.leg_axes import axes_from_outlines
-from legcal.refinement import build_fit
-from legcal.refinement import minimise as solver
-from legcal.refinement.biases import N_KINDS, SharedShifts
-from legcal.refinement.choices import Choices, Prior
-from legcal.refinement.constraints import on_constraints, tangent
-from legcal.refinement.linearize import linearize
-from legcal.refinement.noise import NoiseModel
-from legcal.refinement.normal import normal_equations
-from legcal.refinement.priors import named_jacobian, named_values
-from legcal.refinement.problem import FitProblem
-from legcal.refinement.rows import Rows
-from legcal.refinement.shifted import with_biases
-from legcal.refinement.state import State
 
 K = 0.1
 BOUND = ("3-rps", "3-upu-tilted", "tricept", "3-rpr", "hexapod-rod")

@@ -10,17 +10,21 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.simulation.dressing import dressed
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.rays import PixelRays
 from legcal.simulation.rendering.scene import prepare_scene, render
-from legcal.simulation.shapes import Box, Cylinder, Mesh, Shape, Sphere
 from legcal.simulation.solids import (
+    Box,
+    Cylinder,
     Material,
+    Mesh,
     PlacedSolid,
+    Shape,
     Solid,
+    Sphere,
+    dressed,
     link_poses,
     placed,
     solids_of,

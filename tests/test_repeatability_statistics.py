@@ -5,16 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from legcal.calibration.noise import (
+    QUANTITIES,
+    AxisValues,
+    Repeats,
+    Sample,
+    Spread,
+    axis_values,
+    leg_orientations,
+    pool,
+    sample_of,
+)
+from legcal.data.axes import LegAxes, axes_from_outlines, outline_derivative
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.mechanism.leg import Cylinder, Leg, LegKind
-from legcal.observations.leg_axes import LegAxes, axes_from_outlines, outline_derivative
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
-from legcal.repeatability.quantities import QUANTITIES, AxisValues, axis_values
-from legcal.repeatability.repeats import Repeats
-from legcal.repeatability.samples import leg_orientations
-from legcal.repeatability.spread import Sample, Spread, pool, sample_of
+from legcal.machine.leg import Cylinder, Leg, LegKind
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

@@ -6,11 +6,11 @@ from dataset_folder import Folder, folder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from legcal.dataset.folder import load_dataset
-from legcal.detection.fit import fit_blocks
-from legcal.detection.limb import Samples, basis
-from legcal.detection.response import to_light
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError
+from legcal.perception.limb import Samples, basis
+from legcal.perception.picture import to_light
+from legcal.perception.straight import fit_blocks
 
 __all__ = ["folder"]
 BLUR, HALF_WIDTH, WHITE = 0.6, 14.0, 255.0

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from rendering import Bar, Light, render
 
-from legcal.detection.picture import Grey, to_grey
 from legcal.geometry.types import Array
-from legcal.recognition.segments import Segments, find_segments
+from legcal.perception.bars import Segments, find_segments
+from legcal.perception.picture import Grey, to_grey
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

@@ -14,12 +14,12 @@ from hexapod_session import (
 from thinned import thinned
 
 from legcal.errors import DidNotConverge
-from legcal.refinement.biases import possible_shifts
-from legcal.refinement.observed import observed_outlines
-from legcal.refinement.refine import refine
-from legcal.refinement.settings import DEFAULT_SETTINGS, RefinementSettings
-from legcal.refinement.settling import NO_CHANGES, Changes, unsettled
-from legcal.refinement.solution import Solution
+from legcal.estimation.biases import possible_shifts
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.observations import observed_outlines
+from legcal.estimation.rounds import NO_CHANGES, Changes, unsettled
+from legcal.estimation.solution import Solution
+from legcal.estimation.state import DEFAULT_SETTINGS, RefinementSettings
 
 
 @pytest.fixture(scope="module")

@@ -15,17 +15,16 @@ from hexapod_session import (
     simulate,
 )
 
+from legcal.data.outlines import Outlines
+from legcal.estimation.biases import KINDS, N_KINDS, estimated_shifts, possible_shifts
+from legcal.estimation.build import build_fit
+from legcal.estimation.influence import scores_of_shifts, with_shifts
+from legcal.estimation.joint_fit import refine
+from legcal.estimation.noise import NoiseModel
+from legcal.estimation.observations import ObservedOutlines, observed_outlines
+from legcal.estimation.problem import linearize, with_biases
+from legcal.estimation.variances import Effects, estimate_variances
 from legcal.geometry.types import Array
-from legcal.observations.outlines import Outlines
-from legcal.refinement.bias_scores import scores_of_shifts, with_shifts
-from legcal.refinement.biases import KINDS, N_KINDS, estimated_shifts, possible_shifts
-from legcal.refinement.build import build_fit
-from legcal.refinement.linearize import linearize
-from legcal.refinement.noise import NoiseModel
-from legcal.refinement.observed import ObservedOutlines, observed_outlines
-from legcal.refinement.refine import refine
-from legcal.refinement.shifted import with_biases
-from legcal.refinement.variances import Effects, estimate_variances
 
 LEAST_GAIN = 25.0
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from legcal.errors import NotVisible
-from legcal.simulation.silhouette import contact_offsets, silhouette
+from legcal.simulation.visibility import contact_offsets, silhouette
 from legcal.vision.cylinder import outlines_of_axis
 
 PLACES = st.tuples(*[st.floats(-1.0, 1.0)] * 5, st.floats(0.3, 3.0), st.floats(0.001, 0.2))

@@ -12,13 +12,8 @@ from simulated import files_of, settings, small_camera
 
 import legcal
 from legcal.errors import OutOfResources, UsageError
-from legcal.simulation.folder import (
-    TRUTH_NAME,
-    check_dataset_destination,
-    dataset_folder,
-)
-from legcal.simulation.simulate import simulate
-from legcal.simulation.summary import summary_table
+from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
+from legcal.simulation.session import simulate, summary_table
 
 FEW = settings(poses=1, views=1)
 OWN = ("dataset.yaml", "images/c1_p01.png", "models/a.yaml", "truth/models/a.yaml")
@@ -236,6 +231,6 @@ def test_the_python_of_the_description_of_simulated_datasets_runs(
     assert 1e-4 < names["apart"].displacement.mean() < 2e-3
 
 
-@pytest.mark.parametrize("name", legcal.__all__)
+@pytest.mark.parametrize("name", dir(legcal))
 def test_every_public_name_is_found(name: str) -> None:
     assert getattr(legcal, name) is not None

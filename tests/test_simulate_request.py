@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 
 from legcal.errors import UsageError
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.simulation.poses import Sampling
 from legcal.simulation.request import Request, requested
 from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.truth import Distribution, ParameterErrors, Spread
 
 
 def test_the_defaults_are_those_that_the_help_names() -> None:

@@ -10,19 +10,18 @@ import numpy as np
 import pytest
 from boards import CHARUCO
 
-from legcal.dataset.board_entry import described_board
-from legcal.dataset.folder import load_dataset
+from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.geometry.frames import motion_from_xyz_quat
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.observations.board_poses import camera_poses
-from legcal.simulation.board_choice import chosen_board
+from legcal.geometry.motions import motion_from_xyz_quat
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.perception.boards import camera_poses
+from legcal.simulation.board import chosen_board
 from legcal.simulation.request import Request, requested
+from legcal.simulation.session import simulate
 from legcal.simulation.settings import Level, SimulationSettings
-from legcal.simulation.simulate import simulate
-from legcal.vision.board import Board
-from legcal.vision.corner_search import find_corners
+from legcal.vision.board import Board, described_board
+from legcal.vision.corners import find_corners
 
 
 @cache

@@ -8,15 +8,14 @@ import pytest
 from simulated import settings
 from thinned import thinned
 
-from legcal.dataset.folder import Dataset, load_dataset
+from legcal.data.dataset import Dataset, load_dataset
+from legcal.data.outlines import Outlines, read_observations
 from legcal.geometry.types import Array
-from legcal.observations.outlines import Outlines
-from legcal.observations.table import read_observations
 from legcal.simulation.rendering.appearance import Appearance
+from legcal.simulation.session import simulate
 from legcal.simulation.settings import Level
-from legcal.simulation.simulate import simulate
 from legcal.vision.camera import Camera
-from legcal.vision.camera_writer import camera_info
+from legcal.vision.camera_file import camera_info
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

@@ -15,16 +15,20 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.closing import leg_vectors
-from legcal.mechanism.configurations import REGULAR, Configurations
-from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.singularity import side, singularity
-from legcal.simulation.clearance import Clearance, segment_distance
-from legcal.simulation.extremes import JITTER, are_extreme
-from legcal.simulation.motion import draw_poses, given_poses
+from legcal.machine.closing import leg_vectors
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import REGULAR, Configurations, side, singularity
+from legcal.simulation.poses import (
+    JITTER,
+    Clearance,
+    are_extreme,
+    draw_poses,
+    given_poses,
+    segment_distance,
+)
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel

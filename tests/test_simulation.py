@@ -11,17 +11,22 @@ from staged_hexapods import exact_session, noisy_session
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.lines import moment
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parameters import to_vector
+from legcal.machine.leg import to_vector
+from legcal.machine.load import load_mechanism
 from legcal.simulation.cameras import cameras_around, look_at, sample_camera
-from legcal.simulation.extremes import JITTER
-from legcal.simulation.forward import follow_from_home, solve_poses
-from legcal.simulation.leg_vectors import leg_vectors
-from legcal.simulation.machine import hexapod, perturb
+from legcal.simulation.machine import (
+    extreme_poses,
+    follow_from_home,
+    hexapod,
+    leg_vectors,
+    perturb,
+    random_poses,
+    solve_poses,
+)
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.poses import extreme_poses, random_poses
+from legcal.simulation.poses import JITTER
+from legcal.simulation.studies.paper import simulate_session
 from legcal.simulation.table_noise import TableNoise
-from legcal.studies.session import simulate_session
 
 
 def test_the_hexapod_in_memory_is_the_shipped_one() -> None:
@@ -118,7 +123,7 @@ def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: boo
 def test_a_machine_that_reaches_no_pose_of_its_travel_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("legcal.simulation.poses._ROUNDS", 20)
+    monkeypatch.setattr("legcal.simulation.machine._ROUNDS", 20)
     machine = replace(hexapod(), travel=np.tile([[0.1, 0.1], [0.9, 0.9]], (3, 1)))
     with pytest.raises(DidNotConverge, match="Only 0 of 2 random poses"):
         extreme_poses(machine, 2, np.random.default_rng(0))

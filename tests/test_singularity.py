@@ -11,13 +11,13 @@ from mechanisms import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.mechanism.closing import leg_vectors
-from legcal.mechanism.demands import demands_at, moved
-from legcal.mechanism.kinematics import Follower, forward_kinematics, inverse_kinematics
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.singularity import dimensionless, side, singularity
+from legcal.machine.closing import leg_vectors
+from legcal.machine.equations import demands_at, moved
+from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import dimensionless, side, singularity
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 

@@ -9,12 +9,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.simulation.dressing import dressed
-from legcal.simulation.motion import draw_poses
-from legcal.simulation.shapes import Box, Cylinder, Mesh, Sphere
-from legcal.simulation.solids import link_poses, placed, solids_of
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.simulation.poses import draw_poses
+from legcal.simulation.solids import (
+    Box,
+    Cylinder,
+    Mesh,
+    Sphere,
+    dressed,
+    link_poses,
+    placed,
+    solids_of,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(p.stem for p in (ROOT / "models").glob("*.yaml"))

@@ -15,10 +15,9 @@ from legcal import load_mechanism
 from legcal.cli import main
 from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries
-from legcal.report.model_files import write_model
-from legcal.report.urdf import reload_and_check, write_calibrated_yaml, write_urdf
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries
+from legcal.machine.written import reload_and_check, write_calibrated_yaml, write_model, write_urdf
 
 MACHINES = ("hexapod", "3-upu", "3-rpr", "tricept", "hexapod-strut")
 

@@ -6,14 +6,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.mechanism.chain import ClosedChain
-from legcal.mechanism.robot_xml import parse_xml
-from legcal.mechanism.sources.loops import close_loop
-from legcal.mechanism.sources.mjcf import closing_joints
-from legcal.mechanism.sources.mjcf_bodies import read_bodies
-from legcal.mechanism.sources.mjcf_tree import MjcfTree
-from legcal.mechanism.sources.mjcf_values import Values
-from legcal.mechanism.urdf_checks import Problems
+from legcal.machine.chain import ClosedChain
+from legcal.machine.mjcf import MjcfTree, Values, closing_joints, read_bodies
+from legcal.machine.tree import close_loop
+from legcal.machine.urdf import Problems, parse_xml
 
 MODEL = """
 <mujoco model="feat">

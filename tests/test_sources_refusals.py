@@ -7,7 +7,7 @@ from mechanism_formats import mjcf, write_format
 
 from legcal import load_mechanism
 from legcal.errors import LegcalError, ModelError, OutOfClass
-from legcal.mechanism.sources.read import read_source
+from legcal.machine.formats import read_source
 
 HEXAPOD = load_mechanism("hexapod")
 MJCF = mjcf(HEXAPOD, "bodies")

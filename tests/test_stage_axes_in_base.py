@@ -9,22 +9,18 @@ from machine_session import PINHOLE
 from scipy.spatial.transform import RigidTransform, Rotation
 from staged_machines import Observed, made_up_base, seen_from, shipped, three_steps
 
+from legcal.data.axes import LegAxes
+from legcal.data.measurements import Measurements, View
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.observations.leg_axes import LegAxes
-from legcal.observations.measurements import Measurements, View
-from legcal.stages.base_unknowns import BaseUnknowns, turned_axis
-from legcal.stages.camera_starts import camera_starts
-from legcal.stages.joints_in_base import locate_joints_in_base
-from legcal.stages.joints_in_camera import locate_joints_in_cameras, oriented
-from legcal.stages.least_squares import structure_jacobian, structure_residuals
-from legcal.stages.leg_directions import select_axes
-from legcal.stages.nominal import NominalMechanism
-from legcal.stages.rigid_parts import build_rigid
-from legcal.stages.scalar_products import build_scalar_products
+from legcal.machine.leg import LegGeometry, LegKind
+from legcal.paper.base_unknowns import BaseUnknowns, camera_starts, turned_axis
+from legcal.paper.joints_in_base import build_rigid, build_scalar_products, locate_joints_in_base
+from legcal.paper.joints_in_camera import locate_joints_in_cameras, oriented
+from legcal.paper.leg_directions import select_axes
+from legcal.paper.nominal import NominalMechanism
+from legcal.paper.solver import structure_jacobian, structure_residuals
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 ACROSS = np.array([[0.3, 1.0, 0.0], [-0.2, 1.0, 0.1], [1.0, 0.2, 0.0], [0.1, 0.4, 1.0]])

@@ -9,12 +9,16 @@ from staged_machines import shipped
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.stages import meeting_axes, meeting_points
-from legcal.stages.joints_in_base import locate_joints_in_base
-from legcal.stages.joints_in_camera import locate_joints_in_cameras
-from legcal.stages.leg_directions import directions_through_joints, find_misses
-from legcal.stages.meeting_axes import turned
-from legcal.stages.meeting_points import derivative_of_miss, miss_of_joint
+from legcal.paper import joints_in_camera as meeting_axes
+from legcal.paper import joints_in_camera as meeting_points
+from legcal.paper.joints_in_base import locate_joints_in_base
+from legcal.paper.joints_in_camera import (
+    derivative_of_miss,
+    locate_joints_in_cameras,
+    miss_of_joint,
+    turned,
+)
+from legcal.paper.leg_directions import directions_through_joints, find_misses
 
 
 @pytest.mark.parametrize("name", ["3-rps", "3-rpr"])

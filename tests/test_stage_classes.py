@@ -7,14 +7,14 @@ import pytest
 from machine_session import SHIPPED
 from staged_machines import Observed, Steps, planned, shipped, three_steps
 
+from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import planned_session
 from legcal.errors import NotIdentifiable
-from legcal.identify.planned import planned_session
-from legcal.identify.ranks import Analysis
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.load import load_mechanism
-from legcal.stages.joints_in_base import locate_joints_in_base
-from legcal.stages.joints_in_camera import locate_joints_in_cameras
-from legcal.stages.nominal import Criteria
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.paper.joints_in_base import locate_joints_in_base
+from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.paper.nominal import Criteria
 
 FULL_RANK = ("3-rpr", "3-spr", "3-upu-tilted")  # of (9): in a plane, or three joints and no axis
 LIKE_HEXAPOD = ("nategh-agheli", "6-sps", "hexapod-strut")

@@ -8,14 +8,12 @@ from staged_hexapods import exact_session, five_millimetres_away
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.mechanism.parameters import KinematicParameters
+from legcal.machine.leg import KinematicParameters
+from legcal.paper.joints_in_base import JointsInBase, build_scalar_products, locate_joints_in_base
+from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.paper.nominal import Criteria
 from legcal.simulation.machine import Machine, hexapod
-from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
-from legcal.stages.joints_in_camera import locate_joints_in_cameras
-from legcal.stages.nominal import Criteria
-from legcal.stages.scalar_products import build_scalar_products
-from legcal.studies.estimators import nominal_of
-from legcal.studies.session import SimulatedSession
+from legcal.simulation.studies.paper import SimulatedSession, nominal_of
 
 
 def _locate(

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from staged_hexapods import exact_session, noisy_session
 
+from legcal.data.axes import LegAxes
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.observations.leg_axes import LegAxes
+from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
+from legcal.paper.leg_directions import select_axes
+from legcal.paper.nominal import Criteria
 from legcal.simulation.observe import OutlineNoise
-from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.stages.leg_directions import select_axes
-from legcal.stages.nominal import Criteria
-from legcal.studies.estimators import nominal_of
-from legcal.studies.session import SimulatedSession
+from legcal.simulation.studies.paper import SimulatedSession, nominal_of
 
 
 def _locate(session: SimulatedSession, axes: LegAxes, criteria: Criteria) -> JointsInCamera:

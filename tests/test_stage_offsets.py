@@ -10,20 +10,19 @@ from staged_machines import shipped, three_steps
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import BoolArray
-from legcal.mechanism.leg import LegKind
-from legcal.simulation.machine import Machine
-from legcal.simulation.observe import OutlineNoise
-from legcal.stages.joints_in_base import locate_joints_in_base
-from legcal.stages.joints_in_camera import locate_joints_in_cameras
-from legcal.stages.leg_directions import (
+from legcal.machine.leg import LegKind
+from legcal.paper.joints_in_base import locate_joints_in_base
+from legcal.paper.joints_in_camera import locate_joints_in_cameras
+from legcal.paper.leg_directions import (
     LegDirections,
     directions_through_joints,
     observed_directions,
 )
-from legcal.stages.nominal import Criteria
-from legcal.stages.offsets import build_consecutive, identify_offsets, leg_ends, pairs_apart
-from legcal.studies.estimators import nominal_of
-from legcal.studies.session import SimulatedSession
+from legcal.paper.nominal import Criteria
+from legcal.paper.offsets import build_consecutive, identify_offsets, leg_ends, pairs_apart
+from legcal.simulation.machine import Machine
+from legcal.simulation.observe import OutlineNoise
+from legcal.simulation.studies.paper import SimulatedSession, nominal_of
 
 
 def _directions(session: SimulatedSession, nominal: Machine, criteria: Criteria) -> LegDirections:

@@ -7,19 +7,18 @@ import pytest
 from staged_hexapods import exact_session, five_millimetres_away
 
 from legcal.errors import NotIdentifiable
-from legcal.mechanism.parameters import KinematicParameters
+from legcal.machine.leg import KinematicParameters
+from legcal.paper.four_steps import run_steps
+from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
+from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
+from legcal.paper.leg_directions import LegDirections, directions_through_joints, select_axes
+from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.offsets import Offsets, identify_offsets
+from legcal.paper.platform_joints import PlatformJoints, locate_platform_joints
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.stages.joints_in_base import JointsInBase, locate_joints_in_base
-from legcal.stages.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.stages.leg_directions import LegDirections, directions_through_joints, select_axes
-from legcal.stages.nominal import Criteria, NominalMechanism
-from legcal.stages.offsets import Offsets, identify_offsets
-from legcal.stages.platform_joints import PlatformJoints, locate_platform_joints
-from legcal.stages.run import run_steps
-from legcal.studies.estimators import nominal_of
-from legcal.studies.session import SimulatedSession, simulate_session
+from legcal.simulation.studies.paper import SimulatedSession, nominal_of, simulate_session
 
 
 @dataclass(frozen=True, eq=False)

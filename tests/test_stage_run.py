@@ -9,18 +9,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_session
 
+from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.geometry.types import IntArray
-from legcal.mechanism.parameters import KinematicParameters
-from legcal.observations.leg_axes import LegAxes, axes_from_outlines
-from legcal.simulation.machine import Machine
+from legcal.machine.leg import KinematicParameters
+from legcal.paper.four_steps import StagedResult, run_steps
+from legcal.paper.nominal import Criteria
+from legcal.simulation.machine import Machine, extreme_poses
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.poses import extreme_poses
+from legcal.simulation.studies.paper import SimulatedSession, nominal_of, platform_errors
 from legcal.simulation.table_noise import TableNoise
-from legcal.stages.nominal import Criteria
-from legcal.stages.run import StagedResult, run_steps
-from legcal.studies.eq20 import platform_errors
-from legcal.studies.estimators import nominal_of
-from legcal.studies.session import SimulatedSession
 
 
 def _run(

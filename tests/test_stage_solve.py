@@ -8,14 +8,17 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.stages.least_squares import (
+from legcal.paper.solver import (
     LeastSquares,
     Term,
+    moved,
+    moved_points,
+    register_groups,
+    register_points,
+    solve_least_squares,
     structure_jacobian,
     structure_residuals,
 )
-from legcal.stages.motion import moved, moved_points, register_groups, register_points
-from legcal.stages.solve import solve_least_squares
 
 
 def _line(outlier: float, robust: bool) -> LeastSquares:

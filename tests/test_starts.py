@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.recognition.agreement import Poses, agreement
-from legcal.recognition.starts import MOST, joined, pose_starts
+from legcal.perception.agreement import Poses, agreement
+from legcal.perception.camera_search import MOST, joined, pose_starts
 
 
 def _turns(poses: Poses, T: RigidTransform) -> tuple[Array, Array]:

@@ -10,29 +10,29 @@ from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, five_millimetres_away
 from staged_machines import Observed, planned, shipped, three_steps
 
+from legcal.calibration.identify.ranks import Analysis, determined
+from legcal.calibration.identify.session import planned_session
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.identify.planned import planned_session
-from legcal.identify.ranks import Analysis
-from legcal.identify.weak import determined
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parametrization import Parametrization, parametrize, vector_of
+from legcal.machine.leg import LegGeometry, LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.parameters import Parametrization, parametrize, vector_of
+from legcal.paper import platform_joints
+from legcal.paper.four_steps import StagedResult, run_steps
+from legcal.paper.nominal import Criteria
+from legcal.paper.platform_pose import Transformation
+from legcal.paper.platform_problem import build_rigid, rigid_problem
+from legcal.paper.solver import (
+    LeastSquares,
+    Solution,
+    solve_least_squares,
+    structure_jacobian,
+    structure_residuals,
+)
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.stages import platform_joints
-from legcal.stages.least_squares import LeastSquares, structure_jacobian, structure_residuals
-from legcal.stages.nominal import Criteria
-from legcal.stages.platform_pose import Transformation
-from legcal.stages.rigid_platform import build_rigid
-from legcal.stages.rigid_problem import rigid_problem
-from legcal.stages.run import StagedResult, run_steps
-from legcal.stages.solution import Solution
-from legcal.stages.solve import solve_least_squares
-from legcal.studies.estimators import nominal_of
-from legcal.studies.session import simulate_session
+from legcal.simulation.studies.paper import nominal_of, simulate_session
 
 LIKE_HEXAPOD = ("nategh-agheli", "6-sps", "hexapod-strut", "hexapod-rod")
 WITH_AXES = ("3-spr", "3-upu-tilted", "tricept")

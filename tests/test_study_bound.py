@@ -12,27 +12,35 @@ from test_cli import run
 from thinned import thinned
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.parametrization import vector_of
-from legcal.refinement.legs import FittedLegs
-from legcal.refinement.solution import Solution
-from legcal.studies import bound as bound_study
-from legcal.studies import convergence as convergence_study
-from legcal.studies.bound import BoundJudge
-from legcal.studies.bound_record import RunErrors, errors_record
-from legcal.studies.bound_statistics import BoundStatistics, BoundTally
-from legcal.studies.closed_poses import closed_poses, unmeasured
-from legcal.studies.convergence import ConvergenceJudge
-from legcal.studies.outline_bound import Bound, bound_of
-from legcal.studies.outline_design import OutlineDesign, design_of
-from legcal.studies.outline_estimate import errors_of, nominal_start, one_fit
-from legcal.studies.outline_experiment import OutlineExperiment
-from legcal.studies.outline_figures import band_of_ratio
-from legcal.studies.outline_machines import MACHINES
-from legcal.studies.outline_session import Noise, OutlineSession, StartErrors, draw_session
-from legcal.studies.outline_study import OutlineStudy
-from legcal.studies.runner import run_study
-from legcal.studies.workers import child_seed
+from legcal.estimation.solution import Solution
+from legcal.estimation.state import FittedLegs
+from legcal.machine.leg import LegKind
+from legcal.machine.parameters import vector_of
+from legcal.simulation.studies import bound as bound_study
+from legcal.simulation.studies import convergence as convergence_study
+from legcal.simulation.studies.bound import BoundJudge, BoundStatistics, BoundTally
+from legcal.simulation.studies.convergence import ConvergenceJudge
+from legcal.simulation.studies.outlines import (
+    MACHINES,
+    Bound,
+    Noise,
+    OutlineDesign,
+    OutlineExperiment,
+    OutlineSession,
+    OutlineStudy,
+    RunErrors,
+    StartErrors,
+    band_of_ratio,
+    bound_of,
+    design_of,
+    draw_session,
+    errors_of,
+    errors_record,
+    nominal_start,
+    one_fit,
+)
+from legcal.simulation.studies.paper import closed_poses, unmeasured
+from legcal.simulation.studies.runner import child_seed, run_study
 
 NOISE = Noise()
 N_POSES = 5

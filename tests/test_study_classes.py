@@ -14,30 +14,41 @@ from rich.console import Console
 from test_cli import run
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.mechanism.files import shipped_names
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.parametrization import vector_of
-from legcal.mechanism.platform import platform_in_base
-from legcal.refinement.solution import Solution
-from legcal.refinement.start import Start
-from legcal.refinement.state import components, motions
-from legcal.studies import classes
-from legcal.studies.bound import ERRORS
-from legcal.studies.classes import EXPERIMENT, ClassesJudge, errors_of_fit
-from legcal.studies.classes_record import FIT, FitErrors, fit_record
-from legcal.studies.classes_statistics import ClassStatistics, ClassTally
-from legcal.studies.outline_bound import bound_of
-from legcal.studies.outline_design import OutlineDesign
-from legcal.studies.outline_determined import Determined, as_stated, at_best
-from legcal.studies.outline_estimate import one_fit
-from legcal.studies.outline_experiment import OutlineExperiment
-from legcal.studies.outline_family import standing_where_held
-from legcal.studies.outline_machines import SHIPPED
-from legcal.studies.outline_session import OutlineSession, draw_session
-from legcal.studies.outline_study import OutlineStudy
-from legcal.studies.runner import run_study
-from legcal.studies.study import Record
+from legcal.estimation.constraints import Start
+from legcal.estimation.solution import Solution
+from legcal.estimation.state import components, motions
+from legcal.machine.files import shipped_names
+from legcal.machine.kinematics import platform_in_base
+from legcal.machine.leg import LegGeometry
+from legcal.machine.load import load_mechanism
+from legcal.machine.parameters import vector_of
+from legcal.simulation.studies import classes
+from legcal.simulation.studies.bound import ERRORS
+from legcal.simulation.studies.classes import CLASSES as EXPERIMENT
+from legcal.simulation.studies.classes import (
+    FIT,
+    ClassesJudge,
+    ClassStatistics,
+    ClassTally,
+    FitErrors,
+    errors_of_fit,
+    fit_record,
+)
+from legcal.simulation.studies.outlines import (
+    SHIPPED,
+    Determined,
+    OutlineDesign,
+    OutlineExperiment,
+    OutlineSession,
+    OutlineStudy,
+    as_stated,
+    at_best,
+    bound_of,
+    draw_session,
+    one_fit,
+    standing_where_held,
+)
+from legcal.simulation.studies.runner import Record, run_study
 
 FREE_3_UPU = 7  # turns of both axes of a leg at once (six), and its size
 NOISE = EXPERIMENT.noise

@@ -13,22 +13,21 @@ from scipy.spatial.transform import RigidTransform
 from test_cli import run
 
 from legcal.errors import DidNotConverge, UsageError
-from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
-from legcal.simulation.machine import Machine, hexapod
-from legcal.simulation.poses import random_poses
-from legcal.simulation.table_noise import TableNoise
-from legcal.studies import estimators
-from legcal.studies.eq20 import (
+from legcal.machine.leg import KinematicParameters, from_vector, to_vector
+from legcal.simulation.machine import Machine, hexapod, random_poses
+from legcal.simulation.studies import paper as estimators
+from legcal.simulation.studies.paper import (
+    PaperStudy,
+    SimulatedSession,
+    coplanar_hexapod,
     expected_errors,
     expected_norm,
+    noncoplanar_hexapod,
     platform_by_parameters,
     platform_errors,
 )
-from legcal.studies.paper import PaperStudy
-from legcal.studies.runner import StudyResult, run_study
-from legcal.studies.session import SimulatedSession
-from legcal.studies.truths import coplanar_hexapod, noncoplanar_hexapod
-from legcal.studies.workers import child_seed
+from legcal.simulation.studies.runner import StudyResult, child_seed, run_study
+from legcal.simulation.table_noise import TableNoise
 
 N_RUNS = 2
 

@@ -16,10 +16,14 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.studies.checkpoint import CHECKPOINT_NAME, open_checkpoint
-from legcal.studies.checkpoint_lines import header
-from legcal.studies.runner import DOCUMENT_NAME, run_study
-from legcal.studies.workers import child_seed
+from legcal.simulation.studies.runner import (
+    CHECKPOINT_NAME,
+    DOCUMENT_NAME,
+    child_seed,
+    header,
+    open_checkpoint,
+    run_study,
+)
 
 PROGRAM = Path(__file__).with_name("toy_studies.py")
 

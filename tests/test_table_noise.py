@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
-from legcal.observations.leg_axes import LegAxes
-from legcal.observations.table_axes import axes_of_table, table_of_axes
 from legcal.simulation.table_noise import TableNoise, observe_axes, table_of_lines
-from legcal.vision.cylinder import point_with_zero_y
-from legcal.vision.euler import angles_of_direction, direction_derivative, direction_of_angles
+from legcal.vision.cylinder import (
+    angles_of_direction,
+    direction_derivative,
+    direction_of_angles,
+    point_with_zero_y,
+)
 
 
 def _indices(n: int) -> tuple[IntArray, IntArray]:

@@ -16,21 +16,25 @@ from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 from legcal.errors import ModelError, UsageError
-from legcal.geometry.frames import roll_pitch_yaw
+from legcal.geometry.motions import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.mechanism.equations import demanded
-from legcal.mechanism.leg import LegKind
-from legcal.mechanism.leg_geometry import Demand, LegGeometry
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries, in_links, parametrization_of, vector_of
-from legcal.report.urdf_patch import patch_radii
+from legcal.machine.equations import demanded
+from legcal.machine.leg import Demand, LegGeometry, LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries, in_links, parametrization_of, vector_of
+from legcal.machine.urdf import patch_radii
 from legcal.simulation import truth
-from legcal.simulation.motion import draw_poses
-from legcal.simulation.parameter_errors import Distribution, ParameterErrors, Spread, draw_errors
+from legcal.simulation.poses import draw_poses
+from legcal.simulation.session import simulate
 from legcal.simulation.settings import Level, SimulationSettings
-from legcal.simulation.simulate import simulate
-from legcal.simulation.truth import write_true_model
+from legcal.simulation.truth import (
+    Distribution,
+    ParameterErrors,
+    Spread,
+    draw_errors,
+    write_true_model,
+)
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LAYOUTS = {

@@ -11,19 +11,19 @@ from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass
-from legcal.mechanism.kinematics import forward_kinematics, inverse_kinematics
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parameters import KinematicParameters
-from legcal.mechanism.parametrization import geometries
-from legcal.report.leg_origins import moved_origins
-from legcal.report.urdf import (
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import KinematicParameters
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import geometries
+from legcal.machine.urdf import Origin, patch_origins
+from legcal.machine.written import (
     check_closes,
+    moved_origins,
     reload_and_check,
     write_calibrated_yaml,
     write_urdf,
 )
-from legcal.report.urdf_patch import Origin, patch_origins
 
 ORIGIN = re.compile(rb"""(<origin\b[^>]*?\bxyz\s*=\s*["'])([^"']*)(["'])""")
 

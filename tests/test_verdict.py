@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from legcal.detection.measure import MeasuredEdge
-from legcal.detection.pairs import Pair
-from legcal.detection.straight import StraightFit
-from legcal.detection.verdict import NARROW_BIAS, WRONG_WIDTH, Verdict, verdict
 from legcal.geometry.types import Array
+from legcal.perception.limb_fit import MeasuredEdge
+from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, Verdict, verdict
+from legcal.perception.pairs import Pair
+from legcal.perception.straight import StraightFit
 
 WIDTH = np.array([20.0, 18.0])  # by the radius [px]
 LENGTH = 200.0

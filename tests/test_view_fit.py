@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data.measurements import Measurements, View
+from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.outlines import Outlines
-from legcal.recognition.groups import Group, group_views
-from legcal.recognition.near_fit import reversed_pose, sideways_sigmas
-from legcal.recognition.searching import Search
-from legcal.recognition.view_fit import ViewFit, fit_view, least_evidence
+from legcal.perception.recognise import reversed_pose, sideways_sigmas
+from legcal.perception.search import Group, Search, group_views
+from legcal.perception.view_fit import ViewFit, fit_view, least_evidence
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

@@ -9,16 +9,11 @@ from thinned import thinned
 
 import legcal
 from legcal.geometry.types import Array
-from legcal.mechanism.configurations import Configurations
-from legcal.mechanism.model import Mechanism
-from legcal.simulation.camera_places import places_around
-from legcal.simulation.cameras import look_at, sample_camera
-from legcal.simulation.dressing import dressed
-from legcal.simulation.images import Viewpoint, take_images
-from legcal.simulation.posed_machine import PosedMachine, pose_machine
-from legcal.simulation.shapes import Box
-from legcal.simulation.solids import Solid, solids_of
-from legcal.simulation.visibility import SEEN, LegView, legs_in_image
+from legcal.machine.model import Mechanism
+from legcal.machine.poses import Configurations
+from legcal.simulation.cameras import look_at, places_around, sample_camera
+from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
+from legcal.simulation.visibility import SEEN, LegView, Viewpoint, legs_in_image, take_images
 
 SHIPPED = (
     "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",

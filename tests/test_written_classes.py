@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from legcal.errors import ModelError
-from legcal.mechanism.home import home_with
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.leg_steps import footed, moved_legs
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.mechanism.parametrization import geometries, parametrization_of, vector_of
-from legcal.report.urdf import reload_and_check, write_calibrated_yaml, write_urdf
+from legcal.machine.home import home_with
+from legcal.machine.leg import LegGeometry
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import footed, geometries, moved_legs, parametrization_of, vector_of
+from legcal.machine.written import reload_and_check, write_calibrated_yaml, write_urdf
 
 
 def _other_legs(nominal: Mechanism, size: float) -> tuple[LegGeometry, ...]:

@@ -13,8 +13,7 @@ import numpy as np
 
 from legcal.errors import DidNotConverge
 from legcal.signals import stopped_by_signals
-from legcal.studies.runner import run_study
-from legcal.studies.study import Record
+from legcal.simulation.studies.runner import Record, run_study
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,8 @@ from typing import Annotated
 import typer
 
 from legcal.cli.calibrate import calibrate
-from legcal.cli.camera import camera
-from legcal.cli.detect import detect
-from legcal.cli.evaluate import evaluate
-from legcal.cli.identify import identify
-from legcal.cli.inspect import inspect
-from legcal.cli.locate import locate
-from legcal.cli.new import new
-from legcal.cli.noise import noise
-from legcal.cli.output import print_failure
+from legcal.cli.commands import camera, detect, evaluate, identify, inspect, locate, new, noise
+from legcal.cli.options import print_failure
 from legcal.cli.simulate import simulate
 from legcal.cli.study import study
 from legcal.errors import LegcalError, UsageError

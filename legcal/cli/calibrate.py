@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption
-from legcal.cli.output import print_json, print_table
+from legcal.cli.options import JsonOption, print_json, print_table
 from legcal.errors import UsageError
 from legcal.processors import processors
 
@@ -134,9 +133,9 @@ def calibrate(
             "The calibration could not be run: found no --output (-o), needed the result folder to "
             "write; name one, or the result to test with --check."
         )
-    from legcal.pipeline import calibrate as run
-    from legcal.report.progress_bars import progress_on_stderr
-    from legcal.report.result import result_document
+    from legcal.calibration import calibrate as run
+    from legcal.calibration import result_document
+    from legcal.report import progress_on_stderr
 
     with progress_on_stderr() as progress:
         calibration = run(
@@ -155,7 +154,7 @@ def calibrate(
     if as_json:
         print_json(result_document(calibration))
     else:
-        from legcal.report.summary import summary
+        from legcal.report import summary
 
         print_table(summary(calibration, output))
     if not calibration.verdict.trustworthy:
@@ -164,9 +163,8 @@ def calibrate(
 
 def _check(dataset: Path, result: Path, significance: float | None, *, as_json: bool) -> None:
     """Test an earlier result with new images."""
-    from legcal.checking import SIGNIFICANCE, check
-    from legcal.report.check_report import check_summary
-    from legcal.report.progress_bars import progress_on_stderr
+    from legcal.calibration import SIGNIFICANCE, check, check_summary
+    from legcal.report import progress_on_stderr
 
     with progress_on_stderr() as progress:
         found = check(

@@ -1,8 +1,17 @@
-"""Arguments and options that several commands share."""
+"""What commands print: tables for people, or one JSON document."""
 
-from typing import Annotated
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from legcal.errors import OutOfResources
 
 ModelArgument = Annotated[
     str,
@@ -18,3 +27,58 @@ WorkersOption = Annotated[
     int | None,
     typer.Option(min=1, help="Processes that search images; by default as many as calibrate."),
 ]
+
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+def print_table(renderable: RenderableType) -> None:
+    """Print what a person reads on stdout."""
+    from rich.console import Console
+
+    with _writing_to_stdout():
+        Console(highlight=False).print(renderable)
+        sys.stdout.flush()
+
+
+def print_json(document: dict[str, Any]) -> None:
+    """Print one JSON document on stdout."""
+    with _writing_to_stdout():
+        sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
+        sys.stdout.flush()
+
+
+@contextmanager
+def _writing_to_stdout() -> Iterator[None]:
+    """Say what keeps the output from being written; a reader that has left is none of that."""
+    found = "that it is closed"
+    if sys.stdout is not None:
+        try:
+            yield
+            return
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            found = f"'{error.strerror}'"
+            _leave_stdout()
+    raise OutOfResources(
+        f"The output could not be printed: found {found}, needed a stdout that takes it; send it "
+        "elsewhere."
+    )
+
+
+def _leave_stdout() -> None:
+    """Let what is left in the buffer of stdout go nowhere, so that nothing fails there again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.stdout = None
+
+
+def print_failure(kind: str, message: str, *, as_json: bool) -> None:
+    """Say on stderr, or in JSON on stdout, why a command failed."""
+    if as_json:
+        with suppress(OutOfResources):
+            print_json({"error": {"kind": kind, "message": message}})
+            return
+    if sys.stderr is not None:
+        sys.stderr.write(f"legcal: {message}\n")

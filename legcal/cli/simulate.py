@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import legcal.cli.simulate_options as opt
 from legcal.cli.calibrate import MOST_WORKERS
-from legcal.cli.options import JsonOption, ModelArgument
-from legcal.cli.output import print_json, print_table
+from legcal.cli.options import JsonOption, ModelArgument, print_json, print_table
 from legcal.processors import processors
 
 
@@ -43,11 +42,10 @@ def simulate(
 
     The default is 45 photographs: 3 views of 15 extreme poses each.
     """
-    from legcal.mechanism.load import load_mechanism
-    from legcal.report.progress_bars import progress_on_stderr
-    from legcal.simulation.request import Request, requested
-    from legcal.simulation.simulate import simulate as run
-    from legcal.simulation.summary import summary_document, summary_table
+    from legcal.machine import load_mechanism
+    from legcal.report import progress_on_stderr
+    from legcal.simulation import Request, requested, summary_document, summary_table
+    from legcal.simulation import simulate as run
 
     request = Request(
         level=level.value,

@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption
-from legcal.cli.output import print_json, print_table
+from legcal.cli.options import JsonOption, print_json, print_table
 from legcal.processors import processors
 
 if TYPE_CHECKING:
-    from legcal.studies.outline_experiment import OutlineExperiment
-    from legcal.studies.outline_study import F, Judge, OutlineStudy
-    from legcal.studies.study import Study
+    from legcal.simulation import F, Judge, OutlineExperiment, OutlineStudy, Study
 
 RunsOption = Annotated[int, typer.Option(help="Number of runs.")]
 SeedOption = Annotated[int, typer.Option(help="Seed of all runs.")]
@@ -52,8 +49,7 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
-    from legcal.simulation.table_noise import TableNoise
-    from legcal.studies.paper import PaperStudy
+    from legcal.simulation import PaperStudy, TableNoise
 
     noise = TableNoise.in_radians() if radians else TableNoise()
     _run(PaperStudy(noise), runs, seed, workers, output, as_json=as_json)
@@ -88,7 +84,8 @@ def bound(
     as_json: JsonOption = False,
 ) -> None:
     """Compare the errors of a calibration, and its sigmas, with the Cramer-Rao bound."""
-    from legcal.studies.bound import EXPERIMENT, BoundJudge
+    from legcal.simulation import BOUND as EXPERIMENT
+    from legcal.simulation import BoundJudge
 
     _run(_outlines(BoundJudge(), EXPERIMENT, machine), runs, seed, workers, output, as_json=as_json)
 
@@ -103,7 +100,8 @@ def convergence(
     as_json: JsonOption = False,
 ) -> None:
     """Count where calibrations end that start 5 mm and 3 deg off in everything."""
-    from legcal.studies.convergence import EXPERIMENT, ConvergenceJudge
+    from legcal.simulation import CONVERGENCE as EXPERIMENT
+    from legcal.simulation import ConvergenceJudge
 
     chosen = _outlines(ConvergenceJudge(), EXPERIMENT, machine)
     _run(chosen, runs, seed, workers, output, as_json=as_json)
@@ -119,7 +117,8 @@ def classes(
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate every shipped machine, by the four steps and by the fit, beside the bound."""
-    from legcal.studies.classes import EXPERIMENT, ClassesJudge
+    from legcal.simulation import CLASSES as EXPERIMENT
+    from legcal.simulation import ClassesJudge
 
     chosen = _outlines(ClassesJudge(), EXPERIMENT, machine)
     _run(chosen, runs, seed, workers, output, as_json=as_json)
@@ -129,7 +128,7 @@ def _outlines(
     judge: Judge[F], experiment: OutlineExperiment, machines: list[str] | None
 ) -> OutlineStudy[F]:
     """Return the study of a judge, on the machines that were asked for or on all."""
-    from legcal.studies.outline_study import OutlineStudy
+    from legcal.simulation import OutlineStudy
 
     chosen = replace(experiment, machines=tuple(machines)) if machines else experiment
     return OutlineStudy(judge, chosen)
@@ -139,8 +138,8 @@ def _run(
     chosen: Study, runs: int, seed: int, workers: int | None, output: Path | None, *, as_json: bool
 ) -> None:
     """Run a study and print what it found."""
-    from legcal.report.progress_bars import progress_on_stderr
-    from legcal.studies.runner import run_study
+    from legcal.report import progress_on_stderr
+    from legcal.simulation import run_study
 
     with progress_on_stderr() as progress:
         result = run_study(

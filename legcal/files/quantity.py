@@ -1,8 +1,12 @@
-"""Quantities as people write them in options: a number and its unit, ``2mm``."""
+"""A number as somebody states it, with its unit and how well it is known: ``420±0.1 mm``."""
+
+from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Real
 
 from legcal.errors import UsageError
 from legcal.files.schema import describe
@@ -45,3 +49,135 @@ def parse_quantity(text: str, units: Mapping[str, float], what: str) -> float:
             "leave out the sign."
         )
     return value * units.get(unit, 1.0)
+
+
+SMALLEST_SIGMA = 1e-9  # [m, rad, px]; what is known better is fixed
+LARGEST_SIGMA = 1e6  # [m, rad, px]; tells nothing of any parameter
+
+_DIMENSIONS = {"m": LENGTH, "rad": ANGLE, "px": PIXELS}
+_SIZES = {unit: size for units in _DIMENSIONS.values() for unit, size in units.items()}
+_DIMENSION = {unit: name for name, units in _DIMENSIONS.items() for unit in units}
+_NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
+_VALUE = re.compile(_NUMBER, re.ASCII)
+_PRIOR = re.compile(rf"{_NUMBER}(?:±|\+/?-){_NUMBER}", re.ASCII)
+EXAMPLE = "0.4200±0.0001 or 420±0.1 mm"
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A number as somebody stated it.
+
+    Attributes
+    ----------
+    value : float
+        In SI units or pixels.
+    sigma : float or None
+        Its standard deviation; None where there is none.
+    dimension : {"m", "rad", "px", ""}
+        What its unit is one of; "" where none was written.
+    """
+
+    value: float
+    sigma: float | None = None
+    dimension: str = ""
+
+
+def read_prior(value: object) -> Stated:
+    """Return a prior given as text, as (value, sigma) or as {value, sigma}.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these, its units contradict each other, or sigma is zero, negative, far
+        too small or not finite.
+    """
+    if isinstance(value, Stated):
+        return value
+    if isinstance(value, str):
+        return _read_prior_text(value)
+    if isinstance(value, Mapping) and set(value) == {"value", "sigma"}:
+        value = (value["value"], value["sigma"])
+    if not isinstance(value, Sequence) or len(value) != 2 or not all(map(_is_number, value)):
+        raise ValueError(
+            f"found {describe(value)}, needed a value and its sigma; write it like {EXAMPLE}."
+        )
+    try:
+        return _prior(float(value[0]), float(value[1]))
+    except OverflowError as error:
+        raise ValueError(
+            "found a number beyond 1e308, needed a value and its sigma; correct it."
+        ) from error
+
+
+def _read_prior_text(text: str) -> Stated:
+    """Return the prior that a text states; a unit at its end counts for both numbers."""
+    match = _PRIOR.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            f"found {describe(text.strip())}, needed a value and its sigma; write it like "
+            f"{EXAMPLE}."
+        )
+    value, unit, sigma, unit_of_sigma = match.groups()
+    if unit and not unit_of_sigma:
+        raise ValueError(
+            f"found {describe(text.strip())}, needed the unit of sigma too; write it at "
+            f"the end, like {EXAMPLE}."
+        )
+    mean = read_value(value + (unit or unit_of_sigma))
+    spread = read_value(sigma + unit_of_sigma)
+    if mean.dimension != spread.dimension:
+        raise ValueError(
+            f"found {describe(text.strip())}, needed units of one kind; write both in one unit."
+        )
+    return _prior(mean.value, spread.value, mean.dimension)
+
+
+def read_value(text: str) -> Stated:
+    """Return the number that a text states, with its unit if there is one."""
+    match = _VALUE.fullmatch(text)
+    if match is None or not math.isfinite(float(match[1])):
+        raise ValueError(
+            f"found {describe(text.strip())}, needed a number, with a unit or in SI units; "
+            "write one, such as 0.42 or 420mm."
+        )
+    unit = match[2]
+    if unit and unit not in _SIZES:
+        raise ValueError(
+            f"found the unknown unit '{unit}', needed one of {', '.join(_SIZES)}; leave it out "
+            "for SI units and pixels."
+        )
+    return Stated(_in_si(float(match[1]), unit), None, _DIMENSION.get(unit, ""))
+
+
+def _in_si(number: float, unit: str) -> float:
+    """Return a number in SI units or pixels, 350 mm as the same number that 0.35 m is."""
+    size = _SIZES.get(unit, 1.0)
+    per_one = round(1.0 / size)
+    return number / per_one if math.isclose(per_one * size, 1.0, rel_tol=1e-12) else number * size
+
+
+def _prior(value: float, sigma: float, dimension: str = "") -> Stated:
+    """Return a prior if its numbers make one."""
+    if not math.isfinite(value):
+        raise ValueError(f"found the value {value:g}, needed a finite one; correct it.")
+    if not math.isfinite(sigma) or sigma <= 0.0:
+        raise ValueError(
+            f"found the sigma {sigma:g}, needed a finite one above zero; give one standard "
+            "deviation, or fix the parameter."
+        )
+    if sigma < SMALLEST_SIGMA:
+        raise ValueError(
+            f"found the sigma {sigma:g}, needed at least {SMALLEST_SIGMA:g}; fix the parameter at "
+            "the value instead."
+        )
+    if sigma > LARGEST_SIGMA:
+        raise ValueError(
+            f"found the sigma {sigma:g}, needed at most {LARGEST_SIGMA:g}; free the parameter or "
+            "leave the prior out."
+        )
+    return Stated(value, sigma, dimension)
+
+
+def _is_number(value: object) -> bool:
+    """Say whether something is a real number; true is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)

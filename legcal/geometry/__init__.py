@@ -1,1 +1,5 @@
-"""Lines, frames and directions: pure NumPy, knows no robot and no camera."""
+"""geometry."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
-"""Section 4.3: simulated measurements. No module of the method imports this package."""
+"""simulation."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

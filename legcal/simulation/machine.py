@@ -1,15 +1,18 @@
-"""Simulated machines: true parameters and what is needed to move and to see them."""
+"""Random platform poses of simulated machines (section 4.3)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.frames import frame_on_points
-from legcal.geometry.types import Array, IntArray
-from legcal.mechanism.parameters import KinematicParameters, from_vector, to_vector
+from legcal.errors import DidNotConverge
+from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
+from legcal.machine import KinematicParameters, from_vector, to_vector
+from legcal.simulation.poses import near_ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,3 +125,222 @@ def _without_rounding(
     """Set the coordinates that the frame makes zero to exactly zero."""
     vector = to_vector(parameters, frame_legs)
     return from_vector(vector, len(parameters.offsets), frame_legs)
+
+
+def leg_vectors(parameters: KinematicParameters, T_Rb_Re: RigidTransform) -> Array:
+    """Return A_j B_j of every leg in R_b at one or several poses, (..., n_legs, 3) [m]."""
+    return legs_and_arms(parameters, T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation)[0]
+
+
+def legs_and_arms(parameters: KinematicParameters, R: Array, t: Array) -> tuple[Array, Array]:
+    """Return A B and R B of all legs at poses R, t of R_e in R_b, both (..., n_legs, 3) [m]."""
+    arms = parameters.platform_joints @ np.swapaxes(R, -1, -2)
+    return arms + t[..., None, :] - parameters.base_joints, arms
+
+
+def length_jacobian(parameters: KinematicParameters, R: Array, t: Array) -> Array:
+    """Return d lengths / d (translation, rotation vector in R_b), (..., n_legs, 6)."""
+    legs, arms = legs_and_arms(parameters, R, t)
+    u = legs / np.linalg.norm(legs, axis=-1, keepdims=True)
+    return np.concatenate([u, np.cross(arms, u)], axis=-1)
+
+
+_ITERATIONS = 30
+_EXACT = 1e-14  # of the lengths
+_ON_THE_WAY = 1e-6
+_LARGEST_TURN = 0.3  # [rad] in one iteration
+_DAMPING = 1e-12  # keeps singular poses solvable, and is nothing beside others
+_SINGULAR = 0.1  # smallest singular value of the scaled Jacobian that a pose may have
+_STEPS = 6  # from home
+
+
+class Followed(NamedTuple):
+    """Where a machine came to from home.
+
+    Attributes
+    ----------
+    R, t : (n, 3, 3) and (n, 3) array
+        Poses of R_e in R_b [m]; where the lengths were not reached, the last one on the way.
+    reached : (n,) array of bool
+        Which have the lengths that were asked for.
+    """
+
+    R: Array
+    t: Array
+    reached: BoolArray
+
+    @property
+    def T_Rb_Re(self) -> RigidTransform:
+        """The poses."""
+        return RigidTransform.from_components(self.t, Rotation.from_matrix(self.R))
+
+
+def solve_poses(
+    parameters: KinematicParameters, lengths: Array, start: RigidTransform
+) -> RigidTransform:
+    """Return the platform poses with given leg lengths that Newton's method finds from a start.
+
+    Parameters
+    ----------
+    parameters : KinematicParameters
+        Joint centres in R_b and R_e.
+    lengths : (n_poses, 6) array
+        Leg lengths [m].
+    start : RigidTransform, n_poses of them
+        T_Rb_Re near the answers.
+
+    Returns
+    -------
+    RigidTransform
+        T_Rb_Re, n_poses of them.
+
+    Raises
+    ------
+    DidNotConverge
+        If the legs cannot reach some row of lengths from its start.
+    """
+    R, t, error = _newton(parameters, lengths, start.rotation.as_matrix(), start.translation)
+    if not np.all(error == 0.0):
+        raise DidNotConverge(
+            f"A simulated pose was not found: leg lengths are still {1e3 * error.max():.2g} mm off "
+            f"after {_ITERATIONS} iterations; choose lengths that the machine can reach."
+        )
+    return RigidTransform.from_components(t, Rotation.from_matrix(R))
+
+
+def follow_from_home(machine: Machine, lengths: Array) -> Followed:
+    """Return the poses with given leg lengths that are reached from home in small steps.
+
+    They are in the assembly mode of home; those beyond or beside a singularity are not reached.
+
+    Parameters
+    ----------
+    machine : Machine
+        The machine.
+    lengths : (n_poses, n_legs) array
+        Leg lengths [m].
+
+    Returns
+    -------
+    Followed
+    """
+    n = len(lengths)
+    R = np.tile(machine.home.rotation.as_matrix(), (n, 1, 1))
+    t = np.tile(machine.home.translation, (n, 1))
+    reached = np.ones(n, dtype=np.bool_)
+    first = np.linalg.norm(leg_vectors(machine.parameters, machine.home), axis=-1)
+    size = float(np.mean(np.linalg.norm(machine.parameters.platform_joints, axis=-1)))
+    unit = np.array([1.0, 1.0, 1.0, size, size, size])
+    for part in np.linspace(0.0, 1.0, _STEPS + 1)[1:]:
+        here = np.flatnonzero(reached)
+        wanted = first + part * (lengths[here] - first)
+        accuracy = _EXACT if part == 1.0 else _ON_THE_WAY
+        R_new, t_new, error = _newton(machine.parameters, wanted, R[here], t[here], accuracy)
+        J = length_jacobian(machine.parameters, R_new, t_new) / unit
+        smallest = np.linalg.svd(J, compute_uv=False)[:, -1]
+        well = (error == 0.0) & (smallest >= _SINGULAR)
+        R[here[well]], t[here[well]] = R_new[well], t_new[well]
+        reached[here] = well
+    return Followed(R, t, reached)
+
+
+def _newton(
+    parameters: KinematicParameters, lengths: Array, R: Array, t: Array, accuracy: float = _EXACT
+) -> tuple[Array, Array, Array]:
+    """Return R, t and the remaining error [m] of each pose; zero where Newton's method arrived."""
+    R, t = R.copy(), t.copy()
+    tolerance = accuracy * lengths.max(axis=1, initial=0.0)
+    best = np.full(len(R), np.inf)
+    active = np.arange(len(R))
+    for _ in range(_ITERATIONS):
+        legs, arms = legs_and_arms(parameters, R[active], t[active])
+        norms = np.linalg.norm(legs, axis=-1)
+        error = lengths[active] - norms
+        size = np.abs(error).max(axis=1, initial=0.0)
+        limit = tolerance[active]
+        done = (size < limit) | ((size < 100 * limit) & (size >= best[active]))
+        best[active] = np.where(done, 0.0, np.minimum(best[active], size))
+        active = active[~done]
+        if len(active) == 0:
+            break
+        u = legs[~done] / norms[~done, :, None]
+        J = np.concatenate([u, np.cross(arms[~done], u)], axis=-1)
+        N = np.swapaxes(J, -1, -2) @ J + _DAMPING * np.eye(6)
+        step = np.linalg.solve(N, np.swapaxes(J, -1, -2) @ error[~done, :, None])[..., 0]
+        turn = np.linalg.norm(step[:, 3:], axis=1, keepdims=True)
+        t[active] += step[:, :3]
+        turned = step[:, 3:] * np.minimum(1.0, _LARGEST_TURN / np.maximum(turn, 1e-300))
+        R[active] = _turn(turned) @ R[active]
+    return R, t, best
+
+
+def _turn(w: Array) -> Array:
+    """Return the rotations of Gibbs vectors w / 2 (n, 3): by w [rad] where that is small."""
+    g = 0.5 * w
+    cross = np.zeros((len(w), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = g
+    cross[:, [1, 2, 0], [2, 0, 1]] = -g
+    scale = 2.0 / (1.0 + np.sum(g**2, axis=1))[:, None, None]
+    return np.asarray(np.eye(3) + scale * (cross + cross @ cross))
+
+
+_ROUNDS = 1000
+
+
+def extreme_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> RigidTransform:
+    """Return random poses with every leg near its shortest or its longest (section 4.3).
+
+    Poses are followed from home in small steps, so that they stay in its assembly mode; those
+    that cannot be reached or pass near a singularity are drawn again.
+
+    Parameters
+    ----------
+    machine : Machine
+        The machine.
+    n_poses : int
+        Number of poses.
+    rng : numpy.random.Generator
+        Source of the poses.
+
+    Returns
+    -------
+    RigidTransform
+        T_Rb_Re, n_poses of them.
+
+    Raises
+    ------
+    DidNotConverge
+        If too few are reached.
+    """
+    n = machine.n_legs
+    return _drawn(machine, n_poses, lambda: near_ends(rng.integers(0, 2, n), rng.random(n)))
+
+
+def random_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> RigidTransform:
+    """Return random poses with every leg length drawn uniformly from its travel.
+
+    They are followed from home as those of :func:`extreme_poses`.
+    """
+    return _drawn(machine, n_poses, lambda: rng.random(machine.n_legs))
+
+
+def _drawn(machine: Machine, n_poses: int, draw: Callable[[], Array]) -> RigidTransform:
+    """Return poses whose leg lengths are drawn, as parts of the travel, until enough are reached.
+
+    Each round draws as many as are missing, so that the draws are those of one pose at a time.
+    """
+    lowest, highest = machine.travel.T
+    R, t = np.zeros((0, 3, 3)), np.zeros((0, 3))
+    for _ in range(_ROUNDS):
+        if len(R) == n_poses:
+            break
+        part = np.array([draw() for _ in range(n_poses - len(R))])
+        new = follow_from_home(machine, lowest + part * (highest - lowest))
+        R = np.concatenate([R, new.R[new.reached]])
+        t = np.concatenate([t, new.t[new.reached]])
+    if len(R) < n_poses:
+        raise DidNotConverge(
+            f"Only {len(R)} of {n_poses} random poses of a simulated machine were found; "
+            "check its travel."
+        )
+    return RigidTransform.from_components(t, Rotation.from_matrix(R))

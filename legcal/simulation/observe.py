@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.geometry.types import Array, IntArray
-from legcal.observations.outlines import Outlines
-from legcal.simulation.silhouette import silhouette
-from legcal.vision.camera import Camera
+from legcal.data import Outlines
+from legcal.geometry import Array, IntArray
+from legcal.simulation.visibility import silhouette
+from legcal.vision import Camera
 
 
 @dataclass(frozen=True)

@@ -2,26 +2,202 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from legcal.dataset.folder import OBSERVATIONS_NAME
-from legcal.dataset.given_axes import AXES_NAME
-from legcal.dataset.given_corners import CORNERS_NAME
-from legcal.observations.axes_file import write_axis_table
-from legcal.observations.corners_file import write_corners
-from legcal.observations.measurements import Measurements, View
-from legcal.observations.table import write_observations
-from legcal.simulation.corner_tables import corners_of_images
-from legcal.simulation.dataset_files import image_names, measurements_of
-from legcal.simulation.folder import TRUTH
-from legcal.simulation.hints import rough_pose
+from legcal.data import (
+    AXES_NAME,
+    CORNERS_NAME,
+    OBSERVATIONS_NAME,
+    Corners,
+    Measurements,
+    Outlines,
+    View,
+    found_corners,
+    join_corners,
+    write_axis_table,
+    write_corners,
+    write_observations,
+)
+from legcal.geometry import Array
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.cameras import rough_pose
+from legcal.simulation.folder import TRUTH, image_names, measurements_of
 from legcal.simulation.imaged_machine import ImagedMachine
-from legcal.simulation.parameter_errors import Distribution
+from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.settings import Level, SimulationSettings
-from legcal.simulation.tables import axes_of_images, outlines_of_images
+from legcal.simulation.solids import PosedMachine
+from legcal.simulation.table_noise import AxisTable, TableNoise, observe_axes
+from legcal.simulation.truth import Distribution
+from legcal.simulation.visibility import Images, Stretch, Viewpoint, silhouette
+from legcal.vision import Camera
+
+EXACT_PX = 1e-3  # standard deviation that outlines without noise claim for their edge points
+_SIDEWAYS = 1e-3  # component along the image y axis below which a leg has no point M_LS
+
+
+def outlines_of_images(
+    images: Images,
+    machines: Sequence[PosedMachine],
+    viewpoints: Sequence[Viewpoint],
+    sigma_px: float,
+    rng: np.random.Generator | None,
+) -> Outlines:
+    """Return the outlines of all visible stretches, by row, leg and edge.
+
+    Every pixel along an outline gives one edge point with white noise, and a line is fitted to
+    them: the covariance of its offsets at the ends is known.
+
+    Parameters
+    ----------
+    images : Images
+        The images.
+    machines, viewpoints : sequence
+        The machine in every pose, and the cameras.
+    sigma_px : float
+        Standard deviation of an edge point [px].
+    rng : numpy.random.Generator or None
+        Source of the noise; None leaves the outlines exact.
+    """
+    claimed = max(sigma_px, EXACT_PX)
+    rows, stretches, h, ends, covariances = [], [], [], [], []
+    for row in range(len(images)):
+        camera = viewpoints[images.view[row]].camera
+        here = [s for leg in images.seen(row) for s in images.shown[row][leg].stretches]
+        T_base_camera = viewpoints[images.view[row]].T_base_camera
+        for stretch in here:
+            line, pixels = _exact(
+                camera, *_axis(machines[images.pose[row]], T_base_camera, stretch)
+            )
+            lengths = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1)
+            n_points = max(2, round(float(lengths.mean())))
+            covariance = OutlineNoise(claimed, n_points).covariance
+            if rng is not None and sigma_px > 0.0:
+                offsets = rng.multivariate_normal(np.zeros(2), covariance, size=2)
+                line, pixels = shifted_outlines(camera, line, pixels, offsets)
+            rows.append(row)
+            stretches.append(stretch)
+            h.append(line)
+            ends.append(pixels)
+            covariances.append(covariance)
+    n = 2 * len(rows)
+    return Outlines(
+        row=np.repeat(np.array(rows, dtype=np.intp), 2),
+        leg=np.repeat(np.array([s.leg for s in stretches], dtype=np.intp), 2),
+        part=tuple(s.part for s in stretches for _ in range(2)),
+        edge=np.tile(np.array([1, 2], dtype=np.intp), len(rows)),
+        h=np.array(h).reshape(n, 3),
+        ends=np.array(ends).reshape(n, 2, 2),
+        covariance=np.repeat(np.array(covariances).reshape(-1, 2, 2), 2, axis=0),
+        used=np.ones(n, dtype=np.bool_),
+        reason=("",) * n,
+        source=("detected",) * n,
+    )
+
+
+def axes_of_images(
+    images: Images,
+    machines: Sequence[PosedMachine],
+    viewpoints: Sequence[Viewpoint],
+    noise: TableNoise,
+    rng: np.random.Generator,
+) -> AxisTable:
+    """Return the table of the axes of all legs that images show, by row and leg.
+
+    A leg parallel to the image x axis has no point M_LS = (x, 0, z) and is left out.
+
+    Parameters
+    ----------
+    images, machines, viewpoints
+        As in :func:`outlines_of_images`.
+    noise : TableNoise
+        What disturbs the axes.
+    rng : numpy.random.Generator
+        Source of the noise.
+    """
+    row, leg, u, A = [], [], [], []
+    for r in range(len(images)):
+        machine = machines[images.pose[r]]
+        T = viewpoints[images.view[r]].T_base_camera.inv()
+        for j in images.seen(r):
+            along = machine.B[j] - machine.A[j]
+            direction = T.rotation.apply(along / np.linalg.norm(along))
+            if abs(direction[1]) > _SIDEWAYS:
+                row.append(r)
+                leg.append(j)
+                u.append(direction)
+                A.append(T.apply(machine.A[j]))
+    shape = (len(row), 3)
+    return observe_axes(
+        np.array(row, dtype=np.intp),
+        np.array(leg, dtype=np.intp),
+        np.array(u).reshape(shape),
+        np.array(A).reshape(shape),
+        noise,
+        rng,
+    )
+
+
+def _axis(
+    machine: PosedMachine, T_base_camera: RigidTransform, stretch: Stretch
+) -> tuple[Array, Array, float]:
+    """Return the direction (3,) of a stretch and both ends (2, 3) of its axis in the camera."""
+    A = machine.A[stretch.leg]
+    along = machine.B[stretch.leg] - A
+    u = along / np.linalg.norm(along)
+    T_camera_base = T_base_camera.inv()
+    ends = A + np.array([[stretch.start], [stretch.end]]) * u
+    return T_camera_base.as_matrix()[:3, :3] @ u, T_camera_base.apply(ends), stretch.radius
+
+
+def _exact(camera: Camera, u: Array, axis_ends: Array, radius: float) -> tuple[Array, Array]:
+    """Return normals (2, 3) and ends (2, 2, 2) [px] of a cylinder between points of its axis."""
+    h, offsets = silhouette(u, axis_ends[0], np.asarray(radius))
+    return h, camera.project(axis_ends[None] + offsets[:, None])
+
+
+def corners_of_images(
+    images: Images,
+    machines: Sequence[PosedMachine],
+    viewpoints: Sequence[Viewpoint],
+    placed: PlacedBoard,
+    sigma_px: float,
+    rng: np.random.Generator | None,
+) -> Corners:
+    """Return the corners of the board that images show, by row and number.
+
+    Parameters
+    ----------
+    images : Images
+        The images.
+    machines, viewpoints : sequence
+        The machine in every pose, with the board beside it, and the cameras.
+    placed : PlacedBoard
+        The board.
+    sigma_px : float
+        Standard deviation of each coordinate [px].
+    rng : numpy.random.Generator or None
+        Source of the noise; None leaves the corners exact.
+    """
+    P_base = placed.T_base_board.apply(placed.board.points)
+    found = []
+    for row in range(len(images)):
+        view = viewpoints[images.view[row]]
+        seen = placed.seen(machines[images.pose[row]], view.camera, view.T_base_camera)
+        corner = np.flatnonzero(seen)
+        px = view.camera.project(view.T_base_camera.inv().apply(P_base[corner]))
+        if rng is not None:
+            px = px + sigma_px * rng.normal(size=px.shape)
+            size = np.array([view.camera.width, view.camera.height]) - 0.5
+            inside = np.all((px >= -0.5) & (px <= size), axis=1)
+            corner, px = corner[inside], px[inside]
+        sigma = np.full(len(corner), max(sigma_px, EXACT_PX))
+        found.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
+    return join_corners(found)
+
 
 _OFTEN = 0.5  # of the photographs of a view that show a leg which its hint names
 

@@ -4,26 +4,79 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import Field as DataclassField
+from functools import cache
 from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+from pydantic import Field, create_model
 
 from legcal.errors import UsageError
-from legcal.files.quantity import ANGLE, LENGTH, PIXELS, parse_quantity
-from legcal.files.schema import closest, describe
-from legcal.mechanism.model import Mechanism
-from legcal.simulation.appearance_file import read_appearance
-from legcal.simulation.board_choice import KINDS
-from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import (
-    LARGEST,
-    Distribution,
-    ParameterErrors,
-    Spread,
-    kinds_of,
+from legcal.files import (
+    ANGLE,
+    LENGTH,
+    PIXELS,
+    FileSchema,
+    closest,
+    describe,
+    parse_quantity,
+    parse_yaml,
+    read_text,
+    validate,
 )
-from legcal.simulation.rendering.appearance import Appearance
+from legcal.machine import Mechanism
+from legcal.simulation.board import KINDS
+from legcal.simulation.poses import Sampling
+from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.settings import DEFAULT_ERRORS, Level, SimulationSettings
 from legcal.simulation.table_noise import TableNoise
+from legcal.simulation.truth import LARGEST, Distribution, ParameterErrors, Spread, kinds_of
+
+
+def read_appearance(path: Path) -> Appearance:
+    """Return the appearance that a file describes.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each value that cannot be read.
+    UsageError
+        If a number makes no sense.
+    """
+    found = parse_yaml(read_text(path, "appearance file"), path, "appearance file")
+    entry = validate(_schema(), found, path)
+    values = {name: getattr(entry, name) for name in entry.model_fields_set}
+    if "lights" in values:
+        values["lights"] = tuple(Light(**light.model_dump()) for light in values["lights"])
+    return Appearance(**values)
+
+
+@cache
+def _schema() -> type[FileSchema]:
+    """Return the schema of the file."""
+    light = _schema_of(Light, {})
+    electrons = Annotated[float, Field(allow_inf_nan=True)]  # .inf: no noise
+    other_types = {"lights": tuple[light, ...], "electrons": electrons}  # type: ignore[valid-type]
+    return _schema_of(Appearance, other_types)
+
+
+def _schema_of(described: type[Any], other_types: dict[str, Any]) -> type[FileSchema]:
+    """Return the schema of a dataclass."""
+    types = get_type_hints(described) | other_types
+    columns: dict[str, Any] = {f.name: (types[f.name], _default(f)) for f in fields(described)}
+    return create_model(described.__name__, __base__=FileSchema, **columns)
+
+
+def _default(field: DataclassField[Any]) -> Any:
+    """Return the default of a field, or that it must be given."""
+    return ... if field.default is MISSING else field.default
+
 
 _ERROR_KINDS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "joints": (("base_joints", "platform_joints"), LENGTH),

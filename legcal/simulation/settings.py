@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.data import SIGMA_RANGE
 from legcal.errors import UsageError
-from legcal.observations.axes_file import SIGMA_RANGE
-from legcal.simulation.motion import Sampling
-from legcal.simulation.parameter_errors import KINDS, LARGEST, Distribution, ParameterErrors, Spread
+from legcal.simulation.poses import Sampling
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.table_noise import TableNoise
-from legcal.vision.board import Board
+from legcal.simulation.truth import KINDS, LARGEST, Distribution, ParameterErrors, Spread
+from legcal.vision import Board
 
 _MILLIMETRES = Spread(2e-3)  # of the size by which the paper disturbs its machine
 _TENTH_DEGREE = Spread(float(np.deg2rad(0.1)))

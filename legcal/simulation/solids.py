@@ -1,20 +1,248 @@
-"""The solids that a mechanism is seen as: the visuals of its URDF, and where they are."""
+"""A machine in one pose as viewing rays meet it: triangles, hit by embree."""
 
-from collections.abc import Mapping, Sequence
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+import trimesh
+from lxml import etree
+from scipy.spatial.transform import RigidTransform, Rotation
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from legcal.geometry.frames import product
-from legcal.geometry.lines import distance_to_line
-from legcal.geometry.types import Array
-from legcal.mechanism.cylinders import COAXIAL
-from legcal.mechanism.leg import Leg
-from legcal.mechanism.model import Mechanism
-from legcal.simulation.shapes import Cylinder, Shape
-from legcal.simulation.visuals import Visual, visuals
+from legcal.errors import ModelError
+from legcal.geometry import Array, BoolArray, IntArray, distance_to_line, product
+from legcal.machine import COAXIAL, Configurations, Leg, Mechanism, Urdf, number_list, parse_robot
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A closed cylinder about the z axis, its middle at the origin.
+
+    Attributes
+    ----------
+    radius, length : float
+        Its size [m].
+    """
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere about the origin.
+
+    Attributes
+    ----------
+    radius : float
+        Its size [m].
+    """
+
+    radius: float
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes, its middle at the origin.
+
+    Attributes
+    ----------
+    size : tuple of float
+        Its whole lengths along x, y, z [m].
+    """
+
+    size: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A surface of triangles.
+
+    Attributes
+    ----------
+    vertices : (n, 3) array
+        Points [m].
+    faces : (m, 3) array of int
+        The corners of each triangle.
+    """
+
+    vertices: Array
+    faces: IntArray
+
+
+Shape = Cylinder | Sphere | Box | Mesh
+
+
+_SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
+
+
+class Visual(NamedTuple):
+    """A visual of a link: its shape, its pose there, and its colour (r, g, b) if it has one."""
+
+    link: str
+    shape: Shape
+    T_link_shape: RigidTransform
+    colour: tuple[float, float, float] | None
+
+
+def visuals(urdf: Urdf) -> list[Visual]:
+    """Return all visuals of a tree in the order of the file.
+
+    Raises
+    ------
+    ModelError
+        If a shape has no size, or if a mesh is missing or has no triangles; all of them at once.
+    """
+    robot = parse_robot(urdf.path, urdf.content)
+    named = {m.get("name", ""): _rgb(m) for m in robot.findall("material")}
+    problems: list[str] = []
+    found = []
+    for link in robot.findall("link"):
+        for visual in link.findall("visual"):
+            geometry = visual.find("geometry")
+            if geometry is None or len(geometry) == 0:
+                continue
+            try:
+                _check(urdf.path, geometry[0])
+                shape, T = _shown(urdf.path, visual)
+            except ValueError as error:
+                problems.append(
+                    f"{urdf.path}, line {visual.sourceline}: the visual of link "
+                    f"'{link.get('name')}' could not be shown: {error}."
+                )
+                continue
+            material = visual.find("material")
+            colour = None
+            if material is not None:
+                colour = _rgb(material) or named.get(material.get("name", ""))
+            found.append(Visual(link.get("name", ""), shape, T, colour))
+    if problems:
+        raise ModelError(problems)
+    return found
+
+
+def _check(urdf_path: Path, element: etree._Element) -> None:
+    """Check a shape; ValueError says what was found and needed."""
+    tag = str(element.tag)
+    if tag == "mesh":
+        _check_mesh(urdf_path, element)
+    elif tag not in _SIZES:
+        raise ValueError(
+            f"found <{tag}>, needed a cylinder, sphere, box or mesh; write one of them"
+        )
+    for name in _SIZES.get(tag, ()):
+        text, count = element.get(name, ""), 3 if name == "size" else 1
+        numbers = number_list(text, count)
+        if numbers is None or min(numbers) <= 0.0:
+            needed = "a positive number" if count == 1 else f"{count} positive numbers"
+            raise ValueError(f'found <{tag} {name}="{text}">, needed {needed}; write it [m]')
+
+
+def _check_mesh(urdf_path: Path, element: etree._Element) -> None:
+    """Check that a mesh has a file and a size."""
+    name, scale = element.get("filename", ""), element.get("scale", "1 1 1")
+    if _found(urdf_path, name) is None:
+        raise ValueError(
+            f"found no mesh file '{name}', needed it beside the URDF; copy it or correct the name"
+        )
+    factors = number_list(scale, 3)
+    if factors is None or min(abs(factor) for factor in factors) == 0.0:
+        raise ValueError(
+            f'found <mesh scale="{scale}">, needed 3 numbers other than zero; correct it'
+        )
+
+
+def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransform]:
+    """Return the shape of a visual and T_link_shape, as yourdfpy has them.
+
+    A mesh is scaled and placed by yourdfpy, its vertices are those in the link. ValueError says
+    what was found and needed where its file holds none.
+    """
+    from yourdfpy import URDF  # half a second: only where there is something to read
+
+    if visual.find("geometry/mesh") is not None:
+        return _mesh(urdf_path, visual), RigidTransform.identity()
+    alone = io.BytesIO(_alone(visual))
+    robot: Any = URDF.load(alone, build_scene_graph=False, load_meshes=False).robot
+    (read,) = robot.links[0].visuals
+    T = RigidTransform.from_matrix(np.asarray(read.origin, dtype=float))
+    cylinder, sphere = read.geometry.cylinder, read.geometry.sphere
+    if cylinder is not None:
+        return Cylinder(float(cylinder.radius), float(cylinder.length)), T
+    if sphere is not None:
+        return Sphere(float(sphere.radius)), T
+    x, y, z = (float(side) for side in read.geometry.box.size)
+    return Box((x, y, z)), T
+
+
+def _mesh(urdf_path: Path, visual: etree._Element) -> Mesh:
+    """Return the triangles of a mesh file in the link, from the scene that yourdfpy makes of it."""
+    from yourdfpy import URDF
+
+    name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+    try:
+        scene: Any = URDF.load(
+            io.BytesIO(_alone(visual)),
+            filename_handler=lambda fname: str(_found(urdf_path, fname)),
+        ).scene
+        mesh = scene.to_geometry()
+        vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces)
+    except (ValueError, KeyError, IndexError, AttributeError, TypeError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"found a mesh file '{name}' that cannot be read ({reason}), needed a complete one; "
+            "export it again"
+        ) from error
+    if not len(faces) or not np.all(np.isfinite(vertices)):
+        raise ValueError(
+            f"found no triangles in the mesh file '{name}', needed some; export it again"
+        )
+    return Mesh(vertices, faces.astype(np.intp))
+
+
+def _alone(visual: etree._Element) -> bytes:
+    """Return a URDF of one link with the shape and the place of a visual, and nothing else."""
+    robot = etree.Element("robot", {"name": "visual"})
+    shown = etree.SubElement(etree.SubElement(robot, "link", {"name": "link"}), "visual")
+    origin = visual.find("origin")
+    place = {}
+    for key in ("xyz", "rpy"):
+        numbers = None if origin is None else number_list(origin.get(key, ""), 3)
+        place[key] = " ".join(repr(x) for x in numbers or (0.0, 0.0, 0.0))
+    etree.SubElement(shown, "origin", place)
+    shape = visual.find("geometry")[0]  # type: ignore[index]
+    geometry = etree.SubElement(shown, "geometry")
+    etree.SubElement(geometry, str(shape.tag), {str(k): str(v) for k, v in shape.attrib.items()})
+    return etree.tostring(robot)
+
+
+def _found(urdf_path: Path, name: str) -> Path | None:
+    """Return the file that a URDF names: as it stands, or from a folder above the URDF."""
+    if not name.strip() or "\0" in name:
+        return None
+    plain = Path(name.split("://", 1)[-1])
+    tails = [plain, Path(*plain.parts[1:])] if "://" in name and len(plain.parts) > 1 else [plain]
+    for folder in urdf_path.absolute().parents:
+        for tail in tails:
+            if (folder / tail).is_file():
+                return folder / tail
+    return None
+
+
+def _rgb(material: etree._Element) -> tuple[float, float, float] | None:
+    """Return the colour of a ``<material>``, 0 to 1, or None where it has none."""
+    color = material.find("color")
+    rgba = None if color is None else number_list(color.get("rgba", ""), 4)
+    if rgba is None:
+        return None
+    r, g, b = (min(max(x, 0.0), 1.0) for x in rgba[:3])
+    return r, g, b
 
 
 class Sheet(Protocol):
@@ -199,3 +427,250 @@ def _material(visual: Visual, leg: Leg | None) -> Material:
     albedo = max(sum(visual.colour) / 3.0, 0.02)
     r, g, b = (c / albedo for c in visual.colour)
     return replace(material, albedo=albedo, tint=(r, g, b))
+
+
+_BALL = Material(albedo=0.06, specular=1.0, shininess=250.0, limb=0.2)
+_POST = Material(albedo=0.04, specular=0.10, shininess=20.0, limb=0.3)
+_PLATE = Material(albedo=0.09, specular=0.10, shininess=18.0, limb=0.1, texture=0.06)
+_BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
+_POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
+_DEFAULT_RADIUS = 0.02  # of the distance between joints, where a leg shows no cylinder
+_GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
+_FLAT = 0.2  # cosine between legs and plates below which the legs lie along the plates
+
+
+def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
+    """Return all that pictures show of a mechanism: its visuals, and what they lack.
+
+    A link that has no visual of its own gets balls at the joint centres and, for three joints or
+    more, a round plate that carries them on posts, on the side away from the legs. Both plates of a
+    planar machine are below its legs, that of the base lowest, so that the legs are seen from
+    above.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The mechanism.
+
+    Raises
+    ------
+    ModelError
+        As :func:`solids_of` does.
+    """
+    shown = solids_of(mechanism)
+    bare = {mechanism.base, mechanism.platform} - {s.link for s in shown if s.leg is None}
+    radii = np.array([_radius(leg, mechanism) for leg in mechanism.legs])
+    added: list[Solid] = []
+    if mechanism.base in bare:
+        away = _away(mechanism.A_base, mechanism, -1.0)
+        below = 0.0 if mechanism.spatial else _POST_LENGTH + _PLATE_THICKNESS + _GAP
+        added += _end(mechanism.base, mechanism.A_base, radii, [True] * len(radii), away, below)
+    if mechanism.platform in bare:
+        balls = [leg.platform_joint != "" for leg in mechanism.legs]
+        B = mechanism.B_platform
+        away = _away(mechanism.home.apply(B), mechanism, 1.0)
+        if away is not None:
+            away = mechanism.home.rotation.inv().apply(away)
+        added += _end(mechanism.platform, B, radii, balls, away)
+    return (*shown, *added)
+
+
+def _end(
+    link: str,
+    joints: Array,
+    radii: Array,
+    balls: Iterable[bool],
+    away: Array | None,
+    further: float = 0.0,
+) -> list[Solid]:
+    """Return the balls, posts and plate at one end of the legs, in its link.
+
+    The posts are ``further`` radii of the thickest leg longer than they need to be.
+    """
+    solids = []
+    for j, (joint, R, ball) in enumerate(zip(joints, radii, balls, strict=True)):
+        if ball:
+            at = RigidTransform.from_translation(joint)
+            solids.append(Solid(f"{link}_ball{j + 1}", link, Sphere(_BALL_SIZE * R), at, _BALL))
+    if away is None:
+        return solids
+    turn = Rotation.align_vectors([away], [[0.0, 0.0, 1.0]])[0]
+    thickest = float(radii.max())
+    outside = float((joints @ away).max()) + (_POST_LENGTH + further) * thickest
+    for j, (joint, R) in enumerate(zip(joints, radii, strict=True)):
+        length = outside - float(joint @ away)
+        middle = RigidTransform.from_components(joint + 0.5 * length * away, turn)
+        post = Cylinder(_POST_SIZE * float(R), length)
+        solids.append(Solid(f"{link}_post{j + 1}", link, post, middle, _POST))
+    middle = joints.mean(axis=0)
+    across = joints - middle
+    across = across - (across @ away)[:, None] * away
+    thickness = _PLATE_THICKNESS * thickest
+    size = float(np.linalg.norm(across, axis=1).max()) + _PLATE_RIM * thickest
+    at = middle + (outside + 0.5 * thickness - float(middle @ away)) * away
+    pose = RigidTransform.from_components(at, turn)
+    solids.append(Solid(f"{link}_plate", link, Cylinder(size, thickness), pose, _PLATE))
+    return solids
+
+
+def _away(joints_base: Array, mechanism: Mechanism, side: float) -> Array | None:
+    """Return the normal of the plane of joint centres, away from the legs, in the base frame.
+
+    Parameters
+    ----------
+    joints_base : (n_legs, 3) array
+        Joint centres of one end at home.
+    mechanism : Mechanism
+        The mechanism.
+    side : float
+        -1 for the base, +1 for the platform: from A to B times this is away from the legs. Of no
+        account for planar machines.
+
+    Returns
+    -------
+    (3,) array or None
+        None where the joints lie on a line and no plate carries them.
+    """
+    if mechanism.base_normal is not None:
+        return -mechanism.base_normal
+    spread = joints_base - joints_base.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(spread)
+    if len(joints_base) < 3 or sizes[1] < 0.05 * sizes[0]:
+        return None
+    normal = axes[2]
+    legs = (mechanism.home.apply(mechanism.B_platform) - mechanism.A_base).mean(axis=0)
+    cosine = float(normal @ legs) / max(float(np.linalg.norm(legs)), 1e-12)
+    if abs(cosine) < _FLAT:  # the legs lie along the plates: one on each side
+        cosine = float(normal[np.argmax(np.abs(normal))])
+    return np.asarray(side * np.sign(cosine) * normal)
+
+
+def _radius(leg: Leg, mechanism: Mechanism) -> float:
+    """Return the radius of the thickest cylinder of a leg, or one that suits it [m]."""
+    if leg.cylinders:
+        return max(c.radius for c in leg.cylinders)
+    length = np.linalg.norm(mechanism.home.apply(leg.B_platform) - leg.A_base)
+    return _DEFAULT_RADIUS * float(length)
+
+
+_SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
+_SUBDIVISIONS = 2  # of an icosahedron that stands for a sphere
+_FLAT_posed_machine = 1e-3  # thickness of joint centres that lie in a plane, of their size
+
+
+@dataclass(frozen=True, eq=False)
+class PosedMachine:
+    """A machine in one pose.
+
+    Attributes
+    ----------
+    A, B : (n_legs, 3) array
+        Joint centres in the base link [m].
+    solids : tuple of PlacedSolid
+        What is seen of it, in the base link.
+    vertices, faces : (n, 3) array and (m, 3) array of int
+        The same as triangles, in the base link [m].
+    """
+
+    A: Array
+    B: Array
+    solids: tuple[PlacedSolid, ...]
+    vertices: Array
+    faces: IntArray
+
+    def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
+        """Return which points something stands before, seen from a centre.
+
+        Parameters
+        ----------
+        centre : (3,) array
+            The camera centre in the base link [m].
+        points : (n, 3) array
+            Points in the base link [m].
+        margin : (n,) array
+            What is hit this near to a point, or behind it, does not hide it [m].
+        """
+        ray = points - centre
+        distance = np.linalg.norm(ray, axis=-1)
+        ray = ray / distance[:, None]
+        hits, index, _ = _caster(self).intersects_location(
+            np.broadcast_to(centre, ray.shape), ray, multiple_hits=False
+        )
+        hidden = np.zeros(len(points), dtype=np.bool_)
+        reached = np.linalg.norm(np.reshape(hits, (-1, 3)) - centre, axis=-1)
+        hidden[index] = reached < distance[index] - margin[index]
+        return hidden
+
+    def encloses(self, centre: Array) -> bool:
+        """Say whether a point (3,) is in a solid, or between the joints of the machine."""
+        if any(
+            _is_in(shape.solid.shape, shape.T_base_solid.inv().apply(centre))
+            for shape in self.solids
+        ):
+            return True
+        joints = np.concatenate([self.A, self.B])
+        size = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
+        if len(joints) < 5 or size[2] < _FLAT_posed_machine * size[0]:
+            return False
+        from scipy.spatial import Delaunay
+
+        return bool(Delaunay(joints).find_simplex(centre) >= 0)
+
+
+def pose_machine(
+    mechanism: Mechanism, solids: Sequence[Solid], poses: Configurations
+) -> tuple[PosedMachine, ...]:
+    """Return a machine in every pose.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The true machine.
+    solids : sequence of Solid
+        What is seen of it.
+    poses : Configurations
+        Its poses.
+    """
+    meshes = [_triangles(solid.shape) for solid in solids]
+    faces, first = [], 0
+    for mesh in meshes:
+        faces.append(mesh.faces + first)
+        first += len(mesh.vertices)
+    stacked = np.concatenate(faces)
+    machines = []
+    for configuration, T in zip(poses.configurations, poses.poses, strict=True):
+        here = placed(solids, link_poses(mechanism, configuration))
+        vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
+        B = np.asarray(T.apply(mechanism.B_platform))
+        machines.append(PosedMachine(mechanism.A_base, B, here, np.concatenate(vertices), stacked))
+    return tuple(machines)
+
+
+@lru_cache(maxsize=8)  # many cameras may look at one machine, and thousands wait for theirs
+def _caster(machine: PosedMachine) -> RayMeshIntersector:
+    """Return what casts rays at a machine."""
+    return RayMeshIntersector(trimesh.Trimesh(machine.vertices, machine.faces, process=False))
+
+
+def _triangles(shape: Shape) -> Any:
+    """Return a shape as triangles."""
+    if isinstance(shape, Cylinder):
+        return trimesh.creation.cylinder(shape.radius, shape.length, sections=_SECTIONS)
+    if isinstance(shape, Sphere):
+        return trimesh.creation.icosphere(_SUBDIVISIONS, shape.radius)
+    if isinstance(shape, Box):
+        return trimesh.creation.box(shape.size)
+    return trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+
+
+def _is_in(shape: Shape, point: Array) -> bool:
+    """Say whether a point (3,) in the frame of a shape is inside it."""
+    if isinstance(shape, Cylinder):
+        beside = np.hypot(point[0], point[1]) < shape.radius
+        return bool(beside and abs(point[2]) < 0.5 * shape.length)
+    if isinstance(shape, Sphere):
+        return bool(np.linalg.norm(point) < shape.radius)
+    if isinstance(shape, Box):
+        return bool(np.all(np.abs(point) < 0.5 * np.asarray(shape.size)))
+    mesh = _triangles(shape)
+    return bool(mesh.is_watertight and mesh.contains(point[None])[0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from legcal.errors import NotVisible
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry import Array, IntArray
 
 _LEAST_UPRIGHT = 1e-9  # component along the image y axis
 
@@ -22,7 +22,7 @@ class TableNoise:
     Attributes
     ----------
     psi, theta : float
-        Standard deviations of the angles (:mod:`legcal.vision.euler`) [rad].
+        Standard deviations of the angles (:mod:`legcal.vision.cylinder`) [rad].
     x, z : float
         Standard deviations of the coordinates of M_LS [m].
     """

@@ -6,24 +6,252 @@ closed pose nearest to the nominal home.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DidNotConverge, ModelError, OutOfClass
-from legcal.mechanism.home import home_with
-from legcal.mechanism.leg_geometry import LegGeometry
-from legcal.mechanism.load import load_mechanism
-from legcal.mechanism.model import Mechanism
-from legcal.report.model_files import mechanism_text, model_name
-from legcal.report.urdf import check_closes, write_urdf
-from legcal.report.urdf_patch import patch_radii
-from legcal.simulation.parameter_errors import ParameterErrors, draw_errors
-from legcal.simulation.radii import draw_radii
+from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
+from legcal.machine import (
+    LegGeometry,
+    Mechanism,
+    check_closes,
+    footed,
+    geometries,
+    home_with,
+    load_mechanism,
+    mechanism_text,
+    model_name,
+    moved_legs,
+    parametrization_of,
+    patch_radii,
+    write_urdf,
+)
+from legcal.simulation.solids import Cylinder, solids_of
+
+LARGEST = 1.0  # [m] or [rad]
+ANGLES = ("axes", "twists")
+
+
+class Distribution(StrEnum):
+    """How errors of one kind are distributed, about zero."""
+
+    UNIFORM = "uniform"
+    NORMAL = "normal"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How large the errors of one kind of parameter are.
+
+    Attributes
+    ----------
+    size : float
+        Half of the width where they are uniform, one standard deviation where they are normal
+        [m] or [rad].
+    distribution : Distribution
+        How they are distributed.
+
+    Raises
+    ------
+    UsageError
+        If the size is no number, or there is no such distribution.
+    """
+
+    size: float = 0.0
+    distribution: Distribution = Distribution.UNIFORM
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.size, Real) or self.distribution not in list(Distribution):
+            raise UsageError(
+                f"A spread could not be used: found the size {self.size!r} and the distribution "
+                f"{self.distribution!r}, needed a number [m, rad] and "
+                f"{' or '.join(Distribution)}; correct it."
+            )
+        object.__setattr__(self, "size", float(self.size))
+        object.__setattr__(self, "distribution", Distribution(self.distribution))
+
+
+@dataclass(frozen=True)
+class ParameterErrors:
+    """How large the errors of each kind of parameter are.
+
+    Attributes
+    ----------
+    base_joints, platform_joints : Spread
+        Of every coordinate of the joint centres [m].
+    offsets : Spread
+        Of actuated legs [m].
+    lengths : Spread
+        Of legs of constant length [m].
+    axes : Spread
+        Of both angles of axes at base and platform [rad].
+    twists : Spread
+        Of the angles that legs without an S joint keep [rad].
+    radii : Spread
+        Of the cylinders that legs are seen as [m]; no parameter of the kinematics.
+    coplanar : bool
+        Whether joint centres keep their heights, their z in R_b and R_e: what is coplanar stays so.
+    """
+
+    base_joints: Spread = Spread()
+    platform_joints: Spread = Spread()
+    offsets: Spread = Spread()
+    lengths: Spread = Spread()
+    axes: Spread = Spread()
+    twists: Spread = Spread()
+    radii: Spread = Spread()
+    coplanar: bool = False
+
+
+_FIELDS = {
+    "base": "base_joints",
+    "platform": "platform_joints",
+    "offset": "offsets",
+    "length": "lengths",
+    "base_axis": "axes",
+    "platform_axis": "axes",
+    "twist": "twists",
+}
+
+
+KINDS = (*dict.fromkeys(_FIELDS.values()), "radii")  # the fields that are sizes
+
+
+def kinds_of(mechanism: Mechanism) -> set[str]:
+    """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
+    names = parametrization_of(mechanism, twists=True).names
+    kinds = {_FIELDS[name.split(".")[1]] for name in names}
+    return kinds | ({"radii"} if any(leg.cylinders for leg in mechanism.legs) else set())
+
+
+def draw_errors(
+    nominal: Mechanism, errors: ParameterErrors, rng: np.random.Generator
+) -> tuple[LegGeometry, ...]:
+    """Return the legs of a machine with drawn errors, in R_b and R_e.
+
+    Every parameter of the class takes its chance in the same order, however large its error is:
+    errors of one kind do not depend on those of another. B of a leg that is fixed to the platform
+    then slides along the leg to where models put it, the foot of the platform link's origin.
+
+    Parameters
+    ----------
+    nominal : Mechanism
+        The nominal model.
+    errors : ParameterErrors
+        How large the errors are.
+    rng : numpy.random.Generator
+        Source of the errors.
+
+    Raises
+    ------
+    UsageError
+        If an error is negative, not finite or beyond reason.
+    """
+    _check(errors)
+    found, legs = parametrization_of(nominal, twists=True), geometries(nominal)
+    uniform, normal = rng.uniform(-1.0, 1.0, len(found)), rng.normal(size=len(found))
+    step = np.zeros(len(found))
+    for i, name in enumerate(found.names):
+        spread = _spread(errors, name)
+        unit = normal if spread.distribution is Distribution.NORMAL else uniform
+        step[i] = spread.size * unit[i]
+    moved = moved_legs(legs, found.place, step)
+    origin = np.asarray(nominal.T_platform_Re.inv().translation)
+    return footed(moved, origin)
+
+
+def _spread(errors: ParameterErrors, name: str) -> Spread:
+    """Return how large the error of a parameter is, by its name."""
+    _, kind, *more = name.split(".")
+    if errors.coplanar and kind in ("base", "platform") and more == ["z"]:
+        return Spread()
+    found: Spread = getattr(errors, _FIELDS[kind])
+    return found
+
+
+def _check(errors: ParameterErrors) -> None:
+    """Refuse sizes that are no sizes."""
+    problems = []
+    for kind in KINDS:
+        size = getattr(errors, kind).size
+        if not (math.isfinite(size) and 0.0 <= size <= LARGEST):
+            scale, unit = (np.rad2deg(1.0), "deg") if kind in ANGLES else (1e3, "mm")
+            problems.append(
+                f"The errors of {kind.replace('_', ' ')} could not be drawn: found a size of "
+                f"{scale * size:g} {unit}, needed 0 to {scale * LARGEST:.3g} {unit}; correct it."
+            )
+    if problems:
+        raise UsageError(problems)
+
+
+_MOST = {Distribution.UNIFORM: 0.5, Distribution.NORMAL: 0.1}  # of the thinnest cylinder
+_ALIKE = 1e-9  # [m]; cylinders of one leg with one radius are one tube and stay so
+
+
+def draw_radii(
+    nominal: Mechanism, spread: Spread, rng: np.random.Generator
+) -> dict[tuple[str, int], float]:
+    """Return the radii of the true legs.
+
+    Parameters
+    ----------
+    nominal : Mechanism
+        The nominal model.
+    spread : Spread
+        How large the errors are [m].
+    rng : numpy.random.Generator
+        Source of the errors.
+
+    Returns
+    -------
+    dict
+        By link and number of the cylinder among the visual cylinders of that link [m]; all that
+        are coaxial with legs, none if there are no errors.
+
+    Raises
+    ------
+    UsageError
+        If an error may leave nothing of a leg.
+    """
+    if spread.size == 0.0:
+        return {}
+    counts: dict[str, int] = {}
+    radii: dict[tuple[str, int], float] = {}
+    tubes: dict[tuple[int, int], list[tuple[str, int]]] = {}
+    for solid in solids_of(nominal):
+        if isinstance(solid.shape, Cylinder) and solid.link is not None:
+            place = solid.link, counts.setdefault(solid.link, 0)
+            counts[solid.link] += 1
+            if solid.leg is not None:
+                radii[place] = solid.shape.radius
+                tube = solid.leg, round(solid.shape.radius / _ALIKE)
+                tubes.setdefault(tube, []).append(place)
+    _check_radii(spread, min(radii.values(), default=np.inf))
+    uniform, normal = rng.uniform(-1.0, 1.0, len(tubes)), rng.normal(size=len(tubes))
+    unit = normal if spread.distribution is Distribution.NORMAL else uniform
+    for step, places in zip((spread.size * unit).tolist(), tubes.values(), strict=True):
+        for place in places:
+            radii[place] += step
+    return radii
+
+
+def _check_radii(spread: Spread, thinnest: float) -> None:
+    """Refuse errors that may leave nothing of a leg."""
+    most = _MOST[spread.distribution] * thinnest
+    if not spread.size <= most:
+        raise UsageError(
+            f"The errors of radii could not be drawn: found a size of {1e3 * spread.size:g} mm, "
+            f"needed at most {1e3 * most:.3g} mm ({spread.distribution}) for cylinders as thin as "
+            f"{1e3 * thinnest:g} mm; make it smaller."
+        )
+
 
 DRAWS = 20
 FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the true legs demand
@@ -105,7 +333,7 @@ def write_model_with(
     nominal : Mechanism
         The nominal model.
     legs : sequence of LegGeometry
-        The legs in R_b and R_e, see :func:`legcal.report.urdf.write_urdf`.
+        The legs in R_b and R_e, see :func:`legcal.machine.written.write_urdf`.
     home : RigidTransform
         T_base_platform of a pose in which they close.
     folder : Path

@@ -1,9 +1,4 @@
-"""What a camera sees of each leg: the stretches of its cylinders that nothing hides.
-
-Rays go from the camera to points of both outlines of a leg. A point is seen where it is inside the
-image and no solid stands before it. A leg counts as seen in an image where one unbroken stretch
-with both outlines makes up at least 40 % of its length; less is hard to measure in a photograph.
-"""
+"""Which images a simulated dataset has: for each its view, its pose and the legs it shows."""
 
 from __future__ import annotations
 
@@ -15,11 +10,74 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry.types import Array, BoolArray
-from legcal.mechanism.leg import Cylinder, Leg, main_cylinders
-from legcal.simulation.posed_machine import PosedMachine
-from legcal.simulation.silhouette import contact_offsets
-from legcal.vision.camera import Camera
+from legcal.errors import NotVisible, UsageError
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import Cylinder, Leg, main_cylinders
+from legcal.progress import Report, no_progress
+from legcal.simulation.solids import PosedMachine
+from legcal.vision import Camera
+
+
+def contact_offsets(u: Array, A: Array, radius: Array) -> Array:
+    """Return the steps from an axis to the generating lines that its outlines show.
+
+    A circle of radius R whose centre is at a distance d is touched at R^2 / d before its centre
+    and R sqrt(1 - R^2 / d^2) beside it, whatever point of the axis they are counted from.
+
+    Parameters
+    ----------
+    u, A : (..., 3) array
+        Unit directions from base to platform, and a point of each axis, in the camera frame [m].
+    radius : (...) array
+        Radii [m].
+
+    Returns
+    -------
+    (..., 2, 3) array
+        For edges 1 (epsilon +1) and 2 (epsilon -1), in the camera frame [m].
+
+    Raises
+    ------
+    NotVisible
+        If the camera centre is inside a cylinder or on its surface.
+    """
+    centre = A - u * np.sum(u * A, axis=-1, keepdims=True)
+    d = np.linalg.norm(centre, axis=-1, keepdims=True)
+    R = np.broadcast_to(np.asarray(radius, dtype=np.float64), d.shape[:-1])[..., None]
+    if not np.all(d > R):
+        raise NotVisible(
+            "A simulated leg could not be seen: found the camera centre "
+            f"{1e3 * float(d.min()):.1f} mm from its axis, inside the leg, needed one outside; "
+            "move the camera."
+        )
+    away = centre / d
+    aside = np.cross(u, away)
+    before = -(R * R / d) * away
+    beside = R * np.sqrt(1.0 - (R / d) ** 2) * aside
+    return np.stack([before - beside, before + beside], axis=-2)
+
+
+def silhouette(u: Array, A: Array, radius: Array) -> tuple[Array, Array]:
+    """Return the outlines of cylinders and the steps to their generating lines.
+
+    Parameters
+    ----------
+    u, A, radius : array
+        As in :func:`contact_offsets`.
+
+    Returns
+    -------
+    h : (..., 2, 3) array
+        Unit normals of the planes through the camera centre and the generating lines, signed as
+        the moment u x P of a point P of each, eq (3).
+    offsets : (..., 2, 3) array
+        As from :func:`contact_offsets`: the point A + s u of the axis is beside the point
+        A + s u + offset of the generating line.
+    """
+    offsets = contact_offsets(u, A, radius)
+    moments = np.cross(u[..., None, :], A[..., None, :] + offsets)
+    return moments / np.linalg.norm(moments, axis=-1, keepdims=True), offsets
+
 
 SEEN = 0.4  # of a leg's length that one stretch must show
 SHORTEST_PX = 20.0  # a stretch of one cylinder that gives an outline
@@ -223,3 +281,152 @@ def field_of_view(camera: Camera) -> tuple[Array, Array]:
     low, high = xy.min(axis=0), xy.max(axis=0)
     low.flags.writeable = high.flags.writeable = False
     return low, high
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A simulated camera and where it stands.
+
+    Attributes
+    ----------
+    name : str
+        The view.
+    camera : Camera
+        Its intrinsics.
+    T_base_camera : RigidTransform
+        Its true pose in the base link.
+    """
+
+    name: str
+    camera: Camera
+    T_base_camera: RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The images of a dataset, in the order of its rows.
+
+    Attributes
+    ----------
+    view, pose, repeat : (n_rows,) array of int
+        Indices; ``repeat`` counts the images of one pose in one view.
+    shown : tuple, for each row a tuple of LegView, one for each leg
+        What the images show. Images of one pose in one view show the same.
+    """
+
+    view: IntArray
+    pose: IntArray
+    repeat: IntArray
+    shown: tuple[tuple[LegView, ...], ...]
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def seen(self, row: int) -> list[int]:
+        """Return the legs that an image shows well enough to be measured."""
+        return [j for j, leg in enumerate(self.shown[row]) if leg.is_seen]
+
+    def seen_in_view(self, view: int, least: float = 0.0) -> list[int]:
+        """Return the legs that more than a part of the images of a view show."""
+        rows = np.flatnonzero(self.view == view)
+        seen = np.array([[leg.is_seen for leg in self.shown[row]] for row in rows])
+        return [int(j) for j in np.flatnonzero(seen.mean(axis=0) > least)]
+
+    def chosen(self, rows: Sequence[int]) -> Images:
+        """Return some of the images."""
+        index = np.asarray(rows, dtype=np.intp)
+        shown = tuple(self.shown[row] for row in rows)
+        return Images(self.view[index], self.pose[index], self.repeat[index], shown)
+
+
+def take_images(
+    legs: Sequence[Leg],
+    machines: Sequence[PosedMachine],
+    viewpoints: Sequence[Viewpoint],
+    n_images: int,
+    *,
+    shared_poses: bool,
+    progress: Report = no_progress,
+) -> Images:
+    """Return the images that cameras take of a machine in its poses.
+
+    Parameters
+    ----------
+    legs : sequence of Leg
+        The legs of the true machine.
+    machines : sequence of PosedMachine
+        The machine in every pose: those of all views, or those of the first view, then those of
+        the second, and so on.
+    viewpoints : sequence of Viewpoint
+        The cameras.
+    n_images : int
+        Images of each pose in each view.
+    shared_poses : bool
+        Every view sees all poses.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+
+    Raises
+    ------
+    UsageError
+        If a camera is inside the machine.
+    NotVisible
+        If a view shows no leg.
+    """
+    own = len(machines) // len(viewpoints)
+    of_view = [
+        range(len(machines)) if shared_poses else range(v * own, (v + 1) * own)
+        for v in range(len(viewpoints))
+    ]
+    rows: list[tuple[int, int, int]] = []
+    shown: list[tuple[LegView, ...]] = []
+    problems = []
+    for v, (viewpoint, poses) in enumerate(zip(viewpoints, of_view, strict=True)):
+        progress("Views", v, len(viewpoints))
+        camera, T = viewpoint.camera, viewpoint.T_base_camera
+        _refuse_inside(viewpoint, [machines[p] for p in poses])
+        views = [legs_in_image(legs, machines[p], camera, T) for p in poses]
+        if not any(leg.is_seen for view in views for leg in view):
+            problems.append(_sees_nothing(viewpoint.name, legs, views))
+        for p, view in zip(poses, views, strict=True):
+            rows += [(v, p, k) for k in range(n_images)]
+            shown += [view] * n_images
+    progress("Views", len(viewpoints), len(viewpoints))
+    if problems:
+        raise NotVisible(problems)
+    view_of_row, pose_of_row, repeat_of_row = np.array(rows, dtype=np.intp).T
+    return Images(view_of_row, pose_of_row, repeat_of_row, tuple(shown))
+
+
+def _refuse_inside(viewpoint: Viewpoint, machines: Sequence[PosedMachine]) -> None:
+    """Raise UsageError if a camera is inside the machine in one of the poses."""
+    centre = viewpoint.T_base_camera.translation
+    if any(machine.encloses(centre) for machine in machines):
+        x, y, z = centre
+        raise UsageError(
+            f"view {viewpoint.name}: its camera could not be placed: found it inside the machine, "
+            f"at ({x:.3f}, {y:.3f}, {z:.3f}) m in the base link, needed a place outside in all "
+            "poses; move the camera."
+        )
+
+
+def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegView]]) -> str:
+    """Return that a view shows no leg, and what it shows."""
+    start = f"view {name}: its images could not be simulated: found"
+    if not any(leg.cylinders for leg in legs):
+        return (
+            f"{start} no leg with a visible cylinder in the model, needed URDF visuals that are "
+            "cylinders coaxial with the legs; add them."
+        )
+    most = max(leg.share for view in views for leg in view)
+    if most >= SEEN:
+        longest = max(leg.length_px for view in views for leg in view)
+        return (
+            f"{start} that legs are at most {longest:.1f} px long in them, needed "
+            f"{SHORTEST_PX:g} px of a tube or rod; move the camera nearer (its place is in "
+            "metres), or give it a longer focal length."
+        )
+    return (
+        f"{start} that no image shows a leg (at best {100.0 * most:.0f} % of one), needed an "
+        f"unhidden stretch of {100.0 * SEEN:.0f} % of at least one leg; turn or move the camera."
+    )

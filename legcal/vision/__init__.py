@@ -1,1 +1,5 @@
-"""Section 3.1: the camera, its files and images, and cylinders in its view (eqs 1-5)."""
+"""vision."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

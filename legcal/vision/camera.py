@@ -1,18 +1,19 @@
-"""The calibrated camera: pinhole projection with lens distortion, by OpenCV.
+"""The numbers of a camera by their names: focal lengths, principal point, distortion.
 
-The camera frame has x to the right, y down, z forward. The *sensor plane* of eq (2) is the
-undistorted plane z = 1: a point of it is (x, y, 1), without unit. Pixel (0, 0) is the centre
-of the top-left pixel.
+A fit may look for them. Views whose cameras have the same numbers are taken to show one camera:
+they share its intrinsics, named after the first of them in the order of names.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
 import numpy as np
 
-from legcal.geometry.types import Array
+from legcal.geometry import Array
 
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 
@@ -43,7 +44,7 @@ class Camera:
         looks for the true one.
     sigma : mapping
         Standard deviations of its numbers, by the names of
-        :func:`legcal.vision.intrinsics.intrinsic_names` [px; distortion without unit]; those that
+        :func:`legcal.vision.camera.intrinsic_names` [px; distortion without unit]; those that
         nobody stated are missing.
     """
 
@@ -148,3 +149,141 @@ class Camera:
         normal = np.linalg.solve(np.swapaxes(J, -1, -2), h[..., :2, None])[..., 0]
         value = np.sum(h[..., :2] * xy, axis=-1) + h[..., 2]
         return np.asarray(value / np.linalg.norm(normal, axis=-1))
+
+
+_PINHOLE = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # places in K
+_COEFFICIENTS: Mapping[DistortionModel, tuple[str, ...]] = {  # in OpenCV's order
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+}
+_OF_DISTORTION = {name for names in _COEFFICIENTS.values() for name in names}
+
+
+def intrinsic_names(camera: Camera) -> tuple[str, ...]:
+    """Return the names of a camera's numbers: ``fx fy cx cy``, then its distortion.
+
+    A plumb_bob camera has all five coefficients, also where its file leaves some out as
+    zero. OpenCV's distortion knows no skew: a camera with skew and without distortion has none.
+    """
+    if camera.K[0, 1] != 0.0 and not camera.has_distortion:
+        return tuple(_PINHOLE)
+    return (*_PINHOLE, *_COEFFICIENTS[camera.model])
+
+
+def intrinsic_unit(name: str) -> str:
+    """Return the unit of an intrinsic: ``px``, or nothing for a coefficient of distortion."""
+    return "" if name in _OF_DISTORTION else "px"
+
+
+def intrinsic_values(camera: Camera) -> Array:
+    """Return the numbers of :func:`intrinsic_names`, (n,) [px; distortion without unit]."""
+    pinhole = [camera.K[place] for place in _PINHOLE.values()]
+    return np.array([*pinhole, *_padded(camera)])[: len(intrinsic_names(camera))]
+
+
+def with_intrinsics(camera: Camera, values: Mapping[str, float]) -> Camera:
+    """Return a camera with some of its numbers replaced.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera as it was.
+    values : mapping
+        New values by their names [px; distortion without unit].
+    """
+    K, distortion = camera.K.copy(), _padded(camera)
+    for name, value in values.items():
+        if name in _PINHOLE:
+            K[_PINHOLE[name]] = value
+        else:
+            distortion[_COEFFICIENTS[camera.model].index(name)] = value
+    if _OF_DISTORTION.isdisjoint(values):
+        distortion = camera.distortion
+    return replace(camera, K=K, distortion=distortion)
+
+
+def undistort_derivatives(camera: Camera, pixels: Array, names: Sequence[str]) -> Array:
+    """Return how the points of the sensor plane seen at pixels move with a camera's numbers.
+
+    A pixel stays where it is, so that d(u, v)/d(x, y) d(x, y) + d(u, v)/d(number) = 0.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    pixels : (..., 2) array
+        Pixels.
+    names : sequence of str
+        The numbers that change, n of :func:`intrinsic_names`.
+
+    Returns
+    -------
+    (..., 2, n) array
+        d(x, y) / d(number) of :meth:`legcal.vision.camera.Camera.undistort` [per unit of the
+        number].
+    """
+    flat = pixels.reshape(-1, 2)
+    if len(flat) == 0:  # OpenCV refuses to project nothing
+        return np.zeros((*pixels.shape, len(names)))
+    xy = camera.undistort(flat)
+    moved = distort_derivatives(camera, xy, names)
+    found = -np.linalg.solve(camera.pixels_per_unit(xy), moved)
+    return np.asarray(found.reshape(*pixels.shape, len(names)))
+
+
+def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:
+    """Return for each view the name of the view whose intrinsics it has.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the views.
+    cameras : sequence of Camera
+        The camera of each.
+
+    Returns
+    -------
+    tuple of str
+        The least of the names of views with an equal camera.
+    """
+    keys = [_identity(camera) for camera in cameras]
+    owner: dict[object, str] = {}
+    for name, key in sorted(zip(names, keys, strict=True), key=lambda pair: pair[0]):
+        owner.setdefault(key, name)
+    return tuple(owner[key] for key in keys)
+
+
+def camera_numbers(camera: Camera) -> dict[str, float | str]:
+    """Return all that tells one camera from another: size, model and numbers, by their names."""
+    numbers = zip(intrinsic_names(camera), intrinsic_values(camera).tolist(), strict=True)
+    skew = float(camera.K[0, 1])
+    size = {"width": camera.width, "height": camera.height, "model": camera.model}
+    return size | {"skew": skew} | dict(numbers)
+
+
+def _identity(camera: Camera) -> tuple[object, ...]:
+    """Return what two equal cameras have in common."""
+    numbers = (*camera.K.ravel().tolist(), *_padded(camera).tolist())
+    return (camera.width, camera.height, camera.model, *numbers)
+
+
+def _padded(camera: Camera) -> Array:
+    """Return all the coefficients of a camera's model, those that are left out being zero."""
+    distortion = np.zeros(len(_COEFFICIENTS[camera.model]))
+    distortion[: len(camera.distortion)] = camera.distortion
+    return distortion
+
+
+def distort_derivatives(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
+    """Return the derivative of pixels of points (n, 2) by a camera's numbers, (n, 2, n_names)."""
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
+    zero, distortion = np.zeros(3), _padded(camera)
+    if camera.model == "equidistant":
+        _, jacobian = cv2.fisheye.projectPoints(rays, zero, zero, camera.K, distortion)
+    else:
+        _, jacobian = cv2.projectPoints(rays, zero, zero, camera.K, distortion)
+        jacobian = jacobian[:, 6:]  # behind those by rotation and translation
+    known = (*_PINHOLE, *_COEFFICIENTS[camera.model])
+    columns = [known.index(name) for name in names]
+    return np.asarray(jacobian[:, columns].reshape(len(xy), 2, len(names)))

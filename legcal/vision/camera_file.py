@@ -1,21 +1,100 @@
-"""Camera files: ROS camera_info, OpenCV FileStorage and Kalibr camchain, told by their keys."""
+"""Camera files as legcal writes them: ROS camera_info."""
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
+import yaml
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from legcal.errors import DatasetError
-from legcal.files.schema import parse_yaml, read_text, validate
-from legcal.geometry.types import Array
-from legcal.vision.camera import Camera, DistortionModel
-from legcal.vision.camera_schema import KalibrEntry, MatrixEntry, OpenCVEntry, RosEntry
-from legcal.vision.intrinsics import intrinsic_names
-from legcal.vision.quiet import quiet_opencv
+from legcal.files import FileSchema, parse_yaml, read_text, validate
+from legcal.geometry import Array
+from legcal.vision.camera import Camera, DistortionModel, intrinsic_names
+from legcal.vision.image_file import quiet_opencv
+
+Pixels = Annotated[int, Field(gt=0)]
+Sigma = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+CALIBRATED = "legcal_camera"  # the key under which legcal camera says what it found
+
+
+class _OpenSchema(FileSchema):
+    """A block whose other keys belong to other programs."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class MatrixEntry(_OpenSchema):
+    """A matrix as ROS and OpenCV write it: its size, and its numbers row by row."""
+
+    rows: int
+    cols: int
+    data: list[float]
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> "MatrixEntry":
+        if self.rows * self.cols != len(self.data):
+            raise ValueError(
+                f"found {len(self.data)} numbers in a matrix of {self.rows} x {self.cols}, needed "
+                f"{self.rows * self.cols}; correct rows, cols or data."
+            )
+        return self
+
+
+def _is_3x3(matrix: MatrixEntry) -> MatrixEntry:
+    """Refuse a camera matrix of another size."""
+    if (matrix.rows, matrix.cols) != (3, 3):
+        raise ValueError(
+            f"found a matrix of {matrix.rows} x {matrix.cols}, needed 3 x 3; copy K from the "
+            "calibration."
+        )
+    return matrix
+
+
+CameraMatrix = Annotated[MatrixEntry, AfterValidator(_is_3x3)]
+
+
+class CalibratedEntry(_OpenSchema):
+    """What legcal adds to a camera that it calibrated: standard deviations by name."""
+
+    version: Literal[1]
+    sigma: dict[str, Sigma]
+
+
+class RosEntry(_OpenSchema):
+    """A ROS camera_info file."""
+
+    image_width: Pixels
+    image_height: Pixels
+    camera_matrix: CameraMatrix
+    distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
+    distortion_coefficients: MatrixEntry
+    legcal_camera: CalibratedEntry | None = None
+
+
+class OpenCVEntry(_OpenSchema):
+    """An OpenCV FileStorage, as its calibration sample writes it."""
+
+    image_width: Pixels
+    image_height: Pixels
+    camera_matrix: CameraMatrix
+    distortion_coefficients: MatrixEntry
+    fisheye_model: int = 0
+
+
+class KalibrEntry(_OpenSchema):
+    """One camera of a Kalibr camchain."""
+
+    camera_model: Literal["pinhole"]
+    distortion_model: Literal["radtan", "equidistant", "none"]
+    intrinsics: tuple[float, float, float, float]
+    distortion_coeffs: list[float] = Field(default_factory=list)
+    resolution: tuple[Pixels, Pixels]
+
 
 _COUNTS: Mapping[DistortionModel, tuple[int, ...]] = {
     "plumb_bob": (0, 4, 5),
@@ -242,3 +321,35 @@ def _matrix_problems(path: Path, K: Array, size: tuple[int, int]) -> list[str]:
                 f"{size[0]} x {size[1]} px; calibrate at the size of the images."
             )
     return problems
+
+
+def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None) -> str:
+    """Return the text of a ROS camera_info file that reads back as the same camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    name : str
+        What the file calls it.
+    more : mapping, optional
+        Keys that stand at the end; ROS does not read them.
+    """
+    distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
+    projection = np.column_stack([camera.K, np.zeros(3)])
+    document = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": camera.K.ravel().tolist()},
+        "distortion_model": camera.model,
+        "distortion_coefficients": {
+            "rows": 1,
+            "cols": len(distortion),
+            "data": distortion.tolist(),
+        },
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": projection.ravel().tolist()},
+        **(more or {}),
+    }
+    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100))

@@ -1,26 +1,43 @@
-"""Image files: complete, of the camera's size, and read as grey levels.
-
-OpenCV fills what is missing of a truncated JPEG with grey and says nothing, so completeness
-is checked on the bytes first: a JPEG must reach its end-of-image marker, a PNG its IEND
-chunk with right checksums, a TIFF must hold all the strips or tiles that its first
-directory lists. Damage inside the compressed data of a JPEG that leaves its markers in place
-is not seen.
-"""
+"""Images made larger, for searches that do not see what is only a few pixels wide."""
 
 import os
 import re
 import struct
+import threading
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from legcal.errors import DatasetError
-from legcal.geometry.types import Image
+from legcal.geometry import Array, Image
 from legcal.vision.camera import Camera
-from legcal.vision.quiet import quiet_opencv
+
+_lock = threading.Lock()
+_state = {"depth": 0, "level": 0}
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Silence OpenCV's log inside the block; the last thread to leave restores its level."""
+    with _lock:
+        if _state["depth"] == 0:
+            _state["level"] = cv2.utils.logging.getLogLevel()
+            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        _state["depth"] += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _state["depth"] -= 1
+            if _state["depth"] == 0:
+                cv2.utils.logging.setLogLevel(_state["level"])
+
 
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
@@ -220,3 +237,20 @@ def _tiff_size(content: bytes) -> ImageSize:
     if not (starts and lengths and tags.get(256) and tags.get(257)):
         raise _BadImage("a TIFF without a picture")
     return ImageSize(tags[256][0], tags[257][0])
+
+
+MOST_PIXELS = 6_000_000  # of an image that is made larger
+
+
+def enlarged(grey: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
+    """Return an image made larger by a whole factor; a large one as it is."""
+    if scale == 1 or grey.size > MOST_PIXELS:
+        return grey
+    size = (scale * grey.shape[1], scale * grey.shape[0])
+    larger = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(larger, dtype=np.uint8)
+
+
+def reduced(px: Array, scale: int) -> Array:
+    """Return pixels of an enlarged image as those of the image; middles of pixels are whole."""
+    return np.asarray((px + 0.5) / scale - 0.5)

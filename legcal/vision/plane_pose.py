@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.frames import motion_of
-from legcal.geometry.types import Array
+from legcal.geometry import Array, motion_of
 from legcal.vision.camera import Camera
 
 _ITERATIONS = 50

@@ -1,14 +1,19 @@
-"""The rays of a camera's pixels."""
+"""What is printed on a face of a box, as rays see it."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
+from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry.types import IntArray
-from legcal.vision.camera import Camera
+from legcal.geometry import Array, IntArray
+from legcal.simulation.solids import Box, Cylinder, Material, Mesh, PlacedSolid, Shape, Sphere
+from legcal.vision import Camera
 
 Single = NDArray[np.float32]
 Faces = NDArray[np.integer[Any]]
@@ -103,3 +108,382 @@ def _offsets(samples: int) -> tuple[Single, Single]:
     shifts = np.random.default_rng(0).random((2, _TILE * _TILE, 1))
     u, v = ((lattice[:, None] + shifts) % 1.0 - 0.5).astype(np.float32)
     return u, v
+
+
+@dataclass(frozen=True, eq=False)
+class SolidInView:
+    """A solid at its place in the camera frame.
+
+    Attributes
+    ----------
+    shape : Cylinder, Sphere, Box or Mesh
+        Its shape.
+    material : Material
+        Its surface.
+    R, w : (3, 3) and (3,) array
+        Rotation and translation [m] of T_camera_solid.
+    centre : (3,) array
+        The middle of a sphere that holds it [m].
+    reach : float
+        The radius of that sphere [m].
+    """
+
+    shape: Shape
+    material: Material
+    R: Array
+    w: Array
+    centre: Array
+    reach: float
+
+
+def in_view(solids: Sequence[PlacedSolid], T_camera_base: RigidTransform) -> list[SolidInView]:
+    """Return solids in the frame of a camera."""
+    if not solids:
+        return []
+    motions = np.stack([placed.T_base_solid.as_matrix() for placed in solids])
+    found = []
+    for placed, T in zip(solids, T_camera_base.as_matrix() @ motions, strict=True):
+        shape, R, w = placed.solid.shape, T[:3, :3], T[:3, 3]
+        middle, reach = holding_sphere(shape)
+        found.append(SolidInView(shape, placed.solid.material, R, w, R @ middle + w, reach))
+    return found
+
+
+def holding_sphere(shape: Shape) -> tuple[Array, float]:
+    """Return middle (3,) and radius of a sphere around a shape, in its own frame [m]."""
+    if isinstance(shape, Mesh):
+        low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
+        middle = 0.5 * (low + high)
+        return middle, float(np.linalg.norm(shape.vertices - middle, axis=1).max())
+    if isinstance(shape, Cylinder):
+        return np.zeros(3), float(np.hypot(shape.radius, 0.5 * shape.length))
+    if isinstance(shape, Sphere):
+        return np.zeros(3), shape.radius
+    return np.zeros(3), 0.5 * float(np.linalg.norm(shape.size))
+
+
+def first_triangle(solid: SolidInView, mesh: Mesh, x: Single, y: Single) -> tuple[Single, IntArray]:
+    """Return depth [m] and triangle of a mesh that rays (x, y, 1) meet first; infinite where none.
+
+    Embree finds the triangle in single precision; the depth is that of its plane.
+    """
+    rays = np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float64) @ solid.R
+    origin = -solid.R.T @ solid.w
+    triangle = _caster(mesh).intersects_first(np.broadcast_to(origin, rays.shape), rays)
+    z = np.full(len(x), np.inf, dtype=np.float32)
+    hit = np.flatnonzero(triangle >= 0)
+    corners = mesh.vertices[mesh.faces[triangle[hit]]]
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.sum(n * (corners[:, 0] - origin), axis=1) / np.sum(n * rays[hit], axis=1)
+    z[hit] = np.where(np.isfinite(depth) & (depth > 0.0), depth, np.inf)
+    return z, np.where(triangle >= 0, triangle, 0).astype(np.intp)
+
+
+def is_hidden(solid: SolidInView, mesh: Mesh, P: Single, lamp: Array) -> Single:
+    """Return 1 where a mesh stands between points (3, n) of the camera frame and a lamp, else 0."""
+    points = (P.T - solid.w) @ solid.R
+    towards = (lamp - solid.w) @ solid.R - points
+    hidden = _caster(mesh).intersects_any(points, towards)
+    return np.asarray(hidden, dtype=np.float32)
+
+
+@lru_cache(maxsize=256)
+def _caster(mesh: Mesh) -> Any:
+    """Return what casts rays at a mesh."""
+    import trimesh  # half a second: only where there is a mesh
+
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).ray
+
+
+LATERAL, CAP = 0, 1  # faces of a cylinder
+_TINY = 1e-12
+
+
+def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:
+    """Return where rays enter a solid.
+
+    Parameters
+    ----------
+    solid : SolidInView
+        A solid that the camera is not inside of.
+    x, y : (n,) array
+        Rays (x, y, 1).
+
+    Returns
+    -------
+    z : (n,) array
+        Depth [m]; infinite where the ray passes.
+    face : (n,) array of int
+        The face of the solid that is met, of a mesh the triangle.
+    """
+    shape = solid.shape
+    if isinstance(shape, Cylinder):
+        return _cylinder(solid, shape, x, y)
+    if isinstance(shape, Sphere):
+        return _sphere(solid, shape, x, y)
+    if isinstance(shape, Box):
+        return _box(solid, shape, x, y)
+    return first_triangle(solid, shape, x, y)
+
+
+def normals(solid: SolidInView, P: Single, face: Faces) -> Single:
+    """Return the outward unit normals at points of a solid's faces, (3, n).
+
+    Parameters
+    ----------
+    solid : SolidInView
+        The solid.
+    P : (3, n) array
+        Points of its surface in the camera frame [m].
+    face : (n,) array of int
+        Their faces.
+    """
+    shape = solid.shape
+    w = solid.w.astype(np.float32)[:, None]
+    if isinstance(shape, Sphere):
+        return np.asarray((P - w) * np.float32(1.0 / shape.radius))
+    if isinstance(shape, Cylinder):
+        u = solid.R[:, 2].astype(np.float32)
+        away = P - w
+        s = u @ away
+        n = (away - u[:, None] * s) * np.float32(1.0 / shape.radius)
+        caps = np.flatnonzero(face)
+        if len(caps):
+            n[:, caps] = u[:, None] * np.sign(s[caps])
+        return n
+    if isinstance(shape, Box):
+        sides = np.concatenate([-solid.R, solid.R], axis=1).astype(np.float32)
+        return sides[:, face]
+    corners = shape.vertices[shape.faces[face]]
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ solid.R.T
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), _TINY)
+    n *= -np.sign(np.sum(n * P.T, axis=1, keepdims=True))  # towards the camera, however they turn
+    return np.asarray(n.T.astype(np.float32))
+
+
+def _cylinder(solid: SolidInView, shape: Cylinder, x: Single, y: Single) -> tuple[Single, Faces]:
+    """Return depths and faces of a closed cylinder."""
+    ux, uy, uz = solid.R[:, 2].tolist()
+    wx, wy, wz = solid.w.tolist()
+    hx, hy, hz = np.cross(solid.R[:, 2], solid.w).tolist()
+    along = float(solid.R[:, 2] @ solid.w)
+    half = 0.5 * shape.length
+    cx, cy, cz = y * uz - uy, ux - x * uz, x * uy - y * ux  # d x u
+    c2 = np.maximum(cx * cx + cy * cy + cz * cz, _TINY)
+    m = x * hx + y * hy + hz  # distance from the axis, times |d x u|
+    disc = c2 * shape.radius**2 - m * m
+    hit = disc > 0.0
+    du = x * ux + y * uy + uz
+    z = ((x * wx + y * wy + wz) - du * along - np.sqrt(np.maximum(disc, 0.0))) / c2
+    s = z * du - along
+    hit &= (np.abs(s) <= half) & (z > 0.0)
+    z[~hit] = np.inf
+    face = np.zeros(len(x), dtype=np.uint8)
+    if abs(along) > half:  # one cap faces the camera
+        end = -half if along > 0.0 else half
+        ex, ey, ez = (solid.w + end * solid.R[:, 2]).tolist()
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            depth = (along + end) / du
+            px, py, pz = depth * x - ex, depth * y - ey, depth - ez
+            on_cap = (px * px + py * py + pz * pz <= shape.radius**2) & (depth > 0.0) & (depth < z)
+        z[on_cap] = depth[on_cap]
+        face[on_cap] = CAP
+    return z, face
+
+
+def _sphere(solid: SolidInView, shape: Sphere, x: Single, y: Single) -> tuple[Single, Faces]:
+    """Return depths of a sphere."""
+    wx, wy, wz = solid.w.tolist()
+    cx, cy, cz = y * wz - wy, wx - x * wz, x * wy - y * wx  # d x w
+    d2 = x * x + y * y + 1.0
+    disc = d2 * shape.radius**2 - (cx * cx + cy * cy + cz * cz)
+    z = ((x * wx + y * wy + wz) - np.sqrt(np.maximum(disc, 0.0))) / d2
+    z[(disc <= 0.0) | (z <= 0.0)] = np.inf
+    return z, np.zeros(len(x), dtype=np.uint8)
+
+
+def _box(solid: SolidInView, shape: Box, x: Single, y: Single) -> tuple[Single, Faces]:
+    """Return depths and faces (-x, -y, -z, x, y, z) of a box."""
+    origin = -solid.R.T @ solid.w
+    enter = np.full(len(x), -np.inf, dtype=np.float32)
+    leave = np.full(len(x), np.inf, dtype=np.float32)
+    face = np.zeros(len(x), dtype=np.uint8)
+    for axis in range(3):
+        rx, ry, rz = solid.R[:, axis].tolist()
+        d = x * rx + y * ry + rz
+        d[d == 0.0] = _TINY
+        low = (-0.5 * shape.size[axis] - float(origin[axis])) / d
+        high = (0.5 * shape.size[axis] - float(origin[axis])) / d
+        first, last = np.minimum(low, high), np.maximum(low, high)
+        later = first > enter
+        enter[later] = first[later]
+        face[later] = np.where(d[later] > 0.0, axis, axis + 3)
+        np.minimum(leave, last, out=leave)
+    enter[(enter > leave) | (enter <= 0.0)] = np.inf
+    return enter, face
+
+
+NEAR = 1e-4  # [m] in front of the camera
+MARGIN = 2  # [px]
+_SPARE = 0.02  # of the picture, around it
+_SHIFT = 4  # bits of a fraction of a pixel
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
+    """Return the pixels that a solid may cover, with a small margin.
+
+    The hull of points around the solid is cut to the part of the sensor plane that the picture
+    shows, where the lens is known, before it is distorted.
+
+    Parameters
+    ----------
+    rays : PixelRays
+        The camera's rays.
+    solid : SolidInView
+        The solid.
+
+    Returns
+    -------
+    (n,) array of int
+        Pixels as row * width + column, in order.
+    """
+    points = surrounding_points(solid)
+    in_front = points[:, 2] > NEAR
+    if not in_front.any():
+        return np.zeros(0, dtype=np.intp)
+    if not in_front.all():
+        return np.arange(rays.width * rays.height)
+    hull = _hull(points[:, :2] / points[:, 2:])
+    spare = _SPARE * (rays.high - rays.low)
+    hull = _cut(hull, rays.low - spare, rays.high + spare)
+    if not len(hull):
+        return np.zeros(0, dtype=np.intp)
+    return _filled(_hull(rays.camera.distort(_dense(hull))), rays.width, rays.height)
+
+
+def surrounding_points(solid: SolidInView) -> Array:
+    """Return points whose convex hull holds the solid, (n, 3), in the camera frame [m]."""
+    shape = solid.shape
+    if isinstance(shape, Cylinder):
+        n = 12
+        angles = 2.0 * np.pi * np.arange(n) / n
+        outer = shape.radius / np.cos(np.pi / n)
+        ring = np.stack([outer * np.cos(angles), outer * np.sin(angles), np.zeros(n)], axis=-1)
+        end = np.array([0.0, 0.0, 0.5 * shape.length])
+        points = np.concatenate([ring - end, ring + end])
+    elif isinstance(shape, Box):
+        points = _CORNERS * np.array(shape.size)
+    elif isinstance(shape, Sphere):
+        points = 2.0 * shape.radius * _CORNERS
+    else:
+        points = shape.vertices
+    return np.asarray(points @ solid.R.T + solid.w)
+
+
+def _hull(points: Array) -> Array:
+    """Return the convex hull of points in the plane, in order, (n, 2)."""
+    return np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], dtype=np.float64)
+
+
+def _cut(polygon: Array, low: Array, high: Array) -> Array:
+    """Return the part of a convex polygon inside a rectangle."""
+    if np.all((polygon >= low) & (polygon <= high)):
+        return polygon
+    for axis in (0, 1):
+        for bound, sign in ((low[axis], 1.0), (high[axis], -1.0)):
+            inside = sign * (polygon[:, axis] - bound)
+            kept = []
+            for i in range(len(polygon)):
+                here, before = inside[i], inside[i - 1]
+                if (here >= 0.0) != (before >= 0.0):
+                    t = before / (before - here)
+                    kept.append(polygon[i - 1] + t * (polygon[i] - polygon[i - 1]))
+                if here >= 0.0:
+                    kept.append(polygon[i])
+            if not kept:
+                return np.zeros((0, 2))
+            polygon = np.array(kept)
+    return polygon
+
+
+def _dense(polygon: Array, pieces: int = 12) -> Array:
+    """Return more points along the sides of a polygon: the lens bends them."""
+    t = np.arange(pieces)[:, None] / pieces
+    side = np.roll(polygon, -1, axis=0) - polygon
+    return np.asarray((polygon[:, None] + t * side[:, None]).reshape(-1, 2))
+
+
+def _filled(hull: Array, width: int, height: int) -> IntArray:
+    """Return the pixels in and around a convex polygon of pixels."""
+    low = np.maximum(np.floor(hull.min(axis=0)).astype(int) - MARGIN - 1, 0)
+    high = np.minimum(np.ceil(hull.max(axis=0)).astype(int) + MARGIN + 2, [width, height])
+    if np.any(high <= low):
+        return np.zeros(0, dtype=np.intp)
+    mask = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.uint8)
+    corners = np.rint((hull - low) * 2**_SHIFT).astype(np.int32)
+    cv2.fillConvexPoly(mask, corners, 1, shift=_SHIFT)
+    cv2.polylines(mask, [corners], True, 1, thickness=2 * MARGIN + 1, shift=_SHIFT)
+    where = np.flatnonzero(mask)
+    skipped = width - mask.shape[1]  # pixels between the end of a row and the start of the next
+    return np.asarray(where + where // mask.shape[1] * skipped + low[1] * width + low[0])
+
+
+_PIXELS = 8192  # at a time
+
+
+def printed(solid: SolidInView, x: Single, y: Single, face: Faces) -> Single | None:
+    """Return factors (n,) of the albedo where rays meet a solid; None if nothing is printed on it.
+
+    Parameters
+    ----------
+    solid : SolidInView
+        The solid.
+    x, y, face : (n,) array
+        Rays (x, y, 1), and the faces that they meet.
+    """
+    sheet = solid.material.sheet
+    if sheet is None or not isinstance(solid.shape, Box):
+        return None
+    height = (0.5 if sheet.face > 2 else -0.5) * solid.shape.size[2]
+    origin = -solid.R.T @ solid.w
+    a, b, c = (solid.R[:, i].tolist() for i in range(3))
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        depth = (height - float(origin[2])) / (x * c[0] + y * c[1] + c[2])
+        u = float(origin[0]) + depth * (x * a[0] + y * a[1] + a[2])
+        v = float(origin[1]) + depth * (x * b[0] + y * b[1] + b[2])
+    factor = np.ones(len(x), dtype=np.float32)
+    on = np.flatnonzero((face == sheet.face) & np.isfinite(u) & np.isfinite(v))
+    factor[on] = sheet.reflectance(u[on], v[on])
+    return factor
+
+
+def printed_inside(
+    solid: SolidInView, rays: PixelRays, pixels: IntArray, face: Faces, samples: int
+) -> Single | None:
+    """Return the mean of :func:`printed` over each of some pixels, (n,); None without a print.
+
+    Parameters
+    ----------
+    solid : SolidInView
+        The solid.
+    rays : PixelRays
+        The camera's rays.
+    pixels, face : (n,) array
+        Pixels that show one face of the solid, and which.
+    samples : int
+        Rays of each pixel.
+    """
+    if solid.material.sheet is None:
+        return None
+    means = []
+    for start in range(0, len(pixels), _PIXELS):
+        here = pixels[start : start + _PIXELS]
+        x, y = rays.within(here, samples)
+        faces = np.repeat(face[start : start + _PIXELS], samples)
+        found = printed(solid, x.ravel(), y.ravel(), faces)
+        if found is None:
+            return None
+        means.append(found.reshape(len(here), samples).mean(axis=1))
+    return np.concatenate(means) if means else np.zeros(0, dtype=np.float32)

@@ -4,22 +4,470 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array, Image
-from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.coarse_shadows import CoarseSurface
-from legcal.simulation.rendering.paint import Canvas, Painter
-from legcal.simulation.rendering.rays import PixelRays, Single, pixel_rays
-from legcal.simulation.rendering.sensor import develop
-from legcal.simulation.rendering.shading import Lighting
-from legcal.simulation.rendering.shadows import Lamp, Occluders
-from legcal.simulation.rendering.solid_in_view import SolidInView, in_view
-from legcal.simulation.rendering.surroundings import Surroundings, draw_surroundings
-from legcal.simulation.rendering.texture import background
-from legcal.simulation.solids import PlacedSolid
-from legcal.vision.camera import Camera
+from legcal.geometry import Array, BoolArray, Image, IntArray
+from legcal.simulation.rendering.appearance import Appearance, background
+from legcal.simulation.rendering.light import (
+    CoarseSurface,
+    Lamp,
+    Lighting,
+    Occluders,
+    Part,
+    shade,
+    shares_of_lamps,
+)
+from legcal.simulation.rendering.rays import (
+    PixelRays,
+    Single,
+    SolidInView,
+    footprint,
+    holding_sphere,
+    in_view,
+    intersect,
+    pixel_rays,
+    printed,
+    printed_inside,
+)
+from legcal.simulation.solids import (
+    Box,
+    Cylinder,
+    Material,
+    Mesh,
+    PlacedSolid,
+    Shape,
+    Solid,
+    Sphere,
+)
+from legcal.vision import Camera
+
+_TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=0.08,
+                  tint=(1.15, 1.0, 0.85))  # fmt: skip
+_CABLE = Material(albedo=0.04, specular=0.15, shininess=15.0, limb=0.2)
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What does not move, in the base frame.
+
+    Attributes
+    ----------
+    centre : (3,) array
+        The middle of the machine [m].
+    radius : float
+        The radius of a sphere around the machine [m].
+    up : (3,) array
+        The side of the base on which the machine stands.
+    floor, clutter, cables : tuple of PlacedSolid
+        Below, behind and around, and in front of the machine.
+    """
+
+    centre: Array
+    radius: float
+    up: Array
+    floor: tuple[PlacedSolid, ...]
+    clutter: tuple[PlacedSolid, ...]
+    cables: tuple[PlacedSolid, ...]
+
+
+def draw_surroundings(
+    placed: Sequence[PlacedSolid],
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    appearance: Appearance,
+    rng: np.random.Generator,
+) -> Surroundings:
+    """Draw what stands around a machine in one view.
+
+    Parameters
+    ----------
+    placed : sequence of PlacedSolid
+        The machine in some pose.
+    camera, T_base_camera
+        The camera and its pose: clutter stands where it looks.
+    appearance : Appearance
+        How much there is.
+    rng : numpy.random.Generator
+        Source.
+    """
+    centre, radius = _around(placed)
+    up = np.array([0.0, 0.0, 1.0])
+    eye = T_base_camera.translation
+    floor = _table(placed, centre, radius, up, eye) if appearance.table else ()
+    return Surroundings(
+        centre=centre,
+        radius=radius,
+        up=up,
+        floor=floor,
+        clutter=tuple(
+            _piece(i, centre, radius, camera, T_base_camera, rng) for i in range(appearance.clutter)
+        ),
+        cables=tuple(
+            _cable(i, centre, radius, T_base_camera, rng) for i in range(appearance.cables)
+        ),
+    )
+
+
+def _around(placed: Sequence[PlacedSolid]) -> tuple[Array, float]:
+    """Return the middle and the radius of a sphere around solids; a unit sphere around nothing."""
+    if not placed:
+        return np.zeros(3), 1.0
+    spheres = [(p.T_base_solid, *holding_sphere(p.solid.shape)) for p in placed]
+    middles = np.array([T.apply(middle) for T, middle, _ in spheres])
+    reaches = np.array([reach for _, _, reach in spheres])
+    low, high = (middles - reaches[:, None]).min(axis=0), (middles + reaches[:, None]).max(axis=0)
+    centre = 0.5 * (low + high)
+    return centre, float((np.linalg.norm(middles - centre, axis=1) + reaches).max())
+
+
+def _table(
+    placed: Sequence[PlacedSolid], centre: Array, radius: float, up: Array, eye: Array
+) -> tuple[PlacedSolid, ...]:
+    """Return a table right below the lowest solid; none where it would hide the machine."""
+    lowest = min((_lowest(p, up) for p in placed), default=-radius)
+    if float(eye @ up) <= lowest:
+        return ()
+    size = 4.0 * radius, 3.2 * radius, 0.06 * radius
+    foot = centre + (lowest - float(centre @ up) - 0.5 * size[2]) * up
+    T = RigidTransform.from_components(foot, Rotation.from_euler("z", 0.3))
+    return (_placed("table", Box(size), T, _TABLE),)
+
+
+def _lowest(placed: PlacedSolid, up: Array) -> float:
+    """Return the height of the lowest point of a solid."""
+    shape, T = placed.solid.shape, placed.T_base_solid
+    if isinstance(shape, Cylinder):
+        c = abs(float(T.rotation.as_matrix()[:, 2] @ up))
+        down = 0.5 * shape.length * c + shape.radius * max(1.0 - c * c, 0.0) ** 0.5
+        return float(T.translation @ up) - float(down)
+    middle, reach = holding_sphere(shape)
+    if isinstance(shape, Box):
+        reach = 0.5 * float(np.abs(T.rotation.as_matrix().T @ up) @ np.array(shape.size))
+    return float(T.apply(middle) @ up) - reach
+
+
+def _piece(
+    number: int,
+    centre: Array,
+    radius: float,
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    rng: np.random.Generator,
+) -> PlacedSolid:
+    """Return a rod, box or ball behind the machine, somewhere in the picture."""
+    depth = float(T_base_camera.inv().apply(centre)[2])
+    pixel = rng.uniform([-0.05, -0.05], [1.05, 1.05]) * [camera.width, camera.height]
+    xy = camera.undistort(np.clip(pixel, 0.0, [camera.width - 1.0, camera.height - 1.0])[None])[0]
+    z = max(depth, 0.0) + radius * rng.uniform(1.6, 5.0)
+    size = radius * rng.uniform(0.2, 1.0) * (z / max(depth, radius))
+    kind = rng.choice(3, p=[0.5, 0.4, 0.1])
+    shape: Shape
+    if kind == 0:
+        shape = Cylinder(size * rng.uniform(0.03, 0.15), size * rng.uniform(1.5, 4.0))
+    elif kind == 1:
+        a, b, c = (size * rng.uniform(0.3, 1.2, 3)).tolist()
+        shape = Box((a, b, c))
+    else:
+        shape = Sphere(0.3 * size)
+    z += holding_sphere(shape)[1]
+    turn = (
+        Rotation.random(rng=rng) if kind == 0 else Rotation.from_euler("z", rng.uniform(0.0, 7.0))
+    )
+    where = T_base_camera.apply(z * np.array([xy[0], xy[1], 1.0]))
+    material = Material(
+        albedo=float(rng.uniform(0.05, 0.7)),
+        specular=float(rng.choice([0.05, 0.15, 0.6])),
+        shininess=float(rng.uniform(10.0, 60.0)),
+        limb=float(rng.uniform(0.1, 0.4)),
+        texture=float(rng.uniform(0.0, 0.2)),
+        tint=_tint(rng),
+    )
+    return _placed(
+        f"clutter{number + 1}", shape, RigidTransform.from_components(where, turn), material
+    )
+
+
+def _cable(
+    number: int,
+    centre: Array,
+    radius: float,
+    T_base_camera: RigidTransform,
+    rng: np.random.Generator,
+) -> PlacedSolid:
+    """Return a thin dark cylinder that crosses the picture between camera and machine."""
+    eye = T_base_camera.translation
+    way = centre - eye
+    distance = float(np.linalg.norm(way))
+    t = rng.uniform(0.45, 0.9) * max(1.0 - radius / distance, 0.3)
+    width = radius * t
+    aside = T_base_camera.rotation.apply([*rng.uniform(-0.8, 0.8, 2), 0.0])
+    turn = T_base_camera.rotation * Rotation.from_euler(
+        "xz", [np.pi / 2 + rng.uniform(-0.3, 0.3), rng.uniform(0.0, np.pi)]
+    )
+    where = eye + t * way + width * aside
+    shape = Cylinder(width * rng.uniform(0.006, 0.02), 6.0 * width)
+    return _placed(f"cable{number + 1}", shape, RigidTransform.from_components(where, turn), _CABLE)
+
+
+def _placed(name: str, shape: Shape, T: RigidTransform, material: Material) -> PlacedSolid:
+    """Return a solid that is no part of the machine."""
+    return PlacedSolid(Solid(name, None, shape, T, material), T)
+
+
+def _tint(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Return a colour of mean 1."""
+    rgb = rng.uniform(0.5, 1.0, 3) ** 1.5
+    r, g, b = (3.0 * rgb / rgb.sum()).tolist()
+    return r, g, b
+
+
+def develop(radiance: Single, appearance: Appearance, rng: np.random.Generator) -> Image:
+    """Return the image of a radiance: blur, saturation, noise, gamma, rounding.
+
+    Parameters
+    ----------
+    radiance : (height, width) or (height, width, 3) array
+        Linear light, 1 at full scale.
+    appearance : Appearance
+        Lens and sensor.
+    rng : numpy.random.Generator
+        Source of the noise.
+
+    Returns
+    -------
+    array of uint8 or uint16
+        The image.
+    """
+    level = radiance * np.float32(appearance.exposure)
+    if appearance.blur > 0.0:
+        level = np.asarray(cv2.GaussianBlur(level, (0, 0), appearance.blur))
+    np.minimum(level, 1.0, out=level)
+    electrons = appearance.electrons
+    if np.isfinite(electrons):
+        sigma = np.sqrt(level / electrons + (appearance.read_noise / electrons) ** 2)
+        sigma *= rng.standard_normal(level.shape, dtype=np.float32)
+        level += sigma
+    np.clip(level, 0.0, 1.0, out=level)
+    if appearance.gamma != 1.0:
+        cv2.pow(level, 1.0 / appearance.gamma, level)
+    full = 255.0 if appearance.bits == 8 else 65535.0
+    level *= full
+    level += 0.5
+    return level.astype(np.uint8 if appearance.bits == 8 else np.uint16)
+
+
+_TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
+_THIN = 3.0  # [px] solids that rays through pixel centres may miss
+_PIXELS = 8192  # on edges, at a time
+_SHADED = 3  # of so many of a pixel's rays that meet a solid, one is shaded
+_FACES = 8  # that are told apart in the search for edges
+
+
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    """A picture being painted.
+
+    Attributes
+    ----------
+    z : (n,) array
+        Depth of what every pixel's centre shows [m]; infinite for the background.
+    terms : (n_terms, n_channels, n) array
+        Radiance: the sum, or apart what no shadow takes away and the light of each lamp.
+    """
+
+    z: Single
+    terms: Single
+
+
+class Painter:
+    """Paints solids with one light and one camera.
+
+    Parameters
+    ----------
+    rays : PixelRays
+        The camera's rays.
+    light : Lighting
+        The light.
+    samples : int
+        Rays of each pixel on an edge.
+    """
+
+    def __init__(self, rays: PixelRays, light: Lighting, samples: int) -> None:
+        self.rays, self.light, self.samples = rays, light, samples
+
+    def paint(
+        self, canvas: Canvas, solids: Sequence[SolidInView], bystanders: Sequence[SolidInView] = ()
+    ) -> None:
+        """Paint solids over a picture, where they are in front of what it shows.
+
+        Parameters
+        ----------
+        canvas : Canvas
+            The picture; changed in place.
+        solids : sequence of SolidInView
+            What to paint.
+        bystanders : sequence of SolidInView
+            What is not painted but casts shadows.
+        """
+        behind = canvas.z.copy()
+        occluders = Occluders([*solids, *bystanders])
+        feet = [footprint(self.rays, solid) for solid in solids]
+        key, face = self._first_hits(canvas.z, solids, feet)
+        edge = self._edges(key, solids, feet)
+        on_edge = np.flatnonzero(edge)
+        near = self._near_edges(key, on_edge, solids, feet)
+        parts = []
+        for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
+            inside = foot[(key[foot] // _FACES == i + 1) & ~edge[foot]]
+            if len(inside):
+                x, y = self.rays.x.take(inside), self.rays.y.take(inside)
+                ink = printed_inside(solid, self.rays, inside, face[inside], self.samples)
+                shaded = shade(solid, x, y, canvas.z[inside], face[inside], self.light, ink)
+                parts.append(Part(i, inside, shaded))
+        seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
+        for part, shares in zip(parts, seen, strict=True):
+            canvas.terms[:, :, part.pixels] = part.radiance(shares, len(canvas.terms))
+        del key, face, parts, seen
+        for start in range(0, len(on_edge), _PIXELS):
+            pixels = on_edge[start : start + _PIXELS]
+            shown = near[:, start : start + _PIXELS]
+            self._paint_edge(canvas, pixels, behind[pixels], solids, shown, occluders)
+
+    def _first_hits(
+        self, z: Single, solids: Sequence[SolidInView], feet: Sequence[IntArray]
+    ) -> tuple[NDArray[np.uint16], NDArray[np.int32]]:
+        """Find what every pixel's centre shows: solid and face as a key (0: none of them), face."""
+        key = np.zeros(len(z), dtype=np.uint16)
+        faces = np.zeros(len(z), dtype=np.int32)
+        for i, (solid, foot) in enumerate(zip(solids, feet, strict=True)):
+            depth, face = intersect(solid, self.rays.x.take(foot), self.rays.y.take(foot))
+            closer = np.flatnonzero(depth < z.take(foot) * np.float32(_TIE))
+            pixels = foot[closer]
+            z[pixels], faces[pixels] = depth[closer], face[closer]
+            key[pixels] = _FACES * (i + 1)
+            if not isinstance(solid.shape, Mesh):
+                key[pixels] += face[closer].astype(np.uint16)
+        return key, faces
+
+    def _edges(
+        self, key: NDArray[np.uint16], solids: Sequence[SolidInView], feet: Sequence[IntArray]
+    ) -> BoolArray:
+        """Return the pixels that an edge of a painted surface may cross.
+
+        A straight edge through a pixel parts its centre from that of one of the four beside it.
+        """
+        picture = key.reshape(self.rays.height, self.rays.width)
+        cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        edge = (cv2.dilate(picture, cross) != cv2.erode(picture, cross)).ravel()
+        for solid, foot in zip(solids, feet, strict=True):
+            if self._is_thin(solid):
+                edge[foot] = True
+        return np.asarray(edge, dtype=np.bool_)
+
+    def _near_edges(
+        self,
+        key: NDArray[np.uint16],
+        on_edge: IntArray,
+        solids: Sequence[SolidInView],
+        feet: Sequence[IntArray],
+    ) -> BoolArray:
+        """Return which solids each of some pixels may show, (n_solids, n): those of pixels around.
+
+        Thin ones may be anywhere in their footprints.
+        """
+        rows, columns = np.divmod(on_edge, self.rays.width)
+        above, below = np.maximum(rows - 1, 0), np.minimum(rows + 1, self.rays.height - 1)
+        left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, self.rays.width - 1)
+        shown = np.zeros((len(solids) + 1, len(on_edge)), dtype=np.bool_)
+        every = np.arange(len(on_edge))
+        for row in (above, rows, below):
+            for column in (left, columns, right):
+                shown[key.take(row * self.rays.width + column) // _FACES, every] = True
+        for solid, foot, here in zip(solids, feet, shown[1:], strict=True):
+            if self._is_thin(solid):
+                here |= np.isin(on_edge, foot, assume_unique=True)
+        return shown[1:]
+
+    def _is_thin(self, solid: SolidInView) -> bool:
+        """Return whether rays through the centres of pixels may miss a solid."""
+        farthest = float(solid.centre[2]) + solid.reach
+        return _thickness(solid) * float(self.rays.camera.K[0, 0]) < _THIN * farthest
+
+    def _paint_edge(
+        self,
+        canvas: Canvas,
+        pixels: IntArray,
+        behind: Single,
+        solids: Sequence[SolidInView],
+        shown: BoolArray,
+        occluders: Occluders,
+    ) -> None:
+        """Average many rays in each of some pixels, which may show some of the solids.
+
+        ``behind`` is the depth before painting.
+        """
+        n, S = len(pixels), self.samples
+        X, Y = self.rays.within(pixels, S)
+        X, Y = X.ravel(), Y.ravel()
+        Z = np.repeat(behind, S)
+        who = np.zeros(n * S, dtype=np.uint16)
+        faces = np.zeros(n * S, dtype=np.int32)
+        one_pixel = np.arange(S)
+        touched = []
+        for i in np.flatnonzero(shown.any(axis=1)).tolist():
+            here = (np.flatnonzero(shown[i])[:, None] * S + one_pixel).ravel()
+            depth, face = intersect(solids[i], X.take(here), Y.take(here))
+            closer = np.flatnonzero(depth < Z.take(here) * np.float32(_TIE))
+            if len(closer):
+                at = here.take(closer)
+                Z[at], who[at], faces[at] = depth.take(closer), i + 1, face.take(closer)
+                touched.append((i, here))
+        uncovered = np.count_nonzero(who.reshape(n, S) == 0, axis=1) / S
+        total = canvas.terms[:, :, pixels] * uncovered.astype(np.float32)
+        parts, weights = [], []
+        for i, here in touched:
+            at = here[who.take(here) == i + 1]
+            if len(at):
+                at, first, weight = _some_of_each(at, at // S)
+                x, y, face = X.take(at), Y.take(at), faces.take(at)
+                ink = printed(solids[i], x, y, face)
+                shaded = shade(solids[i], x, y, Z.take(at), face, self.light, ink)
+                parts.append(Part(i, at[first] // S, shaded, first))
+                weights.append(weight)
+        seen = shares_of_lamps(parts, self.light.lamps, occluders, self.rays)
+        for part, shares, weight in zip(parts, seen, weights, strict=True):
+            light = part.radiance(shares, len(canvas.terms))
+            total[:, :, part.pixels] += light * (weight / np.float32(S))
+        canvas.terms[:, :, pixels] = total
+
+
+def _some_of_each(
+    rays: IntArray, pixel: NDArray[np.intp]
+) -> tuple[IntArray, NDArray[np.intp], Single]:
+    """Return every third ray of each pixel, where each pixel's rays start, and what they weigh.
+
+    A surface's light varies little inside a pixel; that its rays are many matters for its edge.
+    """
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    count = np.diff(first, append=len(rays))
+    kept = (np.arange(len(rays)) - np.repeat(first, count)) % _SHADED == 0
+    n_kept = -(-count // _SHADED)
+    return rays[kept], np.cumsum(n_kept) - n_kept, (count / n_kept).astype(np.float32)
+
+
+def _thickness(solid: SolidInView) -> float:
+    """Return the least size of a solid [m]."""
+    shape = solid.shape
+    if isinstance(shape, Box):
+        return min(shape.size)
+    if isinstance(shape, Cylinder):
+        return min(2.0 * shape.radius, shape.length)
+    if isinstance(shape, Sphere):
+        return 2.0 * shape.radius
+    return np.inf
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,449 @@
+"""Has it moved? A few new images of a machine against the result of an earlier calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from legcal.calibration.changes import (
+    Explanation,
+    Movement,
+    difference,
+    judge_movement,
+    noise_dof,
+    possible_changes,
+)
+from legcal.calibration.earlier import EarlierResult, read_result
+from legcal.calibration.fitting import observe_and_fit
+from legcal.calibration.workpiece import workpiece
+from legcal.data import Dataset, load_dataset
+from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.estimation import (
+    Choices,
+    PlatformPair,
+    Prior,
+    Solution,
+    components,
+    in_file_order,
+    known_parameters,
+)
+from legcal.geometry import Array
+from legcal.machine import (
+    Mechanism,
+    Parametrization,
+    geometries,
+    parametrization_of,
+    pose_sensitivity,
+    vector_of,
+)
+from legcal.progress import Report, no_progress
+from legcal.vision import camera_numbers, intrinsic_names
+from legcal.workers import worker_pool
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+_SHOWN = 3  # explanations
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """The result of :func:`legcal.check`.
+
+    Attributes
+    ----------
+    dataset : Dataset
+        The new images; its ``mechanism`` is the calibrated model of the earlier result.
+    earlier : EarlierResult
+        What was tested.
+    solution : Solution
+        The fit of the new images by themselves.
+    movement : Movement
+        The test; ``movement.moved`` is its answer.
+    at_platform : PlatformPair
+        How far the platform by the new images is from that by the earlier result, root mean square
+        over the poses, and one standard deviation of this if nothing moved.
+    notes : tuple of str
+        What else a reader should know.
+    """
+
+    dataset: Dataset
+    earlier: EarlierResult
+    solution: Solution
+    movement: Movement
+    at_platform: PlatformPair
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """The answer in words."""
+        movement, pair = self.movement, self.at_platform
+        told = (
+            f"probability {_probability(movement.p_value)} if nothing did, significance "
+            f"{100 * movement.significance:g} %"
+        )
+        known = (
+            f"{1e3 * pair.expected_displacement:.3f} mm / "
+            f"{np.degrees(pair.expected_rotation):.4f} deg (1 sigma)"
+        )
+        if not movement.moved:
+            return (
+                f"Nothing has moved as far as these images can tell ({told}); they know the "
+                f"platform against the earlier result to {known}."
+            )
+        found = f"{1e3 * pair.displacement:.3f} mm / {np.degrees(pair.rotation):.4f} deg"
+        return (
+            f"Something has moved ({told}): the platform is {found} from where the earlier result "
+            f"has it, known to {known}; calibrate again."
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the document that ``--json`` prints."""
+        movement, pair = self.movement, self.at_platform
+        return {
+            "legcal_check": 1,
+            "result": str(self.earlier.folder),
+            "moved": movement.moved,
+            "significance": movement.significance,
+            "p_value": movement.p_value,
+            "statistic": movement.statistic,
+            "dof": movement.dof,
+            "of": len(self.earlier.names),
+            "noise_dof": movement.noise_dof,
+            "verdict": self.sentence,
+            "explanations": [_explanation(e) for e in movement.explanations],
+            "platform": {
+                "dX_m": pair.displacement,
+                "dE_rad": pair.rotation,
+                "sigma_dX_m": pair.expected_displacement,
+                "sigma_dE_rad": pair.expected_rotation,
+            },
+            "images": self.dataset.measurements.n_rows,
+            "residuals": {
+                "chi2": self.solution.chi2,
+                "dof": self.solution.dof,
+                "rms_px": self.solution.rms_px,
+            },
+            "notes": list(self.notes),
+        }
+
+
+def check_summary(check: Check) -> RenderableType:
+    """Return what people read."""
+    from rich.console import Group
+    from rich.text import Text
+
+    movement = check.movement
+    images = check.dataset.measurements.n_rows
+    lines = [f"Note: {note}" for note in check.notes]
+    lines.append(
+        f"{images} image{'s' * (images != 1)} compared with {check.earlier.folder}: {movement.dof} "
+        f"of {len(check.earlier.names)} directions of the parameters, "
+        f"statistic {movement.statistic:.1f}."
+    )
+    lines += _explanation_lines(movement)
+    style = "bold red" if movement.moved else "bold green"
+    return Group(*(Text(line) for line in lines), Text(check.sentence, style=style))
+
+
+def _explanation_lines(movement: Movement) -> list[str]:
+    """Return what explains a movement."""
+    if not movement.explanations:
+        return []
+    first = movement.explanations[0]
+    if first.p_value < movement.significance:
+        return [
+            f"No single leg explains it; {first.change.what} explains most "
+            f"({_amount(first)}; {first.remaining:.1f} of {movement.statistic:.1f} are left)."
+        ]
+    lines = [f"It is explained by {first.change.what}: {_amount(first)}."]
+    others = [e.change.what for e in movement.explanations[1 : 1 + _SHOWN]]
+    if others:
+        lines.append(f"These images cannot tell that from: {', '.join(others)}.")
+    return lines
+
+
+def _amount(explanation: Explanation) -> str:
+    """Return by how much something changed, in words."""
+    change = explanation.change
+    parts = []
+    for name, unit, value, sigma in zip(
+        change.components,
+        change.units,
+        explanation.values.tolist(),
+        explanation.sigma.tolist(),
+        strict=True,
+    ):
+        scale, shown = (1e3, "mm") if unit == "m" else (180.0 / np.pi, "deg")
+        parts.append(f"{name} {scale * value:+.3f} {shown} (1 sigma {scale * sigma:.3f})")
+    return ", ".join(parts)
+
+
+def _explanation(explanation: Explanation) -> dict[str, Any]:
+    """Return an explanation as JSON has it."""
+    change = explanation.change
+    return {
+        "what": change.what,
+        "components": list(change.components),
+        "units": list(change.units),
+        "values": explanation.values.tolist(),
+        "sigma": explanation.sigma.tolist(),
+        "remaining": explanation.remaining,
+        "p_value": explanation.p_value,
+    }
+
+
+def _probability(p: float) -> str:
+    """Return a probability as people read it."""
+    return "below 1e-6" if p < 1e-6 else f"{p:.2g}"
+
+
+SIGNIFICANCE = 0.01
+_LARGEST_SIGNIFICANCE = 0.5
+_PLAUSIBLE = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
+
+
+def check(
+    source: str | Path | Dataset,
+    result: str | Path,
+    *,
+    significance: float = SIGNIFICANCE,
+    progress: Report = no_progress,
+    workers: int = 1,
+) -> Check:
+    """Test with a few new images whether an earlier calibration still holds.
+
+    Parameters
+    ----------
+    source : path or Dataset
+        The new images, of cameras anywhere. Nothing is written beside them.
+    result : path
+        The folder that the earlier calibration wrote.
+    significance : float
+        Probability of a false alarm.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+    workers : int
+        Search the images in that many processes.
+
+    Returns
+    -------
+    Check
+
+    Raises
+    ------
+    UsageError
+        If the significance is none.
+    DatasetError, ModelError, OutOfClass
+        If images or result are malformed, or of different machines.
+    NotVisible, NotIdentifiable, DidNotConverge
+        If the new images cannot be fitted, or say nothing.
+    """
+    check_significance(significance)
+    earlier = read_result(result)
+    dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    dataset = _as_calibrated(dataset, earlier)
+    known = _known(dataset, earlier)
+    with worker_pool(workers) as run:
+        choices = _choices(dataset, earlier, known)
+        work = workpiece(dataset, run, None, choices, use_cache=True, every_leg=False)
+        found = observe_and_fit(work, np.arange(dataset.measurements.n_rows), progress)
+    if dataset.axes is None and not found.outlines.used.any():
+        refusal = (
+            f"{dataset.folder}: the earlier result could not be tested: found no used outline in "
+            "any image, needed some; take images that show the legs."
+        )
+        raise NotVisible([refusal, *found.notes])
+    solution = in_file_order(found.solution, found.part.order, dataset)
+    tested = _compare(dataset, earlier, solution, known, significance)
+    notes = (*dataset.notes, *found.notes, *found.doubts, *solution.notes)
+    return replace(tested, notes=tuple(dict.fromkeys(notes)))
+
+
+def check_significance(significance: float) -> None:
+    """Refuse a significance that is none.
+
+    Raises
+    ------
+    UsageError
+        If it is not between 0 and 0.5.
+    """
+    if not 0.0 < significance <= _LARGEST_SIGNIFICANCE:
+        raise UsageError(
+            f"The earlier result could not be tested: found the significance {significance:g}, "
+            f"needed a probability above 0 and up to {_LARGEST_SIGNIFICANCE:g} (0.01 gives one "
+            "false alarm in a hundred checks); correct it."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """The parameters that may have moved, where they were, and how far they may be now.
+
+    Attributes
+    ----------
+    names : tuple of str
+    old : (n,) array
+        Their earlier values.
+    covariance : (n, n) array
+        That of these, room along what was held included.
+    plausible : (n,) array
+        Standard deviations that leave room for whatever moved [m, rad].
+    furthest : float
+        That along directions that are held [m].
+    """
+
+    names: tuple[str, ...]
+    old: Array
+    covariance: Array
+    plausible: Array
+    furthest: float
+
+
+def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
+    """Return new images with the calibrated model in place of the one that they name."""
+    given, calibrated = dataset.mechanism, earlier.mechanism
+    different = ""
+    if sorted(given.leg_names) != sorted(calibrated.leg_names):
+        different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(given.leg_names)}"
+    else:
+        calibrated = calibrated.with_leg_order(given.leg_names)
+        different = _difference(calibrated, given)
+    if different:
+        raise DatasetError(
+            f"{earlier.folder}: the earlier result could not be tested with {dataset.folder}: "
+            f"found the result of another machine, with {different}, needed one of the same; give "
+            "the result that belongs to these images."
+        )
+    return replace(dataset, mechanism=calibrated, wishes=())
+
+
+def _difference(calibrated: Mechanism, given: Mechanism) -> str:
+    """Return what differs between two models of the same legs, nothing if they are one machine."""
+    for one, other in zip(calibrated.legs, given.legs, strict=True):
+        here, there = (f"{leg.name} ({leg.kind}, {leg.type})" for leg in (one, other))
+        if here != there:
+            return f"the leg {here}, not {there}"
+        if one.prismatic != other.prismatic:
+            return f"the joint {one.prismatic}, not {other.prismatic}"
+    frames = [[m.leg_names[j] for j in m.frame_legs] for m in (calibrated, given)]
+    if frames[0] != frames[1]:
+        return f"base_frame {', '.join(frames[0])}, not {', '.join(frames[1])}"
+    return ""
+
+
+def _known(dataset: Dataset, earlier: EarlierResult) -> _Known:
+    """Return what the earlier result says of the parameters that are compared."""
+    mechanism = dataset.mechanism
+    legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    values = vector_of(found, legs, legs)
+    chosen = [found.names.index(name) for name in earlier.names]
+    length = float(np.mean([np.linalg.norm(vector) for vector in _leg_vectors(mechanism)]))
+    plausible = np.array([_PLAUSIBLE * (length if found.units[i] == "m" else 1.0) for i in chosen])
+    furthest = _PLAUSIBLE * length
+    covariance = _with_held(earlier.covariance, earlier.held, furthest)
+    return _Known(earlier.names, values[chosen], covariance, plausible, furthest)
+
+
+def _with_held(covariance: Array, held: Array, furthest: float) -> Array:
+    """Return a covariance with room along what was held, of which nothing is known."""
+    return np.asarray(covariance + furthest**2 * held.T @ held)
+
+
+def _leg_vectors(mechanism: Mechanism) -> Array:
+    """Return the vectors from A to B at home, (n_legs, 3) [m]."""
+    return np.asarray(mechanism.home.apply(mechanism.B_platform) - mechanism.A_base)
+
+
+def _choices(dataset: Dataset, earlier: EarlierResult, known: _Known) -> Choices:
+    """Return priors that leave room for whatever may have moved."""
+    priors = {
+        name: Prior(float(mean), float(sigma))
+        for name, mean, sigma in zip(known.names, known.old, known.plausible, strict=True)
+    }
+    for view in dataset.measurements.views:
+        for owner, numbers in earlier.cameras.items():
+            if numbers != camera_numbers(view.camera):
+                continue
+            for key in intrinsic_names(view.camera):
+                if f"{owner}.{key}" in earlier.intrinsics:
+                    priors[f"{view.name}.{key}"] = Prior(*earlier.intrinsics[f"{owner}.{key}"])
+    owned = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
+    return Choices(
+        fixed=frozenset(earlier.fixed),
+        priors={name: prior for name, prior in priors.items() if name in owned},
+        least_shared_px=earlier.shared_px,
+    )
+
+
+def _compare(
+    dataset: Dataset,
+    earlier: EarlierResult,
+    solution: Solution,
+    known: _Known,
+    significance: float,
+) -> Check:
+    """Return what the fit of the new images says against the earlier result."""
+    mechanism, parametrization = dataset.mechanism, solution.parametrization
+    columns = [parametrization.names.index(name) for name in known.names]
+    values = np.array([solution.values[name] for name in known.names])
+    covariance = _with_held(
+        solution.value_covariance[np.ix_(columns, columns)],
+        solution.held_basis[:, columns],
+        known.furthest,
+    )
+    worse = _earlier_noise(solution, earlier)
+    found = difference(values, covariance, known.plausible, known.old, known.covariance, worse)
+    dof = noise_dof(solution.dof, covariance, known.plausible) if worse == 1.0 else earlier.dof
+    legs = geometries(mechanism)
+    changes = possible_changes(
+        mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
+    )
+    movement = judge_movement(found, dof, changes, significance)
+    poses = components(solution.T_Rb_Re)
+    J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *poses)[:, :, columns]
+    # Priors pull what was found to the earlier result by 1 - G.
+    G = np.eye(len(values)) - covariance / known.plausible**2
+    spread = worse * G @ covariance + G @ known.covariance @ G.T
+    shift = J @ (values - known.old)
+    variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
+    at_platform = PlatformPair(
+        _rms(shift[:, 3:] ** 2),
+        _rms(variance[:, 3:]),
+        _rms(shift[:, :3] ** 2),
+        _rms(variance[:, :3]),
+    )
+    return Check(dataset, earlier, solution, movement, at_platform)
+
+
+def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
+    """Return how many times the variance by the new images is that by the earlier ones, or one."""
+    claimed = solution.outlines.covariance[solution.outlines.used]
+    if len(claimed) == 0:
+        return 1.0
+    now, then = (
+        float(np.mean(np.trace(noise.covariance(claimed), axis1=1, axis2=2)))
+        for noise in (solution.noise, earlier.noise)
+    )
+    return max(then / now, 1.0)
+
+
+def _only(parametrization: Parametrization, columns: Sequence[int]) -> Parametrization:
+    """Return some of the parameters."""
+    place = np.full(parametrization.place.shape, -1, dtype=np.intp)
+    for new, old in enumerate(columns):
+        place[parametrization.place == old] = new
+    return Parametrization(
+        tuple(parametrization.names[i] for i in columns),
+        tuple(parametrization.units[i] for i in columns),
+        place,
+    )
+
+
+def _rms(squares: Array) -> float:
+    """Return the root of the mean over poses of sums of squares (k, 3)."""
+    return float(np.sqrt(np.mean(squares.sum(axis=1))))

@@ -1,0 +1,214 @@
+"""From photographs and readings to a calibrated mechanism: the whole method in one place.
+
+The images are searched and fitted in :mod:`legcal.calibration.fitting`, in an order of rows, views
+and legs that does not depend on the files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from legcal.calibration.fitting import Found, observe_and_fit
+from legcal.calibration.identify.analysis import check_identifiable
+from legcal.calibration.result import write_result
+from legcal.calibration.starts import board_notes
+from legcal.calibration.verdict import Calibration, judge
+from legcal.calibration.workpiece import Workpiece, workpiece
+from legcal.data import (
+    Dataset,
+    Split,
+    Wish,
+    check_fraction,
+    dataset_at,
+    inverse,
+    load_dataset,
+    outlines_at,
+    reject_unused_legs,
+    restore_corners,
+    split_images,
+    wishes_of_call,
+)
+from legcal.errors import UsageError
+from legcal.estimation import (
+    DEFAULT_SETTINGS,
+    Choices,
+    HeldOut,
+    Prior,
+    Solution,
+    compare_held_out,
+    in_file_order,
+    known_parameters,
+    resolve,
+)
+from legcal.files import check_destination, output_path
+from legcal.paper import Criteria, Transformation
+from legcal.progress import Report, no_progress
+from legcal.workers import worker_pool
+
+TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
+
+
+def calibrate(
+    source: str | Path | Dataset,
+    *,
+    output: str | Path | None = None,
+    progress: Report = no_progress,
+    criteria: Criteria = "default",
+    transformation: Transformation | None = None,
+    use_cache: bool = True,
+    workers: int = 1,
+    priors: Mapping[str, tuple[float, float] | str] | Sequence[str] = (),
+    fixed: Sequence[str] = (),
+    free: Sequence[str] = (),
+    holdout: float | None = None,
+) -> Calibration:
+    """Compute joint positions and offsets of a mechanism from a dataset.
+
+    Parameters
+    ----------
+    source : path or Dataset
+        The dataset folder, or what :func:`legcal.load_dataset` returned.
+    output : path, optional
+        Write the result folder there: calibrated model, parameters, observations.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+    criteria : {"default", "literal"}
+        What the four steps minimise: legcal's criteria, or the paper's as printed.
+    transformation : {"points", "cross_product"}, optional
+        How they compute where the platform is, eq (18): by point equality, or as printed. By
+        default as the criteria are.
+    use_cache : bool
+        Use the outlines that an earlier run left beside the dataset, if they still fit.
+    workers : int
+        Search the images in that many processes. With more than one, the program that calls
+        this must be safe to import (``if __name__ == "__main__":``).
+    priors : mapping or sequence of str
+        What is known of parameters: (value, sigma) in SI units or pixels, or text such as
+        ``420±0.1 mm``, by name or pattern; or texts that begin with ``NAME=``. These three
+        win over what ``dataset.yaml`` says.
+    fixed : sequence of str
+        Names or patterns of parameters left at nominal, or ``NAME=VALUE``.
+    free : sequence of str
+        Names or patterns of parameters to look for that are fixed otherwise (intrinsics), and of
+        radii and twists to look for without a prior.
+    holdout : float, optional
+        Keep this part of the images aside, and tell how well the fit of the others foretells them.
+
+    Returns
+    -------
+    Calibration
+        Look at its ``verdict`` before you use it.
+
+    Raises
+    ------
+    DatasetError, ModelError, OutOfClass
+        If the input is malformed or not covered.
+    NotVisible
+        If the images do not show the legs.
+    NotIdentifiable
+        If the observations do not determine the parameters.
+    DidNotConverge
+        If no solver reached its tolerance. Nothing is written in any of these cases.
+    UsageError
+        If ``output`` holds something else, or ``priors``, ``fixed`` and ``free`` name what is no
+        parameter or contradict each other.
+    """
+    if output is not None:
+        check_destination(output_path(output))
+    if holdout is not None:
+        check_fraction(holdout)
+    wishes = wishes_of_call(priors, fixed, free)
+    dataset = source if isinstance(source, Dataset) else load_dataset(source)
+    choices = _choices(dataset, wishes)
+    rows = np.arange(dataset.measurements.n_rows)
+    if holdout is not None and dataset.axes is not None:
+        raise UsageError(
+            f"{dataset.folder}: no images could be kept aside: found a table of axes, needed "
+            "images or outlines, in which a fit is compared with what it did not see; leave out "
+            "--holdout."
+        )
+    split = Split(rows, rows[:0]) if holdout is None else split_images(dataset, holdout)
+    fitted = dataset_at(dataset, split.fitted)
+    left_open = check_identifiable(fitted, choices)
+    with worker_pool(workers) as run:
+        work = workpiece(
+            dataset, run, criteria, choices, use_cache=use_cache, transformation=transformation
+        )
+        found = observe_and_fit(work, split.fitted, progress)
+    kept = [] if found.other_radii else work.keep_outlines(found.outlines, found.notes)
+    unreached = found.part.reached.notes(found.part.measurements)
+    notes = [
+        *dataset.notes,
+        *found.notes,
+        *found.doubts,
+        *choices.notes,
+        *left_open,
+        *kept,
+        *unreached,
+    ]
+    order = found.part.order
+    corners = None if found.corners is None else restore_corners(found.corners, work.order)
+    calibration = judge(
+        fitted,
+        in_file_order(found.solution, order, fitted),
+        found.steps.in_file_order(order),
+        (
+            *notes,
+            *board_notes(dataset, found.solution, corners),
+            *found.solution.notes,
+            *_camera_notes(dataset, found.solution),
+        ),
+    )
+    calibration = replace(calibration, corners=corners)
+    if len(split.kept_aside):
+        held_out = _compare_held_out(work, found, split)
+        calibration = replace(calibration, held_out=held_out)
+    if output is not None:
+        write_result(calibration, Path(output))
+    return calibration
+
+
+def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
+    """Return what dataset and run choose of the parameters.
+
+    Twists that nobody chooses anything of are looked for with a prior: no leg is built without an
+    error of its twist, and one that was left at nominal would spoil what is told of the others.
+    """
+    views, axes_given = dataset.measurements.views, dataset.axes is not None
+    known = known_parameters(
+        dataset.mechanism, views, axes_given=axes_given, with_board=dataset.board is not None
+    )
+    choices = resolve([*dataset.wishes, *wishes], known)
+    twists = {
+        name: Prior(parameter.nominal, TWIST_SIGMA)
+        for name, parameter in known.by_name.items()
+        if name.endswith(".twist") and choices.holds(name, by_default=True)
+    }
+    twists = {name: prior for name, prior in twists.items() if name not in choices.fixed}
+    return replace(choices, priors={**twists, **choices.priors})
+
+
+def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
+    """Return which files hold the focal lengths that the measurements contradict."""
+    names = [view.name for view in dataset.measurements.views]
+    return [
+        f"The focal length of {view} that does not agree is that of "
+        f"{dataset.camera_paths[names.index(view)]}."
+        for view in solution.doubtful_cameras
+    ]
+
+
+def _compare_held_out(work: Workpiece, found: Found, split: Split) -> HeldOut:
+    """Return what the images that were kept aside say of the fit."""
+    aside, solution = work.part(split.kept_aside), found.solution
+    rows = inverse(work.order.rows)[split.kept_aside[aside.order.rows]]
+    outlines = outlines_at(found.outlines, rows)
+    outlines = reject_unused_legs(outlines, aside.measurements, aside.mechanism.leg_names)
+    poses = aside.poses_by(solution.legs)
+    return compare_held_out(
+        solution.posterior, aside.measurements, outlines, poses, DEFAULT_SETTINGS.rejection
+    )

@@ -1,0 +1,181 @@
+"""What a calibration gives: parameters with their uncertainty, and whether to believe them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data import Corners, Dataset, Order, inverse
+from legcal.estimation import (
+    FOCAL_PART,
+    HeldOut,
+    PlatformAccuracy,
+    Solution,
+    known_parameters,
+    platform_accuracy,
+)
+from legcal.machine import LegGeometry
+
+TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What the four steps give by themselves.
+
+    Attributes
+    ----------
+    legs : tuple of LegGeometry or None
+        The legs in R_b and R_e; None if the steps could not be run to the end.
+    T_Rb_camera : tuple of RigidTransform or None
+        The cameras that step 2 places; None as a whole if the steps failed.
+    failure : str
+        Why they failed; "" if they did not.
+    diagnostics : tuple of str
+        What they left out or at nominal, and why.
+    """
+
+    legs: tuple[LegGeometry, ...] | None
+    T_Rb_camera: tuple[RigidTransform | None, ...] | None
+    failure: str
+    diagnostics: tuple[str, ...] = ()
+
+    def in_file_order(self, order: Order) -> Steps:
+        """Return the same with legs and views in the order of the files."""
+        legs, views = inverse(order.legs), inverse(order.views)
+        return replace(
+            self,
+            legs=None if self.legs is None else tuple(self.legs[j] for j in legs.tolist()),
+            T_Rb_camera=None
+            if self.T_Rb_camera is None
+            else tuple(self.T_Rb_camera[v] for v in views.tolist()),
+        )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the calibrated model should replace the nominal one.
+
+    Attributes
+    ----------
+    trustworthy : bool
+        The predicted improvement exceeds two of its standard deviations.
+    sentence : str
+        The same, for people.
+    """
+
+    trustworthy: bool
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The result of :func:`legcal.calibrate`, in the order of the files.
+
+    Attributes
+    ----------
+    dataset : Dataset
+        What it was computed from; its ``mechanism`` is the nominal model.
+    solution : Solution
+        The fit of everything: parameters, covariance, cameras, platform poses, radii.
+    steps : Steps
+        What the four steps gave.
+    platform : PlatformAccuracy or None
+        What the platform of the calibrated model does differently, and how well that is known;
+        None where the motors do not determine its pose.
+    verdict : Verdict
+        Whether to use it.
+    notes : tuple of str
+        What else a reader should know.
+    held_out : HeldOut or None
+        What images that were kept aside say of the fit; None where there are none.
+    corners : Corners or None
+        The corners of the calibration board in all images; None without a board.
+    """
+
+    dataset: Dataset
+    solution: Solution
+    steps: Steps
+    platform: PlatformAccuracy | None
+    verdict: Verdict
+    notes: tuple[str, ...]
+    held_out: HeldOut | None = None
+    corners: Corners | None = None
+
+
+def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[str]) -> Calibration:
+    """Return the calibration with its verdict.
+
+    The improvement that the fit predicts is the distance between the nominal and the
+    calibrated platform at the readings of the dataset; it counts where it exceeds two of its
+    standard deviations. Where readings do not determine a pose, it is that of the parameters.
+    """
+    mechanism, measurements = dataset.mechanism, dataset.measurements
+    platform = platform_accuracy(
+        mechanism,
+        solution.legs,
+        solution.parametrization,
+        solution.kinematic_covariance + solution.held_covariance,
+        measurements.q[measurements.first_rows],
+        solution.T_Rb_Re,
+        solution.sensitivities,
+    )
+    if platform is None:
+        verdict = _verdict_on_parameters(dataset, solution)
+    else:
+        verdict = _verdict_on_platform(platform, solution.focal_doubt)
+    return Calibration(dataset, solution, steps, platform, verdict, tuple(notes))
+
+
+def _verdict_on_platform(platform: PlatformAccuracy, focal_doubt: float) -> Verdict:
+    """Compare the change of the platform with its uncertainty, in displacement.
+
+    A focal length that the measurements contradict counts with what it does to the platform.
+    """
+    change, sigma = platform.change, platform.sigma
+    found = (
+        f"the platform moves by {1e3 * change.mean_displacement:.3f} mm / "
+        f"{np.degrees(change.mean_rotation):.4f} deg against the nominal model, known to "
+        f"{1e3 * sigma.mean_displacement:.3f} mm / {np.degrees(sigma.mean_rotation):.4f} deg "
+        "(1 sigma)"
+    )
+    of_focal = [e.error.mean_displacement for e in platform.effects if "focal" in e.what]
+    doubt = focal_doubt / FOCAL_PART * max(of_focal, default=0.0)
+    if doubt > 0.0:
+        found += f"; a focal length that the measurements contradict may add {1e3 * doubt:.3f} mm"
+    return _verdict(
+        change.mean_displacement, float(np.hypot(sigma.mean_displacement, doubt)), found
+    )
+
+
+def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
+    """Compare the change of joints and lengths with their uncertainty."""
+    known = known_parameters(
+        dataset.mechanism, dataset.measurements.views, with_board=dataset.board is not None
+    ).by_name
+    lengths = [
+        (solution.values[name] - known[name].nominal, sigma)
+        for name, sigma in zip(solution.names, solution.sigma.tolist(), strict=True)
+        if known[name].kind == "kinematic" and known[name].unit == "m"
+    ]
+    change, sigma = np.sqrt(np.mean(np.square(lengths or [(0.0, 0.0)]), axis=0)).tolist()
+    found = (
+        f"joints and lengths change by {1e3 * change:.3f} mm against the nominal model, known to "
+        f"{1e3 * sigma:.3f} mm (1 sigma, both rms); the motors do not determine the pose of the "
+        "platform, so that no error of it is told"
+    )
+    return _verdict(change, sigma, found)
+
+
+def _verdict(improvement: float, sigma: float, found: str) -> Verdict:
+    """Return what an improvement with a standard deviation is worth."""
+    if improvement > TRUSTED_SIGMAS * sigma:
+        return Verdict(True, f"Calibrated: {found}.")
+    return Verdict(
+        False,
+        f"Do not load this into the controller: {found}, and a predicted improvement below two "
+        "sigma is no improvement; take more images or better ones.",
+    )

@@ -1,1 +1,0 @@
-"""A camera calibrated from photographs of a flat board."""

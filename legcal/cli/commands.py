@@ -1,0 +1,409 @@
+"""``legcal noise``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from legcal.cli.calibrate import MOST_WORKERS
+from legcal.cli.options import JsonOption, ModelArgument, WorkersOption, print_json, print_table
+from legcal.errors import UsageError
+from legcal.processors import processors
+
+
+class Model(StrEnum):
+    """How a lens distorts."""
+
+    PLUMB_BOB = "plumb_bob"
+    RATIONAL_POLYNOMIAL = "rational_polynomial"
+    EQUIDISTANT = "equidistant"
+
+
+def camera(
+    images: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="IMAGES...", help="Photographs of the board: files, folders, patterns."
+        ),
+    ],
+    board: Annotated[
+        str,
+        typer.Option(
+            metavar="SPEC",
+            help="chessboard:9x6:25mm (squares), charuco:7x5:40mm:29mm:DICT_4X4_50 (square, "
+            "marker), aprilgrid:6x6:88mm:0.3 (gap as a part of a tag), or a YAML file with a block "
+            "board.",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="The camera_info YAML to write.")
+    ],
+    model: Annotated[
+        Model, typer.Option(help="How the lens distorts; equidistant for a fisheye.")
+    ] = Model.PLUMB_BOB,
+    workers: WorkersOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
+    from legcal.calibration import calibrate_camera
+    from legcal.report import progress_on_stderr
+
+    with progress_on_stderr() as progress:
+        found = calibrate_camera(
+            images,
+            board,
+            model=model.value,
+            output=output,
+            progress=progress,
+            workers=workers or min(processors(), MOST_WORKERS),
+        )
+    if as_json:
+        print_json(found.document())
+    else:
+        from legcal.report import camera_table
+
+        print_table(camera_table(found, output))
+
+
+def detect(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="The folder to write: observations.csv, index.html and every image with what was "
+            "found in it.",
+        ),
+    ],
+    workers: WorkersOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the outlines of the legs and show them over the images, to see what went wrong."""
+    from legcal.calibration import detect as run
+    from legcal.perception import detection_document, picture_names
+    from legcal.report import progress_on_stderr
+
+    with progress_on_stderr() as progress:
+        found = run(
+            dataset,
+            output=output,
+            progress=progress,
+            workers=workers or min(processors(), MOST_WORKERS),
+        )
+    document = detection_document(found, picture_names(found))
+    if as_json:
+        print_json(document)
+    else:
+        from legcal.perception import detection_table
+
+        print_table(detection_table(document, output))
+    if found.unplaced or document["used"] == 0:
+        raise typer.Exit(1)
+
+
+def evaluate(
+    model: ModelArgument,
+    reference: Annotated[
+        str, typer.Argument(metavar="REFERENCE", help="The model to compare with, often the truth.")
+    ],
+    dataset: Annotated[
+        Path | None,
+        typer.Option(
+            "--dataset",
+            metavar="DATASET",
+            help="Compare at the readings of this dataset instead of 100 random poses.",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare two models: platform errors of eq (20), and every parameter."""
+    from legcal.calibration import evaluate as run
+
+    evaluation = run(model, reference, dataset=dataset)
+    if as_json:
+        print_json(evaluation.document())
+    else:
+        from legcal.report import accuracy_table
+
+        print_table(accuracy_table(evaluation))
+
+
+def identify(
+    model: Annotated[
+        str,
+        typer.Argument(
+            metavar="MODEL|DATASET",
+            help="A mechanism as for inspect, or a dataset folder, whose own views are judged.",
+        ),
+    ],
+    view: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--view",
+            metavar="LEG,LEG,...",
+            help="The legs that one camera position shows; once for each position. Without any, "
+            "the smallest sets of views that suffice are recommended.",
+        ),
+    ] = None,
+    images: Annotated[
+        int | None, typer.Option(help="Images a view, each of another pose; 15 without it.")
+    ] = None,
+    board: Annotated[
+        bool,
+        typer.Option(
+            "--board",
+            help="A calibration board on the base is seen in every image: cameras are tied to "
+            "each other.",
+        ),
+    ] = False,
+    hand_held: Annotated[
+        bool,
+        typer.Option(
+            "--hand-held",
+            help="Every image of a view is taken from a place of its own; with --board.",
+        ),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say which parameters a calibration can find, and what would mend what is missing."""
+    from legcal.calibration import answer
+
+    views = [text.split(",") for text in view or []]
+    report = answer(model, views, images, board=board, hand_held=hand_held)
+    if as_json:
+        print_json(report.document())
+    else:
+        from legcal.report import identify_table
+
+        print_table(identify_table(report))
+
+
+def inspect(
+    model: ModelArgument,
+    as_json: JsonOption = False,
+    write: Annotated[
+        Path | None,
+        typer.Option(
+            "--write",
+            metavar="DIR",
+            help="Write the model down as DIR/models/NAME.yaml and DIR/urdf/NAME.urdf.",
+        ),
+    ] = None,
+) -> None:
+    """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
+    from legcal.machine import describe, load_mechanism
+
+    mechanism = load_mechanism(model)
+    description = describe(mechanism)
+    if write is not None:
+        from legcal.machine import write_model
+
+        for path in write_model(mechanism, write):
+            typer.echo(f"Wrote {path}.", err=True)
+    if as_json:
+        print_json(description)
+    else:
+        from legcal.report import inspect_table
+
+        print_table(inspect_table(description))
+
+
+def locate(
+    model: ModelArgument,
+    poses: Annotated[
+        Path,
+        typer.Argument(metavar="POSES", help="A CSV of readings and tool poses in the world."),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="The YAML to write.")
+    ] = ...,  # type: ignore[assignment]
+    urdf: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write models/ and urdf/ with world and tool in them."),
+    ] = None,
+    position_sigma: Annotated[
+        str | None,
+        typer.Option(help="Of a measured position, a component: 0.02mm; else from the residuals."),
+    ] = None,
+    angle_sigma: Annotated[
+        str | None,
+        typer.Option(help="Of a measured orientation: 0.01deg; else from the residuals."),
+    ] = None,
+    encoder_sigma: Annotated[str | None, typer.Option(help="Of a reading: 2um; 0 else.")] = None,
+    tool_position: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Of the tool in the platform [m], taken where the machine leaves it open; 0,0,0 "
+            "else.",
+        ),
+    ] = None,
+    world_link: Annotated[str, typer.Option(help="Of --urdf: the name of the world link.")] = (
+        "world"
+    ),
+    tool_link: Annotated[str, typer.Option(help="Of --urdf: the name of the tool link.")] = "tool",
+    as_json: JsonOption = False,
+) -> None:
+    """Find the base in the world and the tool in the platform from measured tool poses."""
+    from legcal.calibration import (
+        LOCATION_FILE,
+        location_document,
+        write_located_model,
+        write_location,
+    )
+    from legcal.calibration import locate as run
+    from legcal.files import ANGLE, LENGTH, parse_quantity
+    from legcal.machine import load_mechanism
+
+    if urdf is None and (world_link, tool_link) != ("world", "tool"):
+        raise UsageError(
+            "The names of the links could not be used: found them without --urdf, needed the "
+            "folder of the model to write; name it or leave the names out."
+        )
+
+    def quantity(text: str | None, units: Mapping[str, float], what: str) -> float | None:
+        return None if text is None else parse_quantity(text, units, what)
+
+    LOCATION_FILE.check_place(output)
+    mechanism = load_mechanism(model)
+    location = run(
+        mechanism,
+        poses,
+        position_sigma=quantity(position_sigma, LENGTH, "--position-sigma"),
+        angle_sigma=quantity(angle_sigma, ANGLE, "--angle-sigma"),
+        encoder_sigma=quantity(encoder_sigma, LENGTH, "--encoder-sigma") or 0.0,
+        tool_position=None if tool_position is None else _point(tool_position),
+    )
+    written = []
+    if urdf is not None:
+        paths = write_located_model(mechanism, location, urdf, world=world_link, tool=tool_link)
+        written += [str(path) for path in paths]
+    write_location(location, output)
+    written.append(str(output))
+    if as_json:
+        print_json(location_document(location) | {"written": written})
+    else:
+        from legcal.report import location_table
+
+        print_table(location_table(location, written))
+    if not location.trustworthy:
+        raise typer.Exit(1)
+
+
+def _point(text: str) -> list[float]:
+    """Return three lengths, in metres or with their units."""
+    from legcal.files import read_value
+
+    try:
+        values = [read_value(part) for part in text.split(",")]
+    except ValueError as error:
+        raise UsageError(f"--tool-position could not be used: {error}") from error
+    if len(values) != 3 or any(value.dimension not in ("", "m") for value in values):
+        raise UsageError(
+            f"--tool-position could not be used: found '{text}', needed three lengths x,y,z in the "
+            "platform; write them like 0,0,0.05 or 0mm,0mm,50mm."
+        )
+    return [value.value for value in values]
+
+
+def new(
+    table: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[TABLE]", help="A YAML or CSV table of the legs.", show_default=False
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="DIR", help="The folder of models/ and urdf/."),
+    ] = ...,  # type: ignore[assignment]
+    family: Annotated[
+        str | None, typer.Option(help="Instead of a table: number and type of legs, 6-UPS.")
+    ] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of all lengths: mm or m.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the model and its files.")] = None,
+    base_radius: Annotated[float | None, typer.Option(help="Circle of the base joints.")] = None,
+    platform_radius: Annotated[
+        float | None, typer.Option(help="Circle of the platform joints.")
+    ] = None,
+    height: Annotated[float | None, typer.Option(help="Of the platform over the base.")] = None,
+    base_spread: Annotated[
+        float | None, typer.Option(help="Angle in a pair of base joints (6 legs), in degrees: 30.")
+    ] = None,
+    platform_spread: Annotated[
+        float | None, typer.Option(help="Angle in a pair of platform joints: 30.")
+    ] = None,
+    turn: Annotated[
+        float | None,
+        typer.Option(help="Of the platform about z, in degrees: 0; planar 30."),
+    ] = None,
+    offset: Annotated[float | None, typer.Option(help="Leg length at reading zero.")] = None,
+    travel: Annotated[
+        tuple[float, float] | None, typer.Option(help="Lowest and highest reading.")
+    ] = None,
+    leg_radius: Annotated[float | None, typer.Option(help="Radius of tube and rod.")] = None,
+    tilt: Annotated[
+        float | None,
+        typer.Option(help="Of R and U axes from their default, in degrees: 0."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a model, YAML and URDF, from a table of joints or a few dimensions."""
+    from legcal.machine import create_model, describe, described
+
+    dimensions = {
+        "base_radius": base_radius,
+        "platform_radius": platform_radius,
+        "height": height,
+        "base_spread": base_spread,
+        "platform_spread": platform_spread,
+        "turn": turn,
+        "offset": offset,
+        "travel": travel,
+        "leg_radius": leg_radius,
+        "tilt": tilt,
+    }
+    asked = described(table, family=family, unit=unit, name=name, dimensions=dimensions)
+    created = create_model(asked, output, force=force)
+    description = describe(created.mechanism)
+    if as_json:
+        paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
+        print_json(description | {"paths": paths})
+    else:
+        from rich.text import Text
+
+        from legcal.report import inspect_table
+
+        print_table(inspect_table(description))
+        print_table(Text(f"\nwritten: {created.yaml_path} {created.urdf_path}", overflow="ignore"))
+
+
+def noise(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="A dataset with several images of each pose.")
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate how precisely images tell where legs are, from repeated images of the same poses."""
+    from legcal.calibration import measure_noise
+    from legcal.report import progress_on_stderr
+
+    with progress_on_stderr() as progress:
+        found = measure_noise(dataset, progress=progress, workers=min(processors(), MOST_WORKERS))
+    if as_json:
+        from legcal.calibration import noise_document
+
+        print_json(noise_document(found))
+    else:
+        from legcal.report import noise_table
+
+        print_table(noise_table(found))

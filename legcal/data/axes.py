@@ -1,0 +1,524 @@
+"""The table ``axes.csv``: axes of legs as the paper states them, instead of images and outlines.
+
+One row an axis: view, image and leg, named as in ``observations.csv``; the Euler angles
+psi and theta (:mod:`legcal.vision.cylinder`) and the point M_LS = (x, 0, z) in the camera; their
+standard deviations, which are taken for true. Angles in radians, lengths in metres.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines, number_in, place_in_measurements, row_names, rows_by_name
+from legcal.errors import DatasetError, NotVisible
+from legcal.files import describe, read_named_rows, write_atomically
+from legcal.geometry import Array, IntArray, normal_basis
+from legcal.vision import (
+    Camera,
+    angles_of_direction,
+    axis_of_outlines,
+    direction_derivative,
+    direction_of_angles,
+    point_with_zero_y,
+)
+
+_FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a file claims
+
+
+@dataclass(frozen=True, eq=False)
+class LegAxes:
+    """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.
+
+    Attributes
+    ----------
+    row, leg : (n,) array of int
+        Indices of the image and of the leg.
+    u : (n, 3) array
+        Unit directions in the camera frame, from base to platform.
+    M : (n, 3) array
+        A point of each axis in the camera frame [m].
+    basis : (n, 2, 3) array
+        Unit vectors e1, e2 normal to u, in which the covariance is written.
+    covariance : (n, 4, 4) array
+        Covariance of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m], where the axis is known
+        as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
+    """
+
+    row: IntArray
+    leg: IntArray
+    u: Array
+    M: Array
+    basis: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+def choose_axes(axes: LegAxes, index: IntArray) -> LegAxes:
+    """Return some of the axes, by their indices in a new order."""
+    parts = (axes.u, axes.M, axes.basis, axes.covariance)
+    return LegAxes(axes.row[index], axes.leg[index], *(part[index] for part in parts))
+
+
+def axes_from_outlines(
+    outlines: Outlines, measurements: Measurements, radius_of_part: Mapping[str, float]
+) -> LegAxes:
+    """Return the axis of every leg of which both outlines are used, eqs (4) and (5).
+
+    The cylinders of one leg in one image (a tube and a rod) share an axis: they are joined,
+    weighted by their covariances.
+
+    Parameters
+    ----------
+    outlines : Outlines
+        Outlines in images; those that are rejected or lack their partner are passed over.
+    measurements : Measurements
+        The images and their cameras.
+    radius_of_part : mapping from str to float
+        Radius of each cylinder by its URDF link [m].
+
+    Returns
+    -------
+    LegAxes
+        One row for each leg in each image, by image and then by leg. The reference point M is
+        the point of the axis in the middle of the used piece, where it is known best.
+
+    Raises
+    ------
+    NotVisible
+        If no image shows both outlines of a leg, or two outlines coincide.
+    """
+    pairs = _pairs(outlines)
+    if len(pairs) == 0:
+        raise NotVisible(
+            "Leg axes could not be computed: no leg has both outlines in any image; at least "
+            "two images of every leg are needed; check the camera poses and the detection."
+        )
+    radius = np.array([radius_of_part[outlines.part[first]] for first in pairs[:, 0]])
+    h = outlines.h[pairs]
+    u, M = axis_of_outlines(h[:, 0], h[:, 1], radius)
+    view = measurements.view[outlines.row[pairs[:, 0]]]
+    rays, h_of_offset = _end_rays_and_derivatives(outlines, pairs, view, measurements)
+    M = _nearest_point_to_ray(u, M, rays.mean(axis=(1, 2)))
+    basis = normal_basis(u)
+    derivative = axis_derivative(h, h_of_offset, u, M, basis)
+    offsets = np.zeros((len(pairs), 4, 4))
+    offsets[:, :2, :2] = outlines.covariance[pairs[:, 0]]
+    offsets[:, 2:, 2:] = outlines.covariance[pairs[:, 1]]
+    offsets += _FLOOR_PX**2 * np.eye(4)
+    covariance = derivative @ offsets @ np.swapaxes(derivative, -1, -2)
+    separate = LegAxes(
+        outlines.row[pairs[:, 0]], outlines.leg[pairs[:, 0]], u, M, basis, covariance
+    )
+    return join_axes(separate, separate.row)
+
+
+def axis_derivative(h: Array, h_of_offset: Array, u: Array, M: Array, basis: Array) -> Array:
+    """Return the derivative of axes with respect to the offsets of both outlines.
+
+    A change of h_i must keep h_i . u = 0 (4) and h_i . M = epsilon_i R (5), so the
+    changes of u and of M solve the same 2 x 2 system.
+
+    Parameters
+    ----------
+    h : (n, 2, 3) array
+        Unit normals of both outlines.
+    h_of_offset : (n, 2, 2, 3) array
+        Derivative of each normal with respect to the offsets of its two ends [1/px].
+    u, M : (n, 3) array
+        The axes [m].
+    basis : (n, 2, 3) array
+        e1 and e2 of each axis.
+
+    Returns
+    -------
+    (n, 4, 4) array
+        d(alpha1, alpha2, beta1, beta2) / d(offsets of edge 1, of edge 2) [rad/px, m/px].
+    """
+    system = np.einsum("nia,nja->nij", h, basis)
+    change = np.zeros((len(u), 2, 2, 4))  # (n, equation i, of u or of M, offset)
+    for i in range(2):
+        for column, point in enumerate((u, M)):
+            change[:, i, column, 2 * i : 2 * i + 2] = -np.einsum(
+                "nea,na->ne", h_of_offset[:, i], point
+            )
+    solved = np.linalg.solve(system, change.reshape(len(u), 2, 8)).reshape(len(u), 2, 2, 4)
+    return np.concatenate([solved[:, :, 0], solved[:, :, 1]], axis=1)
+
+
+def join_axes(axes: LegAxes, group: IntArray) -> LegAxes:
+    """Return one axis for each leg in each group of rows, weighted by the covariances.
+
+    Parameters
+    ----------
+    axes : LegAxes
+        Observed axes, in one camera frame within a group.
+    group : (n,) array of int
+        Axes with the same group and leg are observations of one line.
+
+    Returns
+    -------
+    LegAxes
+        Joined axes, ordered by group and then by leg; ``row`` is the first of each.
+    """
+    keys = np.stack([group, axes.leg], axis=1)
+    _, first, which, count = np.unique(
+        keys, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    u, M, basis, covariance = (
+        part[first] for part in (axes.u, axes.M, axes.basis, axes.covariance)
+    )
+    several = np.flatnonzero(count > 1)
+    if len(several):
+        members = np.flatnonzero(count[which.ravel()] > 1)
+        line = np.searchsorted(several, which.ravel()[members])
+        u[several], M[several], basis[several], covariance[several] = _joined(
+            axes, first[several], members, line
+        )
+    return LegAxes(axes.row[first], axes.leg[first], u, M, basis, covariance)
+
+
+def _joined(
+    axes: LegAxes, first: IntArray, members: IntArray, line: IntArray
+) -> tuple[Array, Array, Array, Array]:
+    """Return u, M, basis and covariance of the weighted mean of the observations of each line.
+
+    Parameters
+    ----------
+    axes : LegAxes
+    first : (m,) array of int
+        The first observation of each line, in whose basis the mean is taken.
+    members, line : (n,) array of int
+        Observations, and the line that each of them shows.
+    """
+    u, M, basis = axes.u[first], axes.M[first], axes.basis[first]
+    E = basis[line]
+    # Each observation at the height of the first one's M, written in its basis.
+    slope = axes.u[members] / np.sum(axes.u[members] * u[line], axis=-1, keepdims=True)
+    shift = np.sum(u[line] * (M[line] - axes.M[members]), axis=-1)
+    point = axes.M[members] + shift[:, None] * slope - M[line]
+    value = np.concatenate([E @ slope[..., None], E @ point[..., None]], axis=1)
+    turn = E @ np.swapaxes(axes.basis[members], -1, -2)
+    move = np.zeros((len(line), 4, 4))
+    move[:, :2, :2] = move[:, 2:, 2:] = turn
+    move[:, 2:, :2] = shift[:, None, None] * turn
+    weight = np.linalg.inv(move @ axes.covariance[members] @ np.swapaxes(move, -1, -2))
+    information, weighted = np.zeros((len(first), 4, 4)), np.zeros((len(first), 4, 1))
+    np.add.at(information, line, weight)
+    np.add.at(weighted, line, weight @ value)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    change = (covariance @ weighted)[..., 0]
+    u += np.einsum("nia,ni->na", basis, change[:, :2])
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    M += np.einsum("nia,ni->na", basis, change[:, 2:])
+    # Carry e1 along so that the covariance keeps its meaning.
+    e1 = basis[:, 0] - u * np.sum(u * basis[:, 0], axis=-1, keepdims=True)
+    e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
+    return u, M, np.stack([e1, np.cross(u, e1)], axis=1), covariance
+
+
+def _pairs(outlines: Outlines) -> IntArray:
+    """Return the indices (edge 1, edge 2) of outlines of one cylinder in one image, (n, 2)."""
+    found: dict[tuple[int, int, str], dict[int, int]] = {}
+    for i in np.flatnonzero(outlines.used):
+        key = (int(outlines.row[i]), int(outlines.leg[i]), outlines.part[i])
+        found.setdefault(key, {})[int(outlines.edge[i])] = int(i)
+    both = [(edges[1], edges[2]) for _, edges in sorted(found.items()) if len(edges) == 2]
+    return np.array(both, dtype=np.intp).reshape(-1, 2)
+
+
+def _end_rays_and_derivatives(
+    outlines: Outlines, pairs: IntArray, view: IntArray, measurements: Measurements
+) -> tuple[Array, Array]:
+    """Return the rays (x, y, 1) of the ends (n, 2, 2, 3) and d h / d offsets (n, 2, 2, 3)."""
+    rays = np.empty((len(pairs), 2, 2, 3))
+    derivative = np.empty((len(pairs), 2, 2, 3))
+    for v in np.unique(view):
+        here = pairs[view == v]
+        camera = measurements.views[v].camera
+        rays[view == v], derivative[view == v] = outline_derivative(
+            camera, outlines.h[here], outlines.ends[here]
+        )
+    return rays, derivative
+
+
+def outline_derivative(camera: Camera, h: Array, ends: Array) -> tuple[Array, Array]:
+    """Return the rays of an outline's ends and how its normal follows offsets of these ends.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    h : (..., 3) array
+        Unit normals of outlines, in its frame.
+    ends : (..., 2, 2) array
+        Their ends [px].
+
+    Returns
+    -------
+    rays : (..., 2, 3) array
+        The ends (x, y, 1) on the sensor plane.
+    derivative : (..., 2, 3) array
+        d h / d offset of each end [1/px], an offset being that of
+        :meth:`legcal.vision.camera.Camera.line_offset`.
+    """
+    xy = camera.undistort(ends)
+    ones = np.ones((*xy.shape[:-1], 1))
+    rays = np.concatenate([xy, ones], axis=-1)
+    # The line follows an offset of an end: (h + dh) . ray = -dvalue keeps the point on it.
+    J = camera.pixels_per_unit(xy)
+    ab = np.broadcast_to(h[..., None, :2], xy.shape)
+    normal = np.linalg.solve(np.swapaxes(J, -1, -2), ab[..., None])[..., 0]
+    moved = np.linalg.norm(normal, axis=-1)  # d (h . ray) / d offset
+    # dh is normal to h, zero on the ray of the other end, and -moved on its own ray.
+    other = rays[..., ::-1, :]
+    direction = np.cross(np.broadcast_to(h[..., None, :], rays.shape), other)
+    scale = -moved / np.sum(direction * rays, axis=-1)
+    return rays, direction * scale[..., None]
+
+
+def _nearest_point_to_ray(u: Array, M: Array, ray: Array) -> Array:
+    """Return the point of each axis nearest to a ray through the camera centre."""
+    d = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    across = u - d * np.sum(u * d, axis=-1, keepdims=True)
+    t = -np.sum(across * M, axis=-1) / np.sum(across * across, axis=-1)
+    return np.asarray(M + t[:, None] * u)
+
+
+def axes_of_table(row: IntArray, leg: IntArray, values: Array, sigmas: Array) -> LegAxes:
+    """Return axes from their angles and their points M_LS.
+
+    Parameters
+    ----------
+    row, leg : (n,) array of int
+        Indices of the image and of the leg.
+    values : (n, 4) array
+        psi, theta [rad] and x, z [m] in the camera frame. Away from |theta| = pi/2 and
+        |psi| = pi/2, where M_LS does not exist.
+    sigmas : (n, 4) array
+        Their standard deviations; their errors are independent.
+
+    Returns
+    -------
+    LegAxes
+    """
+    psi, theta, x, z = values.T
+    u = direction_of_angles(psi, theta)
+    M = np.stack([x, np.zeros_like(x), z], axis=-1)
+    basis = normal_basis(u)
+    scaled = _table_derivative(basis, psi, theta) * sigmas[:, None, :]
+    return LegAxes(row, leg, u, M, basis, scaled @ np.swapaxes(scaled, -1, -2))
+
+
+def table_of_axes(axes: LegAxes) -> tuple[Array, Array]:
+    """Return angles and points M_LS of axes with their standard deviations.
+
+    Correlations between the four, which the table has no place for, are left out; axes that
+    came from :func:`axes_of_table` have none.
+
+    Parameters
+    ----------
+    axes : LegAxes
+
+    Returns
+    -------
+    values, sigmas : (n, 4) array
+        psi, theta [rad] and x, z [m].
+
+    Raises
+    ------
+    NotVisible
+        If an axis is parallel to the plane y = 0, where M_LS does not exist.
+    """
+    M = point_with_zero_y(axes.u, axes.M)
+    # The same line and its covariance, written at M_LS.
+    shift = np.sum((M - axes.M) * axes.u, axis=-1)
+    move = np.tile(np.eye(4), (len(axes), 1, 1))
+    move[:, 2, 0] = move[:, 3, 1] = shift
+    psi, theta = angles_of_direction(axes.u)
+    to_table = np.linalg.inv(_table_derivative(axes.basis, psi, theta)) @ move
+    covariance = to_table @ axes.covariance @ np.swapaxes(to_table, -1, -2)
+    sigmas = np.sqrt(np.einsum("nii->ni", covariance))
+    return np.stack([psi, theta, M[:, 0], M[:, 2]], axis=-1), sigmas
+
+
+def _table_derivative(basis: Array, psi: Array, theta: Array) -> Array:
+    """Return d (alpha, beta) / d (psi, theta, x, z), (n, 4, 4)."""
+    derivative = np.zeros((len(basis), 4, 4))
+    derivative[:, :2, :2] = basis @ direction_derivative(psi, theta)
+    derivative[:, 2:, 2:] = basis[:, :, [0, 2]]
+    return derivative
+
+
+VALUES = ("psi", "theta", "x", "z")
+SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
+COLUMNS = ("view", "image", "leg", *VALUES, *SIGMAS)
+
+LARGEST_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
+ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
+LARGEST_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
+SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
+LEAST_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
+
+
+def write_axes(
+    path: Path, axes: LegAxes, measurements: Measurements, leg_names: Sequence[str]
+) -> None:
+    """Write axes, the file complete or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        ``axes.csv``.
+    axes : LegAxes
+        What to write. Correlations between angles and point are left out.
+    measurements : Measurements
+        The rows they belong to, in the order of the file.
+    leg_names : sequence of str
+        The legs of the mechanism.
+
+    Raises
+    ------
+    NotVisible
+        If an axis has no point M_LS.
+    OSError
+        If the file cannot be written.
+    """
+    write_axis_table(path, axes.row, axes.leg, *table_of_axes(axes), measurements, leg_names)
+
+
+def write_axis_table(
+    path: Path,
+    row: IntArray,
+    leg: IntArray,
+    values: Array,
+    sigmas: Array,
+    measurements: Measurements,
+    leg_names: Sequence[str],
+) -> None:
+    """Write axes that are given as the table has them, the file complete or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        ``axes.csv``.
+    row, leg : (n,) array of int
+        Indices of the image and of the leg.
+    values, sigmas : (n, 4) array
+        psi, theta, x, z and their standard deviations [rad, rad, m, m].
+    measurements, leg_names
+        As in :func:`write_axes`.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    names = row_names(measurements)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    numbers = np.hstack([values, sigmas]).tolist()
+    for r, j, cells in zip(row.tolist(), leg.tolist(), numbers, strict=True):
+        view = measurements.views[measurements.view[r]].name
+        writer.writerow([view, names[r], leg_names[j], *(repr(x) for x in cells)])
+    write_atomically(path, text.getvalue().encode())
+
+
+def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) -> LegAxes:
+    """Read ``axes.csv``.
+
+    Parameters
+    ----------
+    path : Path
+        The table.
+    leg_names : sequence of str
+        The legs of the mechanism.
+    measurements : Measurements
+        The rows that axes belong to, in the order of the file.
+
+    Returns
+    -------
+    LegAxes
+        In the order of the file.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong, naming row and column.
+    """
+    problems: list[str] = []
+    needed = (
+        "the axes of the legs in every image; add them, or delete the file to have images searched"
+    )
+    rows = read_named_rows(
+        path, "table of axes", COLUMNS, "correct the header", problems, needed=needed
+    )
+    places = rows_by_name(measurements)
+    first: dict[tuple[int, int], str] = {}
+    numbers = []
+    for where, cells in rows:
+        place, unknown = place_in_measurements(where, cells, places, leg_names, "axis")
+        found, wrong = _numbers(where, cells)
+        problems += [*unknown, *wrong]
+        numbers.append(found)
+        earlier = where if unknown else first.setdefault(place, where)
+        if earlier != where:
+            problems.append(
+                f"{where}: the axis could not be used: found the same image and leg in "
+                f"{earlier.rsplit(', ', 1)[-1]}, needed it once; remove one of them."
+            )
+    if problems:
+        raise DatasetError(problems)
+    row, leg = np.array(list(first), dtype=np.intp).T
+    table = np.array(numbers)
+    return axes_of_table(row, leg, table[:, :4], table[:, 4:])
+
+
+def _numbers(where: str, cells: Mapping[str, str]) -> tuple[list[float], list[str]]:
+    """Return the eight numbers of a row, and what is wrong with them."""
+    found = {name: number_in(cells[name]) for name in (*VALUES, *SIGMAS)}
+    start = "the axis could not be used: found"
+    problems = [
+        f"{where}, column {name}: {start} "
+        f"{describe(cells[name]) if cells[name] else 'an empty cell'}, needed a finite number; "
+        "correct it or remove the row."
+        for name, x in found.items()
+        if not math.isfinite(x)
+    ]
+    problems += [
+        f"{where}, column {name}: {start} {found[name]:g}, needed an angle from {-limit:.4f} to "
+        f"{limit:.4f} rad; write radians, not degrees."
+        for name, limit in LARGEST_ANGLE.items()
+        if math.isfinite(found[name]) and abs(found[name]) > limit + ANGLE_ROUNDING
+    ]
+    problems += [
+        f"{where}, column {name}: {start} {found[name]:g}, needed a coordinate from "
+        f"{-LARGEST_DISTANCE:g} to {LARGEST_DISTANCE:g} m; correct it, or write metres."
+        for name in ("x", "z")
+        if math.isfinite(found[name]) and abs(found[name]) > LARGEST_DISTANCE
+    ]
+    least, most = SIGMA_RANGE
+    problems += [
+        f"{where}, column {name}: {start} {found[name]:g}, needed a standard deviation from "
+        f"{least:g} to {most:g}; give it in {'rad' if name in SIGMAS[:2] else 'm'}."
+        for name in SIGMAS
+        if math.isfinite(found[name]) and not least <= found[name] <= most
+    ]
+    upright = math.cos(found["psi"]) * math.cos(found["theta"]) if not problems else 1.0
+    if abs(upright) < LEAST_UPRIGHT:
+        problems.append(
+            f"{where}, columns psi, theta: {start} an axis parallel to the plane of the camera's x "
+            "and z axes, needed one that crosses it: the point (x, 0, z) does not exist; remove "
+            "the row, or give outlines instead."
+        )
+    return list(found.values()), problems

@@ -1,0 +1,274 @@
+"""The table of outlines as a cache of detection: what to detect again, and what to keep.
+
+After detection the outlines are written to ``observations.csv`` beside the dataset, with a
+fingerprint of all that detection depends on in ``.legcal-cache.json``. A table without that
+file was given by the user: its images are not detected. Rows marked ``edited`` always win.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
+from legcal.data.order import canonical_order, reorder_measurements
+from legcal.data.outlines import (
+    Outlines,
+    choose_outlines,
+    is_edited,
+    no_outlines,
+    row_names,
+    write_observations,
+)
+from legcal.files import FileSchema, write_atomically
+from legcal.geometry import BoolArray, IntArray
+from legcal.version import __version__
+from legcal.vision import board_document
+
+FORMAT = 1
+
+
+class CacheEntry(FileSchema):
+    """The content of ``.legcal-cache.json``.
+
+    Attributes
+    ----------
+    fingerprint : str
+        Of all that the detected outlines in the table came from.
+    given : list of (view, image)
+        The images whose outlines the user gave; they are never detected.
+    notes : tuple of str
+        What was to be said of the images.
+    """
+
+    format: int
+    fingerprint: str
+    given: list[tuple[str, str]]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionPlan:
+    """What is left to detect.
+
+    Attributes
+    ----------
+    detect : (n,) array of int
+        Rows of the measurements whose images are to be detected.
+    keep : Outlines
+        Outlines to use as they are; its edited rows win over those that detection finds.
+    given : (n_rows,) array of bool
+        Rows whose outlines the user gave.
+    notes : tuple of str
+        What was to be said of the images when they were searched, if none is searched again.
+    is_cached : bool
+        Whether all outlines are those that an earlier run left.
+    """
+
+    detect: IntArray
+    keep: Outlines
+    given: BoolArray
+    notes: tuple[str, ...] = ()
+    is_cached: bool = False
+
+
+def plan_detection(
+    table: Outlines | None,
+    has_image: BoolArray,
+    recorded: str | None,
+    current: str,
+    given: BoolArray,
+) -> DetectionPlan:
+    """Return which images to detect and which outlines of the table to keep.
+
+    Parameters
+    ----------
+    table : Outlines or None
+        The table beside the dataset, if there is one.
+    has_image : (n_rows,) array of bool
+        Whether a row has an image file; one without cannot be detected.
+    recorded : str or None
+        The fingerprint beside the table; None for a table that the user gave.
+    current : str
+        The fingerprint of the dataset as it is.
+    given : (n_rows,) array of bool
+        Rows that the user gave to a table which legcal has completed since.
+    """
+    if table is None:
+        return DetectionPlan(np.flatnonzero(has_image), no_outlines(), np.zeros_like(has_image))
+    edited = is_edited(table)
+    listed = np.zeros_like(has_image)
+    listed[table.row[~edited]] = True
+    if recorded is None:
+        return DetectionPlan(np.flatnonzero(has_image & ~listed), table, listed)
+    if recorded == current:
+        return DetectionPlan(np.zeros(0, dtype=np.intp), table, given)
+    detect = has_image & ~(given & listed)
+    keep = choose_outlines(table, edited | ~detect[table.row])
+    return DetectionPlan(np.flatnonzero(detect), keep, given & listed)
+
+
+def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
+    """Return :func:`plan_detection` for a dataset as it lies in its folder.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        The dataset.
+    current : str
+        Its :func:`fingerprint`.
+    """
+    if dataset.axes is not None:  # they take the place of images
+        none = np.zeros(0, dtype=np.intp)
+        given = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
+        return DetectionPlan(none, no_outlines(), given)
+    entry = _read_entry(dataset.folder / CACHE_NAME)
+    paths = [dataset.image_path(row) for row in range(dataset.measurements.n_rows)]
+    has_image = np.array(
+        [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
+    )
+    given_names = set(entry.given) if entry else set()
+    given = np.array([name in given_names for name in _places(dataset)], dtype=np.bool_)
+    recorded = entry.fingerprint if entry else None  # the format is part of the fingerprint
+    plan = plan_detection(dataset.observations, has_image, recorded, current, given)
+    if entry is None or recorded != current or len(plan.detect):
+        return plan
+    return replace(plan, notes=entry.notes, is_cached=True)
+
+
+def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:
+    """Return a fingerprint of all that detected outlines depend on.
+
+    It covers the images, readings, views and cameras, the board and its pose, the mechanism's
+    files, the encoder sigma, the settings of detection and the version of legcal; not the order
+    of the rows.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        The dataset.
+    settings : mapping
+        The settings of detection, as JSON has them.
+    """
+    digest = hashlib.sha256()
+    for part in (*_described(dataset, settings), *_files(dataset)):
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
+    """Return settings, views, readings and board as bytes that do not depend on the rows' order."""
+    leg_names = dataset.mechanism.leg_names
+    order = canonical_order(dataset.measurements, leg_names)
+    measurements = reorder_measurements(dataset.measurements, order)
+    views = [
+        [
+            view.name,
+            None if view.T_base_camera is None else view.T_base_camera.as_matrix().tolist(),
+            None if view.legs is None else sorted(view.legs),
+            [view.camera.model, view.camera.width, view.camera.height],
+            [view.camera.gamma, view.camera.gamma_is_told],
+            [view.camera.K.tolist(), view.camera.distortion.tolist()],
+        ]
+        for view in measurements.views
+    ]
+    rows = [measurements.image, measurements.view.tolist(), measurements.pose.tolist()]
+    document = [FORMAT, __version__, settings, views, rows, measurements.sigma_q]
+    if dataset.board is not None:  # it places the cameras near which outlines are looked for
+        T = dataset.T_base_board
+        document.append(board_document(dataset.board))
+        document.append(None if T is None else T.as_matrix().tolist())
+    return [
+        json.dumps(document, sort_keys=True).encode(),
+        np.ascontiguousarray(measurements.q, dtype="<f8").tobytes(),
+    ]
+
+
+def _files(dataset: Dataset) -> list[bytes]:
+    """Return digests of the mechanism's files and of the images, sorted by name."""
+    mechanism = dataset.mechanism
+    models = [path for path in (mechanism.yaml_path, mechanism.urdf_path) if path is not None]
+    images = sorted({image for image in dataset.measurements.image if image})
+    return [_digest(path) for path in (*models, *(dataset.folder / name for name in images))]
+
+
+def _digest(path: Path) -> bytes:
+    """Return the SHA-256 of a file; that of a file which is not there is empty."""
+    try:
+        return hashlib.sha256(path.read_bytes()).digest()
+    except FileNotFoundError:
+        return b""
+
+
+def store_outlines(
+    dataset: Dataset,
+    outlines: Outlines,
+    current: str,
+    given: BoolArray,
+    notes: Sequence[str] = (),
+) -> str | None:
+    """Write outlines and the fingerprint of what they came from beside the dataset.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        The dataset.
+    outlines : Outlines
+        All of its outlines, detected, edited and given.
+    current : str
+        Its :func:`fingerprint`.
+    given : (n_rows,) array of bool
+        ``DetectionPlan.given``.
+    notes : sequence of str
+        What is to be said of the images.
+
+    Returns
+    -------
+    str or None
+        A note if the folder cannot be written to: detection is repeated next time. None if
+        the outlines were written.
+    """
+    places = [
+        list(name) for name, is_given in zip(_places(dataset), given, strict=True) if is_given
+    ]
+    entry = {
+        "format": FORMAT,
+        "fingerprint": current,
+        "given": sorted(places),
+        "notes": list(notes),
+    }
+    path = dataset.folder / OBSERVATIONS_NAME
+    try:
+        write_observations(path, outlines, dataset.measurements, dataset.mechanism.leg_names)
+        write_atomically(dataset.folder / CACHE_NAME, (json.dumps(entry) + "\n").encode())
+    except OSError as error:
+        return (
+            f"{path}: the outlines could not be kept: found '{error.strerror}', needed a folder "
+            "that can be written to; the images will be searched again next time."
+        )
+    return None
+
+
+def _places(dataset: Dataset) -> Sequence[tuple[str, str]]:
+    """Return view and image name of every row."""
+    measurements = dataset.measurements
+    views = [measurements.views[v].name for v in measurements.view.tolist()]
+    return list(zip(views, row_names(measurements), strict=True))
+
+
+def _read_entry(path: Path) -> CacheEntry | None:
+    """Return the fingerprint file; one that cannot be read matches nothing."""
+    try:
+        content = path.read_bytes()
+        entry = CacheEntry.model_validate_json(content)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValidationError):
+        return CacheEntry(format=0, fingerprint="unreadable", given=[])
+    return entry

@@ -1,0 +1,748 @@
+"""A dataset: the folder of section 4.1, read and validated before any work."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, field_validator
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data.axes import LegAxes, choose_axes, read_axes
+from legcal.data.corners import Corners, read_corners
+from legcal.data.measurements import Measurements, View, read_measurements
+from legcal.data.outlines import Outlines, read_observations
+from legcal.errors import DatasetError, UsageError
+from legcal.files import (
+    EXAMPLE,
+    FileSchema,
+    Name,
+    Number,
+    Stated,
+    Version,
+    closest,
+    describe,
+    parse_yaml,
+    path_problem,
+    read_prior,
+    read_text,
+    read_value,
+    validate,
+)
+from legcal.geometry import Image, MotionEntry
+from legcal.machine import DATASET_YAML, Mechanism, load_mechanism, shipped_folders, shipped_names
+from legcal.vision import Board, Camera, image_problem, read_board, read_camera, read_image
+
+AXES_NAME = "axes.csv"
+
+
+def read_given_axes(
+    path: Path, leg_names: Sequence[str], measurements: Measurements
+) -> tuple[LegAxes | None, list[str]]:
+    """Return the axes of the legs that the views use, and a note about others.
+
+    Parameters
+    ----------
+    path : Path
+        The table; None is returned if there is none.
+    leg_names : sequence of str
+        The legs of the mechanism.
+    measurements : Measurements
+        The rows that axes belong to.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong.
+    """
+    if not os.path.exists(path):
+        return None, []
+    axes = read_axes(path, leg_names, measurements)
+    views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
+    names = [leg_names[leg] for leg in axes.leg.tolist()]
+    wanted = [
+        view.legs is None or name in view.legs for view, name in zip(views, names, strict=True)
+    ]
+    used = np.flatnonzero(wanted)
+    if len(used) == 0:
+        raise DatasetError(
+            f"{path}: the axes could not be used: found only legs that their views leave out, "
+            "needed legs that dataset.yaml names for the views; correct these or the table."
+        )
+    left_out = len(axes) - len(used)
+    note = f"{path}: {left_out} axes of legs that their views leave out are not used."
+    return choose_axes(axes, used), [note] if left_out else []
+
+
+def rows_without_axes(table_path: Path, measurements: Measurements, axes: LegAxes) -> list[str]:
+    """Return one sentence for each row of the measurements that has no axis."""
+    blank = np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist()
+    return [
+        f"{table_path}, row {row + 1}: the row could not be used: found no axis of it in "
+        f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row."
+        for row in blank
+    ]
+
+
+CORNERS_NAME = "corners.csv"
+LEAST_CORNERS = 4  # in an image that must place its camera
+
+
+def read_given_corners(
+    path: Path, board: Board | None, measurements: Measurements
+) -> Corners | None:
+    """Return the corners beside a dataset, if there are any.
+
+    Parameters
+    ----------
+    path : Path
+        The table; None is returned if there is none.
+    board : Board or None
+        The board that the dataset describes.
+    measurements : Measurements
+        The rows that corners belong to.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong.
+    """
+    if not os.path.exists(path):
+        return None
+    if board is None:
+        raise DatasetError(
+            f"{path}: the corners could not be used: found no board in the dataset file, needed "
+            "the one that they belong to; describe it in the block board, or remove the table."
+        )
+    return read_corners(path, board, measurements)
+
+
+def rows_without_board(
+    table_path: Path, measurements: Measurements, corners: Corners, hand_held: Sequence[int]
+) -> list[str]:
+    """Return one sentence for each row of a hand-held view in which the board has no pose.
+
+    Parameters
+    ----------
+    table_path : Path
+        ``measurements.csv``, for messages.
+    measurements : Measurements
+        The rows.
+    corners : Corners
+        The given corners.
+    hand_held : sequence of int
+        The rows of hand-held views.
+    """
+    counts = np.bincount(corners.row[corners.used], minlength=measurements.n_rows)
+    return [
+        f"{table_path}, row {row + 1}: its camera could not be placed: found "
+        f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {LEAST_CORNERS} in "
+        "every image of a camera that is held in the hand; add them or remove the row."
+        for row in hand_held
+        if counts[row] < LEAST_CORNERS
+    ]
+
+
+Action = Literal["prior", "fixed", "free"]
+_WORDS: Mapping[Action, str] = {
+    "prior": "prior",
+    "fixed": "parameter to fix",
+    "free": "parameter to free",
+}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What somebody asks of one parameter, or of all that a pattern matches.
+
+    Attributes
+    ----------
+    name : str
+        A name or a pattern.
+    action : {"prior", "fixed", "free"}
+        What to do with it.
+    where : str
+        Where this was said: the start of a sentence about it.
+    stated : Stated or None
+        The prior, or the value that it is fixed at; None for the nominal one.
+    in_file : bool
+        Said in ``dataset.yaml``, which gives way to what is asked for in a run.
+    """
+
+    name: str
+    action: Action
+    where: str
+    stated: Stated | None = None
+    in_file: bool = False
+
+
+def wishes_of_call(
+    priors: Mapping[str, object] | Sequence[str] = (),
+    fixed: Sequence[str] = (),
+    free: Sequence[str] = (),
+) -> tuple[Wish, ...]:
+    """Return what the arguments of a call or the options of a command ask for.
+
+    Parameters
+    ----------
+    priors : mapping or sequence of str
+        Pairs (value, sigma) in SI units or pixels, or texts with units, by name; or texts that
+        begin with ``NAME=``.
+    fixed, free : sequence of str
+        Names; ``NAME=VALUE`` fixes at a value that is not the nominal one.
+
+    Raises
+    ------
+    UsageError
+        With one sentence for each that cannot be read.
+    """
+    entries: list[tuple[Action, str, object]] = []
+    if isinstance(priors, Mapping):
+        entries += [("prior", str(name), value) for name, value in priors.items()]
+    else:
+        entries += [("prior", text, None) for text in _listed(priors)]
+    entries += [("fixed", text, None) for text in _listed(fixed)]
+    entries += [("free", text, None) for text in _listed(free)]
+    found: list[Wish] = []
+    problems: list[str] = []
+    for action, text, value in entries:
+        where = f"The {_WORDS[action]} {describe(text)}"
+        try:
+            found.append(read_wish(action, text, where, value))
+        except ValueError as error:
+            problems.append(f"{where} could not be used: {error}")
+    if problems:
+        raise UsageError(problems)
+    return tuple(found)
+
+
+def read_wish(
+    action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
+) -> Wish:
+    """Return a wish as it was written.
+
+    Parameters
+    ----------
+    action : {"prior", "fixed", "free"}
+        What to do.
+    text : str
+        The name, with ``=VALUE`` behind it where the value does not stand apart.
+    where : str
+        Where this was said.
+    value : Stated, str, pair of numbers, mapping or None
+        The prior, where it stands apart from its name.
+    in_file : bool
+        Said in ``dataset.yaml``.
+
+    Raises
+    ------
+    ValueError
+        If the value cannot be read: found, needed, and what to do.
+    """
+    name, stated = text, None
+    if value is not None:
+        stated = read_prior(value)
+    elif action != "free" and "=" in text:
+        name, _, behind = text.rpartition("=")
+        stated = read_prior(behind) if action == "prior" else read_value(behind)
+    if action == "prior" and stated is None:
+        raise ValueError(
+            f"found no value, needed one and its sigma; write them behind the name: {EXAMPLE}."
+        )
+    return Wish(name, action, where, stated, in_file)
+
+
+def _listed(texts: Iterable[str]) -> list[str]:
+    """Return texts as a list; a single text is one of them."""
+    return [texts] if isinstance(texts, str) else [str(text) for text in texts]
+
+
+OBSERVATIONS_NAME = "observations.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Everything that a calibration starts from.
+
+    Attributes
+    ----------
+    folder : Path
+        The dataset folder.
+    yaml_path, table_path : Path
+        ``dataset.yaml`` and the table of measurements.
+    camera_paths : tuple of Path
+        The camera file of each view.
+    mechanism : Mechanism
+        The nominal model.
+    measurements : Measurements
+        The rows of the table, in its order.
+    observations : Outlines or None
+        The rows of ``observations.csv`` if there is one: given, cached or edited.
+    notes : tuple of str
+        What is odd but allowed.
+    axes : LegAxes or None
+        The rows of ``axes.csv`` if there is one, of the legs that the views use. Images are
+        then not searched, and there are no observations.
+    wishes : tuple of Wish
+        What the block ``parameters`` asks of parameters by name.
+    board : Board or None
+        The calibration board that is fixed to the base.
+    T_base_board : RigidTransform or None
+        Its pose in the base link, where it is known.
+    corners : Corners or None
+        The rows of ``corners.csv`` if there is one. Images are then not searched for the board.
+    """
+
+    folder: Path
+    yaml_path: Path
+    table_path: Path
+    camera_paths: tuple[Path, ...]
+    mechanism: Mechanism
+    measurements: Measurements
+    observations: Outlines | None
+    notes: tuple[str, ...] = ()
+    axes: LegAxes | None = None
+    wishes: tuple[Wish, ...] = ()
+    board: Board | None = None
+    T_base_board: RigidTransform | None = None
+    corners: Corners | None = None
+
+    def image_path(self, row: int) -> Path | None:
+        """Return the image file of a row; None where only outlines are given."""
+        image = self.measurements.image[row]
+        return self.folder / image if image else None
+
+    def read_image(self, row: int) -> Image:
+        """Return the image of a row as (height, width) grey levels 0 to 255, float32.
+
+        Raises
+        ------
+        DatasetError
+            If the row has no image, or its file cannot be used.
+        """
+        return self.image_reader([row])(0)
+
+    def image_reader(self, rows: Sequence[int]) -> ImageReader:
+        """Return what reads the images of these rows, in this order, in any process."""
+        return ImageReader(
+            tuple(self.image_path(row) for row in rows),
+            tuple(self._camera(row) for row in rows),
+            tuple(self._where(row) for row in rows),
+        )
+
+    def image_problem(self, row: int) -> str | None:
+        """Return what keeps the image of a row from being used, or None; nothing is decoded."""
+        path = self.image_path(row)
+        return image_problem(path, self._camera(row), self._where(row)) if path else None
+
+    def _camera(self, row: int) -> Camera:
+        """Return the camera that took the image of a row."""
+        return self.measurements.views[int(self.measurements.view[row])].camera
+
+    def _where(self, row: int) -> str:
+        """Return the place of a row for a message."""
+        return f"{self.table_path}, row {row + 1}"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageReader:
+    """Reads images by their number.
+
+    Attributes
+    ----------
+    paths : tuple of Path or None
+        The files; None where a row has no image.
+    cameras : tuple of Camera
+        The camera of each image.
+    places : tuple of str
+        Where each image is named, for messages.
+    """
+
+    paths: tuple[Path | None, ...]
+    cameras: tuple[Camera, ...]
+    places: tuple[str, ...]
+
+    def __call__(self, k: int) -> Image:
+        """Return image k as (height, width) grey levels 0 to 255, float32."""
+        path = self.paths[k]
+        if path is None:
+            raise DatasetError(
+                f"{self.places[k]}: its image could not be read: found an empty cell, needed an "
+                f"image; name one or give its outlines in {OBSERVATIONS_NAME}."
+            )
+        return read_image(path, self.cameras[k], self.places[k])
+
+
+def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
+    """Return one sentence for each row that neither an image nor tables make usable.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        The dataset.
+    hand_held : sequence of int
+        The rows of hand-held views, which need the board.
+    """
+    table_path, measurements = dataset.table_path, dataset.measurements
+    if dataset.corners is None:
+        problems = [
+            f"{table_path}, row {row + 1}, column image: its camera could not be placed: found "
+            f"neither an image nor {CORNERS_NAME}, needed the board in every image of a camera "
+            "that is held in the hand; name an image or give the corners."
+            for row in hand_held
+            if not measurements.image[row]
+        ]
+    else:
+        problems = rows_without_board(table_path, measurements, dataset.corners, hand_held)
+    if dataset.axes is not None:
+        return [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
+    outlines = dataset.observations
+    given = set() if outlines is None else set(outlines.row.tolist())
+    for row in range(measurements.n_rows):
+        path = dataset.image_path(row)
+        if path is None and row not in given:
+            problems.append(
+                f"{table_path}, row {row + 1}, column image: the row could not be used: "
+                f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
+                "them; name an image or remove the row."
+            )
+        elif path is not None and (os.path.exists(path) or row not in given):
+            found = dataset.image_problem(row)
+            problems += [found] if found else []
+    return problems
+
+
+ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
+GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
+
+
+class ViewEntry(FileSchema):
+    """One camera position."""
+
+    camera: str
+    gamma: Annotated[Number, Field(ge=GAMMAS[0], le=GAMMAS[1])] | None = None  # not known
+    T_base_camera: MotionEntry | None = None
+    hand_held: Annotated[bool, Strict()] = False
+    legs: Annotated[list[str], Field(min_length=1)] | None = None
+
+    @field_validator("legs")
+    @classmethod
+    def _names_each_leg_once(cls, legs: list[str] | None) -> list[str] | None:
+        twice = sorted({name for name in legs or () if (legs or []).count(name) > 1})
+        if twice:
+            raise ValueError(f"found {', '.join(twice)} twice, needed each leg once; remove one.")
+        return legs
+
+
+def _can_be_fixed(text: str) -> str:
+    """Refuse a value that a parameter cannot be fixed at."""
+    read_wish("fixed", text, "")
+    return text
+
+
+class ParametersEntry(FileSchema):
+    """What is known of parameters, which are left as they are and which are looked for."""
+
+    priors: dict[Name, Annotated[Stated, BeforeValidator(read_prior)]] = Field(default_factory=dict)
+    fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
+    free: list[Name] = Field(default_factory=list)
+
+    def wishes(self, path: Path) -> tuple[Wish, ...]:
+        """Return what the block asks for; ``path`` is that of the file, for messages."""
+        block = f"{path}: parameters"
+        return (
+            *(
+                read_wish("prior", name, f"{block}.priors.{name}", stated, in_file=True)
+                for name, stated in self.priors.items()
+            ),
+            *(
+                read_wish("fixed", text, f"{block}.fixed '{text}'", in_file=True)
+                for text in self.fixed
+            ),
+            *(
+                read_wish("free", text, f"{block}.free '{text}'", in_file=True)
+                for text in self.free
+            ),
+        )
+
+
+class DatasetEntry(FileSchema):
+    """The whole of ``dataset.yaml``."""
+
+    legcal_dataset: Version
+    mechanism: str
+    measurements: str
+    encoder_sigma: Annotated[Number, Field(gt=0.0)]
+    views: Annotated[dict[Name, ViewEntry], Field(min_length=1)]
+    parameters: ParametersEntry = Field(default_factory=ParametersEntry)
+    board: dict[str, Any] | None = None  # read by its kind
+
+    @field_validator("encoder_sigma")
+    @classmethod
+    def _is_that_of_an_encoder(cls, sigma: float) -> float:
+        least, most = ENCODER_SIGMAS
+        if not least <= sigma <= most:
+            raise ValueError(
+                f"found {sigma:g} m, needed {least:g} to {most:g} m; give one standard deviation "
+                "of a reading in metres."
+            )
+        return sigma
+
+
+def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board: bool) -> list[str]:
+    """Return what keeps views from being hand-held.
+
+    Parameters
+    ----------
+    path : Path
+        ``dataset.yaml``.
+    views : mapping of str to ViewEntry
+        Its views.
+    has_board : bool
+        Whether it describes a calibration board.
+    """
+    held = {name: view for name, view in views.items() if view.hand_held}
+    problems = [
+        f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
+        "board on the base in every image of a camera that is held in the hand; describe it in "
+        "the block board."
+        for name in held
+        if not has_board
+    ]
+    problems += [
+        f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "
+        "held in the hand, needed none, the board tells the pose of every image; remove it."
+        for name, view in held.items()
+        if view.T_base_camera is not None
+    ]
+    return problems
+
+
+def expand_hand_held(
+    path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
+) -> tuple[Measurements, tuple[int, ...], list[str]]:
+    """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows.
+
+    Parameters
+    ----------
+    path : Path
+        ``dataset.yaml``, for messages.
+    measurements : Measurements
+        The rows, with the views of the file.
+    views : mapping of str to ViewEntry
+        Those views.
+
+    Returns
+    -------
+    measurements : Measurements
+        With the new views in the places of the old ones.
+    origin : tuple of int
+        The view of the file that each new view comes from.
+    problems : list of str
+        Names that the file has given to other views.
+    """
+    new: list[View] = []
+    origin: list[int] = []
+    problems: list[str] = []
+    index = np.zeros_like(measurements.view)
+    for v, (name, entry) in enumerate(views.items()):
+        rows = np.flatnonzero(measurements.view == v)
+        if not entry.hand_held:
+            index[rows] = len(new)
+            new.append(measurements.views[v])
+            origin.append(v)
+            continue
+        for k, row in enumerate(rows.tolist(), start=1):
+            index[row] = len(new)
+            new.append(replace(measurements.views[v], name=f"{name}-{k}", hand_held=True))
+            origin.append(v)
+        taken = [f"{name}-{k + 1}" for k in range(len(rows)) if f"{name}-{k + 1}" in views]
+        problems += [
+            f"{path}: views.{other} could not be used: found the name that an image of the "
+            f"hand-held view {name} gets, needed another; rename it."
+            for other in taken
+        ]
+    return replace(measurements, views=tuple(new), view=index), tuple(origin), problems
+
+
+CACHE_NAME = ".legcal-cache.json"
+
+
+def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
+    """Read a dataset and check everything in it that can be checked without decoding images.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The dataset folder, or its ``dataset.yaml``.
+    check_images : bool
+        Also check that every image that must be read exists, is complete and has the size of
+        its camera file.
+
+    Returns
+    -------
+    Dataset
+        With rows, views and legs in the order of the files.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each thing that is wrong.
+    ModelError, OutOfClass
+        If the mechanism does not load.
+    """
+    yaml_path = _dataset_file(Path(folder))
+    folder = yaml_path.parent
+    entry = _read_entry(yaml_path)
+    board, T_base_board = read_board(entry.board, yaml_path)
+    problems = hand_held_problems(yaml_path, entry.views, has_board=board is not None)
+    if found := path_problem(folder, entry.measurements):
+        problems.append(
+            f"{yaml_path}: measurements could not be used: found {found} ({entry.measurements}), "
+            "needed a relative path inside it; move the table there."
+        )
+    camera_paths = tuple(folder / view.camera for view in entry.views.values())
+    cameras = _read_cameras(camera_paths, problems)
+    mechanism = load_mechanism(_mechanism_path(folder, entry.mechanism))
+    problems += _leg_problems(yaml_path, entry.views, mechanism.leg_names)
+    if problems:
+        raise DatasetError(problems)
+    views = tuple(
+        _view(name, view, cameras[path])
+        for (name, view), path in zip(entry.views.items(), camera_paths, strict=True)
+    )
+    table_path = folder / entry.measurements
+    rows, notes = read_measurements(table_path, folder, views, mechanism.legs, entry.encoder_sigma)
+    measurements, origin, problems = expand_hand_held(yaml_path, rows, entry.views)
+    if problems:
+        raise DatasetError(problems)
+    _refuse_two_tables(folder)
+    axes, left_out = read_given_axes(folder / AXES_NAME, mechanism.leg_names, measurements)
+    dataset = Dataset(
+        folder=folder,
+        yaml_path=yaml_path,
+        table_path=table_path,
+        camera_paths=tuple(camera_paths[v] for v in origin),
+        mechanism=mechanism,
+        measurements=measurements,
+        observations=_read_outlines(folder, mechanism, measurements),
+        notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
+        axes=axes,
+        wishes=entry.parameters.wishes(yaml_path),
+        board=board,
+        T_base_board=T_base_board,
+        corners=read_given_corners(folder / CORNERS_NAME, board, measurements),
+    )
+    held = [view.hand_held for view in entry.views.values()]
+    of_hand = [row for row, v in enumerate(rows.view.tolist()) if held[v]]
+    problems = row_problems(dataset, of_hand) if check_images else []
+    if problems:
+        raise DatasetError(problems)
+    return dataset
+
+
+def _refuse_two_tables(folder: Path) -> None:
+    """Refuse a dataset with axes and outlines."""
+    if os.path.exists(folder / AXES_NAME) and os.path.exists(folder / OBSERVATIONS_NAME):
+        raise DatasetError(
+            f"{folder}: the observations could not be read: found {AXES_NAME} and "
+            f"{OBSERVATIONS_NAME}, needed one of them; remove the one that is not to be used."
+        )
+
+
+def _dataset_file(given: Path) -> Path:
+    """Return the path of dataset.yaml."""
+    path = (
+        given
+        if given.suffix in (".yaml", ".yml") and not os.path.isdir(given)
+        else given / DATASET_YAML
+    )
+    if not os.path.isdir(path.parent):
+        raise DatasetError(
+            f"{given}: the dataset could not be read: found no such folder, needed a folder with a "
+            f"{DATASET_YAML}; check the path."
+        )
+    if not os.path.exists(path):
+        raise DatasetError(
+            f"{given}: the dataset could not be read: found no {path.name} in the folder, needed "
+            "one; give the folder of a dataset."
+        )
+    return path
+
+
+def _read_entry(path: Path) -> DatasetEntry:
+    """Return what dataset.yaml says."""
+    found = parse_yaml(read_text(path, "dataset file"), path, "dataset file")
+    version = found.get("legcal_dataset", 1)
+    if version != 1 or isinstance(version, bool):
+        raise DatasetError(
+            f"{path}: the dataset could not be read: found legcal_dataset {describe(version)}, "
+            "needed version 1; use the legcal that wrote it, or write the file as version 1."
+        )
+    return validate(DatasetEntry, found, path)
+
+
+def _read_cameras(paths: tuple[Path, ...], problems: list[str]) -> dict[Path, Camera]:
+    """Return the camera of each file; files that cannot be used add to the problems."""
+    cameras = {}
+    for path in dict.fromkeys(paths):
+        try:
+            cameras[path] = read_camera(path)
+        except DatasetError as error:
+            problems += error.problems
+    return cameras
+
+
+def _mechanism_path(folder: Path, named: str) -> Path:
+    """Return the model's path relative to the dataset if there is one, else a shipped one."""
+    path = folder / named
+    if not os.path.isfile(path) and named in shipped_names():
+        return shipped_folders()[0] / f"{named}.yaml"
+    return path
+
+
+def _leg_problems(
+    path: Path, views: Mapping[str, ViewEntry], leg_names: Sequence[str]
+) -> list[str]:
+    """Return the legs of views that the mechanism does not have."""
+    return [
+        f"{path}: views.{name}.legs could not be used: found the unknown leg {describe(leg)}, "
+        f"needed legs of the mechanism; {closest(leg, leg_names)}"
+        for name, view in views.items()
+        for leg in view.legs or ()
+        if leg not in leg_names
+    ]
+
+
+def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
+    """Return a view of the measurements."""
+    return View(
+        name=name,
+        camera=replace(camera, gamma=entry.gamma or 1.0, gamma_is_told=entry.gamma is not None),
+        T_base_camera=entry.T_base_camera.motion() if entry.T_base_camera else None,
+        legs=tuple(entry.legs) if entry.legs else None,
+    )
+
+
+def _read_outlines(
+    folder: Path, mechanism: Mechanism, measurements: Measurements
+) -> Outlines | None:
+    """Return the outlines beside the dataset, if there are any."""
+    path = folder / OBSERVATIONS_NAME
+    if not os.path.exists(path):
+        return None
+    is_own = (folder / CACHE_NAME).exists()
+    return read_observations(path, mechanism.legs, measurements, skip_stale=is_own)
+
+
+def _unused_views(path: Path, measurements: Measurements) -> list[str]:
+    """Return a note for each view without a row."""
+    return [
+        f"{path}: view {view.name} has no row in the table of measurements and is left out."
+        for v, view in enumerate(measurements.views)
+        if not np.any(measurements.view == v)
+    ]

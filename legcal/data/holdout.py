@@ -1,0 +1,139 @@
+"""Images that are kept aside: a fit that has not seen them must foretell what they show.
+
+Whole poses are kept aside, since images of one pose share what is unknown of it. They are drawn
+by chance, in an order that does not depend on the files, and so that every leg in every view
+loses no more than its share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legcal.data.dataset import Dataset
+from legcal.data.order import axes_at, canonical_order, corners_at, measurements_at, outlines_at
+from legcal.errors import NotIdentifiable, UsageError
+from legcal.geometry import BoolArray, IntArray
+
+_SEED = 20020721
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """The images of a dataset that are fitted, and those that are kept aside.
+
+    Attributes
+    ----------
+    fitted, kept_aside : (n,) array of int
+        Rows of the measurements, rising.
+    """
+
+    fitted: IntArray
+    kept_aside: IntArray
+
+
+def check_fraction(fraction: float) -> None:
+    """Refuse a part of the images that is none.
+
+    Raises
+    ------
+    UsageError
+        If it is not between 0 and 1.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise UsageError(
+            f"The images to keep aside could not be chosen: found the fraction {fraction:g}, "
+            "needed a number between 0 and 1 (0.2 keeps a fifth aside); correct it."
+        )
+
+
+def split_images(dataset: Dataset, fraction: float) -> Split:
+    """Return which images to fit and which to keep aside.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        All images.
+    fraction : float
+        Part of the images to keep aside, between 0 and 1.
+
+    Returns
+    -------
+    Split
+
+    Raises
+    ------
+    UsageError
+        If the fraction is not between 0 and 1.
+    NotIdentifiable
+        If there are too few images to keep any aside.
+    """
+    check_fraction(fraction)
+    measurements = dataset.measurements
+    shown = _shown(dataset)
+    wanted = max(1, round(fraction * measurements.n_rows))
+    most = np.minimum(np.ceil(fraction * shown.sum(axis=0)), shown.sum(axis=0) - 1)
+    aside = np.zeros(measurements.n_rows, dtype=np.bool_)
+    for pose in _poses_by_chance(dataset):
+        tried = aside | (measurements.pose == pose)
+        fits = np.all(shown[tried].sum(axis=0) <= np.maximum(most, 0.0))
+        if fits and tried.sum() <= wanted:
+            aside = tried
+    if not aside.any():
+        raise NotIdentifiable(
+            f"{dataset.folder}: no images could be kept aside: found "
+            f"{measurements.n_rows} image{'s' * (measurements.n_rows != 1)} of "
+            f"{measurements.n_poses} pose{'s' * (measurements.n_poses != 1)}, needed so many that "
+            f"a whole pose is {100 * fraction:g} % of them and every leg stays in every view that "
+            "shows it; take more images or leave out --holdout."
+        )
+    return Split(np.flatnonzero(~aside), np.flatnonzero(aside))
+
+
+def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
+    """Return a dataset with some of its images only."""
+    observations, axes, corners = dataset.observations, dataset.axes, dataset.corners
+    return replace(
+        dataset,
+        measurements=measurements_at(dataset.measurements, rows),
+        observations=None if observations is None else outlines_at(observations, rows),
+        axes=None if axes is None else axes_at(axes, rows),
+        corners=None if corners is None else corners_at(corners, rows),
+    )
+
+
+def _poses_by_chance(dataset: Dataset) -> IntArray:
+    """Return all poses in an order of chance that does not depend on the order of the rows."""
+    measurements = dataset.measurements
+    rows = canonical_order(measurements, dataset.mechanism.leg_names).rows
+    poses = np.array(list(dict.fromkeys(measurements.pose[rows].tolist())), dtype=np.intp)
+    return np.random.default_rng(_SEED).permutation(poses)
+
+
+def _shown(dataset: Dataset) -> BoolArray:
+    """Return which leg in which view each row shows or may show, (n_rows, n_views * n_legs)."""
+    measurements, names = dataset.measurements, dataset.mechanism.leg_names
+    shown = np.zeros((measurements.n_rows, len(measurements.views), len(names)), dtype=np.bool_)
+    given = np.zeros(measurements.n_rows, dtype=np.bool_)
+    for table, used in _tables(dataset):
+        row, leg = table[used].T
+        shown[row, measurements.view[row], leg] = True
+        given[row] = True
+    for row in np.flatnonzero(~given).tolist():
+        view = int(measurements.view[row])
+        legs = measurements.views[view].legs
+        shown[row, view] = [legs is None or name in legs for name in names]
+    return shown.reshape(measurements.n_rows, -1)
+
+
+def _tables(dataset: Dataset) -> list[tuple[IntArray, BoolArray]]:
+    """Return image row and leg of everything that tables list, and whether it is used."""
+    found = []
+    if dataset.axes is not None:
+        axes = dataset.axes
+        found.append((np.column_stack([axes.row, axes.leg]), np.ones(len(axes), dtype=np.bool_)))
+    if dataset.observations is not None:
+        outlines = dataset.observations
+        found.append((np.column_stack([outlines.row, outlines.leg]), outlines.used))
+    return found

@@ -1,0 +1,387 @@
+"""Starting values: platform poses and cameras from any kinematic parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data import Measurements
+from legcal.errors import DatasetError, DidNotConverge
+from legcal.estimation.state import FittedLegs, Layout, State, components, motions, turned
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import (
+    Demand,
+    LegGeometry,
+    LegKind,
+    demanded,
+    freedoms,
+    tied_twist,
+    tied_twist_slope,
+    turn_of,
+)
+
+_RANK = 1e-7  # of the largest singular value
+_MET = 1e-13  # [m]
+_NEARLY_MET = 1e-10  # [m], of demands that cannot all be met to rounding
+_MAX_STEPS = 20
+_PLATFORM_AXIS, _TWIST = slice(9, 11), 11  # among the numbers of a leg
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRows:
+    """The equations of legs at poses; all rows are lengths.
+
+    Attributes
+    ----------
+    values : (n_poses, m) array
+        How far each row is from met [m]; for a row that holds by a reading |AB| - q0.
+    by_pose : (n_poses, m, 6) array
+        Derivative by rotation [rad] and displacement [m] of R_e in R_b.
+    by_local : (n_poses, m, 12) array
+        Derivative by the numbers of the row's leg.
+    leg : (m,) array of int
+        The leg of each row.
+    measured : (m,) array of bool
+        Which rows hold by a reading.
+    """
+
+    values: Array
+    by_pose: Array
+    by_local: Array
+    leg: IntArray
+    measured: BoolArray
+
+    def of(self, rows: BoolArray) -> PoseRows:
+        """Return some of the rows."""
+        return PoseRows(
+            self.values[:, rows],
+            self.by_pose[:, rows],
+            self.by_local[:, rows],
+            self.leg[rows],
+            self.measured[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """The motions of platform poses that the constraints leave.
+
+    Attributes
+    ----------
+    Z : (n_poses, 6, f) array
+        Basis of the motions at rest parameters; zero columns where a pose has fewer.
+    Q : (n_kept, n_poses, 6) array
+        Motion by each unknown other than poses.
+    """
+
+    Z: Array
+    Q: Array
+
+
+def pose_rows(
+    legs: Sequence[LegGeometry], R: Array, t: Array, *, by_local: bool = True
+) -> PoseRows:
+    """Return what all legs demand at poses R (k, 3, 3), t (k, 3) of R_e in R_b.
+
+    Without *by_local* these derivatives have no columns.
+    """
+    found = [demanded(leg, R, t, by_local=by_local) for leg in legs]
+    counts = [len(part.demands) for part in found]
+    measured = [
+        leg.kind is LegKind.ACTUATED and demand is Demand.LENGTH
+        for leg, part in zip(legs, found, strict=True)
+        for demand in part.demands
+    ]
+    return PoseRows(
+        np.concatenate([part.values for part in found], axis=1),
+        np.concatenate([part.by_pose for part in found], axis=1),
+        np.concatenate([part.by_local for part in found], axis=1),
+        np.repeat(np.arange(len(legs)), counts),
+        np.array(measured, dtype=np.bool_),
+    )
+
+
+def is_constrained(legs: Sequence[LegGeometry], frame_legs: Sequence[int]) -> bool:
+    """Say whether anything is demanded of poses besides readings."""
+    return len(frame_legs) < 3 or any(map(n_bonds, legs))
+
+
+def on_constraints(state: State, frame_legs: Sequence[int]) -> State:
+    """Return the state with every pose moved, as little as possible, to where constraints hold.
+
+    Where they contradict each other a pose goes where they are met best.
+
+    Raises
+    ------
+    DidNotConverge
+        If a pose does not come to rest.
+    """
+    if not any(map(n_bonds, state.legs)):
+        return state
+    free = list(freedoms(frame_legs))
+    R, t, size = state.R_pose, state.t_pose, np.inf
+    for _ in range(_MAX_STEPS):
+        rows = _binding(state.legs, R, t, by_local=False)
+        step = np.zeros((len(t), 6))
+        inverse = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
+        step[:, free] = -np.einsum("kij,kj->ki", inverse, rows.values)
+        previous, size = size, float(np.abs(step).max(initial=0.0))
+        R, t = turned(R, step[:, :3]), t + step[:, 3:]
+        if size < _MET or (size < _NEARLY_MET and size > 0.5 * previous):
+            return replace(state, R_pose=R, t_pose=t)
+        if not size < 1e3:
+            break
+    raise DidNotConverge(
+        "The fit of everything could not keep the platform on what its joints allow: found a pose "
+        f"that still moves by {size:.2g} m or rad, needed rest; start nearer to the truth (joints "
+        "to 5 mm, axes to 3 deg)."
+    )
+
+
+def tangent(state: State, layout: Layout, legs: FittedLegs) -> Tangent | None:
+    """Return the motions of poses that the constraints leave; None where all are free."""
+    if not is_constrained(state.legs, legs.frame_legs):
+        return None
+    free = list(freedoms(legs.frame_legs))
+    n_poses = layout.n_poses
+    rows = _binding(state.legs, state.R_pose, state.t_pose)
+    Q = np.zeros((layout.n_kept + 1, n_poses, 6))
+    if len(rows.leg) == 0:
+        Z = np.broadcast_to(np.eye(6)[:, free], (n_poses, 6, len(free))).copy()
+        return Tangent(Z, Q[:-1])
+    _, s, vt = np.linalg.svd(rows.by_pose[:, :, free])
+    n = s.shape[1]
+    held = s > _RANK * s[:, :1]
+    least = int(held.sum(axis=1).min(initial=n))
+    basis = np.swapaxes(vt, -1, -2)[:, :, least:].copy()
+    basis[:, :, : n - least] *= ~held[:, None, least:]
+    Z = np.zeros((n_poses, 6, basis.shape[2]))
+    Z[:, free] = basis
+    inverse = np.zeros((n_poses, 6, len(rows.leg)))
+    inverse[:, free] = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
+    for i, leg in enumerate(rows.leg):
+        place = np.minimum(layout.place[leg], layout.n_kept)
+        by_local = rows.by_local[:, i]
+        if place[_TWIST] == layout.n_kept:
+            slope = tied_twist_slope(state.legs[leg], legs.nominal[leg])
+            by_local[:, _PLATFORM_AXIS] += by_local[:, [_TWIST]] * slope
+        Q[place] -= by_local.T[..., None] * inverse[None, :, :, i]
+    return Tangent(Z, Q[:-1])
+
+
+def following(state: State, frame_legs: Sequence[int], leg: int, column: int) -> Array:
+    """Return how poses (n_poses, 6) follow one of the numbers of a leg, all else at rest."""
+    free = list(freedoms(frame_legs))
+    rows = _binding(state.legs, state.R_pose, state.t_pose)
+    inverse = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
+    by_number = np.where(rows.leg == leg, rows.by_local[:, :, column], 0.0)
+    motion = np.zeros((len(state.t_pose), 6))
+    motion[:, free] = -np.einsum("kfm,km->kf", inverse, by_number)
+    return motion
+
+
+def n_bonds(leg: LegGeometry) -> int:
+    """Return how many equations of a leg hold without a reading."""
+    return len(leg.demands) - (leg.kind is not LegKind.CONSTANT)
+
+
+def _binding(legs: Sequence[LegGeometry], R: Array, t: Array, *, by_local: bool = True) -> PoseRows:
+    """Return the rows that hold without a reading."""
+    rows = pose_rows(legs, R, t, by_local=by_local)
+    return rows.of(~rows.measured)
+
+
+_MAX_ITERATIONS = 60
+_STEP = 1e-12  # [m, rad]
+_LARGEST_TURN = 0.3  # [rad] in one step
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit begins.
+
+    Attributes
+    ----------
+    legs : tuple of LegGeometry
+        The legs in R_b and R_e.
+    T_camera_Rb : tuple of RigidTransform
+        Camera poses, one a view.
+    T_Rb_Re : tuple of RigidTransform
+        Platform poses, one a pose.
+    label : str
+        Where it comes from: ``nominal`` or ``staged``.
+    T_Rb_board : RigidTransform
+        The calibration board, where images show one.
+    """
+
+    legs: tuple[LegGeometry, ...]
+    T_camera_Rb: tuple[RigidTransform, ...]
+    T_Rb_Re: tuple[RigidTransform, ...]
+    label: str
+    T_Rb_board: RigidTransform = field(default_factory=RigidTransform.identity)
+
+
+def start_from(
+    geometry: Sequence[LegGeometry],
+    measurements: Measurements,
+    legs: FittedLegs,
+    T_camera_Rb: Sequence[RigidTransform],
+    T_Rb_Re: Sequence[RigidTransform],
+    label: str,
+) -> Start:
+    """Return a start whose platform poses fit the parameters and the readings.
+
+    Parameters
+    ----------
+    geometry : sequence of LegGeometry
+        The legs, nominal or from the four steps, in R_b and R_e.
+    measurements : Measurements
+    legs : FittedLegs
+    T_camera_Rb : sequence of RigidTransform
+        Camera poses, one a view: from :func:`cameras_from_hints` or from step 2.
+    T_Rb_Re : sequence of RigidTransform
+        A platform pose, one a pose, in the right assembly mode: the nominal forward kinematics.
+    label : str
+        Name of the start.
+
+    Returns
+    -------
+    Start
+    """
+    q0 = np.array([leg.q0 for leg in geometry])
+    lengths = legs.sign * measurements.q[measurements.first_rows] + q0
+    poses = platform_poses(geometry, lengths, T_Rb_Re, legs.frame_legs)
+    return Start(tuple(geometry), tuple(T_camera_Rb), poses, label)
+
+
+def with_values(
+    geometry: Sequence[LegGeometry], legs: FittedLegs, values: Mapping[int, float]
+) -> tuple[LegGeometry, ...]:
+    """Return legs some of whose parameters, by their number, have given values [m, rad]."""
+    wanted = np.append(legs.vector(tuple(geometry)), 0.0)
+    wanted[list(values)] = list(values.values())
+    asked = np.isin(legs.parametrization.place, list(values))
+    return tuple(
+        _with_numbers(leg, nominal, wanted[place], is_asked) if is_asked.any() else leg
+        for leg, nominal, place, is_asked in zip(
+            geometry, legs.nominal, legs.parametrization.place, asked, strict=True
+        )
+    )
+
+
+def _with_numbers(
+    leg: LegGeometry, nominal: LegGeometry, numbers: Array, asked: BoolArray
+) -> LegGeometry:
+    """Return a leg some of whose numbers have given values; axes count from the nominal ones."""
+    moved = replace(
+        leg,
+        A=np.where(asked[:3], numbers[:3], leg.A),
+        B=np.where(asked[3:6], numbers[3:6], leg.B),
+        q0=float(numbers[6]) if asked[6] else leg.q0,
+        base_axis=_axis_at(leg.base_axis, nominal.base_axis, numbers[7:9], asked[7:9]),
+        platform_axis=_axis_at(
+            leg.platform_axis, nominal.platform_axis, numbers[9:11], asked[9:11]
+        ),
+    )
+    if leg.twist is None or not asked[9:].any():
+        return moved
+    return replace(moved, twist=tied_twist(moved, nominal, float(numbers[11])))
+
+
+def _axis_at(
+    axis: Array | None, nominal: Array | None, angles: Array, asked: BoolArray
+) -> Array | None:
+    """Return an axis at angles from the nominal one, as it was if none is asked for."""
+    if axis is None or nominal is None or not asked.any():
+        return axis
+    there = np.asarray(turn_of(nominal, angles).apply(nominal))
+    return there if there @ axis > 0.0 else -there
+
+
+def cameras_from_hints(
+    measurements: Measurements, T_base_Rb: RigidTransform
+) -> tuple[RigidTransform, ...]:
+    """Return T_camera_Rb of every view from its rough pose in the base link.
+
+    Raises
+    ------
+    DatasetError
+        If a view has no rough pose.
+    """
+    missing = [view.name for view in measurements.views if view.T_base_camera is None]
+    if missing:
+        raise DatasetError(
+            f"The fit could not be started: the views {', '.join(missing)} have no T_base_camera; "
+            "a camera pose good to 2 cm and 2 deg is needed; add it to dataset.yaml."
+        )
+    return tuple(
+        view.T_base_camera.inv() * T_base_Rb
+        for view in measurements.views
+        if view.T_base_camera is not None
+    )
+
+
+def platform_poses(
+    geometry: Sequence[LegGeometry],
+    lengths: Array,
+    T_Rb_Re: Sequence[RigidTransform],
+    frame_legs: Sequence[int],
+) -> tuple[RigidTransform, ...]:
+    """Return the platform poses at which the legs have given lengths, all at once.
+
+    Where no pose has these lengths (parameters far from the truth) the pose with the least
+    squares of what the legs demand is returned: a fit can still start there.
+
+    Parameters
+    ----------
+    geometry : sequence of LegGeometry
+        The legs in R_b and R_e.
+    lengths : (n_poses, n_legs) array
+        Leg lengths [m] of actuated legs; NaN where unknown. Others are not looked at.
+    T_Rb_Re : sequence of RigidTransform
+        Poses nearby, in the right assembly mode.
+    frame_legs : sequence of int
+        The legs that define R_b and R_e.
+
+    Returns
+    -------
+    tuple of RigidTransform
+        T_Rb_Re.
+    """
+    free = list(freedoms(frame_legs))
+    reading = lengths - np.array([leg.q0 for leg in geometry])
+    R, t = components(T_Rb_Re)
+    damping = np.full(len(R), 1e-6)
+    error, J = _misses(geometry, reading, R, t)
+    cost = np.sum(error**2, axis=1)
+    for _ in range(_MAX_ITERATIONS):
+        J_free = J[:, :, free]
+        N = np.swapaxes(J_free, -1, -2) @ J_free + damping[:, None, None] * np.eye(len(free))
+        step = np.zeros((len(t), 6))
+        gradient = np.einsum("kli,kl->ki", J_free, error)
+        step[:, free] = -np.linalg.solve(N, gradient[..., None])[..., 0]
+        turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+        step *= np.minimum(1.0, _LARGEST_TURN / np.maximum(turn, 1e-300))
+        R_next, t_next = turned(R, step[:, :3]), t + step[:, 3:]
+        error_next, J_next = _misses(geometry, reading, R_next, t_next)
+        cost_next = np.sum(error_next**2, axis=1)
+        better = cost_next <= cost
+        damping = np.where(better, np.maximum(damping * 0.1, 1e-14), damping * 10.0)
+        R[better], t[better], cost[better] = R_next[better], t_next[better], cost_next[better]
+        error[better], J[better] = error_next[better], J_next[better]
+        if np.abs(step).max() < _STEP:
+            break
+    return motions(R, t)
+
+
+def _misses(
+    geometry: Sequence[LegGeometry], reading: Array, R: Array, t: Array
+) -> tuple[Array, Array]:
+    """Return how far all rows are from met (n_poses, m) [m] and their derivatives by the pose."""
+    rows = pose_rows(geometry, R, t)
+    wanted = np.where(rows.measured, reading[:, rows.leg], 0.0)
+    known = np.isfinite(wanted)
+    return np.where(known, rows.values - wanted, 0.0), rows.by_pose * known[..., None]

@@ -1,0 +1,396 @@
+"""From what somebody asks of parameters to choices: patterns resolved, contradictions refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Literal
+
+import numpy as np
+
+from legcal.data import Action, View, Wish
+from legcal.errors import DatasetError, UsageError
+from legcal.estimation.choices import Choices, Prior
+from legcal.files import closest
+from legcal.machine import (
+    Leg,
+    LegKind,
+    Mechanism,
+    free_coordinates,
+    geometries,
+    parametrization_of,
+    radius_name,
+    vector_of,
+)
+from legcal.vision import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
+
+Kind = Literal["kinematic", "radius", "intrinsic", "board"]
+BOARD_SCALE = "board.scale"  # the factor on the dimensions of a calibration board
+_RATIO = 10.0  # between a radius or length and its nominal value: more is a mistake of the unit
+_FOCAL_RATIO = 2.0
+_COEFFICIENT = 1e3  # of distortion; far more than any lens has
+
+
+@dataclass(frozen=True)
+class KnownParameter:
+    """A parameter and what values make sense for it.
+
+    Attributes
+    ----------
+    nominal : float
+        Its value in the model or camera file [unit].
+    unit : {"m", "rad", "px", ""}
+        Its unit; "" for coefficients of distortion and for the size of a board.
+    kind : {"kinematic", "radius", "intrinsic", "board"}
+        What it belongs to.
+    least, most : float
+        Between these a stated value is believed [unit].
+    sigma : float or None
+        What its camera file says of its uncertainty, one standard deviation [unit].
+    """
+
+    nominal: float
+    unit: str
+    kind: Kind
+    least: float
+    most: float
+    sigma: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class KnownParameters:
+    """The parameters of a machine and of the cameras that look at it.
+
+    Attributes
+    ----------
+    by_name : mapping
+        The parameters, in the order kinematic ones with twists, radii, intrinsics, the size of the
+        calibration board.
+    others : mapping
+        Names that look like parameters and are none, and why: the end of a sentence.
+    synonyms : mapping
+        Other names of intrinsics, and the one that counts: views of one camera share them.
+    """
+
+    by_name: Mapping[str, KnownParameter]
+    others: Mapping[str, str]
+    synonyms: Mapping[str, str]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All names by which a parameter may be called."""
+        return (*self.by_name, *self.synonyms)
+
+    def counted(self, name: str) -> str:
+        """Return the name that counts for a name."""
+        return self.synonyms.get(name, name)
+
+
+def known_parameters(
+    mechanism: Mechanism,
+    views: Sequence[View],
+    *,
+    axes_given: bool = False,
+    with_board: bool = False,
+) -> KnownParameters:
+    """Return the parameters of a machine and of the cameras of its views.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal model.
+    views : sequence of View
+        The views of the dataset.
+    axes_given : bool
+        Leg axes were measured in place of outlines: radii and intrinsics are in them already.
+    with_board : bool
+        A calibration board stands on the base.
+    """
+    by_name, others = _kinematic(mechanism), _no_parameters(mechanism)
+    seen: dict[str, KnownParameter] = dict(_radii(mechanism))
+    intrinsics, synonyms = _intrinsics(views)
+    seen |= intrinsics
+    board = (
+        {BOARD_SCALE: KnownParameter(1.0, "", "board", 1.0 / _RATIO, _RATIO)} if with_board else {}
+    )
+    if axes_given:
+        reason = "measured axes, in which cameras and radii are contained already"
+        others |= dict.fromkeys((*seen, *synonyms), reason)
+        return KnownParameters(by_name | board, others, {})
+    return KnownParameters(by_name | seen | board, others, synonyms)
+
+
+def _kinematic(mechanism: Mechanism) -> dict[str, KnownParameter]:
+    """Return the kinematic parameters with their nominal values."""
+    legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    values = vector_of(found, legs, legs)
+    metres = np.array(found.units) == "m"
+    size = float(np.abs(values[metres]).max())
+    known = {}
+    for name, unit, nominal in zip(found.names, found.units, values.tolist(), strict=True):
+        least, most = -np.pi, np.pi
+        if unit == "m":
+            least, most = nominal - size, nominal + size
+        if name.endswith(".length"):
+            least = nominal / _RATIO
+        known[name] = KnownParameter(nominal, unit, "kinematic", least, most)
+    return known
+
+
+def _radii(mechanism: Mechanism) -> Iterator[tuple[str, KnownParameter]]:
+    """Yield the radii of the visible parts of the legs."""
+    for leg in mechanism.legs:
+        for part, radius in leg.radius_of_part.items():
+            limits = radius / _RATIO, radius * _RATIO
+            yield radius_name(leg.name, part), KnownParameter(radius, "m", "radius", *limits)
+
+
+def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[str, str]]:
+    """Return the numbers of cameras, and the other names that they have."""
+    cameras = [view.camera for view in views]
+    owners = shared_cameras([view.name for view in views], cameras)
+    known: dict[str, KnownParameter] = {}
+    synonyms: dict[str, str] = {}
+    for view, camera, owner in zip(views, cameras, owners, strict=True):
+        values = intrinsic_values(camera).tolist()
+        for name, nominal in zip(intrinsic_names(camera), values, strict=True):
+            if view.name != owner:
+                synonyms[f"{view.name}.{name}"] = f"{owner}.{name}"
+                continue
+            limits = {
+                "cx": (-0.5, camera.width - 0.5),
+                "cy": (-0.5, camera.height - 0.5),
+                "fx": (nominal / _FOCAL_RATIO, nominal * _FOCAL_RATIO),
+                "fy": (nominal / _FOCAL_RATIO, nominal * _FOCAL_RATIO),
+            }.get(name, (-_COEFFICIENT, _COEFFICIENT))
+            unit = intrinsic_unit(name)
+            sigma = camera.sigma.get(name) or None
+            known[f"{owner}.{name}"] = KnownParameter(nominal, unit, "intrinsic", *limits, sigma)
+    return known, synonyms
+
+
+def _no_parameters(mechanism: Mechanism) -> dict[str, str]:
+    """Return the names that look like parameters of a machine and are none, and why."""
+    free = free_coordinates(len(mechanism.legs), mechanism.frame_legs)
+    known = parametrization_of(mechanism, twists=True).names
+    others: dict[str, str] = {}
+    for j, leg in enumerate(mechanism.legs):
+        for side, frame in (("base", "R_b"), ("platform", "R_e")):
+            for axis, letter in enumerate("xyz"):
+                name = f"{leg.name}.{side}.{letter}"
+                if name in known:
+                    continue
+                is_zero = not free[j, axis] and (axis < 2 or len(mechanism.frame_legs) == 3)
+                others[name] = (
+                    f"a coordinate that is zero by the definition of {frame}"
+                    if is_zero
+                    else "a coordinate on which nothing depends"
+                )
+        angles = ("base_axis.1", "base_axis.2", "platform_axis.1", "platform_axis.2", "twist")
+        names = [f"{leg.name}.{angle}" for angle in angles]
+        reason = f"an angle that is no parameter of a leg of type {leg.type} in this machine"
+        others |= {name: reason for name in names if name not in known}
+        others |= _other_lengths(leg)
+    return others
+
+
+def _other_lengths(leg: Leg) -> dict[str, str]:
+    """Return the names of the length and offset that a leg does not have, and why."""
+    offset, length = f"{leg.name}.offset", f"{leg.name}.length"
+    if leg.kind is LegKind.CONSTANT:
+        return {offset: f"a leg of constant length, whose parameter is {length}"}
+    if leg.kind is LegKind.ACTUATED:
+        return {length: f"a leg with an encoder, whose parameter is {offset}"}
+    reason = "a leg without an encoder, whose length is whatever the platform makes it"
+    return {offset: reason, length: reason}
+
+
+_DONE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
+
+
+def resolve(wishes: Sequence[Wish], known: KnownParameters) -> Choices:
+    """Return the choices that wishes come to.
+
+    Parameters
+    ----------
+    wishes : sequence of Wish
+        Of the dataset and of this run; the latter win.
+    known : KnownParameters
+        The parameters that there are.
+
+    Returns
+    -------
+    Choices
+
+    Raises
+    ------
+    UsageError, DatasetError
+        With one sentence for each name that is no parameter's, value that cannot be meant, and
+        pair of wishes that contradict each other.
+    """
+    in_file, its_problems = _decisions([w for w in wishes if w.in_file], known)
+    asked, problems = _decisions([w for w in wishes if not w.in_file], known)
+    if problems:
+        raise UsageError([*problems, *its_problems])
+    if its_problems:
+        raise DatasetError(its_problems)
+    given_way = [name for name in in_file if asked.get(name, in_file[name]) != in_file[name]]
+    decisions = {name: _known(d, known.by_name[name]) for name, d in (in_file | asked).items()}
+    choices = _choices(decisions, given_way)
+    _refuse_all_fixed(choices, known)
+    return choices
+
+
+@dataclass(frozen=True)
+class _Decision:
+    """What is to be done with one parameter, in its unit."""
+
+    action: Action
+    value: float | None = None
+    sigma: float | None = None
+
+
+def _known(decision: _Decision, parameter: KnownParameter) -> _Decision:
+    """Return what a decision comes to where the camera file says how uncertain a number is."""
+    if decision.action != "free" or parameter.sigma is None:
+        return decision
+    return _Decision("prior", parameter.nominal, parameter.sigma)
+
+
+def _choices(decisions: Mapping[str, _Decision], given_way: Sequence[str]) -> Choices:
+    """Return decisions sorted by what they are."""
+    stated = {name: (d.value, d.sigma) for name, d in decisions.items() if d.value is not None}
+    note = f"What the dataset says of {', '.join(given_way)} gave way to what this run asks for."
+    return Choices(
+        frozenset(name for name, d in decisions.items() if d.action == "fixed"),
+        frozenset(name for name, d in decisions.items() if d.action == "free"),
+        {name: Prior(value, sigma) for name, (value, sigma) in stated.items() if sigma is not None},
+        {name: value for name, (value, sigma) in stated.items() if sigma is None},
+        (note,) if given_way else (),
+    )
+
+
+def _decisions(
+    wishes: Sequence[Wish], known: KnownParameters
+) -> tuple[dict[str, _Decision], list[str]]:
+    """Return what wishes of one source come to for each parameter, and what is wrong with them."""
+    found: dict[str, list[tuple[Wish, _Decision]]] = {}
+    problems: list[str] = []
+    for wish in wishes:
+        names = _matches(wish, known)
+        if not names:
+            problems.append(_no_match(wish, known))
+        for name in names:
+            parameter = known.by_name[name]
+            problem = _misstated(wish, name, parameter)
+            if problem:
+                problems.append(problem)
+            else:
+                found.setdefault(name, []).append((wish, _decision(wish, name, parameter)))
+    problems += [
+        p for name, several in found.items() if (p := _contradiction(name, several, known))
+    ]
+    return {name: _strongest([d for _, d in several]) for name, several in found.items()}, problems
+
+
+def _matches(wish: Wish, known: KnownParameters) -> tuple[str, ...]:
+    """Return the parameters that a wish is about, by the names that count."""
+    if wish.name in known.names:
+        return (known.counted(wish.name),)
+    names = [known.counted(name) for name in known.names if fnmatchcase(name, wish.name)]
+    return tuple(dict.fromkeys(names))
+
+
+def _no_match(wish: Wish, known: KnownParameters) -> str:
+    """Return the sentence about a name that is no parameter's."""
+    others = [name for name in known.others if name == wish.name or fnmatchcase(name, wish.name)]
+    if others:
+        return (
+            f"{wish.where} could not be used: found {others[0]}, {known.others[others[0]]}, needed "
+            "a parameter; leave it out."
+        )
+    is_pattern = not set(wish.name).isdisjoint("*?[")
+    found = "a pattern that no name matches" if is_pattern else "an unknown name"
+    return (
+        f"{wish.where} could not be used: found {found}, needed a parameter of this machine or of "
+        f"its cameras; {closest(wish.name, known.names)}"
+    )
+
+
+def _misstated(wish: Wish, name: str, parameter: KnownParameter) -> str:
+    """Return what is wrong with the value that a wish states for a parameter, if anything."""
+    stated = wish.stated
+    if stated is None:
+        return ""
+    if stated.dimension not in ("", parameter.unit):
+        needed = f"a number in {parameter.unit}" if parameter.unit else "a number without unit"
+        return (
+            f"{wish.where} could not be used: found a number in {stated.dimension} for {name}, "
+            f"needed {needed}; correct the unit."
+        )
+    if parameter.least <= stated.value <= parameter.most:
+        return ""
+    return (
+        f"{wish.where} could not be used: found {_with_unit(stated.value, parameter)} for {name}, "
+        f"needed one between {parameter.least:.4g} and {parameter.most:.4g}, not so far from the "
+        f"nominal {_with_unit(parameter.nominal, parameter)}; check the number and its unit."
+    )
+
+
+def _decision(wish: Wish, name: str, parameter: KnownParameter) -> _Decision:
+    """Return what a wish comes to for one parameter."""
+    if wish.stated is None:
+        return _Decision(wish.action)
+    value = wish.stated.value
+    if name.endswith(".twist"):  # an angle between lines
+        value -= float(np.pi * np.round((value - parameter.nominal) / np.pi))
+    return _Decision(wish.action, value, wish.stated.sigma)
+
+
+def _contradiction(
+    name: str, several: Sequence[tuple[Wish, _Decision]], known: KnownParameters
+) -> str:
+    """Return what is wrong with all that is asked of one parameter, if anything."""
+    fixed = [wish for wish, decision in several if decision.action == "fixed"]
+    others = [wish for wish, decision in several if decision.action != "fixed"]
+    stated = {(d.value, d.sigma): wish for wish, d in several if d.value is not None}
+    if fixed and others:
+        done, pair = f"both fixed and {_DONE[others[0].action]}", (fixed[0], others[0])
+    elif len(stated) > 1:
+        first, second, *_ = stated.values()
+        done = "fixed at two values" if fixed else "given two different priors"
+        pair = (first, second)
+    else:
+        return ""
+    other = next((w.name for w in pair if w.name in known.synonyms), "")
+    also = f", which is {other} too," if other else ""  # views that have one camera
+    return (
+        f"{name}{also} could not be {done}: found {_quoted(pair[0])} and {_quoted(pair[1])}, "
+        "needed one of them; remove the other."
+    )
+
+
+def _strongest(decisions: Sequence[_Decision]) -> _Decision:
+    """Return what several decisions that agree come to: one that states a value says most."""
+    return next((d for d in decisions if d.value is not None), decisions[0])
+
+
+def _refuse_all_fixed(choices: Choices, known: KnownParameters) -> None:
+    """Raise UsageError if nothing of the mechanism is left to be found."""
+    names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
+    if all(choices.holds(name, by_default=name.endswith(".twist")) for name in names):
+        raise UsageError(
+            "The mechanism could not be calibrated: found all of its parameters fixed, needed one "
+            "at least that is not; fix fewer of them."
+        )
+
+
+def _quoted(wish: Wish) -> str:
+    """Return where a wish was said, as part of a sentence."""
+    return wish.where[:1].lower() + wish.where[1:] if not wish.in_file else wish.where
+
+
+def _with_unit(value: float, parameter: KnownParameter) -> str:
+    """Return a value and its unit."""
+    return f"{value:.4g} {parameter.unit}".rstrip()

@@ -1,0 +1,296 @@
+"""What a fit means at the platform: what it changes there, and how well that is known.
+
+Errors over the workspace are those at a hundred poses all over the travel, the same at which
+``legcal evaluate`` compares two models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DidNotConverge
+from legcal.estimation.constraints import platform_poses
+from legcal.estimation.solution import Sensitivity
+from legcal.estimation.state import components
+from legcal.geometry import Array
+from legcal.machine import (
+    LegGeometry,
+    LegKind,
+    Mechanism,
+    Parametrization,
+    geometries,
+    platform_in_base,
+    pose_differences,
+    pose_sensitivity,
+    workspace,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformError:
+    """How far the platform is off at poses, one number a pose.
+
+    Attributes
+    ----------
+    displacement : (n_poses,) array
+        Displacement of the origin of R_e, the platform joint of the first frame leg [m].
+    rotation : (n_poses,) array
+        Angle of rotation [rad].
+
+    Notes
+    -----
+    A predicted error is one standard deviation of the whole vector: the root of the expected
+    square of its length.
+    """
+
+    displacement: Array
+    rotation: Array
+
+    @property
+    def mean_displacement(self) -> float:
+        """Mean over the poses [m]."""
+        return float(self.displacement.mean())
+
+    @property
+    def mean_rotation(self) -> float:
+        """Mean over the poses [rad]."""
+        return float(self.rotation.mean())
+
+    @property
+    def max_displacement(self) -> float:
+        """Largest of all poses [m]."""
+        return float(self.displacement.max())
+
+    @property
+    def max_rotation(self) -> float:
+        """Largest of all poses [rad]."""
+        return float(self.rotation.max())
+
+
+def predict_platform_error(
+    legs: Sequence[LegGeometry],
+    parametrization: Parametrization,
+    covariance: Array,
+    frame_legs: Sequence[int],
+    T_Rb_Re: Sequence[RigidTransform],
+) -> PlatformError:
+    """Return the predicted platform error at poses, one standard deviation.
+
+    Parameters
+    ----------
+    legs : sequence of LegGeometry
+        The calibrated legs in R_b and R_e.
+    parametrization : Parametrization
+        Their parameters.
+    covariance : (p, p) array
+        The covariance of these parameters [m^2, m rad, rad^2]; zero for what is known.
+    frame_legs : sequence of int
+        The legs that define R_b and R_e: three in space, two in a plane.
+    T_Rb_Re : sequence of RigidTransform
+        Platform poses.
+
+    Returns
+    -------
+    PlatformError
+
+    Raises
+    ------
+    NotIdentifiable
+        If the readings do not determine a pose.
+    """
+    J = platform_by_parameters(legs, parametrization, frame_legs, T_Rb_Re)
+    return expected_error(J, covariance)
+
+
+def platform_by_parameters(
+    legs: Sequence[LegGeometry],
+    parametrization: Parametrization,
+    frame_legs: Sequence[int],
+    T_Rb_Re: Sequence[RigidTransform],
+) -> Array:
+    """Return the derivative of platform poses by the parameters, (n_poses, 6, p).
+
+    Rotation vectors in R_b come first [rad], displacements of the origin of R_e second [m].
+
+    Raises
+    ------
+    NotIdentifiable
+        If the readings do not determine a pose.
+    """
+    return pose_sensitivity(legs, parametrization, frame_legs, *components(T_Rb_Re))
+
+
+def expected_error(by_parameters: Array, covariance: Array) -> PlatformError:
+    """Return one standard deviation of the platform at poses.
+
+    Parameters
+    ----------
+    by_parameters : (n_poses, 6, p) array
+        From :func:`platform_by_parameters`.
+    covariance : (p, p) array
+        Of the parameters.
+    """
+    variance = np.sum((by_parameters @ covariance) * by_parameters, axis=2)
+    return PlatformError(_root_of_sum(variance[:, 3:]), _root_of_sum(variance[:, :3]))
+
+
+def moved_by(by_parameters: Array, changes: Array) -> PlatformError:
+    """Return how far small changes of the parameters move the platform at poses.
+
+    Parameters
+    ----------
+    by_parameters : (n_poses, 6, p) array
+        From :func:`platform_by_parameters`.
+    changes : (p, c) array
+        Independent changes of the parameters [m, rad], of which the root of the sum of squares
+        is told.
+    """
+    motion = np.sum((by_parameters @ changes) ** 2, axis=2)
+    return PlatformError(_root_of_sum(motion[:, 3:]), _root_of_sum(motion[:, :3]))
+
+
+def _root_of_sum(squares: Array) -> Array:
+    """Return the root of sums of squares, (n_poses,), which rounding may leave below zero."""
+    return np.asarray(np.sqrt(np.maximum(squares.sum(axis=1), 0.0)))
+
+
+_REACHED = 1e-8  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What a mistake in something that counts as known would do to the platform.
+
+    Attributes
+    ----------
+    what : str
+        The mistake: ``a focal length 1 % longer``.
+    error : PlatformError
+        How far the platform would move, over the workspace; at the readings of the dataset where
+        that is not known.
+    """
+
+    what: str
+    error: PlatformError
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformAccuracy:
+    """What a fit means at the platform; angles and distances as in :class:`PlatformError`.
+
+    Attributes
+    ----------
+    change : PlatformError
+        From the nominal to the calibrated platform at the readings of every pose.
+    sigma : PlatformError
+        Predicted error of the calibrated platform there, one standard deviation.
+    workspace : PlatformError or None
+        The same at poses all over the travel; None where the model cannot reach them.
+    effects : tuple of Effect
+        What mistakes in what counts as known would do.
+    """
+
+    change: PlatformError
+    sigma: PlatformError
+    workspace: PlatformError | None
+    effects: tuple[Effect, ...]
+
+
+def platform_accuracy(
+    mechanism: Mechanism,
+    legs: Sequence[LegGeometry],
+    parametrization: Parametrization,
+    covariance: Array,
+    q: Array,
+    T_Rb_Re: Sequence[RigidTransform],
+    sensitivities: Sequence[Sensitivity] = (),
+) -> PlatformAccuracy | None:
+    """Return what calibrated legs mean at the platform.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal machine.
+    legs : sequence of LegGeometry
+        Its calibrated legs in R_b and R_e.
+    parametrization : Parametrization
+        Their parameters.
+    covariance : (p, p) array
+        The covariance of these [m^2, m rad, rad^2]; zero for what is held.
+    q : (n_poses, n_legs) array
+        The readings of the dataset [m].
+    T_Rb_Re : sequence of RigidTransform
+        The platform there, as fitted.
+    sensitivities : sequence of Sensitivity
+        What mistakes in what counts as known would do to the parameters.
+
+    Returns
+    -------
+    PlatformAccuracy or None
+        None where the motors do not determine the pose.
+
+    Raises
+    ------
+    NotIdentifiable
+        If the readings of a pose do not determine it: the machine is singular there.
+    """
+    if not mechanism.is_determined:
+        return None
+
+    def follow(poses: Sequence[RigidTransform]) -> Array:
+        """Return how calibrated poses move with the parameters."""
+        return platform_by_parameters(legs, parametrization, mechanism.frame_legs, poses)
+
+    calibrated = poses_at_readings(mechanism, legs, q, T_Rb_Re)
+    nominal = poses_at_readings(mechanism, geometries(mechanism), q, T_Rb_Re)
+    here, poses = follow(calibrated), _workspace_poses(mechanism, legs)
+    everywhere = None if poses is None else follow(poses)
+    judged = here if everywhere is None else everywhere
+    return PlatformAccuracy(
+        PlatformError(*pose_differences(calibrated, nominal)),
+        expected_error(here, covariance),
+        None if everywhere is None else expected_error(everywhere, covariance),
+        tuple(Effect(s.what, moved_by(judged, s.steps)) for s in sensitivities),
+    )
+
+
+def _workspace_poses(
+    mechanism: Mechanism, legs: Sequence[LegGeometry]
+) -> Sequence[RigidTransform] | None:
+    """Return where calibrated legs put the platform at readings all over the travel."""
+    try:
+        drawn = workspace(mechanism)
+    except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
+        return None
+    nearby = [platform_in_base(mechanism, T) for T in drawn.poses]
+    poses = poses_at_readings(mechanism, legs, drawn.readings, nearby)
+    reached = [
+        T for T, q in zip(poses, drawn.readings, strict=True) if _is_reached(mechanism, legs, q, T)
+    ]
+    return reached or None
+
+
+def _is_reached(
+    mechanism: Mechanism, legs: Sequence[LegGeometry], q: Array, T_Rb_Re: RigidTransform
+) -> bool:
+    """Say whether legs have the lengths of readings (n_legs,) at a pose: some have them nowhere."""
+    return all(
+        abs(np.linalg.norm(T_Rb_Re.apply(leg.B) - leg.A) - sign * reading - leg.q0) < _REACHED
+        for leg, sign, reading in zip(legs, mechanism.sign, q, strict=True)
+        if leg.kind is LegKind.ACTUATED
+    )
+
+
+def poses_at_readings(
+    mechanism: Mechanism,
+    legs: Sequence[LegGeometry],
+    q: Array,
+    nearby: Sequence[RigidTransform],
+) -> tuple[RigidTransform, ...]:
+    """Return T_Rb_Re of legs at readings (n_poses, n_legs), near known poses."""
+    q0 = [np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs]
+    return platform_poses(legs, mechanism.sign * q + q0, nearby, mechanism.frame_legs)

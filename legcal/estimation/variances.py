@@ -1,0 +1,120 @@
+"""Restricted maximum likelihood: how large random effects are, by what residuals say of them.
+
+With b the effects, of which one unit has the whitened columns B, and M the projector onto what
+a fit leaves of residuals, z = B^T M r holds all that the residuals r say of them, and K = B^T
+M B. If b has the covariance D, z has K + K D K, and the logarithm of the likelihood, zero for D
+= 0, is::
+
+    L = -log det(1 + K D) / 2 + z^T (1 + D K)^-1 D z / 2
+
+Its slope and its expected curvature are sums of squares of y = (1 + K D)^-1 z and of
+(1 + K D)^-1 K. At D = 0 they are Rao's score test, and the first step are moments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from legcal.geometry import Array, BoolArray, IntArray
+
+_SETTLED = 1e-6  # change of the log-likelihood
+_MAX_STEPS = 50
+_HALVINGS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Effects:
+    """What the residuals of a fit say of b random effects.
+
+    Attributes
+    ----------
+    z : (b,) array
+        Their scores where all of them are zero, the fit following.
+    K : (b, b) array
+        Covariance of the scores if all of them are zero.
+    kind : (b,) array of int
+        Effects of one kind have one variance.
+    """
+
+    z: Array
+    K: Array
+    kind: IntArray
+
+    @property
+    def n_kinds(self) -> int:
+        """Number of variances."""
+        return int(self.kind.max(initial=-1)) + 1
+
+    def log_likelihood(self, variances: Array) -> float:
+        """Return the logarithm of the likelihood of variances (n_kinds,), 0 for none."""
+        some, root, L = self._factor(variances)
+        y = solve_triangular(L, root * self.z[some], lower=True, check_finite=False)
+        return float(0.5 * y @ y - np.log(np.diagonal(L)).sum())
+
+    def slope(self, variances: Array) -> tuple[Array, Array]:
+        """Return its derivatives (n_kinds,) and their covariance (n_kinds, n_kinds)."""
+        some, root, L = self._factor(variances)
+        seen = root[:, None] * np.column_stack([self.K[some], self.z[some]])
+        seen = solve_triangular(L, seen, lower=True, check_finite=False)
+        found = np.column_stack([self.K, self.z]) - seen[:, :-1].T @ seen
+        left, y = found[:, :-1], found[:, -1]
+        of_kind = (self.kind == np.arange(self.n_kinds)[:, None]).astype(np.float64)
+        slope = 0.5 * of_kind @ (y**2 - np.diagonal(left))
+        return slope, np.asarray(0.5 * of_kind @ left**2 @ of_kind.T)
+
+    def _factor(self, variances: Array) -> tuple[IntArray, Array, Array]:
+        """Return the effects with a variance, its root, and L L^T = 1 + D^(1/2) K D^(1/2)."""
+        some = np.flatnonzero(variances[self.kind] > 0.0)
+        root = np.asarray(np.sqrt(variances[self.kind[some]]))
+        spread = root[:, None] * self.K[np.ix_(some, some)] * root
+        L = np.asarray(np.linalg.cholesky(np.eye(len(some)) + spread), dtype=np.float64)
+        return np.asarray(some), root, L
+
+
+def estimate_variances(effects: Effects, least_gain: float) -> tuple[Array, float]:
+    """Return the variances of random effects by restricted maximum likelihood.
+
+    Parameters
+    ----------
+    effects : Effects
+    least_gain : float
+        Twice the log-likelihood that the variances must gain over no effects at all; with less,
+        all of them are zero.
+
+    Returns
+    -------
+    variances : (n_kinds,) array
+        In the squared unit of the effects; never negative.
+    gain : float
+        Twice the log-likelihood gained.
+    """
+    variances, best = np.zeros(effects.n_kinds), 0.0
+    for _ in range(_MAX_STEPS):
+        slope, information = effects.slope(variances)
+        step = _step(slope, information, variances > 0.0)
+        before = best
+        for halving in range(_HALVINGS):
+            trial = np.maximum(variances + 0.5**halving * step, 0.0)
+            likelihood = effects.log_likelihood(trial)
+            if likelihood >= best:
+                variances, best = trial, likelihood
+                break
+        # Even steps like this to the end would not gain enough.
+        hopeless = best < 0.25 * least_gain and best - before < least_gain / (8.0 * _MAX_STEPS)
+        if best - before < _SETTLED or hopeless:
+            break
+    gain = 2.0 * best
+    return (variances if gain > least_gain else np.zeros_like(variances)), gain
+
+
+def _step(slope: Array, information: Array, inside: BoolArray) -> Array:
+    """Return the scoring step of the variances that may move: not from zero downwards."""
+    free = np.flatnonzero((inside | (slope > 0.0)) & (np.diagonal(information) > 0.0))
+    step = np.zeros_like(slope)
+    if len(free):
+        block = information[np.ix_(free, free)]
+        step[free] = np.linalg.lstsq(block, slope[free], rcond=1e-12)[0]
+    return step

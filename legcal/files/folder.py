@@ -1,0 +1,415 @@
+"""The output folder: a set of files that appears complete or not at all.
+
+A set of files is first written into a temporary folder beside its destination (in it, where it
+is a file system of its own) and moved there when it is complete. A run that stops before that
+leaves the destination as it was; what the temporary folder of a killed run leaves behind is never
+looked at again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Container, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from legcal.errors import DatasetError, LegcalError, OutOfResources, UsageError
+from legcal.files.schema import parse_yaml, read_text
+
+TEMPORARY_SUFFIX = ".legcal-part"
+_MOST_OF_NAME = 40  # letters: a name of the greatest length leaves none for what is added to it
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that any other program sees its old or its new content, never a part.
+
+    Parameters
+    ----------
+    path : Path
+        The file; one that is there is replaced.
+    content : bytes
+        Its new content.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; the old file is then untouched.
+    """
+    with temporary_folder(path.parent, path.name) as folder:
+        (folder / path.name).write_bytes(content)
+        os.replace(folder / path.name, path)
+
+
+@contextmanager
+def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Give a folder of a name that nobody else uses, and remove it when the block ends."""
+    folder = Path(
+        tempfile.mkdtemp(prefix=f".{name[:_MOST_OF_NAME]}.", suffix=TEMPORARY_SUFFIX, dir=parent)
+    )
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def path_problem(folder: Path, named: str) -> str | None:
+    """Return what keeps a path from being a relative path inside a folder, or None.
+
+    Symbolic links are followed: a link that leads out of the folder is a way out of it.
+
+    Parameters
+    ----------
+    folder : Path
+        The dataset folder.
+    named : str
+        The path as the file names it.
+    """
+    if PurePosixPath(named).is_absolute() or PureWindowsPath(named).is_absolute():
+        return "an absolute path"
+    try:
+        target = (folder / named).resolve()
+    except (OSError, RuntimeError, ValueError):
+        return "a path that cannot be followed"
+    if not target.is_relative_to(folder.resolve()):
+        return "a path that leads out of the dataset folder"
+    return None
+
+
+@dataclass(frozen=True)
+class OwnYaml:
+    """A kind of file.
+
+    Attributes
+    ----------
+    noun : str
+        What is written, with its article, for sentences: "the camera".
+    what : str
+        What the file is called where it cannot be read: "camera file".
+    key : str
+        The entry by which a file of this kind is known.
+    needed : str
+        What may stand in its place, for sentences: "a new file or an earlier location".
+    """
+
+    noun: str
+    what: str
+    key: str
+    needed: str
+
+    def check_place(self, path: Path) -> None:
+        """Refuse a place where no file can be written, or where another one stands.
+
+        Raises
+        ------
+        UsageError
+            With what is there instead.
+        """
+        start = f"{path}: {self.noun} could not be written: found"
+        if not path.name or os.path.isdir(path):
+            raise UsageError(f"{start} a folder, needed the name of a file; give one in it.")
+        if not os.path.isdir(path.parent):
+            raise UsageError(
+                f"{start} no folder {path.parent}, needed one that exists; create it or give "
+                "another file."
+            )
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise UsageError(
+                f"{start} that {path.parent} cannot be written to, needed permission to create "
+                "files in it; give another file."
+            )
+        if os.path.lexists(path) and not self._is_own(path):
+            raise UsageError(
+                f"{start} another file of that name, needed {self.needed}; give another file."
+            )
+
+    def _is_own(self, path: Path) -> bool:
+        """Say whether a file is of this kind."""
+        try:
+            return self.key in parse_yaml(read_text(path, self.what), path, self.what)
+        except DatasetError:
+            return False
+
+    def write(self, path: Path, text: str) -> None:
+        """Write a file; an earlier one of its kind is replaced, any other is not.
+
+        Raises
+        ------
+        UsageError
+            As :meth:`check_place`.
+        OutOfResources
+            If the file cannot be written.
+        """
+        self.check_place(path)
+        try:
+            write_atomically(path, text.encode())
+        except OSError as error:
+            raise OutOfResources(
+                f"{path}: {self.noun} could not be written: found '{error.strerror}', needed a "
+                "folder that takes it; free some space or give another file."
+            ) from error
+
+
+@dataclass(frozen=True)
+class OutputKind:
+    """A kind of output folder.
+
+    Attributes
+    ----------
+    noun : str
+        What the folder holds.
+    marker, key : str
+        The JSON document that legcal leaves in such a folder, and a key in it.
+    """
+
+    noun: str
+    marker: str
+    key: str
+
+    def is_in(self, folder: Path) -> bool:
+        """Say whether a folder holds an output of this kind that legcal wrote."""
+        try:
+            found = json.loads((folder / self.marker).read_bytes())
+        except (OSError, ValueError, RecursionError):
+            return False
+        return isinstance(found, dict) and self.key in found
+
+
+RESULT = OutputKind("result", "result.json", "legcal_result")
+
+
+def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
+    """Return the path of an output folder; an empty text is none, where a path would be ".".
+
+    Raises
+    ------
+    UsageError
+        If it is empty.
+    """
+    if output == "":
+        raise UsageError(
+            f"The {kind.noun} could not be written: found an empty text, needed the path of a "
+            "folder; name one, '.' for the current folder."
+        )
+    return Path(output)
+
+
+def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
+    """Refuse an output folder that holds something else than an earlier output of its kind.
+
+    Parameters
+    ----------
+    destination : Path
+        The output folder; it need not exist.
+    kind : OutputKind
+        What it is to hold.
+
+    Raises
+    ------
+    UsageError
+        If it is a file, holds files but nothing of this kind, or cannot be written to.
+    """
+    check_path(destination, kind)
+    start = f"{destination}: the {kind.noun} could not be written: found"
+    if destination.is_dir() and holds_files(destination) and not kind.is_in(destination):
+        raise UsageError(
+            f"{start} a folder with other files and no {kind.marker} of legcal, needed a new or "
+            f"empty folder or that of an earlier {kind.noun}; give another output folder."
+        )
+    target = destination if destination.is_dir() else existing_parent(destination)
+    if not is_writable(target):
+        raise UsageError(
+            f"{start} that {target} cannot be written to, needed permission to create files "
+            "in it; give another output folder."
+        )
+
+
+def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
+    """Refuse a path at which no folder is and none can be made.
+
+    Parameters
+    ----------
+    destination, kind
+        As in :func:`check_destination`.
+
+    Raises
+    ------
+    UsageError
+        If it is too long, a file or below one, or a folder that cannot be listed.
+    """
+    start = f"{destination}: the {kind.noun} could not be written: found"
+    remedy = "needed a path that can be created; give another output folder."
+    try:
+        os.lstat(destination)
+        if destination.is_dir():
+            os.listdir(destination)
+    except FileNotFoundError:
+        pass
+    except NotADirectoryError as error:
+        above = existing_parent(destination)
+        raise UsageError(f"{start} that {above} is a file, {remedy}") from error
+    except OSError as error:
+        raise UsageError(f"{start} '{error.strerror}', {remedy}") from error
+    if destination.is_symlink() and not destination.exists():
+        raise UsageError(f"{start} a broken link, needed a folder; give another output folder.")
+    if destination.exists() and not destination.is_dir():
+        raise UsageError(
+            f"{start} a file of that name, needed a folder; give another output folder."
+        )
+
+
+def in_the_way(destination: Path, kind: OutputKind, found: str) -> str:
+    """Return what is said about something that stands where a file of an output belongs."""
+    return (
+        f"{destination}: the {kind.noun} could not be written: found {found}, needed its place; "
+        "move it away, or give another folder; nothing was changed."
+    )
+
+
+def is_writable(folder: Path) -> bool:
+    """Say whether files can be created in a folder."""
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+
+def holds_files(folder: Path) -> bool:
+    """Say whether a folder holds more than what killed runs left behind."""
+    return any(not path.name.endswith(TEMPORARY_SUFFIX) for path in folder.iterdir())
+
+
+def existing_parent(destination: Path) -> Path:
+    """Return the nearest folder above that exists."""
+    for parent in destination.absolute().parents:
+        if parent.exists():
+            return parent
+    return Path(destination.absolute().anchor)
+
+
+@contextmanager
+def result_folder(
+    destination: Path,
+    kind: OutputKind = RESULT,
+    stale: Iterable[Path] = (),
+    *,
+    replaceable: Container[Path] | None = None,
+) -> Iterator[Path]:
+    """Give a temporary folder whose files become the result when the block ends well.
+
+    An earlier result is replaced file by file; other files beside it are kept. If the block or
+    the moving is interrupted, the destination is as it was before.
+
+    Parameters
+    ----------
+    destination : Path
+        The output folder; it and its parents are created at the end.
+    kind : OutputKind
+        What it is to hold.
+    stale : iterable of Path
+        Files of an earlier output, relative to the folder, that go where they are not replaced.
+    replaceable : container of Path, optional
+        The only files, relative to the folder, that may be replaced; all without it.
+
+    Yields
+    ------
+    Path
+        An empty folder to write into.
+
+    Raises
+    ------
+    UsageError
+        As :func:`check_destination`, before the block runs; or if something else stands in the
+        place of a file, after it.
+    OutOfResources
+        If the files cannot be written, as on a full disk.
+    """
+    check_destination(destination, kind)
+    try:
+        with temporary_folder(_workshop(destination), destination.name) as temporary:
+            new = temporary / "new"
+            new.mkdir()
+            with _named(destination, new):
+                yield new
+            _check_places(new, destination, kind, replaceable)
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            if destination.exists():
+                _replace_files(new, destination, temporary / "old", stale)
+            else:
+                os.rename(new, destination)
+    except OSError as error:
+        raise OutOfResources(
+            f"{destination}: the {kind.noun} could not be written: found '{error.strerror}', "
+            "needed a folder that takes its files; free some space or give another output folder; "
+            "nothing was written."
+        ) from error
+
+
+@contextmanager
+def _named(destination: Path, new: Path) -> Iterator[None]:
+    """Let what is refused in the block speak of the destination, not of the temporary folder."""
+    try:
+        yield
+    except LegcalError as error:
+        said = [problem.replace(str(new), str(destination)) for problem in error.problems]
+        raise type(error)(said) from error
+
+
+def _check_places(
+    new: Path, destination: Path, kind: OutputKind, replaceable: Container[Path] | None
+) -> None:
+    """Refuse to replace what is no file of an earlier output, and to write through links."""
+    for name in _files_in(new):
+        found = ""
+        for parent in [destination / above for above in name.parents if above != Path()]:
+            if parent.is_symlink() or (parent.exists() and not parent.is_dir()):
+                found = f"{parent.relative_to(destination)}, which is no folder of its own"
+        if not found and os.path.lexists(destination / name):
+            if (destination / name).is_dir():
+                found = f"{name}, which is a folder"
+            elif replaceable is not None and name not in replaceable:
+                found = f"{name}, which legcal did not write"
+        if found:
+            raise UsageError(in_the_way(destination, kind, found))
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """Return the files of a folder, relative to it."""
+    return [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()]
+
+
+def _workshop(destination: Path) -> Path:
+    """Return the folder for temporary files: beside the destination if they can move from there.
+
+    Files do not move from one file system to another, and a folder that is one of its own (a
+    mount) may stand where nothing else may be written: then it is the destination itself.
+    """
+    parent = existing_parent(destination)
+    if not destination.is_dir():
+        return parent
+    is_near = parent.stat().st_dev == destination.stat().st_dev
+    return parent if is_near and is_writable(parent) else destination
+
+
+def _replace_files(new: Path, destination: Path, old: Path, stale: Iterable[Path]) -> None:
+    """Move files into a folder; if that is interrupted, put back what was there."""
+    names = _files_in(new)
+    gone = [name for name in stale if name not in names and (destination / name).is_file()]
+    kept = [name for name in names if os.path.lexists(destination / name)] + gone
+    for name in kept:
+        (old / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(destination / name, old / name, follow_symlinks=False)
+    try:
+        for name in names:
+            (destination / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(new / name, destination / name)
+        for name in gone:
+            os.unlink(destination / name)
+    except BaseException:
+        for name in [*names, *gone]:
+            with suppress(FileNotFoundError):
+                if name in kept:
+                    os.replace(old / name, destination / name)
+                elif not (new / name).exists():
+                    os.unlink(destination / name)
+        raise

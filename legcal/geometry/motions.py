@@ -1,0 +1,150 @@
+"""How files write a rigid motion."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, field_validator
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.files import FileSchema, Metres, Number
+from legcal.geometry.types import Array
+
+_ONE = np.eye(3)
+
+
+def frame_on_points(points: Array, normal: Array | None = None) -> RigidTransform:
+    """Return the frame that three points define: origin, x axis, xy plane (z completes).
+
+    Two points define the frame of a planar mechanism: its z axis is the normal of the plane, its
+    x axis the direction of the second point in that plane.
+
+    Parameters
+    ----------
+    points : (3, 3) or (2, 3) array
+        Joint centres in some frame L [m].
+    normal : (3,) array, optional
+        Unit normal of the plane of motion in L, for two points; z without it.
+
+    Returns
+    -------
+    RigidTransform
+        T_L_frame. The points have coordinates (0, 0, 0), (x > 0, 0, 0), (., y > 0, 0) in it;
+        of two points the second one has (x > 0, 0, .).
+
+    Raises
+    ------
+    ValueError
+        If two points coincide or the three are collinear.
+    """
+    x = points[1] - points[0]
+    spread = float(np.linalg.norm(points - points[0], axis=1).max())
+    if len(points) == 3:
+        z = np.cross(x, points[2] - points[0])
+    else:
+        z = np.array([0.0, 0.0, 1.0]) if normal is None else normal
+        x = x - (x @ z) * z
+        z = z * float(x @ x)
+    if spread == 0.0 or np.linalg.norm(z) < 1e-9 * spread**2:
+        raise ValueError("the points that should define a frame coincide or are collinear")
+    x = x / np.linalg.norm(x)
+    z = z / np.linalg.norm(z)
+    return motion_of(np.column_stack([x, np.cross(z, x), z]), points[0])
+
+
+def motion_of(R: Array, t: Array) -> RigidTransform:
+    """Return the rigid motion of a rotation matrix and a translation.
+
+    Quick: ``RigidTransform.from_components`` decomposes every matrix anew, which is most of the
+    time of reading a model.
+
+    Parameters
+    ----------
+    R : (..., 3, 3) array
+        Rotation matrix, orthogonal but for rounding, which is corrected.
+    t : (..., 3) array
+        Translation [m].
+    """
+    matrix = np.zeros((*R.shape[:-2], 4, 4))
+    matrix[..., :3, :3] = R @ (1.5 * _ONE - 0.5 * (np.swapaxes(R, -1, -2) @ R))
+    matrix[..., :3, 3] = t
+    matrix[..., 3, 3] = 1.0
+    return RigidTransform(matrix, normalize=False, copy=False)
+
+
+def product(*motions: RigidTransform) -> RigidTransform:
+    """Return the product of motions, as ``*`` does, quickly; see :func:`motion_of`."""
+    matrix = motions[0].as_matrix()
+    for motion in motions[1:]:
+        matrix = matrix @ motion.as_matrix()
+    return motion_of(matrix[..., :3, :3], matrix[..., :3, 3])
+
+
+def motion_from_xyz_quat(xyz: Sequence[float], quat_xyzw: Sequence[float]) -> RigidTransform:
+    """Return the rigid motion written as ``{xyz: [m], quat_xyzw: [-]}`` in the files."""
+    return motion_of(Rotation.from_quat(quat_xyzw).as_matrix(), np.asarray(xyz))
+
+
+def motion_to_xyz_quat(T: RigidTransform) -> dict[str, list[float]]:
+    """Return a rigid motion as the files write it, with the scalar part not negative."""
+    return {
+        "xyz": [float(x) for x in T.translation],
+        "quat_xyzw": [float(x) for x in T.rotation.as_quat(canonical=True)],
+    }
+
+
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """Return the angles of a rotation about fixed x, y, z, (3,) [rad], to rounding everywhere.
+
+    Near a pitch of 90 degrees the yaw is badly determined: whatever it comes out as, the roll
+    makes up for it.
+
+    Parameters
+    ----------
+    rotation : (3, 3) array
+        Rotation matrix.
+    """
+    r = rotation
+    yaw = np.arctan2(r[1, 0], r[0, 0])
+    s, c = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
+
+Vector = tuple[Metres, Metres, Metres]
+
+
+def _of_unit_norm(quat: tuple[float, ...]) -> tuple[float, ...]:
+    """Refuse a quaternion that is not one of a turn, up to its last digits."""
+    norm = math.hypot(*quat)
+    if abs(norm - 1.0) > QUATERNION_TOLERANCE:
+        raise ValueError(
+            f"found a quaternion of norm {norm:.6g}, needed 1 within {QUATERNION_TOLERANCE:g}; "
+            "check its four numbers, x y z w."
+        )
+    return quat
+
+
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_of_unit_norm)]
+
+
+class MotionEntry(FileSchema):
+    """A rigid motion: ``{xyz: [m], quat_xyzw: [-]}``."""
+
+    xyz: Vector
+    quat_xyzw: Quaternion
+
+    @field_validator("quat_xyzw")
+    @classmethod
+    def _made_exact(cls, quat: Quaternion) -> Quaternion:
+        norm = math.hypot(*quat)
+        x, y, z, w = (c / norm for c in quat)
+        return x, y, z, w
+
+    def motion(self) -> RigidTransform:
+        """Return the motion, its quaternion made exactly unit."""
+        return motion_from_xyz_quat(self.xyz, self.quat_xyzw)

@@ -1,1 +1,0 @@
-"""Where the base stands in the world and the tool in the platform, from measured tool poses."""

@@ -1,0 +1,127 @@
+"""Rigid bodies of a mechanism and the joints between them, whatever tree its URDF chose.
+
+Links that fixed joints hold together are one body, and so are two bodies that a ``6d`` closure
+welds. What remains are the mechanism's own joints: those of the tree, and a sphere at each
+``3d`` closure. The virtual platform joint carries nothing and is left out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import ModelError
+from legcal.geometry import product
+from legcal.machine.chain import Closure
+from legcal.machine.urdf import Urdf
+
+ConnectionType = Literal["revolute", "prismatic", "sphere"]
+
+
+@dataclass(frozen=True, eq=False)
+class Connection:
+    """A joint of the mechanism between two bodies.
+
+    Attributes
+    ----------
+    type : {"revolute", "prismatic", "sphere"}
+        What moves.
+    bodies : tuple of str
+        The bodies on both sides, named by one of their links; parent and child for a joint of
+        the tree.
+    T_body_joint : tuple of RigidTransform
+        The joint frame in either body. The second one is the first one moved by the joint.
+    joint : str or None
+        The URDF joint; None for a closure.
+    closure : int or None
+        The index of the closure; None for a joint of the tree.
+    """
+
+    type: ConnectionType
+    bodies: tuple[str, str]
+    T_body_joint: tuple[RigidTransform, RigidTransform]
+    joint: str | None
+    closure: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """The bodies and connections of a mechanism.
+
+    Attributes
+    ----------
+    body_of : dict of str to str
+        The body of every link.
+    T_body_link : dict of str to RigidTransform
+        The pose of every link in its body.
+    connections : tuple of Connection
+        The joints between bodies, without the virtual platform joint.
+    """
+
+    body_of: dict[str, str]
+    T_body_link: dict[str, RigidTransform]
+    connections: tuple[Connection, ...]
+
+
+def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | None) -> Bodies:
+    """Return the bodies of a tree with closures, and the joints between them.
+
+    Raises
+    ------
+    ModelError
+        If a weld closes a loop of bodies that are rigid already.
+    """
+    body_of = {link: link for link in urdf.links}
+    T_body_link = {link: RigidTransform.identity() for link in urdf.links}
+    for joint in urdf.joints.values():
+        if not joint.moves:
+            _merge(body_of, T_body_link, joint.parent, joint.child, joint.T_parent_origin)
+    for closure in closures:
+        if closure.kind == "6d":
+            one, two = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
+            if body_of[one] == body_of[two]:
+                raise ModelError(
+                    f"{urdf.path}: the 6d closure of '{closure.frame_1}' and '{closure.frame_2}' "
+                    "could not be used: found both on one rigid body, needed two; remove it."
+                )
+            _merge(body_of, T_body_link, one, two, RigidTransform.identity())
+    tree = [
+        Connection(
+            "prismatic" if joint.type == "prismatic" else "revolute",
+            (body_of[joint.parent], body_of[joint.child]),
+            (product(T_body_link[joint.parent], joint.T_parent_origin), T_body_link[joint.child]),
+            joint.name,
+            None,
+        )
+        for joint in urdf.joints.values()
+        if joint.moves and joint.name != platform_joint
+    ]
+    spheres = []
+    for i, closure in enumerate(closures):
+        if closure.kind == "3d":
+            one, two = (frame_link(urdf, name) for name in (closure.frame_1, closure.frame_2))
+            bodies, poses = (body_of[one], body_of[two]), (T_body_link[one], T_body_link[two])
+            spheres.append(Connection("sphere", bodies, poses, None, i))
+    return Bodies(body_of, T_body_link, (*tree, *spheres))
+
+
+def frame_link(urdf: Urdf, frame: str) -> str:
+    """Return the link whose frame a name means: a link, or the child of a joint."""
+    return frame if frame in urdf.links else urdf.joints[frame].child
+
+
+def _merge(
+    body_of: dict[str, str],
+    T_body_link: dict[str, RigidTransform],
+    keep: str,
+    join: str,
+    T_keep_join: RigidTransform,
+) -> None:
+    """Make the body of one link part of the body of another."""
+    into, gone = body_of[keep], body_of[join]
+    T_into_gone = product(T_body_link[keep], T_keep_join, T_body_link[join].inv())
+    for link, body in body_of.items():
+        if body == gone:
+            body_of[link] = into
+            T_body_link[link] = product(T_into_gone, T_body_link[link])

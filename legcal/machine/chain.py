@@ -1,0 +1,276 @@
+"""The closed chain in Pinocchio: the URDF's tree, and anchors where loops close.
+
+This is the one module that touches Pinocchio. Two of its traps are kept in here: the Jacobian
+of an anchor is silently zero unless ``computeJointJacobians`` came first, and off the constraint
+the frame anchor's Jacobian is that of the logarithm only after ``Jlog6(M) Ad(M)^-1``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import ModelError
+from legcal.geometry import Array, IntArray, motion_of
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Two frames of the tree that coincide: their points (``3d``) or the whole frames (``6d``)."""
+
+    kind: Literal["3d", "6d"]
+    frame_1: str
+    frame_2: str
+
+    @property
+    def rows(self) -> int:
+        """Number of equations."""
+        return 3 if self.kind == "3d" else 6
+
+
+class ClosedChain:
+    """A tree of joints with loop closures.
+
+    Configurations are Pinocchio's (quaternions for floating joints, cosine and sine for planar
+    and continuous ones), velocities its tangent vectors. The object holds Pinocchio's work space,
+    so that one object serves one thread; it pickles by being built again.
+
+    Parameters
+    ----------
+    text : str
+        A checked URDF.
+    closures : sequence of Closure
+        What coincides.
+    normals : sequence of (3,) array or None
+        For each frame closure that need hold in a plane only, the normal of the plane in its first
+        frame. Where all joints move in the plane, rounding of their axes opens it across.
+
+    Raises
+    ------
+    ModelError
+        If Pinocchio cannot build the model.
+    """
+
+    def __init__(
+        self, text: str, closures: Sequence[Closure], normals: Sequence[Array | None] = ()
+    ) -> None:
+        self.text = text
+        self.closures = tuple(closures)
+        self.normals = tuple(normals) or (None,) * len(self.closures)
+        self._held = [None if n is None else _in_plane(n) for n in self.normals]
+        try:
+            self._model: Any = pin.buildModelFromXML(text)
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise ModelError(
+                f"the URDF could not be built: found '{reason}' from Pinocchio, needed a tree that "
+                "it reads; correct the URDF."
+            ) from error
+        self._data: Any = self._model.createData()
+        self._anchors = [self._anchor(closure) for closure in self.closures]
+        self._anchor_data = [anchor.createData() for anchor in self._anchors]
+        self.nq: int = self._model.nq
+        self.nv: int = self._model.nv
+        self.n_rows = sum(closure.rows for closure in self.closures)
+
+    def __reduce__(self) -> tuple[type["ClosedChain"], tuple[object, ...]]:
+        return ClosedChain, (self.text, self.closures, self.normals)
+
+    def neutral(self) -> Array:
+        """Return the configuration with every joint at zero."""
+        return np.array(pin.neutral(self._model))
+
+    def integrate(self, configuration: Array, step: Array) -> Array:
+        """Return the configuration after a step in the tangent space."""
+        return np.asarray(pin.integrate(self._model, configuration, step))
+
+    def residual(self, configuration: Array) -> Array:
+        """Return how far every closure is from closed, (n_rows,) [m] and [rad].
+
+        What opens across a plane counts here, in contrast to :meth:`linearize`.
+        """
+        pin.forwardKinematics(self._model, self._data, configuration)
+        pieces = []
+        for anchor, data in zip(self._anchors, self._anchor_data, strict=True):
+            anchor.calc(self._model, self._data, data)
+            pieces.append(data.constraint_position_error)
+        return np.concatenate(pieces) if pieces else np.zeros(0)
+
+    def linearize(self, configuration: Array) -> tuple[Array, Array]:
+        """Return the residual of the closures and its exact Jacobian.
+
+        Parameters
+        ----------
+        configuration : (nq,) array
+            Any configuration.
+
+        Returns
+        -------
+        residual : (n_rows,) array
+            Three rows [m] for a point, six [m, rad] for a frame, in the order of the closures.
+        jacobian : (n_rows, nv) array
+            Its derivative with respect to a tangent step.
+        """
+        model, data = self._model, self._data
+        pin.computeJointJacobians(model, data, configuration)
+        residual, jacobian = np.empty(self.n_rows), np.empty((self.n_rows, self.nv))
+        row = 0
+        for closure, anchor, anchor_data, held in zip(
+            self.closures, self._anchors, self._anchor_data, self._held, strict=True
+        ):
+            anchor.calc(model, data, anchor_data)
+            rows = slice(row, row + closure.rows)
+            residual[rows] = anchor_data.constraint_position_error
+            block = anchor.jacobian(model, data, anchor_data)
+            if closure.kind == "6d":
+                M = anchor_data.c1Mc2
+                block = pin.Jlog6(M) @ M.inverse().action @ block
+            if held is not None:
+                residual[rows], block = held @ residual[rows], held @ block
+            jacobian[rows] = block
+            row = rows.stop
+        return residual, jacobian
+
+    def placement(self, configuration: Array, base: str, frame: str) -> tuple[Array, Array]:
+        """Return rotation (3, 3) and translation (3,) [m] of a frame in another at a configuration.
+
+        The same as :meth:`pose` without the cost of the type, for inner loops.
+        """
+        pin.forwardKinematics(self._model, self._data, configuration)
+        M = self._placement(base).actInv(self._placement(frame))
+        return M.rotation, M.translation
+
+    def turns(self, configuration: Array, base: str, frames: Sequence[str]) -> Array:
+        """Return the rotations (n, 3, 3) of frames in another one at a configuration."""
+        pin.forwardKinematics(self._model, self._data, configuration)
+        R = self._placement(base).rotation.T
+        return np.array([R @ self._placement(frame).rotation for frame in frames])
+
+    def pose(self, configuration: Array, base: str, frame: str) -> RigidTransform:
+        """Return T_base_frame between two frames at a configuration."""
+        pin.forwardKinematics(self._model, self._data, configuration)
+        M = self._placement(base).actInv(self._placement(frame))
+        return motion_of(M.rotation, M.translation)
+
+    def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
+        """Return residual and Jacobian of holding a frame at a pose, at the last linearisation.
+
+        Returns
+        -------
+        residual : (6,) array
+            Logarithm of the remaining motion [m, rad].
+        jacobian : (6, nv) array
+            Its derivative.
+        """
+        M = self._placement(base).actInv(self._placement(frame))
+        matrix = T_base_frame.as_matrix()
+        error = pin.SE3(matrix[:3, :3], matrix[:3, 3]).actInv(M)
+        jacobian = pin.Jlog6(error) @ self.twist(base, frame)
+        return np.array(pin.log6(error).vector), np.asarray(jacobian)
+
+    def twist(self, base: str, frame: str) -> Array:
+        """Return how a tangent step moves one frame in another, at the last linearisation.
+
+        Returns
+        -------
+        (6, nv) array
+            Displacement and rotation of ``frame`` relative to ``base``, in ``frame``.
+        """
+        M = self._placement(base).actInv(self._placement(frame))
+        J_frame, J_base = (
+            pin.getFrameJacobian(self._model, self._data, self._frame(name), pin.LOCAL)
+            for name in (frame, base)
+        )
+        return np.asarray(J_frame - M.inverse().action @ J_base)
+
+    def q_index(self, joint: str) -> int:
+        """Return where the value of a joint stands in a configuration."""
+        return int(self._model.joints[self._model.getJointId(joint)].idx_q)
+
+    def v_index(self, joint: str) -> int:
+        """Return where the rate of a joint stands in a tangent vector."""
+        return int(self._model.joints[self._model.getJointId(joint)].idx_v)
+
+    def rotation_columns(self) -> IntArray:
+        """Return the tangent coordinates that are angles."""
+        columns: list[int] = []
+        for joint in list(self._model.joints)[1:]:  # the first is the universe
+            name, start, size = joint.shortname(), int(joint.idx_v), int(joint.nv)
+            if "Free" in name:
+                columns += range(start + 3, start + 6)
+            elif "Planar" in name:
+                columns.append(start + 2)
+            elif "R" in name.removeprefix("JointModel")[:1] and size == 1:
+                columns.append(start)
+        return np.array(columns, dtype=np.intp)
+
+    def with_platform(
+        self,
+        configuration: Array,
+        joint: str,
+        base: str,
+        platform: str,
+        T_base_platform: RigidTransform,
+    ) -> Array:
+        """Return the configuration with the virtual joint that carries the platform set.
+
+        A planar joint takes the part of the motion that lies in its plane.
+        """
+        pin.forwardKinematics(self._model, self._data, configuration)
+        index = self._model.getJointId(joint)
+        before = self._data.oMi[self._model.parents[index]] * self._model.jointPlacements[index]
+        after = self._data.oMi[index].actInv(self._placement(platform))
+        matrix = T_base_platform.as_matrix()
+        wanted = self._placement(base) * pin.SE3(matrix[:3, :3], matrix[:3, 3]) * after.inverse()
+        motion = before.actInv(wanted)
+        placed = configuration.copy()
+        start = self.q_index(joint)
+        if self._model.joints[index].nv == 3:
+            angle = np.arctan2(
+                motion.rotation[1, 0] - motion.rotation[0, 1],
+                motion.rotation[0, 0] + motion.rotation[1, 1],
+            )
+            x, y = motion.translation[:2]
+            placed[start : start + 4] = (x, y, np.cos(angle), np.sin(angle))
+        else:
+            placed[start : start + 7] = pin.SE3ToXYZQUAT(motion)
+        return placed
+
+    def _frame(self, name: str) -> int:
+        """Return the index of a link's frame, or of a joint's where no link has the name."""
+        if self._model.existBodyName(name):
+            return int(self._model.getFrameId(name, pin.BODY))
+        if not self._model.existFrame(name):
+            raise ModelError(
+                f"the frame '{name}' could not be found: the URDF has no link or joint of that "
+                "name, needed one; correct closed_loop."
+            )
+        return int(self._model.getFrameId(name))
+
+    def _placement(self, name: str) -> Any:
+        """Return the placement of a frame in the world at the last kinematics."""
+        frame = self._model.frames[self._frame(name)]
+        return self._data.oMi[frame.parentJoint] * frame.placement
+
+    def _anchor(self, closure: Closure) -> Any:
+        """Return Pinocchio's constraint for a closure."""
+        one, two = (
+            self._model.frames[self._frame(name)] for name in (closure.frame_1, closure.frame_2)
+        )
+        make = (
+            pin.PointAnchorConstraintModel
+            if closure.kind == "3d"
+            else pin.FrameAnchorConstraintModel
+        )
+        return make(self._model, one.parentJoint, one.placement, two.parentJoint, two.placement)
+
+
+def _in_plane(normal: Array) -> Array:
+    """Return what keeps displacements in a plane and turns about its normal, (6, 6)."""
+    held = np.zeros((6, 6))
+    held[3:, 3:] = np.outer(normal, normal)
+    held[:3, :3] = np.eye(3) - held[3:, 3:]
+    return held

@@ -1,0 +1,252 @@
+"""What cannot be in a described machine: sizes, lengths and axes out of place, in sentences."""
+
+import re
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry import Array, motion_from_xyz_quat
+from legcal.machine.classification import PERPENDICULAR
+from legcal.machine.leg import (
+    LONGEST,
+    SHORTEST,
+    THICKEST,
+    THINNEST,
+    JointLetter,
+    LegKind,
+    PlatformLetter,
+)
+
+_TYPE = re.compile(r"([RUS])(P?)([RUS]?)")
+
+NEEDED_TYPE = (
+    "R, U or S at the base, P for a slider, then R, U or S at the platform or nothing for a leg "
+    "that is fixed there (UPS, SPU, RPR, UP, SS)"
+)
+
+
+@dataclass(frozen=True)
+class LegType:
+    """The joints of a leg from base to platform, as they are written: ``UPS``, ``SS``, ``UP``.
+
+    Attributes
+    ----------
+    base : {"R", "U", "S"}
+        The joint at the base.
+    has_slider : bool
+        Whether there is a P.
+    platform : {"R", "U", "S", ""}
+        The joint at the platform; empty for a leg that is fixed there.
+    """
+
+    base: JointLetter
+    has_slider: bool
+    platform: PlatformLetter
+
+    @property
+    def has_sphere(self) -> bool:
+        """Whether one of the joints is an S."""
+        return "S" in (self.base, self.platform)
+
+
+def leg_type(text: str) -> LegType | None:
+    """Return the leg type of a text such as ``UPS``; None if it is none."""
+    match = _TYPE.fullmatch(text)
+    if match is None or not (match[2] or match[3]):
+        return None
+    return LegType(cast(JointLetter, match[1]), bool(match[2]), cast(PlatformLetter, match[3]))
+
+
+@dataclass(frozen=True, eq=False)
+class LegEntry:
+    """One leg as described.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    type : LegType
+        Its joints.
+    kind : LegKind
+        Whether its slider has a motor, moves freely, or is not there.
+    A_base, B_platform : (3,) array
+        Joint centres in the base and the platform link [m]; B of a leg that is fixed to the
+        platform is any point of its axis.
+    offset : float or None
+        Length at reading zero [m] of an actuated leg, length of a constant one. A passive slider
+        without one reads the length itself. None also for a constant leg that has the length
+        which home gives it.
+    travel : tuple of float or None
+        Lowest and highest reading [m]; None for constant legs and for passive sliders that move
+        freely.
+    tube, rod : float or None
+        Radii of the base and of the platform half [m]; None where they cannot be seen.
+    base_axis, platform_axis : (3,) array or None
+        Axes of R and outer axes of U as unit vectors in the base and the platform link; None for
+        the default.
+    """
+
+    name: str
+    type: LegType
+    kind: LegKind
+    A_base: Array
+    B_platform: Array
+    offset: float | None
+    travel: tuple[float, float] | None
+    tube: float | None
+    rod: float | None
+    base_axis: Array | None
+    platform_axis: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """A machine as described by a table or a family.
+
+    Attributes
+    ----------
+    name : str
+        The name of the model and of its files.
+    source : str
+        Where it was described, for messages: a path, or the family.
+    unit : str
+        The unit in which it was described, for messages.
+    legs : tuple of LegEntry
+        The legs in order.
+    home : Home or None
+        T_base_platform of a pose in which it closes.
+    base_frame : tuple of str or None
+        The legs whose joints define R_b and R_e.
+    """
+
+    name: str
+    source: str
+    unit: str
+    legs: tuple[LegEntry, ...]
+    home: "Home | None"
+    base_frame: tuple[str, ...] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Home:
+    """A pose with the numbers as they were written.
+
+    Attributes
+    ----------
+    xyz : tuple of float
+        Position [m].
+    quat_xyzw : tuple of float
+        Unit quaternion, as far as its digits go.
+    """
+
+    xyz: tuple[float, ...]
+    quat_xyzw: tuple[float, ...]
+
+    def motion(self) -> RigidTransform:
+        """Return T_base_platform."""
+        return motion_from_xyz_quat(self.xyz, self.quat_xyzw)
+
+
+ALONG = 1.0  # [deg]; a U joint is singular where its outer axis lies along the leg
+
+
+def wrong_sizes(described: Description) -> list[str]:
+    """Return what the numbers alone say is wrong."""
+    problems = []
+    for leg in described.legs:
+        if leg.offset is None:
+            continue
+        ends = leg.travel or (0.0, 0.0)
+        for length in (leg.offset + ends[0], leg.offset + ends[1]):
+            problems += _out_of_proportion(described, leg.name, length)[:1]
+            if problems:
+                return problems
+    for side, joints in (
+        ("base", [leg.A_base for leg in described.legs]),
+        ("platform", [leg.B_platform for leg in described.legs]),
+    ):
+        reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
+        if reach > LONGEST:
+            problems.append(
+                f"{described.source}: the {side} joints could not be used: found them "
+                f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
+                f"{LONGEST:g} m; {_about_the_unit(described.unit, too_long=True)}."
+            )
+    return problems
+
+
+def wrong_lengths(described: Description, lengths: Array) -> list[str]:
+    """Return what is wrong with the lengths of the legs at home."""
+    problems = list[str]()
+    for leg, length in zip(described.legs, lengths, strict=True):
+        found = _out_of_proportion(described, leg.name, float(length))
+        if found:
+            return found
+        for radius in (leg.tube, leg.rod):
+            if radius is not None and not THINNEST < radius / length < THICKEST:
+                return [
+                    f"{described.source}: leg '{leg.name}' could not be used: found a radius of "
+                    f"{1e3 * radius:.4g} mm on a length of {1e3 * length:.4g} mm, needed "
+                    f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
+                ]
+        if leg.kind is LegKind.CONSTANT or leg.travel is None:
+            continue
+        q0 = leg.offset or 0.0
+        low, high = q0 + leg.travel[0], q0 + leg.travel[1]
+        slack = 1e-9
+        if not low - slack <= length <= high + slack:
+            problems.append(
+                f"{described.source}: leg '{leg.name}' cannot close at home: found the length "
+                f"{1e3 * length:.6g} mm there, needed {1e3 * low:.6g} to {1e3 * high:.6g} mm "
+                "(offset plus travel); correct home, offsets or travel."
+            )
+    return problems
+
+
+def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
+    """Return that a leg has a length that no leg has."""
+    if SHORTEST <= length <= LONGEST:
+        return []
+    where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
+    return [
+        f"{where} with lengths in {described.unit}, needed {SHORTEST:g} to {LONGEST:g} m; "
+        f"{_about_the_unit(described.unit, too_long=length > LONGEST, positive=length > 0.0)}."
+    ]
+
+
+def _about_the_unit(unit: str, *, too_long: bool, positive: bool = True) -> str:
+    """Return what to do about sizes out of all proportion."""
+    if not positive:
+        return "correct its joints, offset or travel (length = offset + reading)"
+    if unit == "m" and too_long:
+        return "these look like mm values where m are stated: check the unit"
+    if unit == "mm" and not too_long:
+        return "these look like m values where mm are stated: check the unit"
+    return "check the numbers and the unit"
+
+
+def wrong_axes(
+    described: Description, entry: LegEntry, u: Array, axes: tuple[Array, Array]
+) -> list[str]:
+    """Return which axes do not fit their leg at home."""
+    problems = []
+    for side, letter, axis in (
+        ("base", entry.type.base, axes[0]),
+        ("platform", entry.type.platform, axes[1]),
+    ):
+        angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
+        if letter == "R" and 90.0 - angle > np.degrees(PERPENDICULAR):
+            problems.append(
+                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
+                f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
+                f"correct {side}_axes or home."
+            )
+        if letter == "U" and angle < ALONG:
+            problems.append(
+                f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
+                f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "
+                f"needed it across the leg; correct {side}_axes or home."
+            )
+    return problems

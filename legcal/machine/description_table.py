@@ -1,0 +1,605 @@
+"""The table of a machine: YAML or CSV, read strictly, lengths in the unit that it states."""
+
+import math
+from decimal import Decimal
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+from scipy.spatial.transform import Rotation
+
+from legcal.errors import DatasetError, ModelError
+from legcal.files import (
+    FileSchema,
+    PlainName,
+    Version,
+    closest,
+    describe,
+    is_plain_name,
+    parse_yaml,
+    read_lines,
+    read_text,
+    validate,
+)
+from legcal.geometry import Array, Quaternion, Vector
+from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
+from legcal.machine.leg import MOST_LEGS, LegKind
+
+LARGEST = 1e9  # of any number, whatever its unit
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
+
+
+def _wanted(value: Any, fits: bool, needed: str) -> Any:
+    """Return a value if it fits, else refuse it."""
+    if not fits:
+        raise ValueError(f"found {describe(value)}, needed {needed}; correct it.")
+    return value
+
+
+def _numbers(value: Any) -> Any:
+    entries = value if isinstance(value, list) else [value]
+    return _wanted(
+        value,
+        all(_number(x) or (x is None and isinstance(value, list)) for x in entries),
+        f"a number below {LARGEST:g}, or a list with a number (or null) for each leg",
+    )
+
+
+def is_pair(value: object) -> bool:
+    """Say whether a value is one pair of readings."""
+    return isinstance(value, list) and len(value) == 2 and all(_number(x) for x in value)
+
+
+def _travel(value: Any) -> Any:
+    fits = is_pair(value) or (
+        isinstance(value, list) and all(x is None or is_pair(x) for x in value)
+    )
+    _wanted(value, fits, "[lowest, highest] reading, or a list with that pair (or null) a leg")
+    for pair in [value] if is_pair(value) or not isinstance(value, list) else value:
+        if pair is not None and not pair[0] < pair[1]:
+            raise ValueError(f"found {pair}, needed the lower reading first; correct it.")
+    return value
+
+
+def _is_radius(value: Any) -> bool:
+    if isinstance(value, dict):
+        return (
+            bool(value)
+            and value.keys() <= {"tube", "rod"}
+            and all(_number(x) and x > 0 for x in value.values())
+        )
+    return _number(value) and value > 0
+
+
+def _radius(value: Any) -> Any:
+    entries = value if isinstance(value, list) else [value]
+    return _wanted(
+        value,
+        all(_is_radius(x) or (x is None and isinstance(value, list)) for x in entries),
+        "a positive number, {tube: ..., rod: ...}, or a list with one of these (or null) a leg",
+    )
+
+
+def _points(value: Any) -> Any:
+    rows = value if isinstance(value, list) else [value]
+    for i, row in enumerate(rows):
+        fits = isinstance(row, list) and len(row) in (2, 3) and all(_number(x) for x in row)
+        if not fits:
+            raise ValueError(
+                f"found {describe(row)} in row {i + 1}, needed three numbers below "
+                f"{LARGEST:g}, x y z (two in the plane); correct it."
+            )
+    return [[*row, 0.0][:3] for row in rows]
+
+
+def _directions(value: Any) -> Any:
+    rows = value if isinstance(value, list) else [value]
+    for i, row in enumerate(rows):
+        fits = row is None or (
+            isinstance(row, list)
+            and len(row) == 3
+            and all(_number(x) for x in row)
+            and float(np.linalg.norm(row)) > 1e-6
+        )
+        if not fits:
+            raise ValueError(
+                f"found {describe(row)} in row {i + 1}, needed a direction of three numbers "
+                "that are not all zero, or null for the default; correct it."
+            )
+    return rows
+
+
+def _kinds(value: Any) -> Any:
+    entries = value if isinstance(value, list) else [value]
+    known = [kind.value for kind in LegKind]
+    for kind in entries:
+        if kind is not None and kind not in known:
+            raise ValueError(
+                f"found {describe(kind)}, needed {', '.join(known)}, one for all legs or a "
+                "list; correct it."
+            )
+    return value
+
+
+def _type_of_leg(value: object) -> object:
+    if not isinstance(value, str) or leg_type(value) is None:
+        raise ValueError(f"found the leg type {describe(value)}, needed {NEEDED_TYPE}; correct it.")
+    return value
+
+
+def _type(value: object) -> object:
+    number, _, leg = value.rpartition("-") if isinstance(value, str) else ("", "", "")
+    counts = number.isascii() and number.isdigit() and len(number) < 10 and int(number) > 0
+    if not leg or (not counts and value != leg):
+        raise ValueError(f"found {describe(value)}, needed a type such as 6-UPS; correct it.")
+    _type_of_leg(leg)
+    return value
+
+
+Points = Annotated[list[Any], BeforeValidator(_points)]
+Directions = Annotated[list[Any], BeforeValidator(_directions)]
+
+
+class HomeEntry(FileSchema):
+    """The block ``home``: a pose of the platform in the base."""
+
+    xyz: Vector
+    quat_xyzw: Quaternion | None = None
+    rpy_deg: Vector | None = None
+
+
+class TableFile(FileSchema):
+    """A table in YAML. All lengths are in ``unit``; directions have no length."""
+
+    legcal_table: Version
+    name: PlainName
+    unit: Literal["m", "mm"]
+    type: Annotated[str | None, BeforeValidator(_type)] = None
+    types: list[Annotated[str, BeforeValidator(_type_of_leg)]] | None = None
+    legs: list[PlainName] | None = None
+    base_joints: Points
+    platform_joints: Points
+    offsets: Annotated[Any, BeforeValidator(_numbers)] = None
+    lengths: Annotated[Any, BeforeValidator(_numbers)] = None
+    travel: Annotated[Any, BeforeValidator(_travel)] = None
+    radius: Annotated[Any, BeforeValidator(_radius)] = None
+    kinds: Annotated[Any, BeforeValidator(_kinds)] = None
+    base_axes: Directions | None = None
+    platform_axes: Directions | None = None
+    home: HomeEntry | None = None
+    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
+
+
+WHAT = "table"
+_XYZ = ("x", "y", "z")
+_NUMBERS = (
+    *(f"base_{i}" for i in _XYZ), *(f"platform_{i}" for i in _XYZ),
+    "offset", "length", "travel_low", "travel_high", "radius", "tube", "rod",
+    *(f"base_axis_{i}" for i in _XYZ), *(f"platform_axis_{i}" for i in _XYZ),
+)  # fmt: skip
+_TEXTS = ("leg", "type", "kind", "unit")
+_NEEDED = ("type", "base_x", "base_y", "platform_x", "platform_y")
+
+
+def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
+    """Return a CSV as the mapping that the same table would be in YAML.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    unit : {"m", "mm"} or None
+        The unit of its lengths, unless a column states it.
+
+    Raises
+    ------
+    DatasetError
+        With one sentence for each wrong column or cell.
+    """
+    lines = read_lines(path, WHAT)
+    if len(lines) < 2:
+        raise DatasetError(
+            f"{path}: the table could not be read: found {len(lines)} lines, needed a header and "
+            "one line for each leg; add them."
+        )
+    header = [name.lower() for name in lines[0][1]]
+    _check_header(header, path)
+    problems, rows = list[str](), list[dict[str, Any]]()
+    for number, cells in lines[1:]:
+        if len(cells) != len(header):
+            problems.append(
+                f"{path}, line {number}: the leg could not be read: found {len(cells)} cells, "
+                f"needed {len(header)}; correct the line."
+            )
+            continue
+        row = dict(zip(header, cells, strict=True))
+        if row.get("radius") and (row.get("tube") or row.get("rod")):
+            problems.append(
+                f"{path}, line {number}: the radius could not be decided: found radius beside tube "
+                "or rod, needed one of them; empty the others."
+            )
+        rows.append({key: _cell(key, text, path, number, problems) for key, text in row.items()})
+    if problems:
+        raise DatasetError(problems)
+    return _as_yaml(rows, path, _unit(rows, unit, path))
+
+
+def _check_header(header: list[str], path: Path) -> None:
+    """Refuse columns that are unknown, repeated or missing."""
+    other = next((mark for mark in ";\t" if len(header) == 1 and mark in header[0]), None)
+    if other is not None:
+        mark = "';'" if other == ";" else "tabs"
+        raise DatasetError(
+            f"{path}: the table could not be read: found {mark} between the columns, needed ',' "
+            "there and '.' in numbers; save it again as comma-separated text."
+        )
+    known = (*_TEXTS, *_NUMBERS)
+    problems = [
+        f"{path}: the column '{name}' could not be used: found an unknown name; "
+        f"{closest(name, known)}"
+        for name in header
+        if name not in known
+    ]
+    problems += [
+        f"{path}: the column '{name}' could not be used: found it twice, needed it once; drop one."
+        for name in sorted({name for name in header if header.count(name) > 1})
+    ]
+    problems += [
+        f"{path}: the table could not be read: found no column '{name}', needed it; add it."
+        for name in _NEEDED
+        if name not in header
+    ]
+    if problems:
+        raise DatasetError(problems)
+
+
+def _cell(key: str, text: str, path: Path, line: int, problems: list[str]) -> str | float | None:
+    """Return the value of a cell; an empty one has none, if it need not."""
+    if key in _TEXTS or (not text and key not in _NEEDED):
+        return text or None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) < LARGEST:
+        found = f"'{text}'" if text else "nothing"
+        problems.append(
+            f"{path}, line {line}: {key} could not be read: found {found}, needed a number below "
+            f"{LARGEST:g}; correct the cell."
+        )
+    return value
+
+
+def _unit(rows: list[dict[str, Any]], told: str | None, path: Path) -> str:
+    """Return the unit that the column states, or the one that was told."""
+    stated = {str(row["unit"]) for row in rows if row.get("unit")}
+    if len(stated) > 1:
+        raise DatasetError(
+            f"{path}: the unit could not be decided: found {' and '.join(sorted(stated))}, needed "
+            "the same in all lines; correct the column 'unit'."
+        )
+    if not stated and told is None:
+        raise DatasetError(
+            f"{path}: the lengths could not be understood: found no unit, needed m or mm; add a "
+            "column 'unit', or give --unit mm."
+        )
+    return stated.pop() if stated else str(told)
+
+
+def _as_yaml(rows: list[dict[str, Any]], path: Path, unit: str) -> dict[str, Any]:
+    """Return rows as the keys of the YAML table."""
+
+    def column(key: str) -> list[Any]:
+        return [row.get(key) for row in rows]
+
+    def vectors(key: str) -> list[Any]:
+        found = [[row.get(f"{key}_{i}") for i in _XYZ] for row in rows]
+        if "axis" not in key:
+            return [[x, y, 0.0 if z is None else z] for x, y, z in found]
+        return [None if vector == [None] * 3 else vector for vector in found]
+
+    table: dict[str, Any] = {
+        "legcal_table": 1,
+        "name": path.stem,
+        "unit": unit,
+        "types": column("type"),
+        "base_joints": vectors("base"),
+        "platform_joints": vectors("platform"),
+        "travel": [
+            None if low is None and high is None else [low, high]
+            for low, high in zip(column("travel_low"), column("travel_high"), strict=True)
+        ],
+        "radius": [_radius_columns(row) for row in rows],
+    }
+    for key, name in (("leg", "legs"), ("kind", "kinds"), ("offset", "offsets"),
+                      ("length", "lengths")):  # fmt: skip
+        if any(x is not None for x in column(key)):
+            table[name] = column(key)
+    for key in ("base_axis", "platform_axis"):
+        axes = vectors(key)
+        if any(axis is not None for axis in axes):
+            table[key.replace("axis", "axes")] = axes
+    return table
+
+
+def _radius_columns(row: dict[str, Any]) -> Any:
+    """Return what a row says of the radius."""
+    parts = {part: row[part] for part in ("tube", "rod") if row.get(part) is not None}
+    return parts or row.get("radius")
+
+
+UNITS = {"m": 0, "mm": -3}
+
+
+def read_table(path: Path, unit: str | None = None, name: str | None = None) -> Description:
+    """Return the machine that a table describes.
+
+    Parameters
+    ----------
+    path : Path
+        A YAML file, or a CSV file with one row for each leg.
+    unit : {"m", "mm"}, optional
+        The unit of all lengths, where the table does not state it.
+    name : str, optional
+        The name of the model, instead of the one in the YAML or the stem of the CSV.
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each problem of the file.
+    """
+    try:
+        if path.suffix.lower() == ".csv":
+            found = read_columns(path, unit)
+            found["name"] = name or found["name"]
+            if not is_plain_name(found["name"]) and name is None:
+                raise DatasetError(
+                    f"{path}: the model could not be named after the file: found "
+                    f"{describe(found['name'])}, needed letters, digits, '-', '_' and '.'; "
+                    "give it a name with --name NAME."
+                )
+        else:
+            found = parse_yaml(read_text(path, WHAT), path, WHAT)
+            found = {key: value for key, value in found.items() if value is not None}
+            if name is not None:
+                found["name"] = name
+            if unit is not None:
+                found.setdefault("unit", unit)
+        file = validate(TableFile, found, path)
+    except DatasetError as error:
+        raise ModelError(error.problems) from error
+    if unit is not None and unit != file.unit:
+        raise ModelError(
+            f"{path}: the unit could not be decided: found --unit {unit} and '{file.unit}' in the "
+            "table, needed one of them; leave out --unit."
+        )
+    problems = _contradictions(file, str(path))
+    if problems:
+        raise ModelError(problems)
+    description = _description(file, str(path))
+    problems = _disagreements(description)
+    if problems:
+        raise ModelError(problems)
+    return description
+
+
+def in_metres(value: float, unit: str) -> float:
+    """Return a length in metres: the float nearest to its decimal digits, whatever the unit."""
+    return float(Decimal(repr(float(value))).scaleb(UNITS[unit]))
+
+
+def _types(file: TableFile, n: int) -> list[LegType]:
+    """Return the type of each leg."""
+    texts = file.types or [(file.type or "").split("-")[-1]] * n
+    return [found for text in texts if (found := leg_type(text)) is not None]
+
+
+def _contradictions(file: TableFile, source: str) -> list[str]:
+    """Return which numbers of legs and names contradict each other."""
+    if (file.type is None) == (file.types is None):
+        found = "both" if file.type else "neither"
+        return [
+            f"{source}: the legs could not be understood: found {found} of type and types, needed "
+            "one: 'type: 6-UPS', or 'types' with one entry for each leg."
+        ]
+    n = len(file.base_joints)
+    problems = []
+    for key in (
+        "platform_joints", "types", "legs", "offsets", "lengths", "travel", "radius", "kinds",
+        "base_axes", "platform_axes",
+    ):  # fmt: skip
+        value = getattr(file, key)
+        if isinstance(value, list) and not (key == "travel" and is_pair(value)) and len(value) != n:
+            problems.append(
+                f"{source}: {key} could not be used: found {len(value)} entries and {n} "
+                "base_joints, needed one for each leg; correct their number."
+            )
+    told = (file.type or "").split("-")
+    if len(told) == 2 and int(told[0]) != n:
+        problems.append(
+            f"{source}: type {file.type} could not be used: found {n} base_joints, needed "
+            f"{int(told[0])}; correct the type or the rows."
+        )
+    if not 2 <= n <= MOST_LEGS:
+        remedy = "add rows" if n < 2 else "leave out passive legs"
+        problems.append(
+            f"{source}: base_joints could not be used: found {n} {'leg' if n == 1 else 'legs'}, "
+            f"needed 2 to {MOST_LEGS}; {remedy}."
+        )
+    names = file.legs or [f"leg{j + 1}" for j in range(n)]
+    problems += [
+        f"{source}: legs could not be used: found '{leg}' twice, needed unique names; rename it."
+        for leg in sorted({leg for leg in names if names.count(leg) > 1})
+    ]
+    problems += _unused(file, source, names)
+    frame = file.base_frame or []
+    problems += [
+        f"{source}: base_frame could not be used: found '{leg}', which is not a leg; "
+        f"{closest(leg, names)}"
+        for leg in frame
+        if leg not in names
+    ]
+    if len(set(frame)) != len(frame):
+        problems.append(
+            f"{source}: base_frame could not be used: found a leg twice, needed different legs; "
+            "correct it."
+        )
+    if file.home and (file.home.quat_xyzw is None) == (file.home.rpy_deg is None):
+        problems.append(
+            f"{source}: home could not be used: needed its turn once, as quat_xyzw or as rpy_deg; "
+            "write one of them."
+        )
+    return problems
+
+
+def _unused(file: TableFile, source: str, names: list[str]) -> list[str]:
+    """Return which entries are for legs that have no use for them."""
+    has_slider = [leg.has_slider for leg in _types(file, len(names))]
+    problems = []
+    for key, of_sliders in (("lengths", False), ("offsets", True), ("travel", True)):
+        value = getattr(file, key)
+        shared = not isinstance(value, list) or is_pair(value)
+        entries = [value] * len(names) if shared else value
+        useless = [
+            leg
+            for leg, entry, slides in zip(names, entries, has_slider, strict=False)
+            if entry is not None and slides is not of_sliders
+        ]
+        if useless and not (shared and len(useless) < len(names)):
+            with_p, without_p = ("with", "without") if of_sliders else ("without", "with")
+            problems.append(
+                f"{source}: {key} could not be used: found an entry for leg '{useless[0]}', whose "
+                f"type is {without_p} P, needed it for legs {with_p} P only; leave it out, or "
+                "write null in a list."
+            )
+    return problems
+
+
+def _description(file: TableFile, source: str) -> Description:
+    """Return the machine of a table, its lengths in metres."""
+    n = len(file.base_joints)
+
+    def metres(value: Any) -> Any:
+        if isinstance(value, list):
+            return [metres(x) for x in value]
+        return None if value is None else in_metres(value, file.unit)
+
+    def per_leg(value: Any) -> list[Any]:
+        return value if isinstance(value, list) else [value] * n
+
+    names = file.legs or [f"leg{j + 1}" for j in range(n)]
+    travel = [file.travel] * n if is_pair(file.travel) else per_leg(file.travel)
+    legs = []
+    for j, (name, kind_of_leg, kind, radius) in enumerate(
+        zip(names, _types(file, n), per_leg(file.kinds), per_leg(file.radius), strict=True)
+    ):
+        tube, rod = _radii(radius, file.unit)
+        constant = not kind_of_leg.has_slider
+        default = LegKind.CONSTANT if constant else LegKind.ACTUATED
+        kind = default if kind is None or constant else LegKind(kind)
+        offset = per_leg(file.lengths if constant else file.offsets)[j]
+        reads_length = kind is LegKind.PASSIVE and offset is None  # a pair for all means readings
+        limits = metres(travel[j])
+        if constant or (reads_length and is_pair(file.travel)):
+            limits = None
+        legs.append(
+            LegEntry(
+                name, kind_of_leg, kind,
+                np.array(metres(file.base_joints[j])), np.array(metres(file.platform_joints[j])),
+                metres(offset), None if limits is None else (limits[0], limits[1]), tube, rod,
+                _unit_table(file.base_axes, j), _unit_table(file.platform_axes, j),
+            )
+        )  # fmt: skip
+    frame = None if file.base_frame is None else tuple(file.base_frame)
+    return Description(file.name, source, file.unit, tuple(legs), _home(file), frame)
+
+
+def _radii(radius: Any, unit: str) -> tuple[float | None, float | None]:
+    """Return the radii of tube and rod [m]."""
+    both = radius if isinstance(radius, dict) else {"tube": radius, "rod": radius}
+    tube, rod = (
+        None if both.get(part) is None else in_metres(both[part], unit) for part in ("tube", "rod")
+    )
+    return tube, rod
+
+
+def _unit_table(axes: list[Any] | None, j: int) -> Array | None:
+    """Return one direction of a list, of length one."""
+    if axes is None or axes[j] is None:
+        return None
+    axis = np.array(axes[j], dtype=float)
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
+def _home(file: TableFile) -> Home | None:
+    """Return the home of a table."""
+    if file.home is None:
+        return None
+    xyz = tuple(in_metres(x, file.unit) for x in file.home.xyz)
+    if file.home.quat_xyzw is not None:
+        return Home(xyz, file.home.quat_xyzw)
+    turn = Rotation.from_euler("xyz", file.home.rpy_deg or (0.0, 0.0, 0.0), degrees=True)
+    return Home(xyz, tuple(float(x) for x in turn.as_quat(canonical=True)))
+
+
+def _disagreements(described: Description) -> list[str]:
+    """Return what legs of their types lack or cannot have."""
+    problems = []
+    for leg in described.legs:
+        where = f"{described.source}: leg '{leg.name}' could not be used: found "
+        if leg.kind is LegKind.ACTUATED and leg.offset is None:
+            problems.append(
+                f"{where}an actuated slider without an offset, needed its length at reading zero; "
+                "add it to offsets."
+            )
+        if leg.kind is LegKind.ACTUATED and leg.travel is None:
+            problems.append(
+                f"{where}an actuated slider without travel, needed the lowest and the highest "
+                "reading of its encoder; add them to travel."
+            )
+        if leg.kind is LegKind.CONSTANT and leg.type.has_slider:
+            problems.append(
+                f"{where}the kind constant with a P in its type, needed a type without P for a leg "
+                "of constant length; correct kinds or types."
+            )
+        for side, letter, axis in (
+            ("base", leg.type.base, leg.base_axis),
+            ("platform", leg.type.platform, leg.platform_axis),
+        ):
+            if axis is not None and letter not in ("R", "U"):
+                joint = f"an {letter} joint" if letter else "a leg that is fixed"
+                problems.append(
+                    f"{where}an axis for {joint} at the {side}, needed axes of R and U joints "
+                    f"only; write null in {side}_axes."
+                )
+    problems += _coincident(described)
+    return problems
+
+
+def _coincident(described: Description) -> list[str]:
+    """Return which legs begin and end in the same two points."""
+    problems = []
+    legs = described.legs
+    for j, one in enumerate(legs):
+        for two in legs[j + 1 :]:
+            gap = max(
+                float(np.linalg.norm(one.A_base - two.A_base)),
+                float(np.linalg.norm(one.B_platform - two.B_platform)),
+            )
+            if gap < 1e-6:
+                problems.append(
+                    f"{described.source}: legs '{one.name}' and '{two.name}' could not be used: "
+                    "found both between the same two points, needed different joints; correct "
+                    "their rows."
+                )
+    if any(float(np.ptp([getattr(leg, s) for leg in legs], axis=0).max()) < 1e-6 for s in
+           ("A_base", "B_platform")):  # fmt: skip
+        problems.append(
+            f"{described.source}: the joints could not be used: found all of one side in one "
+            "point, needed them spread out; correct base_joints or platform_joints."
+        )
+    return problems

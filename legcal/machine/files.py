@@ -1,0 +1,126 @@
+"""Finding and reading the files of a mechanism: a path, a folder, or a shipped name."""
+
+import os
+from pathlib import Path
+
+from legcal.errors import DatasetError, ModelError
+from legcal.files import read_text
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+FOLDER_YAML = "robot.yaml"  # as Gepetto names it
+DATASET_YAML = "dataset.yaml"
+
+
+def shipped_folders() -> tuple[Path, Path]:
+    """Return the folders of the shipped models and URDFs, in a wheel or in a checkout."""
+    for top in (_PACKAGE / "shipped", _PACKAGE.parent):
+        if (top / "models").is_dir() and (top / "urdf").is_dir():
+            return top / "models", top / "urdf"
+    return _PACKAGE / "shipped" / "models", _PACKAGE / "shipped" / "urdf"
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the shipped models."""
+    return sorted(path.stem for path in shipped_folders()[0].glob("*.yaml"))
+
+
+def find_model(model: str | Path) -> Path:
+    """Return the file that describes a mechanism, of a path or of the name of a shipped model.
+
+    Parameters
+    ----------
+    model : str or Path
+        A mechanism YAML, a URDF, an MJCF file, a folder with ``robot.yaml``, or a shipped name.
+
+    Returns
+    -------
+    Path
+        A YAML, or another file whose format its content tells.
+
+    Raises
+    ------
+    ModelError
+        If there is no such file and no such shipped model.
+    """
+    path = Path(model)
+    names = shipped_names()
+    is_shipped = str(model) in names
+    if os.path.isdir(path) and not is_shipped:
+        if (path / FOLDER_YAML).is_file():
+            return path / FOLDER_YAML
+        if (path / DATASET_YAML).is_file():
+            raise ModelError(what_a_dataset_is_for(path))
+        raise ModelError(
+            f"{path}: the mechanism could not be read: found a folder without {FOLDER_YAML}, "
+            "needed a folder with it, or a YAML, URDF or MJCF file; give the file."
+        )
+    if os.path.exists(path) and not os.path.isdir(path):
+        if path.suffix.lower() == ".csv":
+            raise ModelError(
+                f"{path}: the mechanism could not be read: found a CSV file, needed a mechanism "
+                f"YAML, URDF or MJCF file; if it is a table of legs: legcal new {path} -o DIR"
+            )
+        return path
+    if is_shipped:
+        return shipped_folders()[0] / f"{model}.yaml"
+    raise ModelError(
+        f"{path}: the mechanism could not be read: found no such file and no shipped model of that "
+        f"name, needed a mechanism YAML, its URDF, or one of {', '.join(names)}; check the path."
+    )
+
+
+def what_a_dataset_is_for(path: Path) -> str:
+    """Return that a dataset is no model, and the commands that take one."""
+    folder = path.parent if path.name == DATASET_YAML else path
+    return (
+        f"{path}: the mechanism could not be read: found a dataset, needed a model; give the "
+        f"model that it names, or judge the dataset with: legcal identify {folder}, and calibrate "
+        f"it with: legcal calibrate {folder} -o OUT"
+    )
+
+
+def find_urdf(yaml_path: Path, written: str | None) -> Path:
+    """Return the URDF of a mechanism YAML: as written in it, or the same stem near it.
+
+    Raises
+    ------
+    ModelError
+        If there is none.
+    """
+    if written is not None:
+        path = yaml_path.parent / written
+        return path.resolve() if ".." in path.parts else path
+    near = [yaml_path.with_suffix(".urdf"), _sibling(yaml_path, "urdf").with_suffix(".urdf")]
+    for path in near:
+        if path.is_file():
+            return path
+    raise ModelError(
+        f"{yaml_path}: the URDF of the mechanism could not be found: looked for {near[0]} and "
+        f"{near[1]}, needed one of them; write its path in legcal.urdf."
+    )
+
+
+def read_file(path: Path, what: str) -> bytes:
+    """Return the bytes of a mechanism file.
+
+    Raises
+    ------
+    ModelError
+        If it is missing, a folder, unreadable or far too large.
+    """
+    try:
+        return read_text(path, what)
+    except DatasetError as error:
+        raise ModelError(error.problems) from error
+
+
+def yaml_of_urdf(path: Path) -> Path | None:
+    """Return the YAML that closes the loops of a URDF, or None."""
+    near = [path.with_suffix(".yaml"), _sibling(path, "models").with_suffix(".yaml")]
+    return next((candidate for candidate in near if candidate.is_file()), None)
+
+
+def _sibling(path: Path, folder: str) -> Path:
+    """Return the path of the same file name in a folder beside its own."""
+    return path.resolve().parent.parent / folder / path.name

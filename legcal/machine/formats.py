@@ -1,0 +1,562 @@
+"""Reading a mechanism of any format: which one it is, and the reader of that format."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from lxml import etree
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import ModelError, OutOfClass
+from legcal.files import closest
+from legcal.geometry import Array
+from legcal.machine.chain import ClosedChain, Closure
+from legcal.machine.files import find_model, find_urdf, read_file, yaml_of_urdf
+from legcal.machine.mjcf import read_mjcf_source
+from legcal.machine.schema import MechanismFile, read_mechanism_file
+from legcal.machine.tree import (
+    DRAWING,
+    Loop,
+    LoopKind,
+    Source,
+    TreeText,
+    assumed_travel,
+    check_one_mechanism,
+    close_loop,
+    reference_poses,
+    set_travel,
+    sliders_without_travel,
+    travel_note,
+)
+from legcal.machine.urdf import (
+    LOOP_TAGS,
+    Problems,
+    Urdf,
+    checked_tree,
+    number_list,
+    parse_robot,
+    parse_urdf,
+    parse_xml,
+    read_urdf,
+)
+
+_UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
+_AXES = dict(zip("XYZ", np.eye(3), strict=True))
+
+
+def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
+    """Check that each joint that stands for another is there once and means something known.
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each that is not.
+    """
+    problems = []
+    for i, (name, kind) in enumerate(zip(file.joint_name, file.joint_type, strict=True)):
+        if name not in urdf.joints:
+            problems.append(
+                f"{path}: joint_name.{i} could not be used: found the joint '{name}', which is not "
+                f"in {urdf.path.name}; {closest(name, sorted(urdf.joints))}"
+            )
+        elif file.joint_name.index(name) != i:
+            problems.append(
+                f"{path}: joint_name.{i} could not be used: found '{name}' twice, needed each "
+                "joint once; remove one."
+            )
+        elif name in file.name_mot and kind != "FIXED":
+            problems.append(
+                f"{path}: name_mot could not be used: found '{name}', which stands for "
+                f"{kind} (joint_name.{i}), needed a joint with one reading; remove it."
+            )
+        if axes_of(kind) is None:
+            problems.append(
+                f"{path}: joint_type.{i} could not be used: found '{kind}', needed SPHERICAL, "
+                "FIXED, or UJOINT_ and two different letters of X, Y, Z; correct it."
+            )
+    if problems:
+        raise ModelError(problems)
+
+
+def axes_of(kind: str) -> str | None:
+    """Return the letters of the axes that a joint type turns about, in order; None if unknown."""
+    if kind in ("SPHERICAL", "FIXED"):
+        return "XYZ" if kind == "SPHERICAL" else ""
+    found = _UNIVERSAL.fullmatch(kind)
+    return found[1] + found[2] if found and found[1] != found[2] else None
+
+
+def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) -> dict[str, str]:
+    """Replace the joints of a URDF that stand for others, and return what frames they carried.
+
+    Parameters
+    ----------
+    robot : Element
+        The URDF, changed in place.
+    file : MechanismFile
+        Names and types, checked.
+    urdf : Urdf
+        The same URDF as read.
+
+    Returns
+    -------
+    dict of str to str
+        The child link of every joint that was replaced: the frame that its name meant.
+    """
+    text = TreeText(dict.fromkeys(urdf.links, ""), dict.fromkeys(urdf.joints, ""))
+    elements = {e.get("name"): e for e in robot if e.tag == "joint"}
+    replaced = {}
+    for name, kind in zip(file.joint_name, file.joint_type, strict=True):
+        element, joint = elements[name], urdf.joints[name]
+        if kind == "FIXED":
+            element.set("type", "fixed")
+            continue
+        replaced[name] = joint.child
+        letters = str(axes_of(kind))
+        parent = joint.parent
+        added = TreeText(dict(text.links), dict(text.joints))
+        for i, letter in enumerate(letters):
+            last = i == len(letters) - 1
+            child = joint.child if last else added.unused(f"{name}_{letter}_link")
+            if not last:
+                added.link(child)
+            T = joint.T_parent_origin if i == 0 else joint.T_parent_origin.identity()
+            added.joint(
+                added.unused(f"{name}_{letter}"), "revolute", parent, child, T, _AXES[letter]
+            )
+            parent = child
+        at = robot.index(element)
+        robot.remove(element)
+        lines = [
+            *(line for link, line in added.links.items() if link not in text.links),
+            *(line for other, line in added.joints.items() if other not in text.joints),
+        ]
+        for line in reversed(lines):
+            new = etree.fromstring(line)
+            new.tail = "\n"
+            robot.insert(at, new)
+        text = added
+    return replaced
+
+
+TRIALS = 24
+STEPS = 200
+CLOSED = 1e-10  # [m] and [rad]
+_SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
+_LONGEST = 0.3  # step [rad, m]
+
+
+def completed(source: Source) -> Source:
+    """Return a mechanism without a block with the poses where it is closed, and all travels.
+
+    Parameters
+    ----------
+    source : Source
+        A mechanism as its file has it.
+
+    Returns
+    -------
+    Source
+        The same with ``poses`` where a closed configuration was found, and a travel about it
+        for sliders that have none.
+
+    Raises
+    ------
+    ModelError
+        If Pinocchio cannot build the tree.
+    """
+    known = {*source.urdf.links, *source.urdf.joints}
+    if not all(name in known for pair in source.file.closed_loop for name in pair):
+        return source  # refused later, with the place of the name
+    closures = [
+        Closure("3d" if kind == "3d" else "6d", one, two)
+        for (one, two), kind in zip(source.file.closed_loop, source.file.type, strict=True)
+    ]
+    try:
+        chain = ClosedChain(source.urdf.text, closures)
+    except ModelError as error:
+        raise ModelError(
+            [f"{source.urdf.path}: {problem}" for problem in error.problems]
+        ) from error
+    start = chain.neutral()
+    for joint, value in source.values.items():
+        start[chain.q_index(joint)] = value
+    found = closed_near(chain, start, source.urdf.links)
+    configuration = start if found is None else found
+    urdf = source.urdf
+    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
+    sliders = sliders_without_travel(urdf)
+    if sliders:
+        readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
+        source = _with_travel(source, readings, poses)
+    return source if found is None else replace(source, poses=poses)
+
+
+def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array | None:
+    """Return a closed configuration near a given one, or None where none was found.
+
+    Of what several starts find, the one is taken where links have turned least.
+    """
+    if _off(chain, start) <= CLOSED:
+        return start
+    rng = np.random.default_rng(1965)
+    best: tuple[float, Array] | None = None
+    drawn = chain.turns(start, links[0], links)
+    for trial in range(TRIALS):
+        away = chain.integrate(start, _SPREAD * trial * rng.normal(size=chain.nv))
+        found = _close(chain, away)
+        if found is None:
+            continue
+        turned = _turned(drawn, chain.turns(found, links[0], links))
+        if best is None or turned < best[0] - 1e-6:
+            best = turned, found
+    return None if best is None else best[1]
+
+
+def _turned(before: Array, after: Array) -> float:
+    """Return by how much rotations (n, 3, 3) differ, all together [rad]."""
+    apart = np.swapaxes(before, 1, 2) @ after
+    return float(Rotation.from_matrix(apart).magnitude().sum())
+
+
+def _close(chain: ClosedChain, configuration: Array) -> Array | None:
+    """Close the loops by damped Gauss-Newton steps, or return None."""
+    damping = 1e-2
+    residual, jacobian = chain.linearize(configuration)
+    for _ in range(STEPS):
+        if float(np.abs(residual).max()) <= CLOSED:
+            return configuration
+        square = jacobian @ jacobian.T + damping * np.eye(len(residual))
+        if not np.linalg.cond(square) < 1e15:  # numbers of hugely different size
+            return None
+        step = -jacobian.T @ np.linalg.solve(square, residual)
+        step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
+        tried = chain.integrate(configuration, step)
+        new_residual, new_jacobian = chain.linearize(tried)
+        if new_residual @ new_residual < residual @ residual:
+            configuration, residual, jacobian = tried, new_residual, new_jacobian
+            damping = max(0.2 * damping, 1e-12)
+        elif damping > 1e6:
+            return None
+        else:
+            damping *= 10.0
+    return None
+
+
+def _off(chain: ClosedChain, configuration: Array) -> float:
+    """Return how far the loops are from closed."""
+    residual = chain.residual(configuration)
+    return float(np.abs(residual).max()) if len(residual) else 0.0
+
+
+def _with_travel(
+    source: Source, readings: Mapping[str, float], poses: Mapping[str, RigidTransform]
+) -> Source:
+    """Write a travel about some readings into the URDF, and note it."""
+    travel = assumed_travel(poses)
+    robot = parse_robot(source.urdf.path, source.urdf.content)
+    set_travel(robot, readings, travel)
+    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    names: Sequence[str] = list(readings)
+    return replace(
+        source,
+        urdf=parse_urdf(source.urdf.path, content),
+        converted=True,
+        notes=(*source.notes, travel_note(names, travel)),
+    )
+
+
+_NO_BLOCK = (
+    ("legcal.home could not be used", "the pose that the file draws could not be used"),
+    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("write legcal.home", "add a block legcal with home"),
+    ("correct legcal.home", "add a block legcal with another home"),
+    ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
+    ("correct legcal.base or legcal.platform", "add a block legcal with another base or platform"),
+    (", legcal.base and legcal.platform", ", or add a block legcal with another base and platform"),
+    ("write legcal.base, legcal.platform and legcal.legs",
+     "add a block legcal with base, platform and legs"),
+)  # fmt: skip
+
+
+def read_yaml_source(path: Path) -> Source:
+    """Return a mechanism from its YAML and the URDF that it names.
+
+    A file without the block ``legcal`` may leave the travel of sliders open, as Gepetto's do.
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each problem of a file.
+    """
+    file = read_mechanism_file(path)
+    block = file.legcal
+    urdf = read_urdf(
+        find_urdf(path, None if block is None else block.urdf), travel_needed=block is not None
+    )
+    check_stand_ins(file, urdf, path)
+    if not file.joint_name:
+        return Source(path, file, urdf, words=_NO_BLOCK if block is None else ())
+    return _converted(path, file, urdf)
+
+
+def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
+    """Return a mechanism whose URDF has joints that stand for others."""
+    robot = parse_robot(urdf.path, urdf.content)
+    frames = replace_stand_ins(robot, file, urdf)
+    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    travel_needed = file.legcal is not None
+    completed = parse_urdf(urdf.path, content, travel_needed=travel_needed)
+    changes = {
+        "closed_loop": [[frames.get(name, name) for name in pair] for pair in file.closed_loop],
+        "joint_name": [],
+        "joint_type": [],
+    }
+    if file.legcal is not None:
+        on_replaced = [joint for joint in file.legcal.legs.values() if joint in frames]
+        if on_replaced:
+            raise ModelError(
+                f"{path}: legcal.legs could not be used: found '{on_replaced[0]}', which stands "
+                "for another joint (joint_name), needed another joint of that leg; name its "
+                "prismatic joint."
+            )
+    words = _NO_BLOCK if file.legcal is None else ()
+    return Source(path, file.model_copy(update=changes), completed, True, words=words)
+
+
+KINDS: dict[str, LoopKind] = {
+    **dict.fromkeys(("spherical", "ball", "point"), "point"),
+    **dict.fromkeys(("fixed", "weld"), "weld"),
+    **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
+    "universal": "universal",
+}
+_WORDS = (("closed_loop", "<loop_joint> or <constraint>"), *DRAWING)
+
+
+def has_loops(robot: etree._Element) -> bool:
+    """Say whether a ``<robot>`` closes loops."""
+    return any(element.tag in LOOP_TAGS for element in robot)
+
+
+def read_loop_source(path: Path, content: bytes) -> Source:
+    """Return the mechanism of a URDF with loops.
+
+    Motors are the prismatic joints that a ``<transmission>`` or ``<ros2_control>`` names, or all
+    prismatic joints where none is named.
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each problem of the file.
+    """
+    robot = parse_robot(path, content)
+    problems = Problems(path)
+    elements = [element for element in robot if element.tag in LOOP_TAGS]
+    bare = checked_tree(robot, path, content, problems, travel_needed=False)
+    loops = _loops(elements, bare, problems)
+    motors, notes = _motors(robot, bare, problems)
+    problems.raise_if_any()
+    for element in elements:
+        robot.remove(element)
+    poses = reference_poses(bare)
+    text = TreeText(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
+    pairs = [close_loop(loop, text, poses) for loop in loops]
+    for line in [*text.links.values(), *text.joints.values()]:
+        if line:
+            robot.append(etree.fromstring(line))
+            robot[-1].tail = "\n"
+    written = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    file = MechanismFile(
+        closed_loop=[frames for frames, _ in pairs],
+        type=[kind for _, kind in pairs],
+        name_mot=motors,
+    )
+    urdf = parse_urdf(path, written, travel_needed=False)
+    return Source(path, file, urdf, True, tuple(notes), words=_WORDS)
+
+
+def _loops(elements: Sequence[etree._Element], urdf: Urdf, problems: Problems) -> list[Loop]:
+    """Return the loops of a URDF, the problems of others noted."""
+    found = []
+    seen: set[str] = set()
+    for i, element in enumerate(elements, start=1):
+        n_before = len(problems)
+        name = element.get("name", "").strip() or f"{element.tag}_{i}"
+        if name in seen:
+            problems.add(element, "has a name that another one has", "give each its own name")
+        seen.add(name)
+        kind = element.get("type", "").strip().lower()
+        if kind not in KINDS:
+            problems.add(
+                element,
+                f"closes a loop with the type '{element.get('type', '')}', needed one of "
+                f"{', '.join(KINDS)}",
+                "cut the loop at another joint",
+            )
+            continue
+        ends = _ends(element, urdf, problems)
+        axes = _axes(element, KINDS[kind], problems)
+        if len(problems) > n_before or ends is None:
+            continue
+        (link_1, T_1), (link_2, T_2) = ends
+        found.append(Loop(name, KINDS[kind], (link_1, link_2), (T_1, T_2), axes))
+    return found
+
+
+def _ends(
+    element: etree._Element, urdf: Urdf, problems: Problems
+) -> tuple[tuple[str, RigidTransform], tuple[str, RigidTransform]] | None:
+    """Return the links of a loop and its frame in each, or None with its problems noted."""
+    sides = [part for part in element if part.tag in ("link1", "link2")]
+    origins: list[etree._Element | None] = [
+        part if part.find("origin") is None else part.find("origin") for part in sides
+    ]
+    if not sides:
+        sides = [part for tag in ("parent", "child") for part in element.findall(tag)]
+        origins = [element.find(f"{part.tag}_origin") for part in sides]
+    if len(sides) != 2:
+        problems.add(
+            element,
+            f"names {len(sides)} links, needed two",
+            "write <link1 link=...> and <link2 link=...>, or <parent ...> and <child ...>",
+        )
+        return None
+    n_before = len(problems)
+    links = [side.get("link", "") for side in sides]
+    for link in links:
+        if link not in urdf.links:
+            problems.add(
+                element, f"names the link '{link}', which is not in the file",
+                closest(link, urdf.links).rstrip("."),
+            )  # fmt: skip
+    if links[0] == links[1]:
+        problems.add(element, f"joins the link '{links[0]}' to itself", "name two links")
+    poses = [_pose(element, origin, problems) for origin in origins]
+    if len(problems) > n_before:
+        return None
+    return (links[0], poses[0]), (links[1], poses[1])
+
+
+def _pose(
+    element: etree._Element, origin: etree._Element | None, problems: Problems
+) -> RigidTransform:
+    """Return the motion that ``xyz`` and ``rpy`` describe, zero where they are not written."""
+    xyz, rpy = (_three(element, origin, key, problems) for key in ("xyz", "rpy"))
+    return RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy))
+
+
+def _three(
+    element: etree._Element, part: etree._Element | None, key: str, problems: Problems
+) -> Array:
+    """Return three numbers of a part of a loop; zero where they are missing."""
+    text = None if part is None else part.get(key)
+    numbers = [0.0] * 3 if text is None else number_list(text, 3)
+    if numbers is None:
+        problems.add(
+            element, f"has {key}={str(text)[:60]!r}, needed 3 finite numbers", "correct the value"
+        )
+    return np.array(numbers or [0.0] * 3)
+
+
+def _axes(element: etree._Element, kind: LoopKind, problems: Problems) -> tuple[Array, Array]:
+    """Return the unit axes of a loop in its two frames; the URDF default is x."""
+    x = np.array([1.0, 0.0, 0.0])
+    if kind not in ("revolute", "universal"):
+        return x, x
+    common = element.find("axis")
+    if common is not None and common.get("frame") is not None:
+        problems.add(
+            element,
+            f"gives its axis in the frame '{common.get('frame')}' alone, needed it in both",
+            "give both frames with rpy so that the axis is the same in them",
+        )
+    parts = [element.find(f"{side}_axis") for side in ("parent", "child")]
+    if kind == "universal" and None in parts:
+        problems.add(
+            element,
+            "is universal and has not two axes",
+            "write <parent_axis xyz=...> and <child_axis xyz=...>",
+        )
+    axes = []
+    for part in parts:
+        given = common if part is None else part
+        axis = x if given is None else _three(element, given, "xyz", problems)
+        norm = float(np.linalg.norm(axis))
+        if norm < 1e-9 and not problems.sentences:
+            problems.add(element, "has a zero axis, needed a direction", "correct its xyz")
+        axes.append(axis / max(norm, 1e-9))
+    return axes[0], axes[1]
+
+
+def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list[str], list[str]]:
+    """Return the joints that have an encoder, and what the reader should know of that."""
+    named = [e for e in robot.iterfind("transmission/joint") if e.get("name") is not None]
+    named += [e for e in robot.iterfind("ros2_control/joint") if e.get("name") is not None]
+    for element in named:
+        if element.get("name") not in urdf.joints:
+            problems.add(
+                element,
+                "is a motor of no joint of the file",
+                closest(str(element.get("name")), urdf.joints).rstrip("."),
+            )
+    motors = list(dict.fromkeys(str(e.get("name")) for e in named))
+    if motors:
+        return motors, []
+    sliders = [joint.name for joint in urdf.joints.values() if joint.type == "prismatic"]
+    return sliders, [
+        f"The file names no motors: all {len(sliders)} prismatic joints were taken as motors; "
+        "name the motors in <transmission> elements if some are not."
+    ] * bool(sliders)
+
+
+XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
+
+
+def read_source(model: str | Path) -> Source:
+    """Return the tree and the closures of a mechanism, checked in themselves.
+
+    Parameters
+    ----------
+    model : str or Path
+        A mechanism YAML or a folder with ``robot.yaml``; a URDF with its YAML beside it (or in
+        ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
+
+    Raises
+    ------
+    ModelError
+        If a file is missing or malformed; all problems of a file at once.
+    OutOfClass
+        If nothing closes the loops, or there are two mechanisms.
+    """
+    path = find_model(model)
+    is_xml = path.suffix.lower() in XML_SUFFIXES
+    source = _read_xml(path) if is_xml else read_yaml_source(path)
+    if source.file.legcal is not None:
+        return source
+    check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
+    return completed(source)
+
+
+def _read_xml(path: Path) -> Source:
+    """Return the mechanism of an XML file, whose outermost element tells the format."""
+    beside = yaml_of_urdf(path)
+    if beside is not None and path.suffix.lower() != ".mjcf":
+        return read_yaml_source(beside)
+    content = read_file(path, "mechanism file")
+    root = parse_xml(path, content, "mechanism file")
+    if root.tag == "mujoco":
+        return read_mjcf_source(path, content)
+    if root.tag != "robot":
+        raise ModelError(
+            f"{path}, line {root.sourceline}: the mechanism could not be read: found <{root.tag}> "
+            "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give one of them."
+        )
+    if has_loops(root):
+        return read_loop_source(path, content)
+    raise OutOfClass(
+        f"{path}: this is not a parallel mechanism: found a URDF, which is a tree without closed "
+        f"loops, and no YAML that closes them; write {path.with_suffix('.yaml')} with closed_loop, "
+        "type, name_mot and a legcal block."
+    )

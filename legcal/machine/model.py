@@ -1,0 +1,177 @@
+"""A parallel mechanism as loaded: its legs, its frames, and its closed chain (section 2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import UsageError
+from legcal.geometry import Array, frame_on_points
+from legcal.machine.chain import ClosedChain
+from legcal.machine.classification import LegChain
+from legcal.machine.leg import Cylinder, KinematicParameters, Leg, LegKind
+from legcal.machine.urdf import Urdf
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """A platform on legs, read from a YAML and its URDF.
+
+    Attributes
+    ----------
+    name : str
+        The robot's name.
+    yaml_path, urdf_path : Path
+        Its files.
+    base, platform : str
+        Links.
+    platform_joint : str or None
+        The virtual joint that carries the platform.
+    legs : tuple of Leg
+        In the order of the YAML.
+    frame_legs : tuple of int
+        The legs whose joint centres define R_b and R_e: origin, x axis, xy plane.
+    spatial : bool
+        Whether the platform moves in space and not in a plane.
+    home : RigidTransform
+        T_base_platform of a pose in the assembly mode.
+    home_configuration : (nq,) array
+        The closed chain there.
+    chain : ClosedChain
+        The tree and its closures in Pinocchio.
+    urdf : Urdf
+        The tree as written.
+    leg_chains : tuple of LegChain
+        The joints of every leg.
+    mobility : int
+        Freedoms of the platform; the motors determine its pose where it equals their number.
+    diagnostics : tuple of str
+        What the reader should know, one sentence each.
+    base_normal, platform_normal : (3,) array or None
+        The normal of the plane of motion in the links of base and platform, the same way up;
+        None in space.
+    """
+
+    name: str
+    yaml_path: Path
+    urdf_path: Path
+    base: str
+    platform: str
+    platform_joint: str | None
+    legs: tuple[Leg, ...]
+    frame_legs: tuple[int, ...]
+    spatial: bool
+    home: RigidTransform
+    home_configuration: Array
+    chain: ClosedChain
+    urdf: Urdf
+    leg_chains: tuple[LegChain, ...]
+    mobility: int = 0
+    diagnostics: tuple[str, ...] = ()
+    base_normal: Array | None = None
+    platform_normal: Array | None = None
+
+    @property
+    def n_legs(self) -> int:
+        """Number of legs."""
+        return len(self.legs)
+
+    @cached_property
+    def leg_names(self) -> tuple[str, ...]:
+        """Names of the legs."""
+        return tuple(leg.name for leg in self.legs)
+
+    @cached_property
+    def motors(self) -> tuple[int, ...]:
+        """Indices of the actuated legs."""
+        return tuple(j for j, leg in enumerate(self.legs) if leg.kind is LegKind.ACTUATED)
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the platform has as many freedoms as there are motors: readings give its pose."""
+        return self.mobility == len(self.motors)
+
+    @cached_property
+    def A_base(self) -> Array:
+        """Base joint centres in the base link, (n_legs, 3) [m]."""
+        return _fixed(np.array([leg.A_base for leg in self.legs]))
+
+    @cached_property
+    def B_platform(self) -> Array:
+        """Platform joint centres in the platform link, (n_legs, 3) [m]."""
+        return _fixed(np.array([leg.B_platform for leg in self.legs]))
+
+    @cached_property
+    def q0(self) -> Array:
+        """Leg lengths at reading zero, (n_legs,) [m]."""
+        return _fixed(np.array([leg.q0 for leg in self.legs]))
+
+    @cached_property
+    def sign(self) -> Array:
+        """Whether each leg grows (+1) or shrinks (-1) with its reading, (n_legs,)."""
+        return _fixed(np.array([float(leg.sign) for leg in self.legs]))
+
+    @cached_property
+    def T_base_Rb(self) -> RigidTransform:
+        """The frame on the base joint centres of the frame legs, in the base link."""
+        return frame_on_points(self.A_base[list(self.frame_legs)], self.base_normal)
+
+    @cached_property
+    def T_platform_Re(self) -> RigidTransform:
+        """The frame on the platform joint centres of the frame legs, in the platform link."""
+        return frame_on_points(self.B_platform[list(self.frame_legs)], self.platform_normal)
+
+    @cached_property
+    def parameters(self) -> KinematicParameters:
+        """The kinematic parameters xi, in R_b and R_e [m]."""
+        base = self.T_base_Rb.inv().apply(self.A_base)
+        platform = self.T_platform_Re.inv().apply(self.B_platform)
+        n_d = len(self.frame_legs)
+        for rank, leg in enumerate(self.frame_legs):  # zero by definition, not by rounding
+            base[leg, rank:n_d] = 0.0
+            platform[leg, rank:n_d] = 0.0
+        passive = [leg.kind is LegKind.PASSIVE for leg in self.legs]
+        return KinematicParameters(base, platform, np.where(passive, np.nan, self.q0))
+
+    def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Mechanism":
+        """Return the mechanism with other visible cylinders of its legs."""
+        legs = tuple(
+            replace(leg, cylinders=tuple(of_leg))
+            for leg, of_leg in zip(self.legs, cylinders, strict=True)
+        )
+        return replace(self, legs=legs)
+
+    def with_leg_order(self, names: Sequence[str]) -> "Mechanism":
+        """Return the same mechanism with its legs in another order.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Every leg once.
+
+        Raises
+        ------
+        UsageError
+            If the names are not those of the legs.
+        """
+        if sorted(names) != sorted(self.leg_names):
+            raise UsageError(
+                f"The legs could not be reordered: found {', '.join(names)}, needed each of "
+                f"{', '.join(self.leg_names)} once; pass all leg names."
+            )
+        order = [self.leg_names.index(name) for name in names]
+        return replace(
+            self,
+            legs=tuple(self.legs[j] for j in order),
+            leg_chains=tuple(self.leg_chains[j] for j in order),
+            frame_legs=tuple(order.index(j) for j in self.frame_legs),
+        )
+
+
+def _fixed(array: Array) -> Array:
+    """Return an array that nobody can change."""
+    array.flags.writeable = False
+    return array

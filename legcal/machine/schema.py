@@ -1,0 +1,172 @@
+"""The YAML of a mechanism, written: :mod:`legcal.machine.schema` reads it."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from legcal.errors import DatasetError, ModelError
+from legcal.files import FileSchema, PlainName, Version, closest, parse_yaml, validate
+from legcal.geometry import MotionEntry
+from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
+
+WHAT = "mechanism file"
+
+
+class LegcalBlock(FileSchema):
+    """The block ``legcal``: what belongs to base, platform and legs.
+
+    What is missing is proposed, see :mod:`legcal.machine.topology`.
+    """
+
+    version: Version
+    urdf: str | None = None
+    base: str
+    platform: str
+    platform_joint: str | None = None
+    base_frame: Annotated[list[str], Field(min_length=2, max_length=3)] | None = None
+    home: MotionEntry | None = None
+    legs: Annotated[dict[PlainName, str], Field(min_length=1)]
+
+    @field_validator("base_frame")
+    @classmethod
+    def _different(cls, value: list[str] | None) -> list[str] | None:
+        if value is None:
+            return None
+        repeated = sorted({name for name in value if value.count(name) > 1})
+        if repeated:
+            raise ValueError(
+                f"found the leg '{repeated[0]}' more than once, needed different legs; "
+                "name each once."
+            )
+        return value
+
+
+class MechanismFile(BaseModel):
+    """A mechanism YAML; keys of other programs beside ours are left alone."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="ignore")
+
+    closed_loop: list[Annotated[list[str], Field(min_length=2, max_length=2)]]
+    type: list[str]
+    name_mot: list[str]
+    joint_name: list[str] = []
+    joint_type: list[str] = []
+    legcal: LegcalBlock | None = None
+
+    @field_validator("type")
+    @classmethod
+    def _small_letters(cls, value: list[str]) -> list[str]:
+        return [kind.lower() for kind in value]
+
+
+def read_mechanism_file(path: Path) -> MechanismFile:
+    """Return a mechanism YAML, checked in itself (its names are checked against the URDF later).
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each problem, naming its place in the file.
+    """
+    content = read_file(path, WHAT)
+    try:
+        found = parse_yaml(content, path, WHAT)
+        _check_kind(found, path)
+        file = validate(MechanismFile, _without_nulls(found), path)
+    except DatasetError as error:
+        raise ModelError(error.problems) from error
+    problems = _contradictions(file, path)
+    if problems:
+        raise ModelError(problems)
+    return file
+
+
+def _check_kind(found: Mapping[str, Any], path: Path) -> None:
+    """Refuse the other YAML files that legcal reads, with the command for each."""
+    if "legcal_table" in found:
+        raise ModelError(
+            f"{path}: the {WHAT} could not be read: found a table of legs (legcal_table), needed a "
+            f"model; write the model of the table with: legcal new {path} -o DIR"
+        )
+    if path.name == DATASET_YAML:
+        raise ModelError(what_a_dataset_is_for(path))
+
+
+def _without_nulls(found: dict[str, Any]) -> dict[str, Any]:
+    """Drop empty optional lists, which YAML reads as null."""
+    return {
+        k: v for k, v in found.items() if v is not None or k not in ("joint_name", "joint_type")
+    }
+
+
+def _contradictions(file: MechanismFile, path: Path) -> list[str]:
+    """Return what does not fit together within the file."""
+    problems = []
+    if len(file.type) != len(file.closed_loop):
+        problems.append(
+            f"{path}: the loops could not be closed: found {len(file.closed_loop)} pairs in "
+            f"closed_loop and {len(file.type)} entries in type, needed equal numbers; write one "
+            "type for each pair."
+        )
+    problems += [
+        f"{path}: type.{i} could not be used: found '{kind}', needed '3d' (points coincide) or "
+        "'6d' (frames coincide); correct it."
+        for i, kind in enumerate(file.type)
+        if kind not in ("3d", "6d")
+    ]
+    if not file.closed_loop:
+        problems.append(
+            f"{path}: the mechanism could not be closed: found no pair in closed_loop, needed the "
+            "loops of a parallel mechanism; write the pairs of frames that coincide."
+        )
+    if len(file.joint_name) != len(file.joint_type):
+        problems.append(
+            f"{path}: joint_name could not be used: found {len(file.joint_name)} names and "
+            f"{len(file.joint_type)} entries in joint_type, needed equal numbers; write one type "
+            "for each joint."
+        )
+    repeated = sorted({name for name in file.name_mot if file.name_mot.count(name) > 1})
+    problems += [
+        f"{path}: name_mot could not be used: found '{name}' more than once, needed each motor "
+        "once; remove the repetition."
+        for name in repeated
+    ]
+    block = file.legcal
+    if block is None:
+        return problems
+    problems += [
+        f"{path}: legcal.base_frame could not be used: found '{name}', which is not a leg; "
+        f"{closest(name, block.legs)}"
+        for name in block.base_frame or ()
+        if name not in block.legs
+    ]
+    return problems
+
+
+def mechanism_yaml(
+    loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
+) -> str:
+    """Return the YAML of a mechanism.
+
+    Parameters
+    ----------
+    loops : sequence of tuples of str
+        The two frames of every closure, and its type.
+    motors : sequence of str
+        The joints with motors.
+    legcal : dict
+        The block ``legcal`` without its version.
+    """
+    document = {
+        "closed_loop": [[one, two] for one, two, _ in loops],
+        "type": [kind for *_, kind in loops],
+        "name_mot": motors,
+        "joint_name": [],
+        "joint_type": [],
+        "legcal": {"version": 1, **legcal},
+    }
+    return str(
+        yaml.safe_dump(document, sort_keys=False, default_flow_style=False, allow_unicode=True)
+    )

@@ -1,0 +1,561 @@
+"""Base, platform and legs of a mechanism whose file does not name them, from its bodies alone.
+
+The base is the body of the URDF's root, the platform the body where most chains end. Legs come in
+the order of ``name_mot``, those without a motor after them in the order of the URDF; they are
+named by what their joints' names have in front of the first underscore, where that tells them
+apart. The frames stand on the legs whose joints span the largest triangle, or lie farthest apart
+in a plane.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import OutOfClass
+from legcal.files import is_plain_name
+from legcal.geometry import Array
+from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
+from legcal.machine.chain import Closure
+from legcal.machine.classification import (
+    CONCURRENT,
+    Axis,
+    LegChain,
+    Step,
+    nearest,
+    off_square,
+    parallel,
+    understand,
+    undirected,
+)
+from legcal.machine.leg import n_frame_legs
+from legcal.machine.schema import LegcalBlock
+from legcal.machine.tree import reference_poses
+from legcal.machine.urdf import Urdf, UrdfJoint
+
+
+def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[LegChain]:
+    """Return the legs between two links, each understood as joint, slider, joint.
+
+    Parameters
+    ----------
+    bodies : Bodies
+        The bodies of the mechanism.
+    urdf : Urdf
+        The tree, for axes.
+    base, platform : str
+        Links.
+
+    Raises
+    ------
+    OutOfClass
+        If the mechanism is not a platform on separate legs of this kind.
+    """
+    ends = bodies.body_of[base], bodies.body_of[platform]
+    if ends[0] == ends[1]:
+        raise OutOfClass(
+            f"{urdf.path}: this is not a parallel mechanism: found the platform '{platform}' fixed "
+            f"to the base '{base}', needed legs between them; correct legcal.base or "
+            "legcal.platform."
+        )
+    origin = np.asarray(bodies.T_body_link[platform].translation)
+    return [understand(steps, origin, urdf.path) for steps in _paths(bodies, urdf, *ends)]
+
+
+def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[Step]]:
+    """Return the joints of every leg from base to platform."""
+    _refuse_second_mechanism(bodies, urdf, base, platform)
+    at: dict[str, list[Connection]] = {}
+    for connection in bodies.connections:
+        _refuse_unsupported(connection, urdf, base, platform)
+        for body in connection.bodies:
+            at.setdefault(body, []).append(connection)
+    paths, used = [], set[int]()
+    for first in at.get(base, []):
+        body, steps, connection = base, list[Step](), first
+        while True:
+            used.add(id(connection))
+            near = connection.bodies.index(body)
+            steps.append(_step(connection, near, urdf))
+            body = connection.bodies[1 - near]
+            if body == platform:
+                break
+            onward = [c for c in at[body] if c is not connection]
+            if body == base or len(onward) != 1 or id(onward[0]) in used:
+                raise OutOfClass(_not_a_chain(urdf, steps, body, base, len(onward)))
+            connection = onward[0]
+        paths.append(steps)
+    stray = [c for c in bodies.connections if id(c) not in used]
+    if stray:
+        raise OutOfClass(
+            f"{urdf.path}: this is not a platform on legs: found {_name(stray[0])} on no chain "
+            "from base to platform, needed every joint on a leg; fix it or remove it."
+        )
+    return paths
+
+
+def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
+    """Refuse loops of other bodies than those that hang together with the platform."""
+    group = {body: body for body in bodies.body_of.values()}
+
+    def find(body: str) -> str:
+        while group[body] != body:
+            body = group[body]
+        return body
+
+    for connection in bodies.connections:
+        if base not in connection.bodies:
+            one, two = (find(body) for body in connection.bodies)
+            group[two] = one
+    others = [
+        next(find(body) for body in c.bodies if body != base)
+        for c in bodies.connections
+        if base in c.bodies and set(c.bodies) != {base}
+    ]
+    for other in others:
+        if other != find(platform) and others.count(other) > 1:
+            member = _most_joined(bodies, {body for body in group if find(body) == other})
+            raise OutOfClass(
+                f"{urdf.path}: the mechanism could not be read: found a second mechanism on the "
+                f"base, with link '{member}', that has no moving body in common with the platform "
+                f"'{platform}', needed one; write each to its own file."
+            )
+
+
+def _most_joined(bodies: Bodies, members: set[str]) -> str:
+    """Return the body of some where most joints meet."""
+    ends = [body for c in bodies.connections for body in c.bodies if body in members]
+    return max(sorted(members), key=ends.count)
+
+
+def _step(connection: Connection, near: int, urdf: Urdf) -> Step:
+    """Return a connection as passed from one of its bodies."""
+    axis = urdf.joints[connection.joint].axis if connection.joint else np.zeros(3)
+    return Step(connection, near, 1 - near, axis)
+
+
+def _refuse_unsupported(connection: Connection, urdf: Urdf, base: str, platform: str) -> None:
+    """Refuse joints that are not part of any leg."""
+    if connection.joint is not None and urdf.joints[connection.joint].type in (
+        "floating",
+        "planar",
+    ):
+        raise OutOfClass(
+            f"{urdf.path}: this mechanism is outside the method: found the "
+            f"{urdf.joints[connection.joint].type} joint '{connection.joint}' inside it, needed "
+            "at most the virtual one that carries the platform; name that one in "
+            "legcal.platform_joint."
+        )
+    if connection.bodies[0] == connection.bodies[1]:
+        raise OutOfClass(
+            f"{urdf.path}: this mechanism is outside the method: found {_name(connection)} "
+            "between two links that are rigidly connected, needed a joint that can move; remove it."
+        )
+    if set(connection.bodies) == {base, platform}:
+        raise OutOfClass(
+            f"{urdf.path}: this mechanism is outside the method: found {_name(connection)} "
+            "directly between base and platform, needed legs; name it in legcal.platform_joint if "
+            "it is the virtual joint that carries the platform."
+        )
+
+
+def _not_a_chain(urdf: Urdf, steps: list[Step], body: str, base: str, n_onward: int) -> str:
+    """Return why the leg that starts with some joints is not a chain."""
+    needed = "needed one unbranched chain from base to platform for each leg"
+    first = steps[0].connection
+    if body == base:
+        found = "returns to the base"
+    elif n_onward == 0:
+        found = f"ends at link '{body}' without reaching the platform"
+    elif n_onward > 1 and _is_an_arm(steps):
+        found = f"carries {n_onward} rods on the moving link '{body}', so that the joints at A move"
+        needed = "needed joints whose centres are fixed in the base"
+    else:
+        found = f"shares link '{body}' with another leg or branches there"
+    return (
+        f"{urdf.path}: this is not a platform on separate legs: the chain that starts with "
+        f"{_name(first)} {found}, {needed}; check closed_loop, legcal.base and legcal.platform."
+    )
+
+
+def _is_an_arm(steps: list[Step]) -> bool:
+    """Say whether joints make an arm whose end moves: one revolute, or several apart."""
+    if any(step.connection.type != "revolute" for step in steps):
+        return False
+    if len(steps) == 1:
+        return True
+    for one, two in pairwise(steps):
+        near, far = nearest(Axis(one.name, *one.line(one.far)), Axis(two.name, *two.line(two.near)))
+        if near is None or far is None or float(np.linalg.norm(far - near)) > CONCURRENT:
+            return True
+    return False
+
+
+def _name(connection: Connection) -> str:
+    """Return a joint or closure as a message names it."""
+    if connection.joint is not None:
+        return f"joint '{connection.joint}'"
+    return f"the 3d closure number {(connection.closure or 0) + 1}"
+
+
+def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
+    """Check that the virtual joint, if there is one, has a type that is covered.
+
+    Raises
+    ------
+    OutOfClass
+        If it is neither floating nor planar, or planar about another axis than its z.
+    """
+    if block.platform_joint is None:
+        return
+    joint = urdf.joints[block.platform_joint]
+    if joint.type not in ("floating", "planar"):
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a {joint.type} "
+            "joint, needed a floating or planar one, which only says where the platform is; "
+            "correct it, or write null if a leg carries the platform."
+        )
+    if joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
+        axis = ", ".join(f"{x:g}" for x in joint.axis)
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
+            f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
+            "plane of its frame; turn its origin rpy instead."
+        )
+
+
+def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> None:
+    """Check that the virtual joint carries the platform from the base.
+
+    Raises
+    ------
+    OutOfClass
+        If its links belong to other bodies.
+    """
+    if block.platform_joint is None:
+        return
+    joint = urdf.joints[block.platform_joint]
+    found = bodies.body_of[joint.parent], bodies.body_of[joint.child]
+    if found != (bodies.body_of[block.base], bodies.body_of[block.platform]):
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found it between the "
+            f"parent '{joint.parent}' and the child '{joint.child}', needed '{block.base}' and "
+            f"'{block.platform}'; name the joint that carries the platform, or write null."
+        )
+
+
+def check_plane(joint: UrdfJoint, normal: Array | None, path: Path) -> None:
+    """Check that a planar virtual joint lets the platform move as its legs do.
+
+    Parameters
+    ----------
+    joint : UrdfJoint
+        The virtual joint.
+    normal : (3,) array or None
+        The normal of the plane of motion in the parent link; None for a mechanism in space.
+    path : Path
+        The file that names it.
+
+    Raises
+    ------
+    OutOfClass
+        If the mechanism moves in space or in another plane.
+    """
+    if joint.type != "planar":
+        return
+    if normal is None:
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint, "
+            "needed a floating one, because the axes of the legs do not let the platform move in "
+            "one plane; correct its type."
+        )
+    z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
+    if not parallel(z, normal):
+        tilt = 90.0 - np.degrees(off_square(z, normal))
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found its plane "
+            f"{tilt:.4g} deg from the plane in which the legs move, needed the same plane within "
+            "0.057 deg; correct its origin rpy."
+        )
+
+
+Normals = tuple[Array, Array]
+
+
+def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
+    """Return the normal of the plane in which a mechanism moves, None if it moves in space.
+
+    All joints must be revolutes, all of their axes parallel; the sliders are perpendicular to
+    them in every leg of the class.
+
+    Parameters
+    ----------
+    chains : sequence of LegChain
+        The legs.
+
+    Returns
+    -------
+    tuple of (3,) array or None
+        The unit normal in the bodies of base and platform, the same way up in both.
+    """
+    normals = [_normals(chain) for chain in chains]
+    first = normals[0]
+    if first is None:
+        return None
+    for other in normals:
+        if other is None or not all(parallel(a, b) for a, b in zip(first, other, strict=True)):
+            return None
+    return first
+
+
+def _normals(chain: LegChain) -> Normals | None:
+    """Return the direction of all axes of a leg in base and platform, None if they differ."""
+    if chain.base.letter != "R" or chain.platform.letter not in ("R", ""):
+        return None
+    v, w = chain.base.inner, chain.platform.inner
+    if v is None or (w is not None and not parallel(v, w)):
+        return None
+    return v, np.asarray(chain.T_zero.rotation.inv().apply(v))
+
+
+def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform]) -> Normals:
+    """Return the normals in the links of base and platform.
+
+    The last component that is not zero is positive in the base.
+    """
+    base, platform = (
+        np.asarray(T.rotation.inv().apply(normal))
+        for normal, T in zip(normals, T_body_link, strict=True)
+    )
+    return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
+
+
+def normals_of_closures(
+    in_links: Normals | None, closures: Sequence[Closure], block: LegcalBlock, urdf: Urdf
+) -> list[Array | None]:
+    """Return for which closures it is enough to hold in the plane, with its normal there.
+
+    Closures of a planar mechanism repeat that it is planar, and contradict each other by what
+    its axes are rounded. All are held in the plane alone; but where a floating joint carries the
+    platform, one more is needed to hold that in the plane.
+
+    Parameters
+    ----------
+    in_links : tuple of (3,) array or None
+        The normals in the links of base and platform; None in space.
+    closures : sequence of Closure
+        What coincides.
+    block : LegcalBlock
+        The links of base and platform, and the virtual joint.
+    urdf : Urdf
+        The tree.
+
+    Returns
+    -------
+    list of (3,) array or None
+        The normal in the first frame of each closure, None where everything is to hold.
+    """
+    if in_links is None:
+        return [None] * len(closures)
+    poses, parents = reference_poses(urdf), {j.child: j for j in urdf.joints.values()}
+    virtual = None if block.platform_joint is None else urdf.joints[block.platform_joint]
+    floats = virtual is not None and virtual.type == "floating"
+    normals: list[Array | None] = []
+    for closure in closures:
+        link = above = frame_link(urdf, closure.frame_1)
+        while above in parents and parents[above] is not virtual:
+            above = parents[above].parent
+        root, normal = (block.base, in_links[0])
+        if above in parents and floats:
+            root, normal = (block.platform, in_links[1])
+        turn = poses[link].rotation.inv() * poses[root].rotation
+        normals.append(np.asarray(turn.apply(normal)) if closure.kind == "6d" else None)
+    return [None, *normals[1:]] if floats else normals
+
+
+VIRTUAL = ("floating", "planar")
+TIE = 1e-6  # of the largest triangle
+
+
+def propose_block(
+    urdf: Urdf, closures: Sequence[Closure], motors: Sequence[str], path: Path
+) -> LegcalBlock:
+    """Return the block ``legcal`` that a file without one means.
+
+    Parameters
+    ----------
+    urdf : Urdf
+        The tree.
+    closures : sequence of Closure
+        What coincides.
+    motors : sequence of str
+        The joints of ``name_mot``.
+    path : Path
+        The file, for messages.
+
+    Returns
+    -------
+    LegcalBlock
+        Without ``home``.
+
+    Raises
+    ------
+    OutOfClass
+        If no body is the platform of separate legs of the class.
+    """
+    virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
+    bodies = rigid_bodies(urdf, closures, None)
+    base = bodies.body_of[urdf.root]
+    real = replace(bodies, connections=_without_virtual(bodies, urdf))
+    carried = [bodies.body_of[j.child] for j in virtual]
+    platform = _platform_body(real, base, carried, urdf, path)
+    carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
+        base, platform}]  # fmt: skip
+    joint = carrier[0].name if carrier else None
+    link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
+    bodies = rigid_bodies(urdf, closures, joint)
+    chains = in_order(find_chains(bodies, urdf, urdf.root, link), motors, urdf)
+    joints = [any_joint(chain) for chain in chains]
+    names = _leg_names(joints)
+    block = LegcalBlock(
+        version=1,
+        base=urdf.root,
+        platform=link,
+        platform_joint=joint,
+        legs=dict(zip(names, joints, strict=True)),
+    )
+    return block.model_copy(update={"base_frame": propose_frame(names, chains)})
+
+
+def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]:
+    """Return the legs to define frames with: those whose joints span most on base and platform.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The legs.
+    chains : sequence of LegChain
+        Their joints.
+
+    Returns
+    -------
+    list of str
+        Three legs, or two of a planar mechanism, or all where there are fewer; the first ones
+        where several span the same.
+    """
+    normals = plane_of_motion(chains)
+    count = n_frame_legs(spatial=normals is None)
+    if len(names) <= count:
+        return list(names)
+    ends = (
+        np.array([chain.base.centre_near for chain in chains]),
+        np.array([chain.platform.centre_far for chain in chains]),
+    )
+    if normals is not None:
+        ends = _flat(ends[0], normals[0]), _flat(ends[1], normals[1])
+    chosen = list(combinations(range(len(names)), count))
+    spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
+    first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
+    return [names[j] for j in chosen[first]]
+
+
+def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> list[LegChain]:
+    """Return legs in the order of their motors, then those without one in the order of the URDF."""
+    rank = {name: i for i, name in enumerate([*urdf.joints, *motors])}
+    rank |= {name: i - len(motors) for i, name in enumerate(motors)}
+    return sorted(chains, key=lambda chain: rank[any_joint(chain)])
+
+
+def any_joint(chain: LegChain) -> str:
+    """Return a joint that names a leg: its slider, or the first one that it has."""
+    named = [s.connection.joint for s in chain.steps if s.connection.joint]
+    return chain.motor or (named[0] if named else "")
+
+
+def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:
+    """Return the connections that are joints of legs."""
+    return tuple(
+        c for c in bodies.connections if c.joint is None or urdf.joints[c.joint].type not in VIRTUAL
+    )
+
+
+def _platform_body(
+    bodies: Bodies, base: str, carried: Sequence[str], urdf: Urdf, path: Path
+) -> str:
+    """Return the body where the legs end: every chain from the base to it is a leg of the class."""
+    at: dict[str, list[str]] = {}
+    for connection in bodies.connections:
+        for here, there in (connection.bodies, connection.bodies[::-1]):
+            at.setdefault(here, []).append(there)
+    n_base = len(at.get(base, []))
+    if n_base < 2:
+        joints = "1 joint" if n_base == 1 else "no joint"
+        raise OutOfClass(
+            f"{path}: this is not a parallel mechanism: found {joints} on the base (the root of "
+            "the URDF), needed one for each leg; write legcal.base, legcal.platform and "
+            "legcal.legs if another link is the base."
+        )
+    meeting = [body for body in at if body != base and len(at[body]) > 2]
+    candidates = meeting or [body for body in at if body != base]
+    candidates = [body for body in candidates if body in carried] or candidates
+    candidates.sort(key=lambda body: (base in at[body], -len(at[body])))  # arms come last
+    found, reasons = [], list[OutOfClass]()
+    for body in candidates:
+        try:
+            find_chains(bodies, urdf, urdf.root, body)
+        except OutOfClass as error:
+            reasons.append(error)
+        else:
+            found.append(body)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise OutOfClass(
+            f"{path}: no platform could be proposed: found several links where legs could end "
+            f"({', '.join(found)}), needed one; write legcal.platform and legcal.legs."
+        )
+    if meeting:
+        raise reasons[0]
+    raise OutOfClass(
+        f"{path}: this mechanism is outside the method: found one closed chain in which no link is "
+        "a platform on legs, because on each side of any link more than a slider or a rod moves "
+        "the joint at A; needed legs of type joint, slider or rod, joint; this machine cannot be "
+        "calibrated this way."
+    )
+
+
+def _main_link(urdf: Urdf, closures: Sequence[Closure], bodies: Bodies, body: str) -> str:
+    """Return the link of a body that most others hang from, or close on."""
+    links = [link for link in urdf.links if bodies.body_of[link] == body]
+    uses = dict.fromkeys(links, 0)
+    for joint in urdf.joints.values():
+        if joint.parent in uses:
+            uses[joint.parent] += 1
+    for closure in closures:
+        for frame in (closure.frame_1, closure.frame_2):
+            if frame_link(urdf, frame) in uses:
+                uses[frame_link(urdf, frame)] += 1
+    return max(links, key=lambda link: uses[link])
+
+
+def _leg_names(joints: Sequence[str]) -> list[str]:
+    """Return names of legs made of the names of their joints where these tell them apart."""
+    fronts = [joint.split("_")[0] for joint in joints]
+    if len(set(fronts)) == len(fronts) and all(map(is_plain_name, fronts)):
+        return fronts
+    return [f"leg{j + 1}" for j in range(len(joints))]
+
+
+def _flat(points: Array, normal: Array) -> Array:
+    """Return points without their heights along a normal."""
+    return np.asarray(points - (points @ normal)[:, None] * normal)
+
+
+def _span(points: Array) -> float:
+    """Return the distance of two points [m], or twice the area of a triangle [m^2]."""
+    if len(points) == 2:
+        return float(np.linalg.norm(points[1] - points[0]))
+    return float(np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0])))

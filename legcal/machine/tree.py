@@ -1,0 +1,432 @@
+"""Closures of formats that join two links by a joint, written as frames that coincide.
+
+A point becomes a ``3d`` pair and a weld a ``6d`` pair. A revolute or universal joint that closes a
+loop becomes one or two revolute joints with massless links, welded to the other side.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from html import escape
+from math import pi
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from lxml import etree
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import OutOfClass
+from legcal.geometry import Array, roll_pitch_yaw
+from legcal.machine.bodies import frame_link
+from legcal.machine.schema import MechanismFile
+from legcal.machine.urdf import Urdf
+
+DRAWING = (
+    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("write legcal.home", "draw the machine nearer to closed"),
+    ("legcal.home", "the pose that the file draws"),
+    (", legcal.base and legcal.platform", " and that the root is the base"),
+    ("legcal.base or legcal.platform", "the joints between them"),
+    ("write legcal.", "write a mechanism YAML with legcal."),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A mechanism as one of its formats has it.
+
+    Attributes
+    ----------
+    path : Path
+        The file that closes the loops; messages name it.
+    file : MechanismFile
+        Closures, motors and the ``legcal`` block, as a mechanism YAML would have them.
+    urdf : Urdf
+        The tree. ``urdf.content`` is the URDF on disk, or one that was made of another format.
+    converted : bool
+        Whether ``urdf.content`` was made of another format, so that ``urdf.path`` names the file
+        of that format.
+    notes : tuple of str
+        What the reader should know of the conversion, one sentence each.
+    values : mapping of str to float
+        Joint values [rad, m] of the configuration that the file is drawn in; others are zero.
+    poses : mapping of str to RigidTransform or None
+        Where the links are in a closed configuration near that one, in the root link; None
+        where none was looked for or found.
+    """
+
+    path: Path
+    file: MechanismFile
+    urdf: Urdf
+    converted: bool = False
+    notes: tuple[str, ...] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+    poses: Mapping[str, RigidTransform] | None = None
+    words: Sequence[tuple[str, str]] = ()
+
+    def in_its_words(self, problem: str) -> str:
+        """Return a message that names keys of the YAML in the words of this format."""
+        for key, word in self.words:
+            problem = problem.replace(key, word)
+        return problem
+
+
+FULL_TURN = 2.0 * pi
+EYE = RigidTransform.identity()
+
+
+@dataclass(frozen=True, eq=False)
+class TextCylinder:
+    """A visual cylinder on a link: its pose there, radius and length [m]."""
+
+    T_link_cylinder: RigidTransform
+    radius: float
+    length: float
+
+
+@dataclass
+class TreeText:
+    """The lines of a URDF while it is put together.
+
+    Attributes
+    ----------
+    links, joints : dict of str to str
+        The line of every link and joint, by name.
+    """
+
+    links: dict[str, str] = field(default_factory=dict)
+    joints: dict[str, str] = field(default_factory=dict)
+
+    def unused(self, name: str, others: Set[str] = frozenset()) -> str:
+        """Return a name that no link and no joint has yet: the given one, or it with a number."""
+        taken = self.links.keys() | self.joints.keys() | others
+        number, found = 1, name
+        while found in taken:
+            number += 1
+            found = f"{name}_{number}"
+        return found
+
+    def link(self, name: str, cylinders: tuple[TextCylinder, ...] = ()) -> None:
+        """Add a link with its visible cylinders."""
+        self.show(
+            name, "".join(visual(origin(c.T_link_cylinder), c.radius, c.length) for c in cylinders)
+        )
+
+    def show(self, name: str, visuals: str) -> None:
+        """Add a link, or write it anew where it stands, with its visuals."""
+        inside = f">{visuals}</link>" if visuals else "/>"
+        self.links[name] = f"  <link name={_quoted(name)}{inside}"
+
+    def joint(
+        self,
+        name: str,
+        kind: str,
+        parent: str,
+        child: str,
+        T_parent_origin: RigidTransform = EYE,
+        axis: Array | None = None,
+        limits: tuple[float, float] | None = (-FULL_TURN, FULL_TURN),
+    ) -> None:
+        """Add a joint; ``axis`` and ``limits`` [rad] or [m] are those of a moving one."""
+        moving = ""
+        if axis is not None:
+            moving = along(axis) + limit(limits)
+        self.connect(name, kind, (parent, child), origin(T_parent_origin) + moving)
+
+    def connect(self, name: str, kind: str, links: tuple[str, str], inside: str) -> None:
+        """Add a joint between parent and child with its elements, the origin first."""
+        parent, child = (_quoted(link) for link in links)
+        self.joints[name] = (
+            f'  <joint name={_quoted(name)} type="{kind}"><parent link={parent}/>'
+            f"<child link={child}/>{inside}</joint>"
+        )
+
+    def body(self) -> str:
+        """Return the lines of all links and joints."""
+        return "\n".join([*self.links.values(), *self.joints.values()])
+
+    def robot(self, name: str) -> bytes:
+        """Return the whole URDF."""
+        head = f'<?xml version="1.0" encoding="utf-8"?>\n<robot name={_quoted(name)}>\n'
+        return f"{head}{self.body()}\n</robot>\n".encode()
+
+
+def origin(T_parent_origin: RigidTransform) -> str:
+    """Return the ``<origin>`` of a rigid motion [m, rad]."""
+    return place(np.asarray(T_parent_origin.translation), T_parent_origin.rotation.as_matrix())
+
+
+def place(xyz: Array, rotation: Array) -> str:
+    """Return the ``<origin>`` at a point [m] with a rotation matrix."""
+    return f'<origin xyz="{_numbers(xyz)}" rpy="{_numbers(roll_pitch_yaw(rotation))}"/>'
+
+
+def along(axis: Array) -> str:
+    """Return the ``<axis>`` of a joint."""
+    return f'<axis xyz="{_numbers(axis)}"/>'
+
+
+def visual(at: str, radius: float, length: float) -> str:
+    """Return the ``<visual>`` of a cylinder at an ``<origin>``."""
+    shape = f'<cylinder radius="{radius!r}" length="{length!r}"/>'
+    return f"<visual>{at}<geometry>{shape}</geometry></visual>"
+
+
+def limit(limits: tuple[float, float] | None) -> str:
+    """Return the ``<limit>`` of a joint; a URDF must name an effort and a velocity too."""
+    ends = ""
+    if limits is not None:
+        lower, upper = (float(x) for x in limits)
+        ends = f'lower="{lower!r}" upper="{upper!r}" '
+    return f'<limit {ends}effort="1000" velocity="1"/>'
+
+
+def _numbers(values: Array) -> str:
+    """Return numbers so that they are read back exactly, rounding noise of zero as zero."""
+    return " ".join(repr(float(x)) if abs(x) > 1e-15 else "0.0" for x in values)
+
+
+def _quoted(text: str) -> str:
+    """Return a text as the value of an attribute."""
+    return f'"{escape(text)}"'
+
+
+def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Path) -> None:
+    """Check that a file holds one mechanism: loops that share a body other than the ground.
+
+    Raises
+    ------
+    OutOfClass
+        If it holds two, or more.
+    """
+    groups = moving_groups(urdf, closures)
+    closed = [links for links, is_closed in groups if is_closed]
+    if len(closed) > 1:
+        names = ", ".join(f"'{links[0]}'" for links in closed[:4])
+        raise OutOfClass(
+            f"{path}: the mechanism could not be read: found {len(closed)} mechanisms, which have "
+            f"no moving body in common (with {names}), needed one; write each to its own file."
+        )
+
+
+def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[list[str], bool]]:
+    """Return the links that joints and closures join, without those of the ground.
+
+    Parameters
+    ----------
+    urdf : Urdf
+        The tree. The ground is its root and what fixed joints hold on it.
+    closures : iterable of pairs of str
+        Frames that coincide.
+
+    Returns
+    -------
+    list of (links, closed)
+        The links of each group in the order of the file, and whether a closure is among them.
+    """
+    group = {link: link for link in urdf.links}
+
+    def find(link: str) -> str:
+        while group[link] != link:
+            group[link] = group[group[link]]
+            link = group[link]
+        return link
+
+    for joint in urdf.joints.values():
+        if not joint.moves:
+            group[find(joint.child)] = find(joint.parent)
+    ground = find(urdf.root)
+    pairs = [(j.parent, j.child) for j in urdf.joints.values() if j.type != "floating" and j.moves]
+    ends = [(frame_link(urdf, one), frame_link(urdf, two)) for one, two in closures]
+    for one, two in (*pairs, *ends):
+        if ground not in (find(one), find(two)):
+            group[find(two)] = find(one)
+    closed = {find(link) for pair in ends for link in pair} - {ground}
+    groups: dict[str, list[str]] = {}
+    for link in urdf.links:
+        if find(link) != ground:
+            groups.setdefault(find(link), []).append(link)
+    return [(links, name in closed) for name, links in groups.items()]
+
+
+def reference_poses(urdf: Urdf) -> dict[str, RigidTransform]:
+    """Return the pose of every link in the root link, all joint values zero."""
+    children: dict[str, list[str]] = {}
+    for joint in urdf.joints.values():
+        children.setdefault(joint.parent, []).append(joint.name)
+    poses = {urdf.root: RigidTransform.identity()}
+    pending = [urdf.root]
+    while pending:
+        link = pending.pop()
+        for name in children.get(link, ()):
+            joint = urdf.joints[name]
+            poses[joint.child] = poses[link] * joint.T_parent_origin
+            pending.append(joint.child)
+    return poses
+
+
+TRAVEL_OF_SIZE = 0.05
+
+
+def sliders_without_travel(urdf: Urdf) -> list[str]:
+    """Return the prismatic joints of a URDF that have no limits."""
+    joints = urdf.joints.values()
+    return [joint.name for joint in joints if joint.type == "prismatic" and joint.limits is None]
+
+
+def assumed_travel(poses: Mapping[str, RigidTransform]) -> tuple[float, float]:
+    """Return a travel for sliders that have none written: 5 % of the mechanism to either side.
+
+    Parameters
+    ----------
+    poses : mapping of str to RigidTransform
+        The links where the mechanism is closed.
+
+    Returns
+    -------
+    tuple of float
+        Lower and upper limit [m], to one significant digit.
+    """
+    points = np.array([pose.translation for pose in poses.values()])
+    size = float(np.ptp(points, axis=0).max())
+    reach = float(f"{TRAVEL_OF_SIZE * size:.0e}") if size > 0.0 else TRAVEL_OF_SIZE
+    return -reach, reach
+
+
+def travel_note(sliders: Sequence[str], travel: tuple[float, float]) -> str:
+    """Return what the reader must know of sliders whose travel was assumed."""
+    names = ", ".join(f"'{name}'" for name in sliders[:6])
+    return (
+        f"The file gives no travel for {len(sliders)} sliders ({names}): {travel[1]:g} m to either "
+        "side of where it is closed was assumed; write their limits."
+    )
+
+
+def set_travel(
+    robot: etree._Element, readings: Mapping[str, float], travel: tuple[float, float]
+) -> None:
+    """Write the travel of sliders about some readings [m] into a URDF."""
+    for element in robot:
+        name = str(element.get("name"))
+        if element.tag == "joint" and name in readings:
+            limit = element.find("limit")
+            if limit is None:
+                limit = etree.SubElement(element, "limit")
+            limit.set("lower", repr(readings[name] + travel[0]))
+            limit.set("upper", repr(readings[name] + travel[1]))
+            for key in ("effort", "velocity"):
+                limit.set(key, limit.get(key, "1000"))
+
+
+LoopKind = Literal["point", "weld", "revolute", "universal"]
+_X, _Y, _Z = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A joint between two links that closes a loop of the tree.
+
+    Attributes
+    ----------
+    name : str
+        Its name; new links and joints are named after it.
+    kind : {"point", "weld", "revolute", "universal"}
+        What of both frames coincides.
+    links : tuple of str
+        The two links.
+    T_link_frame : tuple of RigidTransform
+        The frame of the joint in either link.
+    axes : tuple of (3,) array
+        Unit axis in either frame: the common one of a revolute joint; of a universal one the
+        axis that is fixed in the first link and the axis that is fixed in the second.
+    """
+
+    name: str
+    kind: LoopKind
+    links: tuple[str, str]
+    T_link_frame: tuple[RigidTransform, RigidTransform]
+    axes: tuple[Array, Array] = (_X, _X)
+
+
+def close_loop(
+    loop: Loop, text: TreeText, poses: Mapping[str, RigidTransform]
+) -> tuple[list[str], str]:
+    """Add the frames of a loop to a tree and return the closure.
+
+    Parameters
+    ----------
+    loop : Loop
+        The joint that closes it.
+    text : TreeText
+        The tree; frames are added on links of their own, so that calibration can move them.
+    poses : mapping of str to RigidTransform
+        A configuration that is closed, or near one: the zeros of new joints are taken from it.
+
+    Returns
+    -------
+    frames : list of str
+        The two links that coincide.
+    type : str
+        ``3d`` or ``6d``.
+    """
+    one, two = loop.T_link_frame
+    if loop.kind in ("revolute", "universal"):
+        one, two = _with_axes(loop, poses)
+    ends = []
+    for number, (link, T_link_frame) in enumerate(
+        zip(loop.links, (one, two), strict=True), start=1
+    ):
+        frame = text.unused(f"{loop.name}_{number}")
+        text.link(frame)
+        text.joint(text.unused(f"{frame}_frame"), "fixed", link, frame, T_link_frame)
+        ends.append(frame)
+    turns = {"revolute": (_Z,), "universal": (_X, _Y)}.get(loop.kind, ())
+    for axis in turns:
+        turned = text.unused(f"{loop.name}_turned")
+        text.link(turned)
+        text.joint(text.unused(f"{turned}_joint"), "revolute", ends[0], turned, EYE, axis)
+        ends[0] = turned
+    return ends, "3d" if loop.kind == "point" else "6d"
+
+
+def _with_axes(
+    loop: Loop, poses: Mapping[str, RigidTransform]
+) -> tuple[RigidTransform, RigidTransform]:
+    """Return the frames turned onto the axes of the joint, alike where the loop is closed."""
+    one, two = loop.T_link_frame
+    first, second = (
+        T.rotation.apply(axis) for T, axis in zip(loop.T_link_frame, loop.axes, strict=True)
+    )
+    R_two_one = poses[loop.links[1]].rotation.inv() * poses[loop.links[0]].rotation
+    if loop.kind == "revolute":
+        across = _across(first, np.roll(first, 1))
+        across_two = _across(second, R_two_one.apply(across))
+        rotations = (
+            _columns(across, np.cross(first, across), first),
+            _columns(across_two, np.cross(second, across_two), second),
+        )
+    else:
+        along_y = _across(first, R_two_one.inv().apply(second))
+        along_x = _across(second, R_two_one.apply(first))
+        rotations = (
+            _columns(first, along_y, np.cross(first, along_y)),
+            _columns(along_x, second, np.cross(along_x, second)),
+        )
+    return (
+        RigidTransform.from_components(one.translation, rotations[0]),
+        RigidTransform.from_components(two.translation, rotations[1]),
+    )
+
+
+def _across(axis: Array, direction: Array) -> Array:
+    """Return the unit part of a direction across an axis, or another one where it has none."""
+    for candidate in (direction, np.eye(3)[int(np.argmin(np.abs(axis)))]):
+        part = candidate - (candidate @ axis) * axis
+        if np.linalg.norm(part) > 1e-3 * np.linalg.norm(candidate):
+            break
+    return np.asarray(part / np.linalg.norm(part))
+
+
+def _columns(x: Array, y: Array, z: Array) -> Rotation:
+    """Return the rotation whose columns are three perpendicular unit vectors."""
+    return Rotation.from_matrix(np.column_stack([x, y, z]))

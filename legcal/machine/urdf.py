@@ -1,0 +1,697 @@
+"""Changing attribute values of a URDF in place: every other byte of the file stays as it was."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+from xml.parsers import expat
+
+import numpy as np
+from lxml import etree
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import ModelError
+from legcal.geometry import Array, motion_of
+from legcal.machine.files import read_file
+
+
+def parse_robot(path: Path, content: bytes) -> etree._Element:
+    """Return the ``<robot>`` of a URDF, without comments, entities or the network.
+
+    Raises
+    ------
+    ModelError
+        If it is not well-formed XML in UTF-8, has a document type, or is no named robot.
+    """
+    robot = parse_xml(path, content, "URDF")
+    if robot.tag != "robot":
+        raise ModelError(
+            f"{path}, line {robot.sourceline}: the URDF could not be read: found <{robot.tag}> "
+            "as its outermost element, needed <robot>; give the URDF of the mechanism."
+        )
+    if not robot.get("name", "").strip():
+        raise ModelError(
+            f"{path}, line {robot.sourceline}: the URDF could not be read: found <robot> without "
+            "a name, needed one; write <robot name=...>."
+        )
+    return robot
+
+
+def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
+    """Return the outermost element of an XML file, without comments, entities or the network.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    content : bytes
+        What it holds.
+    what : str
+        What it is, for messages: ``URDF``.
+
+    Raises
+    ------
+    ModelError
+        If it is not well-formed XML in UTF-8 or has a document type.
+    """
+    parser = etree.XMLParser(
+        resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False,
+        remove_comments=True, remove_pis=True,
+    )  # fmt: skip
+    try:
+        root = etree.fromstring(content, parser)
+    except etree.XMLSyntaxError as error:
+        line = error.lineno or 1
+        raise ModelError(
+            f"{path}, line {line}: the {what} could not be read: found {error.msg}, needed "
+            "well-formed XML; mend that line, or copy the file again if it was cut off."
+        ) from error
+    document: Any = root.getroottree().docinfo
+    if document.doctype or document.internalDTD is not None:
+        raise ModelError(
+            f"{path}: the {what} could not be read: found a document type (<!DOCTYPE>), whose "
+            "entities are never expanded, needed plain XML; remove it."
+        )
+    try:
+        content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ModelError(
+            f"{path}: the {what} could not be read: found text in another encoding, needed "
+            "UTF-8; save it as UTF-8."
+        ) from error
+    return root
+
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
+
+LARGEST = 1e12  # squares of larger numbers overflow; none of them is a length, an angle or a limit
+
+# element -> attribute -> how many numbers it holds, and whether they must be positive
+_NUMERIC: dict[str, dict[str, tuple[int, bool]]] = {
+    "origin": {"xyz": (3, False), "rpy": (3, False)},
+    "axis": {"xyz": (3, False)},
+    "limit": dict.fromkeys(("lower", "upper", "effort", "velocity"), (1, False)),
+    "mass": {"value": (1, False)},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), (1, False)),
+    "cylinder": {"radius": (1, True), "length": (1, True)},
+    "sphere": {"radius": (1, True)},
+    "box": {"size": (3, False)},
+    "mesh": {"scale": (3, False)},
+    "dynamics": {"damping": (1, False), "friction": (1, False)},
+}
+
+
+class Problems:
+    """The problems of one URDF, collected to be raised together."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.sentences: list[str] = []
+
+    def __len__(self) -> int:
+        return len(self.sentences)
+
+    def add(self, element: etree._Element, found: str, remedy: str) -> None:
+        """Note what is wrong with an element of the file and how to mend it."""
+        what = f"{element.tag} '{element.get('name')}'" if element.get("name") else element.tag
+        self.sentences.append(
+            f"{self.path}, line {element.sourceline}: {what} could not be used: it {found}; "
+            f"{remedy}{'' if remedy.endswith('?') else '.'}"
+        )
+
+    def raise_if_any(self) -> None:
+        """Raise all problems as one error."""
+        if self.sentences:
+            raise ModelError(self.sentences)
+
+
+def number_list(text: str, count: int) -> list[float] | None:
+    """Return ``count`` finite numbers of sensible size, with spaces between them, or None."""
+    words = text.split()
+    if len(words) != count or not all(_NUMBER.match(word) for word in words):
+        return None
+    numbers = [float(word) for word in words]
+    return numbers if all(math.isfinite(x) and abs(x) < LARGEST for x in numbers) else None
+
+
+def check_numbers(element: etree._Element, problems: Problems) -> None:
+    """Check every number that describes a link or a joint."""
+    for part in element.iter(*_NUMERIC):
+        for attribute, (count, positive) in _NUMERIC[str(part.tag)].items():
+            text = part.get(attribute)
+            if text is None:
+                if part.tag == "cylinder":
+                    problems.add(element, f"has a <cylinder> without {attribute}", "write it [m]")
+                continue
+            numbers = number_list(text, count)
+            if numbers is None:
+                needed = "a finite number" if count == 1 else f"{count} finite numbers"
+                problems.add(
+                    element,
+                    f'has <{part.tag} {attribute}="{_short(text)}">, needed {needed}',
+                    "correct the value",
+                )
+            elif positive and min(numbers) <= 0.0:
+                problems.add(
+                    element,
+                    f'has <{part.tag} {attribute}="{_short(text)}">, needed more than zero',
+                    "correct the value",
+                )
+
+
+def check_tree(
+    links: list[etree._Element], joints: list[etree._Element], problems: Problems
+) -> str:
+    """Check that links and joints are one tree, and return its root link."""
+    for elements in (links, joints):
+        _check_names(elements, problems)
+    known = {e.get("name", "") for e in links}
+    children: dict[str, list[str]] = {}
+    parent_joint: dict[str, str] = {}
+    for joint in joints:
+        ends = {}
+        for tag in ("parent", "child"):
+            end = joint.find(tag)
+            link = None if end is None else end.get("link")
+            if link is None:
+                problems.add(joint, f"has no <{tag} link=...>", "name the link")
+            elif link not in known:
+                problems.add(
+                    joint, f"names the {tag} link '{link}', which is not in the file",
+                    "correct the name",
+                )  # fmt: skip
+            else:
+                ends[tag] = link
+        if len(ends) < 2:
+            continue
+        child = ends["child"]
+        if child in parent_joint:
+            problems.add(
+                joint,
+                f"gives the link '{child}' a second parent (the first is by joint "
+                f"'{parent_joint[child]}')",
+                "a URDF is a tree: give the loop's end a link of its own and close the loop in "
+                "closed_loop of the mechanism YAML",
+            )
+            continue
+        parent_joint[child] = joint.get("name", "")
+        children.setdefault(ends["parent"], []).append(child)
+    return _root(links, parent_joint, children, problems)
+
+
+def _check_names(elements: list[etree._Element], problems: Problems) -> None:
+    """Check that every element has a name of its own."""
+    counts = Counter(e.get("name", "") for e in elements)
+    seen: set[str] = set()
+    for element in elements:
+        name = element.get("name", "")
+        if not name.strip():
+            problems.add(element, "has no name", "name it")
+        elif name in seen:
+            problems.add(
+                element, f"has a name that {counts[name]} of them share", "give each its own name"
+            )
+        seen.add(name)
+
+
+def _root(
+    links: list[etree._Element],
+    parent_joint: dict[str, str],
+    children: dict[str, list[str]],
+    problems: Problems,
+) -> str:
+    """Return the one link without a parent, from which all others must hang."""
+    roots = [e for e in links if e.get("name", "") not in parent_joint]
+    if not links:
+        problems.sentences.append(
+            f"{problems.path}: the URDF could not be used: found no <link>, needed the links of a "
+            "mechanism; expand it with xacro first if it is a xacro file."
+        )
+        return ""
+    if len(roots) > 1:
+        names = ", ".join(f"'{e.get('name')}'" for e in roots[:6])
+        problems.sentences.append(
+            f"{problems.path}: the URDF could not be used: found {len(roots)} links without a "
+            f"parent ({names}), needed one; join them with joints, a platform by a floating one."
+        )
+    root = roots[0].get("name", "") if roots else ""
+    reached: set[str] = set()
+    pending = [e.get("name", "") for e in roots]
+    while pending:
+        link = pending.pop()
+        if link not in reached:
+            reached.add(link)
+            pending.extend(children.get(link, ()))
+    cyclic = [e.get("name", "") for e in links if e.get("name", "") not in reached]
+    if cyclic:
+        problems.sentences.append(
+            f"{problems.path}: the URDF could not be used: the links "
+            f"{', '.join(repr(name) for name in cyclic[:6])} hang from each other in a cycle, "
+            "needed a tree; cut the loop and close it in closed_loop of the mechanism YAML."
+        )
+    return root
+
+
+def _short(text: str) -> str:
+    """Return a value, cut to what a message can show."""
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
+JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "floating", "planar")
+LOOP_TAGS = ("loop_joint", "constraint")
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """One joint of a URDF.
+
+    Attributes
+    ----------
+    name, type, parent, child : str
+        As in the file; ``parent`` and ``child`` are links.
+    T_parent_origin : RigidTransform
+        The joint frame in the parent link, at joint value zero [m].
+    axis : (3,) array
+        Unit axis in the joint frame.
+    limits : tuple of float or None
+        Lower and upper limit [rad] or [m].
+    line : int
+        The line of the file.
+    """
+
+    name: str
+    type: JointType
+    parent: str
+    child: str
+    T_parent_origin: RigidTransform
+    axis: Array
+    limits: tuple[float, float] | None
+    line: int
+
+    @property
+    def moves(self) -> bool:
+        """Whether the joint is not fixed."""
+        return self.type != "fixed"
+
+
+@dataclass(frozen=True, eq=False)
+class Urdf:
+    """A URDF whose tree, names and numbers have been checked.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    content : bytes
+        The file as it stands on disk, or the URDF that was made of another format.
+    name : str
+        The robot's name.
+    links : tuple of str
+        Link names in the order of the file.
+    joints : dict of str to UrdfJoint
+        Joints by name in the order of the file.
+    root : str
+        The link without a parent.
+    has_cylinders : bool
+        Whether any visual is a cylinder.
+    """
+
+    path: Path
+    content: bytes
+    name: str
+    links: tuple[str, ...]
+    joints: dict[str, UrdfJoint]
+    root: str
+    has_cylinders: bool
+
+    @property
+    def text(self) -> str:
+        """The XML as text."""
+        return self.content.decode("utf-8-sig")
+
+
+def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
+    """Return the tree of a URDF file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    travel_needed : bool
+        Whether a prismatic joint without limits is refused; else its limits are None.
+
+    Raises
+    ------
+    ModelError
+        If the file is missing or not XML, has a document type or entities, or if its links,
+        joints or numbers do not describe one tree; one sentence a problem, with line numbers.
+    """
+    return parse_urdf(path, read_file(path, "URDF"), travel_needed=travel_needed)
+
+
+def parse_urdf(path: Path, content: bytes, *, travel_needed: bool = True) -> Urdf:
+    """Return the tree of a URDF that was read before.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    content : bytes
+        What it holds.
+    travel_needed : bool
+        Whether a prismatic joint without limits is refused; else its limits are None.
+
+    Raises
+    ------
+    ModelError
+        As :func:`read_urdf`, of whose tests this has all but those of the file itself.
+    """
+    robot = parse_robot(path, content)
+    problems = Problems(path)
+    for element in robot:
+        if element.tag in LOOP_TAGS:
+            problems.add(
+                element,
+                f"closes a loop with <{element.tag}>, which is not read beside a mechanism YAML",
+                "write the pair of frames in closed_loop of the mechanism YAML",
+            )
+    return checked_tree(robot, path, content, problems, travel_needed=travel_needed)
+
+
+def checked_tree(
+    robot: etree._Element,
+    path: Path,
+    content: bytes,
+    problems: Problems,
+    *,
+    travel_needed: bool = True,
+) -> Urdf:
+    """Return the tree of a ``<robot>``, whatever else it holds; see :func:`parse_urdf`."""
+    links = [e for e in robot if e.tag == "link"]
+    joints = [e for e in robot if e.tag == "joint"]
+    for element in (*links, *joints):
+        check_numbers(element, problems)
+    root = check_tree(links, joints, problems)
+    found = {j.name: j for e in joints if (j := _joint(e, problems, travel_needed)) is not None}
+    problems.raise_if_any()
+    return Urdf(
+        path=path,
+        content=content,
+        name=robot.get("name", path.stem),
+        links=tuple(str(e.get("name")) for e in links),
+        joints=found,
+        root=root,
+        has_cylinders=any(e.find("visual/geometry/cylinder") is not None for e in links),
+    )
+
+
+def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> UrdfJoint | None:
+    """Return a joint, or None with its problems noted."""
+    n_before = len(problems)
+    for tag in ("parent", "child", "origin", "axis", "limit"):
+        if len(element.findall(tag)) > 1:
+            problems.add(element, f"has more than one <{tag}>", "keep one")
+    kind = element.get("type", "")
+    if kind not in JOINT_TYPES:
+        problems.add(
+            element,
+            f"has the type '{kind}', needed one of {', '.join(JOINT_TYPES)}",
+            "write a spherical or universal joint as revolutes, or cut the loop there ('3d')",
+        )
+    if element.find("mimic") is not None:
+        problems.add(
+            element, "has <mimic>, which is not followed", "close the loop in the mechanism YAML"
+        )
+    axis = _axis(element, kind, problems)
+    limits = _limits(element, kind, problems, travel_needed)
+    if len(problems) > n_before:
+        return None
+    origin = element.find("origin")
+    xyz = _vector(origin, "xyz", (0.0, 0.0, 0.0))
+    rpy = _vector(origin, "rpy", (0.0, 0.0, 0.0))
+    ends = [element.find(tag) for tag in ("parent", "child")]
+    parent, child = ("" if end is None else end.get("link", "") for end in ends)
+    return UrdfJoint(
+        name=element.get("name", ""),
+        type=cast("JointType", kind),
+        parent=parent,
+        child=child,
+        T_parent_origin=motion_of(Rotation.from_euler("xyz", rpy).as_matrix(), xyz),
+        axis=axis,
+        limits=limits,
+        line=cast("int", element.sourceline),
+    )
+
+
+def _vector(
+    element: etree._Element | None, attribute: str, default: tuple[float, float, float]
+) -> Array:
+    """Return three numbers of an attribute, or the default where they are missing or wrong."""
+    text = None if element is None else element.get(attribute)
+    found = None if text is None else number_list(text, 3)
+    return np.array(default if found is None else found)
+
+
+def _axis(element: etree._Element, kind: str, problems: Problems) -> Array:
+    """Return the unit axis; the URDF default is x."""
+    axis = _vector(element.find("axis"), "xyz", (1.0, 0.0, 0.0))
+    norm = float(np.linalg.norm(axis))
+    if kind in ("revolute", "continuous", "prismatic", "planar") and norm < 1e-9:
+        problems.add(element, "has a zero axis, needed a direction", "correct <axis xyz>")
+        return axis
+    if kind == "prismatic" and abs(norm - 1.0) > 1e-3:
+        problems.add(
+            element,
+            f"has an axis of length {norm:.6g}, which leaves open how far one unit of the reading "
+            "moves it, needed length 1",
+            "normalise <axis xyz>",
+        )
+    return axis / max(norm, 1e-9)
+
+
+def _limits(
+    element: etree._Element, kind: str, problems: Problems, travel_needed: bool
+) -> tuple[float, float] | None:
+    """Return the limits of a revolute or prismatic joint."""
+    if kind not in ("revolute", "prismatic"):
+        return None
+    limit = element.find("limit")
+    bounds_written = limit is not None and not {"lower", "upper"}.isdisjoint(limit.keys())
+    if kind == "prismatic" and not travel_needed and not bounds_written:
+        return None
+    needed = ("lower", "upper", "effort", "velocity") if kind == "prismatic" else (
+        "effort", "velocity")  # fmt: skip
+    missing = [key for key in needed if limit is None or limit.get(key) is None]
+    if missing or limit is None:
+        problems.add(
+            element,
+            f"lacks {', '.join(missing)} in its <limit>",
+            "give the travel of the joint" if kind == "prismatic" else "give its limits",
+        )
+        return None
+    bounds = [number_list(limit.get(key, "0"), 1) for key in ("lower", "upper")]
+    if bounds[0] is None or bounds[1] is None:
+        return None
+    lower, upper = bounds[0][0], bounds[1][0]
+    if lower > upper or (kind == "prismatic" and lower == upper):
+        problems.add(element, f"has the limits {lower:g} to {upper:g}", "give the lower one first")
+    return lower, upper
+
+
+_ATTRIBUTES = {
+    name: re.compile(rb"""(?<=\s)%s\s*=\s*(?:"([^"]*)"|'([^']*)')""" % name.encode())
+    for name in ("xyz", "rpy", "radius")
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What is written into the origin of a joint.
+
+    Attributes
+    ----------
+    xyz : (3,) array or None
+        Position in the parent link [m]; None where it stays as it is.
+    rpy : (3,) array or None
+        Angles about fixed x, y, z [rad]; None where they stay as they are.
+    """
+
+    xyz: Array | None = None
+    rpy: Array | None = None
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Where a value stands in the file, or is to stand, as byte offsets."""
+
+    start: int
+    end: int
+    before: bytes = b""
+    after: bytes = b""
+
+
+def patch_origins(content: bytes, origins: Mapping[str, Origin]) -> bytes:
+    """Return a URDF with some joint origins changed.
+
+    Values are written with 17 significant digits where they need them. The tags, quotes, comments,
+    white space and line ends of the file are not touched.
+
+    Parameters
+    ----------
+    content : bytes
+        A checked URDF.
+    origins : mapping of str to Origin
+        New origins by joint name.
+
+    Raises
+    ------
+    ModelError
+        If the file has no such joint.
+    """
+    tags = _origin_tags(content)
+    missing = sorted(set(origins) - set(tags))
+    if missing:
+        raise ModelError(
+            f"The URDF could not be changed: found no joint '{missing[0]}', needed the joints of "
+            "the mechanism; give the URDF that was loaded."
+        )
+    changes = [
+        change
+        for joint, origin in origins.items()
+        for change in _changes(content, tags[joint], origin)
+    ]
+    return _changed(content, changes)
+
+
+def patch_radii(content: bytes, radii: Mapping[tuple[str, int], float]) -> bytes:
+    """Return a URDF with other radii of some visual cylinders, otherwise as it was.
+
+    Parameters
+    ----------
+    content : bytes
+        A checked URDF.
+    radii : mapping of (str, int) to float
+        New radii [m] by link and number of the cylinder among the visual cylinders of that link.
+    """
+    tags = _cylinder_tags(content)
+    return _changed(
+        content,
+        [
+            (_span_in_tag(content, tags[place], "radius"), repr(float(R)).encode())
+            for place, R in radii.items()
+        ],
+    )
+
+
+def _changed(content: bytes, changes: Sequence[tuple[_Span, bytes]]) -> bytes:
+    """Return a file with values at the places of some spans."""
+    pieces, at = [], 0
+    for span, value in sorted(changes, key=lambda change: change[0].start):
+        pieces += [content[at : span.start], span.before, value, span.after]
+        at = span.end
+    return b"".join([*pieces, content[at:]])
+
+
+def _cylinder_tags(content: bytes) -> dict[tuple[str, int], int]:
+    """Return where the tag of every visual cylinder stands, by link and number in it."""
+    tags: dict[tuple[str, int], int] = {}
+    path: list[str] = []
+    link, count, is_first = "", 0, True
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal link, count, is_first
+        if path == ["robot"] and tag == "link":
+            link, count = attributes["name"], 0
+        elif path == ["robot", "link", "visual"] and tag == "geometry":
+            is_first = True
+        elif path == ["robot", "link", "visual", "geometry"]:
+            if tag == "cylinder" and is_first:
+                tags[link, count] = parser.CurrentByteIndex
+                count += 1
+            is_first = False
+        path.append(tag)
+
+    def end(_tag: str) -> None:
+        path.pop()
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.Parse(content, True)
+    return tags
+
+
+def _origin_tags(content: bytes) -> dict[str, tuple[int, bool]]:
+    """Return where the origin of every joint of a URDF stands, or would, and whether it does."""
+    tags: dict[str, tuple[int, bool]] = {}
+    path: list[str] = []
+    joint: list[str] = []
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if path == ["robot"] and tag == "joint":
+            joint[:] = [attributes["name"]]
+            at = _tag_end(content, parser.CurrentByteIndex)
+            if content[at - 2 : at] != b"/>":
+                tags[joint[0]] = at, False
+        elif path == ["robot", "joint"] and tag == "origin":
+            tags[joint[0]] = parser.CurrentByteIndex, True
+        path.append(tag)
+
+    def end(_tag: str) -> None:
+        path.pop()
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.Parse(content, True)
+    return tags
+
+
+def _changes(content: bytes, tag: tuple[int, bool], origin: Origin) -> list[tuple[_Span, bytes]]:
+    """Return the values that change in an origin, in the order in which they are written."""
+    at, is_written = tag
+    values = [
+        (name, " ".join(repr(float(x)) for x in value).encode())
+        for name, value in (("xyz", origin.xyz), ("rpy", origin.rpy))
+        if value is not None
+    ]
+    if is_written:
+        return [(_span_in_tag(content, at, name), value) for name, value in values]
+    if not values:
+        return []
+    written = b" ".join(b'%s="%s"' % (name.encode(), value) for name, value in values)
+    return [(_Span(at, at, b"<origin ", b"/>"), written)]
+
+
+def same_point(one: Array, two: Array) -> bool:
+    """Say whether two points differ by no more than the rounding of their computation."""
+    return bool(np.abs(one - two).max() < 4e-16)
+
+
+def _tag_end(content: bytes, start: int) -> int:
+    """Return the offset after the ``>`` of a start tag; quoted values may hold one."""
+    quote = b""
+    for at in range(start, len(content)):
+        byte = content[at : at + 1]
+        if quote:
+            quote = b"" if byte == quote else quote
+        elif byte in (b'"', b"'"):
+            quote = byte
+        elif byte == b">":
+            return at + 1
+    return len(content)
+
+
+def _span_in_tag(content: bytes, start: int, name: str) -> _Span:
+    """Return the span of an attribute's value in a tag, or where an origin is to have it."""
+    tag = content[start : _tag_end(content, start)]
+    found = _ATTRIBUTES[name].search(tag)
+    if found is None:
+        at = start + len(b"<origin")
+        return _Span(at, at, b' %s="' % name.encode(), b'"')
+    group = 1 if found.group(1) is not None else 2
+    return _Span(start + found.start(group), start + found.end(group))

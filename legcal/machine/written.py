@@ -1,0 +1,645 @@
+"""Axes are written as turns of the nominal ones; here as turns of the calibrated ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import DidNotConverge, OutOfClass, OutOfResources, UsageError
+from legcal.files import write_atomically
+from legcal.geometry import Array, motion_to_xyz_quat, roll_pitch_yaw
+from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
+from legcal.machine.classification import LegChain, Step
+from legcal.machine.files import FOLDER_YAML
+from legcal.machine.formats import XML_SUFFIXES
+from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
+from legcal.machine.leg import Leg, LegGeometry, LegKind, geometry_of
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.parameters import (
+    Parametrization,
+    in_links,
+    moved_legs,
+    turn_of,
+    twist_after,
+    vector_of,
+)
+from legcal.machine.schema import mechanism_yaml
+from legcal.machine.urdf import Origin, UrdfJoint, patch_origins, same_point
+
+
+class Handle(NamedTuple):
+    """The joint of the URDF whose origin is moved.
+
+    Attributes
+    ----------
+    joint : UrdfJoint
+        The joint.
+    is_inverse : bool
+        Whether its origin moves the body against the leg's joint, and not this in the body.
+    """
+
+    joint: UrdfJoint
+    is_inverse: bool
+
+
+class Handles:
+    """What moves the joints of legs in the bodies of a mechanism.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The mechanism, as loaded.
+
+    Attributes
+    ----------
+    bodies : Bodies
+        Links that fixed joints and welds hold together.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self._mechanism = mechanism
+        self._urdf = mechanism.urdf
+        self._closures = mechanism.chain.closures
+        self._fixed = rigid_bodies(self._urdf, (), mechanism.platform_joint)
+        self.bodies: Bodies = rigid_bodies(self._urdf, self._closures, mechanism.platform_joint)
+        self._above = {joint.child: joint for joint in self._urdf.joints.values()}
+
+    def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
+        """Return what moves a joint in a body.
+
+        Parameters
+        ----------
+        step : Step
+            The joint of the leg.
+        side : int
+            Its side in the body.
+        body : str
+            The link that stands for the body.
+        leg : str
+            The leg, for messages.
+
+        Raises
+        ------
+        OutOfClass
+            If no origin moves this joint alone.
+        """
+        connection = step.connection
+        if connection.closure is not None:
+            closure = self._closures[connection.closure]
+            return Handle(self._carrier((closure.frame_1, closure.frame_2)[side], leg), False)
+        joint = self._urdf.joints[str(connection.joint)]
+        if side == 0:
+            return Handle(joint, False)
+        if self._fixed.body_of[joint.child] == self._fixed.body_of[body]:
+            return Handle(self._onward(joint, body, leg), True)
+        return self._weld(joint, body, leg)
+
+    def link(self, step: Step, side: int) -> str:
+        """Return the link that carries one side of a joint."""
+        connection = step.connection
+        if connection.closure is not None:
+            closure = self._closures[connection.closure]
+            return frame_link(self._urdf, (closure.frame_1, closure.frame_2)[side])
+        joint = self._urdf.joints[str(connection.joint)]
+        return (joint.parent, joint.child)[side]
+
+    def _onward(self, joint: UrdfJoint, body: str, leg: str) -> UrdfJoint:
+        """Return the fixed joint that leads from the child of a joint to the rest of its body."""
+        link, onward = body, None
+        while link != joint.child and link in self._above:
+            onward = self._above[link]
+            link = onward.parent
+        if link == joint.child and onward is not None and self._carries_only(link, onward):
+            return onward
+        raise OutOfClass(
+            f"{self._mechanism.urdf_path}: leg '{leg}' could not be written: found that joint "
+            f"'{joint.name}' carries the link '{body}' itself, needed legs that hang from base or "
+            "platform, or are closed on them; let a virtual floating joint carry the platform, or "
+            "put a link on a fixed joint between them."
+        )
+
+    def _weld(self, joint: UrdfJoint, body: str, leg: str) -> Handle:
+        """Return the fixed joint under a frame of the closure that welds a leg to a body."""
+        ours, theirs = self._fixed.body_of[body], self._fixed.body_of[joint.child]
+        problem: OutOfClass | None = None
+        for closure in self._closures:
+            frames = closure.frame_1, closure.frame_2
+            on = [self._fixed.body_of[frame_link(self._urdf, frame)] for frame in frames]
+            if closure.kind == "6d" and set(on) == {ours, theirs}:
+                for wanted in (ours, theirs):
+                    try:
+                        carrier = self._carrier(frames[on.index(wanted)], leg)
+                    except OutOfClass as error:
+                        problem = problem or error
+                        continue
+                    return Handle(carrier, wanted == theirs)
+        if problem is not None:
+            raise problem
+        raise OutOfClass(
+            f"{self._mechanism.urdf_path}: leg '{leg}' could not be written: found several welds "
+            f"between joint '{joint.name}' and the link '{body}', needed one; close the leg once."
+        )
+
+    def _carrier(self, frame: str, leg: str) -> UrdfJoint:
+        """Return the fixed joint under a closure's frame, which must carry nothing else."""
+        link = frame_link(self._urdf, frame)
+        above = self._above.get(link)
+        if above is not None and not above.moves and self._carries_only(link, None, closures=1):
+            return above
+        raise OutOfClass(
+            f"{self._mechanism.urdf_path}: leg '{leg}' could not be written: found the closure "
+            f"frame '{frame}' on a link that carries other things too, needed a link of its own on "
+            "a fixed joint; add one at the joint centre."
+        )
+
+    def _carries_only(self, link: str, below: UrdfJoint | None, closures: int = 0) -> bool:
+        """Say whether a link carries one joint or none, and so many frames of closures."""
+        found = [joint for joint in self._urdf.joints.values() if joint.parent == link]
+        frames = [f for c in self._closures for f in (c.frame_1, c.frame_2)]
+        uses = sum(frame_link(self._urdf, frame) == link for frame in frames)
+        return found == ([] if below is None else [below]) and uses == closures
+
+
+ROUNDING = 1e-14  # [rad]: what turns less does not turn
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A rigid motion in a frame: p -> about + R (p - about) + shift.
+
+    Attributes
+    ----------
+    shift, about : (3,) array
+        Displacement, and the point that it is the displacement of [m].
+    turn : Rotation or None
+        R; None where nothing turns, so that nothing is rounded.
+    """
+
+    shift: Array
+    about: Array
+    turn: Rotation | None = None
+
+    def inv(self) -> Motion:
+        """Return the motion back."""
+        turn = None if self.turn is None else self.turn.inv()
+        return Motion(-self.shift, self.about + self.shift, turn)
+
+    def seen_from(self, T_to_from: RigidTransform) -> Motion:
+        """Return the same motion in another frame."""
+        R = T_to_from.rotation
+        turn = None if self.turn is None else R * self.turn * R.inv()
+        return Motion(
+            np.asarray(R.apply(self.shift)), np.asarray(T_to_from.apply(self.about)), turn
+        )
+
+    def of(self, T: RigidTransform) -> RigidTransform:
+        """Return a pose after the motion."""
+        if self.turn is None:
+            return RigidTransform.from_components(T.translation + self.shift, T.rotation)
+        arm = self.turn.apply(T.translation - self.about)
+        return RigidTransform.from_components(self.about + arm + self.shift, self.turn * T.rotation)
+
+
+@dataclass(frozen=True, eq=False)
+class MovedOrigin:
+    """The new origin of a joint.
+
+    Attributes
+    ----------
+    T_parent_origin : RigidTransform
+        In its parent link [m].
+    is_turned : bool
+        Whether its orientation changes too.
+    """
+
+    T_parent_origin: RigidTransform
+    is_turned: bool
+
+
+def moved_origins(mechanism: Mechanism, legs: Sequence[LegGeometry]) -> dict[str, MovedOrigin]:
+    """Return the origin of every joint that carries a number of a leg.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal mechanism, as loaded.
+    legs : sequence of LegGeometry
+        The legs as they are to be, in R_b and R_e, in the order of ``mechanism.legs``. Axes may
+        be given either way round.
+
+    Returns
+    -------
+    dict of str to MovedOrigin
+        By joint; those that stay where they are, are among them.
+
+    Raises
+    ------
+    OutOfClass
+        If the tree ties a leg to base or platform where no origin moves that leg alone.
+    """
+    handles = Handles(mechanism)
+    found: dict[str, MovedOrigin] = {}
+
+    def move(handle: Handle, motion: Motion, body: str) -> None:
+        """Move a joint by a motion that is given in a link of its body."""
+        joint, T_body_link = handle.joint, handles.bodies.T_body_link
+        before = found.get(joint.name, MovedOrigin(joint.T_parent_origin, False))
+        there = T_body_link[joint.parent].inv() * T_body_link[body]
+        seen = motion.seen_from(there) if body != joint.parent else motion
+        seen = seen.inv() if handle.is_inverse else seen
+        found[joint.name] = MovedOrigin(
+            seen.of(before.T_parent_origin), before.is_turned or seen.turn is not None
+        )
+
+    for leg, chain, wanted in zip(
+        mechanism.legs, mechanism.leg_chains, in_links(mechanism, legs), strict=True
+    ):
+        at_base, at_platform = _ends(leg, wanted)
+        grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)
+        if chain.slider is not None:
+            move(*_at_slider(handles, leg, chain, grown))
+        elif any(grown):
+            move(*_in_rod(handles, leg, chain, grown))
+        first, last = chain.steps[0], chain.steps[-1]
+        base, platform = mechanism.base, mechanism.platform
+        move(handles.of(first, first.near, base, leg.name), at_base, base)
+        move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
+    return found
+
+
+def _ends(leg: Leg, wanted: LegGeometry) -> tuple[Motion, Motion]:
+    """Return how the ends of a leg move in the links of base and platform."""
+    is_fixed = leg.platform_joint == ""
+    return (
+        Motion(wanted.A - leg.A_base, leg.A_base, _turn(leg.base_axis, wanted.base_axis)),
+        Motion(
+            wanted.B - leg.B_platform,
+            leg.B_platform,
+            _turn(leg.platform_axis, wanted.platform_axis, directed=is_fixed),
+        ),
+    )
+
+
+def _turn(axis: Array | None, wanted: Array | None, *, directed: bool = False) -> Rotation | None:
+    """Return the smallest rotation of an axis, a line unless it is directed, onto another."""
+    if axis is None or wanted is None:
+        return None
+    if not directed and axis @ wanted < 0.0:
+        wanted = -wanted
+    normal = np.cross(axis, wanted)
+    sine = float(np.linalg.norm(normal))
+    angle = float(np.arctan2(sine, axis @ wanted))
+    return None if angle < ROUNDING else Rotation.from_rotvec(angle / sine * normal)
+
+
+def _twisted(leg: Leg, wanted: LegGeometry, at_platform: Motion) -> float:
+    """Return how far the upper half of a leg turns about it, beside what its end does [rad]."""
+    if leg.twist is None or wanted.twist is None:
+        return 0.0
+    carried = leg.twist
+    if at_platform.turn is not None:
+        carried = float(twist_after(geometry_of(leg), at_platform.turn) or 0.0)
+    twist = wanted.twist - carried
+    twist -= np.pi * np.round(twist / np.pi)
+    return float(twist) if abs(twist) > ROUNDING else 0.0
+
+
+def _screw(along: Array, point: Array, grown: tuple[float, float]) -> Motion:
+    """Return the motion of the upper half of a leg: growth along its line, and turn about it."""
+    growth, twist = grown
+    turn = None if twist == 0.0 else Rotation.from_rotvec(twist * along)
+    return Motion(growth * along, point, turn)
+
+
+def _at_slider(
+    handles: Handles, leg: Leg, chain: LegChain, grown: tuple[float, float]
+) -> tuple[Handle, Motion, str]:
+    """Return what moves the upper half of a leg at its slider, how, and the body that says so."""
+    slider = chain.slider
+    if slider is None:
+        raise ValueError("a rod has no slider")
+    body = slider.connection.bodies[0]  # that of the joint's parent
+    if slider.near == 0:
+        along, point = chain.u_lower, chain.base.centre_far
+    else:
+        along, point = chain.u_upper, chain.platform.centre_near
+    handle = handles.of(slider, 0, body, leg.name)._replace(is_inverse=slider.near != 0)
+    return handle, _screw(leg.sign * along, point, grown), body
+
+
+def _in_rod(
+    handles: Handles, leg: Leg, chain: LegChain, grown: tuple[float, float]
+) -> tuple[Handle, Motion, str]:
+    """Return what moves the upper end of a rod against its lower one, how, and the body."""
+    below, above = chain.steps[chain.n_lower - 1], chain.steps[chain.n_lower]
+    body = chain.bodies[chain.n_lower - 1]
+    try:
+        handle = handles.of(above, above.near, handles.link(below, below.far), leg.name)
+    except OutOfClass:
+        handle = handles.of(below, below.far, handles.link(above, above.near), leg.name)
+        handle = handle._replace(is_inverse=not handle.is_inverse)
+    return handle, _screw(chain.u_lower, chain.base.centre_far, grown), body
+
+
+def mechanism_text(mechanism: Mechanism, urdf: str) -> str:
+    """Return the YAML of a mechanism, complete.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The mechanism, of any format.
+    urdf : str
+        The path of its URDF, relative to the YAML.
+    """
+    return mechanism_yaml(
+        [(c.frame_1, c.frame_2, c.kind) for c in mechanism.chain.closures],
+        [str(leg.prismatic) for leg in mechanism.legs if leg.kind is LegKind.ACTUATED],
+        {
+            "urdf": urdf,
+            "base": mechanism.base,
+            "platform": mechanism.platform,
+            "platform_joint": mechanism.platform_joint,
+            "base_frame": [mechanism.leg_names[j] for j in mechanism.frame_legs],
+            "home": motion_to_xyz_quat(mechanism.home),
+            "legs": {leg.name: _joint_of(mechanism, j) for j, leg in enumerate(mechanism.legs)},
+        },
+    )
+
+
+def model_name(mechanism: Mechanism) -> str:
+    """Return the name that the files of a mechanism get: that of its file, or of its folder."""
+    path = mechanism.yaml_path
+    return path.resolve().parent.name if path.name == FOLDER_YAML else path.stem
+
+
+def write_model(mechanism: Mechanism, folder: Path) -> tuple[Path, Path]:
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism.
+
+    A URDF that was read as it stands is copied byte for byte.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The mechanism, of any format.
+    folder : Path
+        The folder that gets ``models`` and ``urdf``; it is made if there is none.
+
+    Returns
+    -------
+    tuple of Path
+        The YAML and the URDF.
+
+    Raises
+    ------
+    UsageError
+        If a file of either name is there already.
+    OutOfResources
+        If the files cannot be written.
+    """
+    name = model_name(mechanism)
+    places = folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
+    there = [str(path) for path in places if os.path.lexists(path)]
+    if there:
+        raise UsageError(
+            f"{mechanism.yaml_path}: the model '{name}' could not be written: found "
+            f"{' and '.join(there)} already there, needed new files; give another folder."
+        )
+    try:
+        for path in places:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(places[1], mechanism.urdf.content)
+        text = mechanism_text(mechanism, f"../urdf/{name}.urdf")
+        write_atomically(places[0], text.encode())  # last: a URDF alone is no model
+    except OSError as error:
+        raise OutOfResources(
+            f"{folder}: the model could not be written: found '{error.strerror}', needed a folder "
+            "that takes it; free space, correct permissions, or give another folder."
+        ) from error
+    return places
+
+
+def _joint_of(mechanism: Mechanism, j: int) -> str:
+    """Return a joint that stands for a leg: its slider, or any other on it."""
+    leg, chain = mechanism.legs[j], mechanism.leg_chains[j]
+    if leg.prismatic is not None:
+        return leg.prismatic
+    moving = [step.connection.joint for step in chain.steps if step.connection.joint]
+    fixed = [joint.name for joint in mechanism.urdf.joints.values() if joint.child in chain.bodies]
+    return str([*moving, *fixed][0])
+
+
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
+CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
+
+
+def write_urdf(mechanism: Mechanism, legs: Sequence[LegGeometry], destination: Path) -> None:
+    """Write the mechanism's URDF with other numbers of its legs, of whatever class.
+
+    Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
+    Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
+    or axes the mechanism may close elsewhere.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal mechanism, as loaded.
+    legs : sequence of LegGeometry
+        The legs in R_b and R_e, in the order of ``mechanism.legs``. B of a leg that is fixed
+        to the platform is where the platform link's origin has its foot on the leg.
+    destination : Path
+        The file to write.
+
+    Raises
+    ------
+    OutOfClass
+        If the tree ties a leg to base or platform where no origin moves that leg alone.
+    """
+    changed: dict[str, Origin] = {}
+    for name, moved in moved_origins(mechanism, legs).items():
+        before, after = mechanism.urdf.joints[name].T_parent_origin, moved.T_parent_origin
+        xyz, rpy = np.asarray(after.translation), None
+        if moved.is_turned:
+            rpy = roll_pitch_yaw(after.rotation.as_matrix())
+        stays = same_point(xyz, np.asarray(before.translation))
+        if rpy is not None or not stays:
+            changed[name] = Origin(None if stays else xyz, rpy)
+    destination.write_bytes(patch_origins(mechanism.urdf.content, changed))
+
+
+def write_calibrated_yaml(
+    mechanism: Mechanism, destination: Path, urdf_name: str, home: RigidTransform | None = None
+) -> None:
+    """Write the mechanism's YAML with ``legcal.urdf`` naming the calibrated file.
+
+    Every other character stays as it was, but for the numbers of ``legcal.home`` where home moves;
+    the key is added where the file does not have it. A mechanism of another format, or without a
+    block ``legcal``, gets a YAML with all it needs.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal mechanism, as loaded.
+    destination : Path
+        The file to write, beside the calibrated URDF.
+    urdf_name : str
+        The calibrated URDF, relative to ``destination``.
+    home : RigidTransform, optional
+        T_base_platform where the calibrated legs close, if not where the nominal ones do.
+    """
+    if not _is_written_down(mechanism):
+        there = mechanism if home is None else replace(mechanism, home=home)
+        destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
+        return
+    text = mechanism.yaml_path.read_bytes().decode("utf-8")
+    if home is not None:
+        text = _with_home(text, home)
+    value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
+    block = _entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal")
+    written = None if block is None else _entry(block, "urdf")
+    if written is not None:
+        text = text[: written.start_mark.index] + value + text[written.end_mark.index :]
+    elif isinstance(block, yaml.MappingNode) and block.value:
+        first = block.value[0][0].start_mark
+        separator = ", " if block.flow_style else "\n" + " " * first.column
+        text = f"{text[: first.index]}urdf: {value}{separator}{text[first.index :]}"
+    destination.write_bytes(text.encode("utf-8"))
+
+
+def _with_home(text: str, home: RigidTransform) -> str:
+    """Return the text of a YAML with other numbers in ``legcal.home``, if it has one."""
+    written = _entry(_entry(yaml.compose(text, Loader=yaml.SafeLoader), "legcal"), "home")
+    numbers = []
+    for key, values in motion_to_xyz_quat(home).items():
+        entry = _entry(written, key)
+        if isinstance(entry, yaml.SequenceNode):
+            numbers += list(zip(entry.value, values, strict=True))
+    for node, value in sorted(numbers, key=lambda number: -number[0].start_mark.index):
+        text = text[: node.start_mark.index] + repr(value) + text[node.end_mark.index :]
+    return text
+
+
+def _is_written_down(mechanism: Mechanism) -> bool:
+    """Say whether the YAML of a mechanism is one of ours, and holds of the URDF as it is."""
+    if mechanism.yaml_path.suffix.lower() in XML_SUFFIXES:
+        return False
+    content = mechanism.yaml_path.read_bytes().decode("utf-8")
+    document = yaml.compose(content, Loader=yaml.SafeLoader)
+    stand_ins = _entry(document, "joint_name")
+    has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)
+    return isinstance(_entry(document, "legcal"), yaml.MappingNode) and not has_stand_ins
+
+
+def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
+    """Return the value of a key of a mapping, or None."""
+    if not isinstance(node, yaml.MappingNode):
+        return None
+    return next((value for name, value in node.value if name.value == key), None)
+
+
+def check_closes(mechanism: Mechanism) -> None:
+    """Check that a mechanism closes at home: its own readings lead back to it.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The mechanism, loaded from the files in question.
+
+    Raises
+    ------
+    DidNotConverge
+        If no closed pose is found there, or another one.
+    """
+    found = forward_kinematics(mechanism, inverse_kinematics(mechanism, mechanism.home))
+    away = mechanism.home.inv() * found
+    shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
+    if not max(shift, turn) <= CLOSES:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: the mechanism does not close at home: found a pose "
+            f"{1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it at its own "
+            f"readings, needed at most {1e3 * CLOSES:.0e} mm and {np.degrees(CLOSES):.0e} deg; "
+            "check legcal.home."
+        )
+
+
+def reload_and_check(path: Path) -> Mechanism:
+    """Load a mechanism that was just written and check that it closes at home.
+
+    Loading closes the chain there; where the motors determine the pose they must lead back to it.
+    """
+    mechanism = load_mechanism(path)
+    if mechanism.is_determined:
+        check_closes(mechanism)
+    return mechanism
+
+
+_STEP = 1e-6  # [m or rad]
+
+Axes = Mapping[str, Sequence[float]]  # by leg name, in R_b or R_e
+
+
+def nominal_axes(
+    leg_names: Sequence[str], nominal: Sequence[LegGeometry]
+) -> dict[str, dict[str, list[float]]]:
+    """Return the axes that turns count from, at the base in R_b and at the platform in R_e.
+
+    Parameters
+    ----------
+    leg_names : sequence of str
+        Names of the legs.
+    nominal : sequence of LegGeometry
+        The nominal legs in R_b and R_e.
+    """
+    named = list(zip(leg_names, nominal, strict=True))
+    return {
+        "base": {name: leg.base_axis.tolist() for name, leg in named if leg.base_axis is not None},
+        "platform": {
+            name: leg.platform_axis.tolist() for name, leg in named if leg.platform_axis is not None
+        },
+    }
+
+
+def turns_between(
+    parametrization: Parametrization,
+    calibrated: Sequence[LegGeometry],
+    nominal: Sequence[LegGeometry],
+) -> Array:
+    """Return the derivative (p, p) of parameters with calibrated axes by those with nominal ones.
+
+    Twists, which are tied to axes, depend on these and on the turns of the axes.
+
+    Parameters
+    ----------
+    parametrization : Parametrization
+        The parameters of rows and columns.
+    calibrated, nominal : sequence of LegGeometry
+        The legs at which the derivative is taken, and those whose axes counted as zero before.
+    """
+    by_step = []
+    for start in (calibrated, nominal):
+        columns = []
+        for step in _STEP * np.eye(len(parametrization)):
+            ahead, behind = (
+                vector_of(parametrization, moved_legs(calibrated, parametrization.place, by), start)
+                for by in (step, -step)
+            )
+            columns.append((ahead - behind) / (2.0 * _STEP))
+        by_step.append(np.column_stack(columns))
+    return np.asarray(np.linalg.solve(by_step[1].T, by_step[0].T).T)
+
+
+def calibrated_axis(
+    nominal: Sequence[float], leg: str, side: str, values: Mapping[str, float]
+) -> Array:
+    """Return the axis (3,) that a result has, from the nominal one and its turns."""
+    w = np.array([values.get(f"{leg}.{side}_axis.{k}", 0.0) for k in (1, 2)])
+    return np.asarray(turn_of(np.array(nominal), w).apply(nominal))

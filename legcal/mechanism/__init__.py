@@ -1,1 +1,0 @@
-"""Section 2: the mechanism, from URDF and closures to legs, and its kinematics."""

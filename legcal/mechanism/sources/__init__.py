@@ -1,1 +1,0 @@
-"""Reading a mechanism from whatever format it is written in, as one tree with closures."""

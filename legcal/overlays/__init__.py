@@ -1,1 +1,0 @@
-"""What detection found, drawn over the images and summed up, for people."""

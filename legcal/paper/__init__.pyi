@@ -1,0 +1,12 @@
+from .conditions import Condition as Condition
+from .conditions import count_conditions as count_conditions
+from .conditions import three_legs_at_once as three_legs_at_once
+from .conditions import two_directions as two_directions
+from .four_steps import run_base_steps as run_base_steps
+from .four_steps import run_platform_steps as run_platform_steps
+from .four_steps import run_steps as run_steps
+from .nominal import Criteria as Criteria
+from .nominal import NominalMechanism as NominalMechanism
+from .nominal import nominal_mechanism as nominal_mechanism
+from .nominal import point_like_mechanism as point_like_mechanism
+from .platform_pose import Transformation as Transformation

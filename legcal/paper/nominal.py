@@ -1,0 +1,109 @@
+"""What the four steps know of a mechanism: its legs as drawn, in R_b and R_e."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from legcal.geometry import Array, BoolArray
+from legcal.machine import (
+    KinematicParameters,
+    LegGeometry,
+    LegKind,
+    Mechanism,
+    geometries,
+    point_like_legs,
+)
+
+Criteria = Literal["default", "literal"]
+
+
+@dataclass(frozen=True, eq=False)
+class NominalMechanism:
+    """The nominal legs of a mechanism: where the steps start, and which unknowns they have.
+
+    Attributes
+    ----------
+    leg_names : tuple of str
+        Names of the legs, for messages.
+    legs : tuple of LegGeometry
+        Joint centres, axes and lengths; what belongs to the base in R_b, what belongs to the
+        platform in R_e.
+    sign : (n_legs,) array
+        Sign of q in the leg length: L = sign q + q0.
+    frame_legs : tuple of int
+        The legs whose joint centres define R_b and R_e: three in space, two in a plane.
+    """
+
+    leg_names: tuple[str, ...]
+    legs: tuple[LegGeometry, ...]
+    sign: NDArray[Any]
+    frame_legs: tuple[int, ...]
+
+    @property
+    def n_legs(self) -> int:
+        """Number of legs."""
+        return len(self.legs)
+
+    @property
+    def spatial(self) -> bool:
+        """Whether the platform moves in space and not in a plane."""
+        return len(self.frame_legs) == 3
+
+    @cached_property
+    def parameters(self) -> KinematicParameters:
+        """Nominal joint centres and offsets [m]; constant legs have their length, passive NaN."""
+        passive = np.array([leg.kind is LegKind.PASSIVE for leg in self.legs])
+        return KinematicParameters(
+            np.array([leg.A for leg in self.legs]),
+            np.array([leg.B for leg in self.legs]),
+            np.where(passive, np.nan, [leg.q0 for leg in self.legs]),
+        )
+
+    @cached_property
+    def constant(self) -> BoolArray:
+        """Which legs have a constant length and no reading, (n_legs,)."""
+        return np.array([leg.kind is LegKind.CONSTANT for leg in self.legs], dtype=np.bool_)
+
+    @cached_property
+    def on_platform(self) -> BoolArray:
+        """Which legs are fixed to the platform, (n_legs,)."""
+        return np.array([leg.platform_joint == "" for leg in self.legs], dtype=np.bool_)
+
+    @cached_property
+    def revolute(self) -> BoolArray:
+        """Which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
+        return np.array(
+            [leg.base_joint == "R" and leg.base_axis is not None for leg in self.legs],
+            dtype=np.bool_,
+        )
+
+    @cached_property
+    def base_axes(self) -> Array:
+        """Nominal revolute axes in R_b, (n_legs, 3); NaN where :attr:`revolute` is not."""
+        axes = np.full((self.n_legs, 3), np.nan)
+        for j in np.flatnonzero(self.revolute):
+            axes[j] = self.legs[j].base_axis
+        return axes
+
+
+def nominal_mechanism(mechanism: Mechanism) -> NominalMechanism:
+    """Return a mechanism as the steps take it."""
+    return NominalMechanism(
+        mechanism.leg_names, geometries(mechanism), mechanism.sign, mechanism.frame_legs
+    )
+
+
+def point_like_mechanism(
+    leg_names: Sequence[str],
+    parameters: KinematicParameters,
+    sign: NDArray[Any],
+    frame_legs: tuple[int, ...],
+) -> NominalMechanism:
+    """Return a mechanism with point-like joints; legs without an offset are passive."""
+    return NominalMechanism(tuple(leg_names), point_like_legs(parameters), sign, frame_legs)

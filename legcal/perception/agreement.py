@@ -1,0 +1,494 @@
+"""Poses at which a flat machine looks alike from far: near and far exchanged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from legcal.geometry import Array, IntArray
+from legcal.machine import Cylinder
+from legcal.perception.bars import Bars
+from legcal.vision import visible_pieces
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """The visible pieces of all legs at the reading of a picture.
+
+    Attributes
+    ----------
+    leg : (n,) array of int
+        The leg of each piece.
+    ends : (n, 2, 3) array
+        Both ends of its axis in the base link, the first nearer to the base joint [m].
+    place : (n, 2) array
+        Where these ends are along the leg, 0 at A and 1 at B.
+    radius : (n,) array
+        Its radius [m].
+    share : (n,) array
+        Its part of the visible length of its leg.
+    """
+
+    leg: IntArray
+    ends: Array
+    place: Array
+    radius: Array
+    share: Array
+
+    def __len__(self) -> int:
+        """Return the number of pieces."""
+        return len(self.leg)
+
+
+def targets_of(
+    A_base: Array, B_base: Array, cylinders: Sequence[Sequence[Cylinder]], legs: IntArray
+) -> Targets:
+    """Return the pieces of some legs.
+
+    Parameters
+    ----------
+    A_base, B_base : (n_legs, 3) array
+        Joint centres at the reading of the picture, in the base link [m].
+    cylinders : sequence, for each leg a sequence of Cylinder
+        What can be seen of the legs.
+    legs : (m,) array of int
+        The legs to look for.
+    """
+    leg, place, ends, radius, share = [], [], [], [], []
+    for j in legs.tolist():
+        AB = B_base[j] - A_base[j]
+        length = float(np.linalg.norm(AB))
+        pieces = visible_pieces(cylinders[j], length)
+        total = sum(piece.end - piece.start for piece in pieces)
+        for piece in pieces:
+            leg.append(j)
+            place.append((piece.start / length, piece.end / length))
+            ends.append(A_base[j] + np.outer(place[-1], AB))
+            radius.append(piece.radius)
+            share.append((piece.end - piece.start) / total)
+    return Targets(
+        np.array(leg, dtype=np.intp),
+        np.array(ends).reshape(-1, 2, 3),
+        np.array(place).reshape(-1, 2),
+        np.array(radius),
+        np.array(share),
+    )
+
+
+NEAREST = 0.02  # depth of the nearest point of a leg [m]
+WIDTH_ERROR = 0.08  # of a bar and of what is predicted: relative, one standard deviation
+WIDTH_PIXELS = 1.0  # and of a bar in its pixels
+WIDTH_REACH = 2.5  # standard deviations
+TOO_NARROW = 0.4  # by which bars are found, since shading ends inside an outline [px of a bar]
+SLACK_PIXELS = 1.5  # added to every tolerance [px of a bar]
+LINE_ERROR, LINE_PIXELS = 2e-3, 0.7  # of an axis beside its bar, one standard deviation: [m], [px]
+PLACE_ERROR = 0.1  # of the middle of a bar that is as long as its piece, in its length
+LINE_PART = 1.0 / 6.0  # at least this part of the tolerance
+INSIDE = 0.8  # share of a bar that should lie along the leg
+CHUNK = 128  # poses judged together
+TURN_PRIOR, PLACE_PRIOR = 0.3, 0.1  # of one step: angle [rad], of the machine, in its distance
+MOST_TURN, MOST_PLACE = 0.4, 0.2  # the same, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Camera poses T_camera_base.
+
+    Attributes
+    ----------
+    R : (n, 3, 3) array
+        Rotations.
+    t : (n, 3) array
+        Translations [m].
+    shift : (n, n_legs, 2, 3) array
+        Where A and B of each leg are, against where the model has them, in the base link [m].
+    """
+
+    R: Array
+    t: Array
+    shift: Array
+
+    @classmethod
+    def rigid(cls, R: Array, t: Array, n_legs: int) -> "Poses":
+        """Return poses at which all legs are where the model has them."""
+        return cls(R, t, np.zeros((len(R), n_legs, 2, 3)))
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.R)
+
+    def take(self, chosen: IntArray) -> "Poses":
+        """Return some of the poses."""
+        return Poses(self.R[chosen], self.t[chosen], self.shift[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What is known of a picture: its bars, and the legs that it may show.
+
+    Attributes
+    ----------
+    bars : Bars
+        Candidate cylinders.
+    targets : Targets
+        Pieces of legs at its reading.
+    corners : (2, 2) array
+        Least and greatest x and y of the sensor plane that it shows.
+    R, t : (3, 3) and (3,) array
+        Its camera frame, where poses are those of another frame that is fixed to it:
+        X_camera = R X + t.
+    """
+
+    bars: Bars
+    targets: Targets
+    corners: Array
+    R: Array = field(default_factory=lambda: np.eye(3))
+    t: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How poses agree with a picture.
+
+    Attributes
+    ----------
+    value : (n_poses, n_targets) array
+        Agreement of each piece, 0 to 1: how well, times how much of its visible length.
+    bar : (n_poses, n_targets) array of int
+        The bar that agrees best.
+    visible : (n_poses, n_targets) array
+        Share of each piece that is inside the picture.
+    """
+
+    value: Array
+    bar: IntArray
+    visible: Array
+
+    @property
+    def one_bar_each(self) -> Array:
+        """The values, where a bar counts for the piece that it suits best."""
+        same = self.bar[:, :, None] == self.bar[:, None, :]
+        better = self.value[:, None, :] > self.value[:, :, None]
+        return np.where(np.any(same & better, axis=2), 0.0, self.value)
+
+
+def agreement(picture: Picture, poses: Poses, tolerance: float) -> Agreement:
+    """Judge poses by a picture.
+
+    Parameters
+    ----------
+    picture : Picture
+        Its bars and targets.
+    poses : Poses
+        Camera poses.
+    tolerance : float
+        Distance of an axis from a bar at which they agree no longer [m].
+    """
+    n, n_targets = len(poses), len(picture.targets)
+    if n == 0 or n_targets == 0 or len(picture.bars) == 0:
+        visible = _in_picture(picture, poses)[3] if n and n_targets else np.zeros((n, n_targets))
+        return Agreement(np.zeros((n, n_targets)), np.zeros((n, n_targets), np.intp), visible)
+    parts = [
+        _judge(picture, poses.take(np.arange(k, min(k + CHUNK, len(poses)))), tolerance)
+        for k in range(0, len(poses), CHUNK)
+    ]
+    value, bar, visible = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return Agreement(value, bar, visible)
+
+
+def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Array]:
+    """Return ends X (n, T, 2, 3) [m], points (n, T, 2, 2), widths (n, T, 2), and what is shown."""
+    targets = picture.targets
+    ends = np.broadcast_to(targets.ends, (len(poses), *targets.ends.shape))
+    if np.any(poses.shift):
+        of_leg = poses.shift[:, targets.leg]  # (n, T, 2, 3)
+        at = targets.place[:, :, None]
+        ends = ends + (1.0 - at) * of_leg[:, :, :1] + at * of_leg[:, :, 1:]
+    n_ends = 2 * len(targets)
+    R, t = _of_camera(picture, poses)
+    X = ends.reshape(-1, n_ends, 3) @ R.swapaxes(1, 2) + t[:, None, :]
+    X = X.reshape(-1, len(targets), 2, 3)
+    z = np.maximum(X[..., 2:], NEAREST)
+    xy = X[..., :2] / z
+    normal = _vector_product(X[:, :, 0], X[:, :, 1])
+    level = normal[..., 0] ** 2 + normal[..., 1] ** 2
+    flat = np.sqrt(level / (level + normal[..., 2] ** 2 + 1e-24))
+    width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
+    front = (X[..., 2] > NEAREST).all(axis=-1)
+    return X, xy, width, np.where(front, _shown(xy, picture.corners), 0.0)
+
+
+def _of_camera(picture: Picture, poses: Poses) -> tuple[Array, Array]:
+    """Return the poses of the picture's own camera frame: rotations and translations."""
+    return picture.R @ poses.R, poses.t @ picture.R.T + picture.t
+
+
+def _shown(xy: Array, corners: Array) -> Array:
+    """Return the share of segments xy (..., 2, 2) that lies within a rectangle, (...)."""
+    start, step = xy[..., 0, :], xy[..., 1, :] - xy[..., 0, :]
+    safe = np.where(np.abs(step) > 1e-9, step, 1e-9)
+    one, two = (corners[0] - start) / safe, (corners[1] - start) / safe
+    enter = np.minimum(one, two).max(axis=-1)
+    leave = np.maximum(one, two).min(axis=-1)
+    return np.asarray(np.clip(np.minimum(leave, 1.0) - np.maximum(enter, 0.0), 0.0, 1.0))
+
+
+def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, IntArray, Array]:
+    """Return value, bar and visible of :class:`Agreement`."""
+    bars = picture.bars
+    X, xy, width, visible = _in_picture(picture, poses)
+    reach = _reach(bars, X, tolerance)[..., None].astype(np.float32)
+    xy, width = xy.astype(np.float32), width.astype(np.float32)
+    frame = np.concatenate([bars.along, bars.normal]).T.astype(np.float32)  # (2, 2 n_bars)
+    own = np.concatenate(
+        [np.sum(bars.middle * bars.along, axis=1), np.sum(bars.middle * bars.normal, axis=1)]
+    ).astype(np.float32)
+    place = xy @ frame - own
+    n = len(bars)
+    a0, a1 = place[:, :, 0, :n], place[:, :, 1, :n]
+    o0, o1 = place[:, :, 0, n:], place[:, :, 1, n:]
+    half = bars.half_length.astype(np.float32)
+    run = a1 - a0
+    run = np.where(np.abs(run) < 1e-6, np.float32(1e-6), run)
+    slope = (o1 - o0) / run
+    gap = np.abs(o0 - slope * a0) + np.abs(slope) * half
+    value = np.maximum(1.0 - (gap / reach) ** 2, 0.0)
+    w0, w1 = width[:, :, 0, None], width[:, :, 1, None]
+    expected = np.maximum(w0 - (w1 - w0) * a0 / run, np.float32(1e-6))
+    seen = seen_width(bars).astype(np.float32)
+    sigma = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen).astype(np.float32)
+    pull = np.log(expected / seen) / (np.float32(WIDTH_REACH) * sigma)
+    value *= np.maximum(1.0 - pull**2, 0.0)
+    overlap = np.minimum(half, np.maximum(a0, a1)) - np.maximum(-half, np.minimum(a0, a1))
+    overlap = np.maximum(overlap, 0.0)
+    value *= np.minimum(overlap / (np.float32(2.0 * INSIDE) * half), 1.0)
+    length = np.abs(run) * np.maximum(visible, 0.05)[..., None].astype(np.float32)
+    value *= np.minimum(overlap / length, 1.0)
+    best = np.argmax(value, axis=2)
+    found = np.take_along_axis(value, best[..., None], axis=2)[..., 0]
+    return np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible
+
+
+def _reach(bars: Bars, X: Array, tolerance: float) -> Array:
+    """Return a tolerance [m] on the sensor plane at pieces X (n, T, 2, 3), (n, T)."""
+    depth = np.maximum(X[..., 2].mean(axis=-1), NEAREST)
+    return np.asarray(tolerance / depth + SLACK_PIXELS * bars.pixel)
+
+
+def seen_width(bars: Bars) -> Array:
+    """Return the widths of bars (n,) in their middle, as wide as legs are that look like this."""
+    return np.asarray(bars.width.mean(axis=1) + TOO_NARROW * bars.pixel)
+
+
+def improved(
+    pictures: Sequence[Picture],
+    poses: Poses,
+    agreements: Sequence[Agreement],
+    tolerance: float,
+    joint_error: float = 0.0,
+) -> Poses:
+    """Return poses after one Gauss-Newton step towards the bars that agree with them.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        Some pictures of one camera.
+    poses : Poses
+        Camera poses.
+    agreements : sequence of Agreement
+        Of these poses with each picture.
+    tolerance : float
+        As for :func:`agreement`.
+    joint_error : float
+        Standard deviation of the joint centres of the model [m]; 0 to leave them in place.
+    """
+    n, n_legs = poses.shift.shape[:2]
+    centre = _centre(pictures, poses)
+    H, b = _step_prior(centre), np.zeros((n, 6))
+    H_leg, H_cross = np.zeros((n, n_legs, 6, 6)), np.zeros((n, n_legs, 6, 6))
+    b_leg = np.zeros((n, n_legs, 6))
+    for picture, found in zip(pictures, agreements, strict=True):
+        if len(picture.bars) == 0 or len(picture.targets) == 0:
+            continue
+        J, J_leg, residual, weight = _equations(picture, poses, found, tolerance)
+        weighted = (J * weight[..., None]).swapaxes(2, 3)  # (n, T, 6, 4)
+        H += (weighted @ J).sum(axis=1)
+        b -= (weighted @ residual[..., None])[..., 0].sum(axis=1)
+        if joint_error > 0.0:
+            weighted_leg = (J_leg * weight[..., None]).swapaxes(2, 3)
+            of_leg, cross = weighted_leg @ J_leg, weighted @ J_leg
+            gradient = (weighted_leg @ residual[..., None])[..., 0]
+            for piece, leg in enumerate(picture.targets.leg.tolist()):
+                H_leg[:, leg] += of_leg[:, piece]
+                H_cross[:, leg] += cross[:, piece]
+                b_leg[:, leg] -= gradient[:, piece]
+    if joint_error == 0.0:
+        xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
+        return _moved(poses, xi, poses.shift, centre)
+    H_leg += np.eye(6) / joint_error**2
+    b_leg -= poses.shift.reshape(n, n_legs, 6) / joint_error**2
+    back = np.linalg.solve(H_leg, np.concatenate([H_cross.swapaxes(2, 3), b_leg[..., None]], -1))
+    H -= np.einsum("nlij,nljk->nik", H_cross, back[..., :6])
+    b -= np.einsum("nlij,nlj->ni", H_cross, back[..., 6])
+    xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
+    change = back[..., 6] - np.einsum("nlij,nj->nli", back[..., :6], xi)
+    return _moved(poses, xi, poses.shift + change.reshape(poses.shift.shape), centre)
+
+
+def _centre(pictures: Sequence[Picture], poses: Poses) -> Array:
+    """Return the middle of the legs in the frame of each pose, (n, 3) [m]."""
+    ends = [p.targets.ends.reshape(-1, 3) for p in pictures if len(p.targets)]
+    middle = np.concatenate(ends).mean(axis=0) if ends else np.zeros(3)
+    return np.asarray(poses.R @ middle + poses.t)
+
+
+def _step_prior(centre: Array) -> Array:
+    """Return the precision (n, 6, 6) of no step at all: what nothing fixes stays where it is."""
+    J = np.concatenate([-_cross(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
+    distance = PLACE_PRIOR * np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
+    H = J.swapaxes(1, 2) @ J / (distance**2)[:, None, None]
+    H[:, :3, :3] += np.eye(3) / TURN_PRIOR**2
+    return np.asarray(H)
+
+
+def _equations(
+    picture: Picture, poses: Poses, found: Agreement, tolerance: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return what each piece demands: two equations of its line, one of its width, of its place.
+
+    Derivatives (n, T, 4, 6) by the motion of the camera, and by shifts of A and B of the leg;
+    residuals and weights (n, T, 4).
+    """
+    bars, place = picture.bars, picture.targets.place
+    X, xy, width, _ = _in_picture(picture, poses)
+    along, across = bars.along[found.bar], bars.normal[found.bar]
+    to_ends = xy - bars.middle[found.bar][:, :, None, :]
+    a = np.einsum("ntkx,ntx->ntk", to_ends, along)
+    o = np.einsum("ntkx,ntx->ntk", to_ends, across)
+    run = a[..., 1] - a[..., 0]
+    run = np.where(np.abs(run) < 1e-6, 1e-6, run)
+    half = bars.half_length[found.bar]
+    z = np.maximum(X[..., 2], NEAREST)
+    depth = z.mean(axis=-1)
+    # Derivatives of the offset of each end across the bar and along it, (n, T, 2, 3).
+    g, g_along = _of_offset(xy, across, z), _of_offset(xy, along, z)
+    shares = np.stack([(-half - a[..., 0]) / run, (half - a[..., 0]) / run], axis=-1)
+    parts = np.stack([1.0 - shares, shares], axis=-1)  # (n, T, 2 places, 2 ends)
+    residual = np.einsum("ntpe,nte->ntp", parts, o)
+    share = -a[..., 0] / run
+    expected = np.maximum(width[..., 0] + (width[..., 1] - width[..., 0]) * share, 1e-6)
+    seen = seen_width(bars)[found.bar]
+    P = (1.0 - share)[..., None] * X[:, :, 0] + share[..., None] * X[:, :, 1]
+    of_depth = np.zeros_like(P)
+    of_depth[..., 2] = -1.0 / np.maximum(P[..., 2], NEAREST)
+    # Derivatives (n, T, 4, 2, 3) of the residuals by the two ends in the camera frame.
+    D = np.empty((*P.shape[:2], 4, 2, 3))
+    D[:, :, :2] = parts[..., None] * g[:, :, None]
+    D[:, :, 2, 0] = (1.0 - share)[..., None] * of_depth
+    D[:, :, 2, 1] = share[..., None] * of_depth
+    D[:, :, 3] = 0.5 * g_along
+    D = D @ picture.R  # by the ends in the frame of the poses
+    X = (X - picture.t) @ picture.R
+    turning = _vector_product(X[:, :, None], D).sum(axis=3)
+    J = np.concatenate([turning, D.sum(axis=3)], axis=-1)
+    in_base = D @ poses.R[:, None, None]
+    at = place[:, None, :, None]  # (T, 1, 2, 1)
+    J_leg = np.concatenate(
+        [((1.0 - at) * in_base).sum(axis=3), (at * in_base).sum(axis=3)], axis=-1
+    )
+    J_leg[:, :, 2:] = 0.0  # too vague to tell where joints are
+    sigma_width = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen)
+    sigma = max(LINE_ERROR, LINE_PART * tolerance) / depth
+    line = found.value / (sigma**2 + (LINE_PIXELS * bars.pixel) ** 2)
+    # A bar as long as the piece has its middle where the piece has it.
+    length = np.abs(run)
+    sigma_place = PLACE_ERROR * length + 0.5 * np.abs(length - 2.0 * half)
+    return (
+        J,
+        J_leg,
+        np.concatenate(
+            [residual, np.stack([np.log(expected / seen), a.mean(axis=-1)], axis=-1)], axis=-1
+        ),
+        np.stack([line, line, found.value / sigma_width**2, found.value / sigma_place**2], axis=-1),
+    )
+
+
+def _of_offset(xy: Array, normal: Array, z: Array) -> Array:
+    """Return derivatives (n, T, 2, 3) of offsets along normals (n, T, 2) of points xy at depths z.
+
+    They are those by the points in the camera frame.
+    """
+    across = np.broadcast_to(normal[:, :, None, :], xy.shape)
+    in_depth = -np.einsum("ntkx,ntx->ntk", xy, normal)[..., None]
+    return np.asarray(np.concatenate([across, in_depth], axis=-1) / z[..., None])
+
+
+def distances(picture: Picture, poses: Poses, found: Agreement) -> Array:
+    """Return how far pieces are from the bars that agree with them, (n_poses, n_targets) [m].
+
+    Sideways, at the ends of the bars and at the depth of the pieces.
+    """
+    _, _, residual, _ = _equations(picture, poses, found, 1.0)
+    X, _, _, _ = _in_picture(picture, poses)
+    return np.asarray(np.abs(residual[..., :2]).max(axis=-1) * X[..., 2].mean(axis=-1))
+
+
+def _moved(poses: Poses, xi: Array, shift: Array, centre: Array) -> Poses:
+    """Return poses moved by rotation vectors and translations in their frame, (n, 6), not far."""
+    turned = np.linalg.norm(xi[:, :3], axis=1) / MOST_TURN
+    moved = np.linalg.norm(np.cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
+    distance = np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
+    xi = xi / np.maximum(np.maximum(turned, moved / (MOST_PLACE * distance)), 1.0)[:, None]
+    turn = _rotations(xi[:, :3])
+    t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]
+    return Poses(turn @ poses.R, t, shift)
+
+
+def _rotations(vectors: Array) -> Array:
+    """Return the rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    K = _cross(vectors / np.maximum(angle, 1e-12)[:, None])
+    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.asarray(np.eye(3) + s * K + (1.0 - c) * (K @ K))
+
+
+def _vector_product(x: Array, y: Array) -> Array:
+    """Return x x y (..., 3), in a third of the time of numpy's."""
+    out = np.empty(np.broadcast_shapes(x.shape, y.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., i] = x[..., j] * y[..., k] - x[..., k] * y[..., j]
+    return out
+
+
+def _cross(vectors: Array) -> Array:
+    """Return the matrices (n, 3, 3) of vector products with vectors (n, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
+
+
+def exchanged(R: Array, t: Array, X: Array) -> tuple[Array, Array]:
+    """Return the poses that show points of a flat machine alike from far.
+
+    The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
+    through its middle that faces the camera.
+
+    Parameters
+    ----------
+    R, t : (n, 3, 3) and (n, 3) array
+        T_camera_base of some poses: rotations and translations [m].
+    X : (m, 3) array
+        Points of the machine, one at least, in the base link [m].
+
+    Returns
+    -------
+    R, t : (n, 3, 3) and (n, 3) array
+    """
+    middle = X.mean(axis=0)
+    normal = np.linalg.svd(X - middle, full_matrices=False)[2][2]
+    at = R @ middle + t
+    facing = at / np.linalg.norm(at, axis=1, keepdims=True)
+    in_plane = np.eye(3) - 2.0 * np.outer(normal, normal)
+    in_depth = np.eye(3) - 2.0 * facing[:, :, None] * facing[:, None, :]
+    turned = in_depth @ R @ in_plane
+    return turned, at - turned @ middle

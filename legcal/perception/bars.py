@@ -1,0 +1,312 @@
+"""Pairs of edges that may be the two outlines of a cylinder.
+
+A cylinder shows two nearly parallel edges, one where the picture gets brighter across it and one
+where it gets darker; a lit one before something grey may do the same at both. What it is not told
+here: how thick it is, and whether it is a leg at all.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.perception.picture import Grey, reduce
+from legcal.vision import Camera
+
+LONG_SIDE = 480  # of the reduced picture at least [px]
+LARGEST_FACTOR = 4  # by which a picture is reduced: legs are 12 px wide and more
+SHORTEST = 7.0  # of a piece [reduced px]
+LEAST_LENGTH = 14.0  # of a joined edge [reduced px]
+ASIDE = 1.6  # of the ends of a piece from the line that it continues [reduced px]
+TURN = np.deg2rad(4.0)  # between pieces of one edge
+GAP = 3.0  # between them, in lengths of the shorter one
+DARK = 1.0 / 30.0  # part of the brightest light
+MOST = 400  # pieces of a picture, longest first
+STEEPNESSES = 64  # that are told apart in the order of pixels: each one takes time
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Straight edges.
+
+    Attributes
+    ----------
+    ends : (n, 2, 2) array
+        Both ends on the sensor plane. On the way from the first to the second the picture is
+        brighter on the left-hand side, as one sees it: in the direction (dy, -dx).
+    covered : (n,) array
+        Share of the length on which the edge was seen.
+    pixel : float
+        Size of a pixel of the reduced picture on the sensor plane.
+    """
+
+    ends: Array
+    covered: Array
+    pixel: float
+
+    def __len__(self) -> int:
+        """Return the number of edges."""
+        return len(self.ends)
+
+
+def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> Segments:
+    """Return the straight edges of a picture.
+
+    Parameters
+    ----------
+    grey : Grey
+        The picture.
+    camera : Camera
+        Its camera.
+    long_side : int
+        The picture is reduced by the largest whole factor that leaves its longer side this long.
+    """
+    factor = int(np.clip(max(grey.shape) // long_side, 1, LARGEST_FACTOR))
+    pieces = _pieces(reduce(grey, factor))
+    focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
+    pixel = factor / focal
+    if len(pieces) == 0:
+        return Segments(np.zeros((0, 2, 2)), np.zeros(0), pixel)
+    ends = camera.undistort((pieces.reshape(-1, 2) + 0.5) * factor - 0.5).reshape(-1, 2, 2)
+    ends, covered = _join(ends / pixel)
+    return Segments(ends * pixel, covered, pixel)
+
+
+def _pieces(small: Grey) -> Array:
+    """Return pieces of edges (n, 2, 2) in a reduced picture [px]."""
+    levels = _stretched(small)
+    # Reduced enough already. Whether steep pixels come first matters, not in which order.
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, 1.0, n_bins=STEEPNESSES)
+    lines = detector.detect(levels)[0]
+    if lines is None:
+        return np.zeros((0, 2, 2))
+    pieces = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 2)  # of middles of pixels
+    length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
+    order = np.argsort(-length, kind="stable")[:MOST]
+    return np.asarray(pieces[order[length[order] >= SHORTEST]])
+
+
+def _stretched(small: Grey) -> NDArray[np.uint8]:
+    """Return about the logarithm of the light: a dark leg's edges count as much as a bright one's.
+
+    What is darker than ``DARK`` of the brightest is mostly noise and keeps its distances.
+    """
+    top = max(float(np.percentile(small[::4, ::4], 99.5)), 1.0)
+    light = 1.0 + np.clip(small, 0.0, top) / np.float32(DARK * top)
+    return np.asarray((255.0 / math.log1p(1.0 / DARK)) * cv2.log(light), dtype=np.uint8)
+
+
+def _join(ends: Array) -> tuple[Array, Array]:
+    """Join pieces that continue each other; return the edges and how much of them was seen."""
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    along = along / length[:, None]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    middle = ends.mean(axis=1)
+    # Piece j against the line of piece i, the longer one (pieces come longest first).
+    i, j = np.nonzero(np.triu(along @ along.T >= np.cos(TURN), 1))
+    to_ends = ends[j] - middle[i, None]
+    aside = np.abs(np.einsum("nkx,nx->nk", to_ends, normal[i])).max(axis=1)
+    place = np.einsum("nkx,nx->nk", to_ends, along[i])
+    gap = np.maximum(place.min(axis=1), -place.max(axis=1)) - 0.5 * length[i]
+    # A long way ahead a line is known less well.
+    allowed = ASIDE * (1.0 + 0.5 * np.maximum(gap, 0.0) / length[i])
+    near = (gap <= GAP * length[j]) & (aside <= np.minimum(allowed, 2 * ASIDE))
+    i, j = i[near], j[near]
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
+    label: IntArray = np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
+    order = np.argsort(label, kind="stable")
+    found, covered = _fitted(ends[order], length[order], label[order])
+    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= LEAST_LENGTH
+    return found[long], covered[long]
+
+
+def _fitted(pieces: Array, length: Array, label: IntArray) -> tuple[Array, Array]:
+    """Return one line through the pieces of each label, or the pieces as they are if they bend.
+
+    Pieces (n, 2, 2) and their lengths (n,) come label by label, from 0 without gaps, the longest
+    first; lines as well, with the share of each that its pieces cover.
+    """
+    first = np.flatnonzero(np.diff(label, prepend=-1))
+    total = np.add.reduceat(length, first)
+    centre = np.add.reduceat(pieces.mean(axis=1) * length[:, None], first) / total[:, None]
+    away = pieces - centre[label, None]
+    xx, xy, yy = (
+        np.add.reduceat(np.sum(away[..., i] * away[..., j], axis=1) * length, first)
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    turn = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    direction = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    longest = pieces[first, 1] - pieces[first, 0]
+    direction *= np.sign(np.sum(direction * longest, axis=1))[:, None]
+    x, y = direction[label].T[..., None]
+    place, aside = away[..., 0] * x + away[..., 1] * y, away[..., 1] * x - away[..., 0] * y
+    start = np.minimum.reduceat(place.min(axis=1), first)
+    stop = np.maximum.reduceat(place.max(axis=1), first)
+    lines = centre[:, None] + np.stack([start, stop], axis=1)[..., None] * direction[:, None]
+    straight = np.maximum.reduceat(np.abs(aside).max(axis=1), first) <= 1.5 * ASIDE
+    bent = ~straight[label]
+    order = np.argsort(np.concatenate([np.flatnonzero(straight), label[bent]]), kind="stable")
+    share = np.minimum(total / (stop - start), 1.0)
+    return (
+        np.concatenate([lines[straight], pieces[bent]])[order],
+        np.concatenate([share[straight], np.ones(np.count_nonzero(bent))])[order],
+    )
+
+
+CONVERGENCE = np.deg2rad(9.0)  # of two outlines: a leg that points at the camera
+NARROWEST, WIDEST = 2.5, 130.0  # [reduced px]
+SLENDER = 1.5  # length in widths
+LEAST_OVERLAP = 0.35  # of the longer edge
+SAME_WAY = 0.5  # what a pair counts at both of whose edges the picture changes the same way
+MOST_bars = 48  # bars of a picture
+MOST_OF_EDGE = 4  # bars to which one edge belongs
+ALIKE = 0.35, 0.2  # of a bar that says the same as another: distance, widths in widths
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """Candidate cylinders of a picture, best first, on its sensor plane.
+
+    Attributes
+    ----------
+    middle : (n, 2) array
+        The middle of the axis.
+    along : (n, 2) array
+        Unit direction of the axis.
+    half_length : (n,) array
+        From the middle to the ends.
+    width : (n, 2) array
+        Distance of the edges at both ends; the first one is against ``along``.
+    merit : (n,) array
+        Length on which both edges were seen.
+    pixel : float
+        How well edges are known.
+    """
+
+    middle: Array
+    along: Array
+    half_length: Array
+    width: Array
+    merit: Array
+    pixel: float
+
+    def __len__(self) -> int:
+        """Return the number of bars."""
+        return len(self.middle)
+
+    @property
+    def normal(self) -> Array:
+        """Unit normals (n, 2) of the axes."""
+        return np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
+
+    def take(self, chosen: IntArray | BoolArray) -> "Bars":
+        """Return some of the bars."""
+        return Bars(
+            self.middle[chosen],
+            self.along[chosen],
+            self.half_length[chosen],
+            self.width[chosen],
+            self.merit[chosen],
+            self.pixel,
+        )
+
+
+def find_bars(segments: Segments, most: int = MOST_bars) -> Bars:
+    """Return the pairs of edges that may be a cylinder.
+
+    Parameters
+    ----------
+    segments : Segments
+        Straight edges.
+    most : int
+        How many are kept.
+    """
+    ends, pixel = segments.ends, segments.pixel
+    i, j = np.triu_indices(len(ends), 1)
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    along = along / np.where(length > 0.0, length, 1.0)[:, None]
+    cosine = np.sum(along[i] * along[j], axis=1)
+    i, j, cosine = (x[np.abs(cosine) >= np.cos(CONVERGENCE)] for x in (i, j, cosine))
+    axis = along[i] * length[i, None] + np.sign(cosine)[:, None] * along[j] * length[j, None]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    across = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
+    origin = 0.5 * (ends[i].mean(axis=1) + ends[j].mean(axis=1))
+    spans, lines = [], []
+    for edge in (i, j):
+        to_ends = ends[edge] - origin[:, None]
+        t, v = np.einsum("nkx,nx->nk", to_ends, axis), np.einsum("nkx,nx->nk", to_ends, across)
+        slope = (v[:, 1] - v[:, 0]) / (t[:, 1] - t[:, 0])
+        spans.append(np.sort(t, axis=1))
+        lines.append((v[:, 0] - slope * t[:, 0], slope))
+    first, last = (
+        np.maximum(spans[0][:, 0], spans[1][:, 0]),
+        np.minimum(spans[0][:, 1], spans[1][:, 1]),
+    )
+    overlap = last - first
+    longer = np.maximum(length[i], length[j])
+    offsets = [at + slope * np.stack([first, last]) for at, slope in lines]  # each (2, n)
+    gap = offsets[1] - offsets[0]
+    width = np.abs(gap)
+    good = (overlap >= LEAST_OVERLAP * longer) & (gap[0] * gap[1] > 0.0)
+    good &= (width.min(axis=0) >= NARROWEST * pixel) & (width.max(axis=0) <= WIDEST * pixel)
+    good &= overlap >= SLENDER * width.mean(axis=0)
+    merit = overlap * np.minimum(segments.covered[i], segments.covered[j])
+    merit = (
+        merit * np.where(cosine < 0.0, 1.0, SAME_WAY) * np.sqrt(np.maximum(overlap, 0.0) / longer)
+    )
+    centre = 0.5 * (offsets[0] + offsets[1])  # (2, n) of the axis at both ends
+    start, stop = (
+        origin + t[:, None] * axis + v[:, None] * across
+        for t, v in ((first, centre[0]), (last, centre[1]))
+    )
+    chosen = _best(np.where(good, merit, 0.0), i, j, len(ends), most)
+    chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:most]
+    start, stop = start[chosen], stop[chosen]
+    full = np.linalg.norm(stop - start, axis=1)
+    return Bars(
+        0.5 * (start + stop),
+        (stop - start) / full[:, None],
+        0.5 * full,
+        width.T[chosen],
+        merit[chosen],
+        pixel,
+    )
+
+
+def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int, most: int) -> IntArray:
+    """Return the best pairs, few of each edge: more than wanted, some of them may be alike."""
+    used = np.zeros(n_edges, dtype=np.intp)
+    chosen: list[int] = []
+    for k in np.argsort(-merit, kind="stable").tolist():
+        if merit[k] <= 0.0 or len(chosen) == 2 * most:
+            break
+        if max(used[i[k]], used[j[k]]) < MOST_OF_EDGE:
+            used[[i[k], j[k]]] += 1
+            chosen.append(k)
+    return np.array(chosen, dtype=np.intp)
+
+
+def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
+    """Return which bars (n,), best first, do not lie within better ones of the same width."""
+    along = stop - start
+    length = np.linalg.norm(along, axis=1)
+    along = along / length[:, None]
+    # Ends of bar j in the frame of bar i.
+    to_ends = np.stack([start, stop], axis=1)[None] - start[:, None, None]
+    place = np.einsum("ijkx,ix->ijk", to_ends, along)
+    aside = to_ends[..., 1] * along[:, None, None, 0] - to_ends[..., 0] * along[:, None, None, 1]
+    middle = place.mean(axis=2)
+    alike = np.abs(aside).max(axis=2) <= ALIKE[0] * width[:, None]
+    alike &= (middle > 0.0) & (middle < length[:, None])
+    alike &= np.abs(width[None, :] - width[:, None]) <= ALIKE[1] * width[:, None]
+    kept = np.ones(len(start), dtype=np.bool_)
+    for j in range(1, len(start)):
+        kept[j] = not np.any(alike[:j, j] & kept[:j])
+    return kept

@@ -1,0 +1,633 @@
+"""Bars of mirrored images, and whether they explain a view better than its images as they are.
+
+A camera pose is found for mirrored images of many machines as well, with fewer legs on their bars:
+a leg or two on the wrong ones. So a pose at which many legs are missing is held against the best
+one of the images with left and right exchanged.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.perception.agreement import (
+    WIDTH_ERROR,
+    Agreement,
+    Picture,
+    Poses,
+    Targets,
+    agreement,
+    distances,
+    exchanged,
+    improved,
+    seen_width,
+)
+from legcal.perception.bars import Bars
+
+N_FIRST, N_SECOND = 20, 40  # best bars that are tried as the first one, and as the second
+LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
+LONGER = 1.25, 3.0  # a bar is at most so much longer than the piece that it shows: factor, radii
+CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
+WIDTH_REACH = 2.5  # standard deviations of the width of the second bar
+SLACK = 0.2  # of the place along a piece, in its lengths
+TURNED = 1.05  # how far from a solution bars and legs may be that allow none, as a cosine
+CROSSING = 0.03  # sine between axes seen, below which the second bar does not tell the place
+MOST = 3000  # poses of a picture
+
+
+@dataclass(frozen=True, eq=False)
+class _Firsts:
+    """Bars taken for legs, each with a lean: all about a start but the turn and the place."""
+
+    u: Array  # (n, 3) direction in the camera frame, from base to platform
+    P: Array  # (n, 3) where the middle of the piece is put [m]
+    slack: Array  # (n,) how far along the leg it may be instead [m]
+    bar: IntArray  # (n,)
+    target: IntArray  # (n,)
+
+
+def pose_starts(picture: Picture, n_legs: int) -> Poses:
+    """Return camera poses that put two legs where two bars are.
+
+    Parameters
+    ----------
+    picture : Picture
+        Its best bars and all its targets are combined.
+    n_legs : int
+        Number of legs of the machine.
+    """
+    bars, targets = picture.bars.take(np.arange(min(N_SECOND, len(picture.bars)))), picture.targets
+    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
+    if len(bars) < 2 or len(set(targets.leg.tolist())) < 2:
+        return nothing
+    firsts = _firsts(bars, targets)
+    if len(firsts.u) == 0:
+        return nothing
+    middle = targets.ends.mean(axis=1)
+    piece = targets.ends[:, 1] - targets.ends[:, 0]
+    length = np.linalg.norm(piece, axis=1)
+    direction = piece / length[:, None]
+    # All in frames whose x axis is the first leg: of the camera, and of the base link.
+    U_c, U_b = _triads(firsts.u), _triads(direction)[firsts.target]
+    rays, planes = _rays(bars), _planes(bars)
+    n_all, ray_all = planes @ U_c, rays @ U_c  # (n_firsts, n_bars, 3)
+    P_all = np.einsum("fxi,fx->fi", U_c, firsts.P)
+    w_all = direction @ U_b  # (n_firsts, n_targets, 3)
+    d_all = (middle[None] - middle[firsts.target][:, None]) @ U_b
+    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
+    n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
+    across = n[:, 0]
+    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < CROSSING, np.inf, across)
+    good = np.flatnonzero(np.abs(place) <= firsts.slack[f])
+    f, k, m = f[good], k[good], m[good]
+    cosine, sine, place = cosine[good], sine[good], place[good]
+    # Where the second bar's middle is on the second leg, and how wide it should be there.
+    X = d[good] + P[good]
+    X[:, 0] += place
+    v, ray = _turned(w_all[f, m], cosine, sine), ray_all[f, k]
+    vX, vr, Xr = _dot(v, X), _dot(v, ray), _dot(X, ray)
+    along = -(_dot(X, X) * vr - vX * Xr) / _safe(vX * vr - Xr)
+    depth = _dot(U_c[f, 2], X + along[:, None] * v)
+    flat = np.linalg.norm(planes[k][:, :2], axis=1)
+    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
+    seen = seen_width(bars)[k]
+    # The depth of the first leg is no better known.
+    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, bars.pixel / seen)
+    off = np.abs(np.log(expected / seen)) / (WIDTH_REACH * sigma)
+    good_along = np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]
+    good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
+    merit = bars.merit[k] + bars.merit[firsts.bar[f]]
+    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MOST]]
+    f, place = f[good], place[good]
+    R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
+    where = firsts.P[f] + place[:, None] * firsts.u[f]
+    t = where - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
+    return Poses.rigid(R, t, n_legs)
+
+
+def _turns(
+    firsts: _Firsts, targets: Targets, n: Array, w: Array
+) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
+    """Return the turns about a first leg that lay a second one into the plane of a second bar.
+
+    Indices of the first, the second bar and the second piece, and cosine and sine of the turn,
+    from the normals n (n_firsts, n_bars, 3) of the planes and the directions w (n_firsts,
+    n_targets, 3) of the pieces.
+    """
+    n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
+    c0 = n[..., 0] * w[..., 0]
+    c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
+    c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
+    good = c0**2 <= TURNED**2 * (c1**2 + c2**2)
+    good &= (np.arange(n.shape[1]) != firsts.bar[:, None])[:, :, None]
+    good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
+    f, k, m = np.nonzero(good)
+    c0, c1, c2 = (c[good].astype(np.float64) for c in (c0, c1, c2))
+    step = np.arccos(np.clip(-c0 / np.maximum(np.hypot(c1, c2), 1e-12), -1.0, 1.0))
+    base = np.arctan2(c2, c1)
+    turn = np.concatenate([base + step, base - step])
+    f, k, m = (np.concatenate([x, x]) for x in (f, k, m))
+    return f, k, m, np.cos(turn), np.sin(turn)
+
+
+def _firsts(bars: Bars, targets: Targets) -> _Firsts:
+    """Take the best bars for every piece, with all leans that their edges allow."""
+    n = min(N_FIRST, len(bars))
+    first = bars.take(np.arange(n))
+    rays, planes = _rays(first), _planes(first)
+    along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
+    ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    side = np.cross(ray, planes)  # in the plane of the axis, across the ray
+    side *= np.sign(_dot(side, along))[:, None]
+    width = seen_width(first)
+    cone = np.log(first.width[:, 1] / first.width[:, 0])[:, None, None]
+    sigma = (CONE + 1.5 * bars.pixel / width)[:, None, None]
+    length = np.linalg.norm(targets.ends[:, 1] - targets.ends[:, 0], axis=1)
+    flat = np.linalg.norm(planes[:, :2], axis=1)
+    z = 2.0 * targets.radius / (width * flat)[:, None]  # (n, n_targets)
+    v = np.cos(LEANS)[:, None] * side[:, None] + np.sin(LEANS)[:, None] * ray[:, None]
+    # The ends of the bar on an axis along v, and how their widths differ.
+    steep = np.maximum(np.abs(np.einsum("nlx,nx->nl", v, along)), 0.2)
+    reach = (first.half_length[:, None] / steep)[:, None, :] * z[..., None]  # (n, n_targets, leans)
+    z0, z1 = z[..., None] - reach * v[:, None, :, 2], z[..., None] + reach * v[:, None, :, 2]
+    longest = LONGER[0] * length + LONGER[1] * targets.radius
+    good = (np.minimum(z0, z1) > 0.0) & (2.0 * reach <= longest[:, None])
+    ratio = np.log(np.where(good, z0, 1.0) / np.where(good, z1, 1.0))
+    good &= np.abs(ratio - cone) <= 3.0 * sigma
+    i, j, lean = np.nonzero(good)
+    slack = np.maximum(0.5 * length[j] - reach[good], 0.0) + SLACK * length[j]
+    u, P = v[i, lean], z[i, j][:, None] * rays[i]
+    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, slack, i, j)))
+
+
+def _rays(bars: Bars) -> Array:
+    """Return the points (x, y, 1) of the middles, (n, 3)."""
+    return np.concatenate([bars.middle, np.ones((len(bars), 1))], axis=1)
+
+
+def _planes(bars: Bars) -> Array:
+    """Return the unit normals (n, 3) of the planes of the axes and the camera centre."""
+    along = np.concatenate([bars.along, np.zeros((len(bars), 1))], axis=1)
+    planes = np.cross(along, _rays(bars))
+    return np.asarray(planes / np.linalg.norm(planes, axis=1, keepdims=True))
+
+
+def _triads(u: Array) -> Array:
+    """Return right-handed orthonormal matrices (n, 3, 3) whose first columns are u."""
+    other = np.eye(3)[np.argmin(np.abs(u), axis=1)]
+    v = np.cross(u, other)
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    return np.stack([u, v, np.cross(u, v)], axis=2)
+
+
+def _about_x(cosine: Array, sine: Array) -> Array:
+    """Return rotations (n, 3, 3) about the x axis."""
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    rows = [one, zero, zero, zero, cosine, -sine, zero, sine, cosine]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def _turned(x: Array, cosine: Array, sine: Array) -> Array:
+    """Return vectors (n, 3) turned about the x axis."""
+    y, z = x[:, 1], x[:, 2]
+    return np.stack([x[:, 0], cosine * y - sine * z, sine * y + cosine * z], axis=-1)
+
+
+def _dot(x: Array, y: Array) -> Array:
+    return np.asarray(np.einsum("ni,ni->n", x, y))
+
+
+def _safe(x: Array) -> Array:
+    return np.where(np.abs(x) < 1e-12, 1e-12, x)
+
+
+def joined(parts: Sequence[Poses]) -> Poses:
+    """Return all poses of some sets."""
+    R, t, shift = ([getattr(p, name) for p in parts] for name in ("R", "t", "shift"))
+    return Poses(np.concatenate(R), np.concatenate(t), np.concatenate(shift))
+
+
+# Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
+# lead over the next pose in legs of all images together, and as a part.
+CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
+ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
+FEW_SUPPORT, FEW_LEAD, FEW_PART = 0.12, 0.9, 0.3  # of one that shows few legs and has no rival
+HINTED_SUPPORT = 0.6  # share near a rough pose that leaves no doubt
+LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
+HINTED_LEAST = 1.6  # the same near a rough pose
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Poses of a camera, best first, each far from the better ones or with legs on other bars.
+
+    Attributes
+    ----------
+    poses : Poses
+        T_camera_base.
+    support : (n, n_pictures) array
+        How many legs agree in each picture, weighted by how well and how much of them.
+    expected : (n, n_pictures) array
+        How many legs each picture would show.
+    score : (n,) array
+        The support in all pictures together, less what the shifts of the joints cost: legs.
+    leg_error : (n_legs,) array
+        Root mean square distance of the legs from their bars at the first pose [m]; infinite for
+        legs without any.
+    hinted : bool
+        Whether the pose was searched for near a rough one only.
+    by_outlines : bool or None
+        Whether outlines that were measured at the poses speak for the first one; None where bars
+        left no doubt.
+    """
+
+    poses: Poses
+    support: Array
+    expected: Array
+    score: Array
+    leg_error: Array
+    hinted: bool = False
+    by_outlines: bool | None = None
+
+    @property
+    def needed(self) -> float:
+        """How many legs must agree in a picture on average for a pose to be believed."""
+        n = self.support.shape[1]
+        alone = not self.hinted and self._leads(FEW_LEAD, FEW_PART)
+        share = FEW_SUPPORT if alone else ENOUGH_SUPPORT
+        least = HINTED_LEAST if self.hinted else LEAST_SUPPORT
+        return float(max(share * self.expected[0].mean(), least / n))
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether enough legs agree with the first pose."""
+        return len(self.poses) > 0 and float(self.support[0].mean()) >= self.needed
+
+    @property
+    def lead(self) -> float:
+        """Score of the first pose beyond that of the second one, in legs."""
+        if len(self.poses) < 2:
+            return float("inf")
+        return float(self.score[0] - self.score[1])
+
+    @property
+    def leads_clearly(self) -> bool:
+        """Whether bars leave no doubt that the first pose is better than the second one."""
+        return self._leads(CLEAR_LEAD, CLEAR_PART)
+
+    @property
+    def leads(self) -> bool:
+        """Whether bars tell the first pose from the second one."""
+        return self._leads(ENOUGH_LEAD, ENOUGH_PART)
+
+    @property
+    def is_convincing(self) -> bool:
+        """Whether the first pose is to be believed."""
+        if self.by_outlines is not None:
+            return self.by_outlines
+        return self.is_enough and (self.hinted or self.leads)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the first pose leaves no doubt, so that no further search is needed."""
+        if not self.is_enough or self.by_outlines is False:
+            return False
+        if self.hinted:
+            return self.share >= HINTED_SUPPORT
+        return self.share >= CLEAR_SUPPORT and self.leads_clearly
+
+    @property
+    def share(self) -> float:
+        """Share of the expected legs that agree with the first pose."""
+        return float(self.support[0].sum() / self.expected[0].sum()) if len(self.poses) else 0.0
+
+    def _leads(self, legs: float, part: float) -> bool:
+        """Say whether the first pose leads by so many legs and such a part of its score."""
+        return self.lead >= max(legs, part * float(self.score[0]))
+
+    def pose(self, i: int = 0) -> RigidTransform:
+        """Return T_base_camera of a pose."""
+        R = Rotation.from_matrix(self.poses.R[i])
+        return RigidTransform.from_components(self.poses.t[i], R).inv()
+
+
+TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
+LAST = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
+JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
+START_PICTURES = 1, 1, 2, 4  # whose bars suggest poses, as long as there is a doubt
+SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
+KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
+N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
+N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
+POLISH = (0.018, 0.012, 0.008)  # tolerances
+POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
+SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
+SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
+OTHER_TURN, OTHER_PLACE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
+SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
+MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
+JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
+SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
+NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
+FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
+
+
+def place_camera(
+    pictures: Sequence[Picture], n_legs: int, starts: Sequence[int] = START_PICTURES
+) -> Placed:
+    """Return the camera poses on which most legs of all pictures of a view agree.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        Of one camera pose, at different readings.
+    n_legs : int
+        Number of legs of the machine.
+    starts : sequence of int
+        How many pictures more suggest poses, as long as there is a doubt.
+    """
+    by_merit = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
+    best_first = [pictures[k] for k in by_merit]
+    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
+    best = _judged(pictures, nothing)
+    done = 0
+    for n in starts:
+        if done >= len(pictures):
+            break
+        suggested = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
+        done += n
+        poses = joined([best.poses, *suggested])
+        if len(poses) == 0:
+            continue
+        poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
+        some = best_first[: max(SOME_PICTURES, done)]
+        score = supports(some, poses, TOLERANCES[3])[0].sum(axis=1)
+        poses = poses.take(_distinct(poses, score, KEPT[2]))
+        poses = joined([poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))])
+        poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
+        score = supports(some, poses, TOLERANCES[-1])[0].sum(axis=1)
+        poses = poses.take(_best(score, KEPT[3]))
+        poses = joined([poses, _polished(some[:POLISHING], poses)])
+        best = _judged(pictures, refined(pictures, poses, LAST, JOINT_ERROR))
+        if best.is_clear:
+            break
+    return best
+
+
+def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
+    """Return for each of the best poses the best one around it that steps lead to.
+
+    A leg on a wrong bar keeps a pose, and the joints moved for it, from where all legs agree.
+    """
+    n_legs = poses.shift.shape[1]
+    found = []
+    for i in range(min(N_POLISHED, len(poses))):
+        around = _around(pictures, poses.R[i], poses.t[i], n_legs)
+        around = refined(pictures, around, POLISH, JOINT_ERROR)
+        score = supports(pictures, around, POLISH[-1])[0].sum(axis=1)
+        found.append(around.take(_best(score, 1)))
+    return joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
+
+
+def _reversed(pictures: Sequence[Picture], poses: Poses) -> Poses:
+    """Return the poses that show a flat machine alike from far: near and far exchanged."""
+    ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
+    if len(ends) == 0:
+        return poses
+    return Poses.rigid(*exchanged(poses.R, poses.t, ends), poses.shift.shape[1])
+
+
+def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Poses:
+    """Return poses around one: the machine turned a little, further, nearer, or as it is."""
+    ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
+    middle = ends.mean(axis=0) if len(ends) else np.zeros(3)
+    turns = POLISH_TURN * np.concatenate([np.zeros((3, 3)), np.eye(3), -np.eye(3)])
+    further = 1.0 + POLISH_FURTHER * np.array([0.0, 1.0, -1.0, *np.zeros(6)])
+    new = Rotation.from_rotvec(turns).as_matrix() @ R
+    return Poses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
+
+
+def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int) -> Placed:
+    """Return the camera pose near a rough one on which the pictures of a view agree.
+
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        Of one camera pose, at different readings.
+    T_base_camera : RigidTransform
+        The rough pose.
+    n_legs : int
+        Number of legs of the machine.
+    """
+    T = T_base_camera.inv()
+    turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
+    poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
+    poses = refined(pictures, poses, TOLERANCES[:3])
+    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST), JOINT_ERROR)
+    found = _judged(pictures, poses)
+    return replace(found, hinted=True)
+
+
+def with_first(placed: Placed, i: int, pose: Poses, pictures: Sequence[Picture]) -> Placed:
+    """Return poses with the i-th one first, where outlines put it."""
+    order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
+    return replace(
+        placed,
+        poses=joined([pose, placed.poses.take(order[1:])]),
+        support=placed.support[order],
+        expected=placed.expected[order],
+        score=placed.score[order],
+        leg_error=_leg_error(pictures, pose),
+    )
+
+
+def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
+    """Return poses with their support, best first, without those that say the same."""
+    n_legs = poses.shift.shape[1]
+    if len(poses) == 0:
+        empty = np.zeros((0, len(pictures)))
+        return Placed(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
+    found = [agreement(picture, poses, JUDGED) for picture in pictures]
+    values = [one.one_bar_each for one in found]
+    shares = [picture.targets.share for picture in pictures]
+    support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
+    expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
+    cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / JOINT_ERROR**2
+    score = support.sum(axis=1) - SHIFT_COST * cost
+    order = _different(pictures, poses, found, [v >= MATCHED for v in values], score)
+    best = poses.take(order[:1])
+    error = _leg_error(pictures, best)
+    return Placed(poses.take(order), support[order], expected[order], score[order], error)
+
+
+def _different(
+    pictures: Sequence[Picture],
+    poses: Poses,
+    found: Sequence[Agreement],
+    matched: Sequence[BoolArray],
+    score: Array,
+) -> IntArray:
+    """Return the poses, best first, that put other legs on other bars than better ones do.
+
+    So do poses that are far from them: legs in a plane that is seen from its edge are on the same
+    bars from below.
+    """
+    common = np.zeros((len(score), len(score)))
+    for picture, agreed, match in zip(pictures, found, matched, strict=True):
+        if len(picture.bars) == 0:
+            continue
+        same = _one_leg(picture.bars)
+        for j in range(len(picture.targets)):
+            bar, has = agreed.bar[:, j], match[:, j]
+            common += same[np.ix_(bar, bar)] & has[:, None] & has[None, :]
+    least = np.maximum(np.diag(common), 1.0)
+    kept: list[int] = []
+    for i in np.argsort(-score, kind="stable").tolist():
+        alike = common[i, kept] / least[i] >= SAME_MATCHES
+        if not np.any(alike & _near(poses, kept, i, OTHER_TURN, OTHER_PLACE)):
+            kept.append(i)
+    return np.array(kept, dtype=np.intp)
+
+
+def _one_leg(bars: Bars) -> BoolArray:
+    """Return which bars (n, n) may be of one leg: they continue each other or overlap."""
+    apart = np.abs(np.einsum("ijx,ix->ij", bars.middle[None] - bars.middle[:, None], bars.normal))
+    near = np.maximum(apart, apart.T) <= SAME_BAR[1] * bars.width.mean(axis=1)[:, None]
+    return np.asarray(near & (np.abs(bars.along @ bars.along.T) >= np.cos(SAME_BAR[0])))
+
+
+def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
+    """Return the root mean square distance (n_legs,) of legs from their bars [m]."""
+    n_legs = pose.shift.shape[1]
+    square, count = np.zeros(n_legs), np.zeros(n_legs)
+    for picture in pictures:
+        if len(picture.bars) == 0 or len(picture.targets) == 0:
+            continue
+        found = agreement(picture, pose, JUDGED)
+        matched = found.one_bar_each[0] >= MATCHED
+        distance = distances(picture, pose, found)[0]
+        np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
+        np.add.at(count, picture.targets.leg[matched], 1.0)
+    error = np.sqrt(square / np.maximum(count, 1.0))
+    error = np.where(count < FEW_MATCHES, np.maximum(error, FEW_ERROR), error)
+    return np.where(count > 0, error, np.inf)
+
+
+def _starts(picture: Picture, n_legs: int) -> Poses:
+    """Return the poses that suit a picture best, among those that two of its bars suggest."""
+    poses = pose_starts(picture, n_legs)
+    if len(poses) == 0:
+        return poses
+    # From the frame of the picture to that of the poses.
+    back = picture.R.T
+    poses = Poses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
+    poses = poses.take(_best(supports([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
+    poses = refined([picture], poses, TOLERANCES[:3])
+    score = supports([picture], poses, TOLERANCES[2])[0].sum(axis=1)
+    return poses.take(_distinct(poses, score, KEPT[1]))
+
+
+def _merit(picture: Picture) -> float:
+    return float(picture.bars.merit[:8].sum()) if len(picture.bars) else 0.0
+
+
+def refined(
+    pictures: Sequence[Picture],
+    poses: Poses,
+    tolerances: Sequence[float],
+    joint_error: float = 0.0,
+) -> Poses:
+    """Return poses after a step towards the bars for each of some tolerances."""
+    for tolerance in tolerances:
+        found = [agreement(picture, poses, tolerance) for picture in pictures]
+        poses = improved(pictures, poses, found, tolerance, joint_error)
+    return poses
+
+
+def supports(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
+    """Return the support and the expected number of legs, both (n_poses, n_pictures)."""
+    support, expected = [], []
+    for picture in pictures:
+        found = agreement(picture, poses, tolerance)
+        support.append(found.one_bar_each @ picture.targets.share)
+        expected.append(found.visible @ picture.targets.share)
+    return np.stack(support, axis=1), np.stack(expected, axis=1)
+
+
+def _best(score: Array, n: int) -> IntArray:
+    return np.argsort(-score, kind="stable")[:n]
+
+
+def _distinct(poses: Poses, score: Array, n: int) -> IntArray:
+    """Return the best poses that differ from better ones."""
+    kept: list[int] = []
+    for i in np.argsort(-score, kind="stable").tolist():
+        if len(kept) == n:
+            break
+        if not np.any(_near(poses, kept, i, SAME_TURN, SAME_PLACE)):
+            kept.append(i)
+    return np.array(kept, dtype=np.intp)
+
+
+def _near(poses: Poses, some: list[int], i: int, angle: float, part: float) -> BoolArray:
+    """Return which of some poses are within an angle and a part of the distance of pose i."""
+    trace = np.einsum("kij,ij->k", poses.R[some], poses.R[i])
+    turn = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+    # Where the camera stands in the base link.
+    at = -np.einsum("kij,ki->kj", poses.R[some], poses.t[some])
+    apart = np.linalg.norm(at + poses.R[i].T @ poses.t[i], axis=1)
+    return np.asarray((turn < angle) & (apart < part * np.linalg.norm(poses.t[i])))
+
+
+LEFT_RIGHT = np.array([-1.0, 1.0])
+UP_DOWN = np.array([1.0, -1.0])
+UPSIDE_DOWN = np.array([-1.0, -1.0])
+PLAIN = 0.45  # share of the expected legs that mirrored images do not reach
+LEAD, LEAD_PART = 0.3, 0.06  # of the mirrored pictures over the own ones: legs of all images, part
+
+
+def flipped(bars: Bars, corners: Array, flip: Array) -> Bars:
+    """Return the bars of the image with its pixels in the opposite order along some axes.
+
+    Parameters
+    ----------
+    bars : Bars
+        Of the image as it is.
+    corners : (2, 2) array
+        Least and greatest x and y of the sensor plane that it shows.
+    flip : (2,) array
+        -1 along the axes that are turned around.
+    """
+    middle = corners.mean(axis=0)
+    return replace(bars, middle=middle + flip * (bars.middle - middle), along=flip * bars.along)
+
+
+def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
+    """Return the pictures with left and right exchanged."""
+    return [replace(p, bars=flipped(p.bars, p.corners, LEFT_RIGHT)) for p in pictures]
+
+
+def may_be_mirrored(own: Placed) -> bool:
+    """Say whether a placed view needs to be held against its mirror image."""
+    return not own.is_convincing or own.share < PLAIN
+
+
+def is_mirrored(own: Placed, other: Placed) -> bool:
+    """Say whether mirrored pictures explain a view better than its own ones do.
+
+    Those of a machine with a plane of symmetry, as all planar ones, explain it about as well.
+
+    Parameters
+    ----------
+    own : Placed
+        By the pictures as they are.
+    other : Placed
+        By :func:`mirrored` ones.
+    """
+    if not own.is_convincing:
+        return other.is_clear
+    lead = float(other.score[0] - own.score[0])
+    return other.is_convincing and lead >= max(LEAD, LEAD_PART * float(other.score[0]))

@@ -1,0 +1,464 @@
+"""One image with what was found in it.
+
+Widths of lines and sizes of letters grow with the picture, and small pictures are enlarged, so
+that both are legible when the picture fills a screen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data import Dataset, Outlines, choose_outlines
+from legcal.geometry import Array, Image, IntArray
+from legcal.machine import Cylinder
+from legcal.perception.outline import OUTSIDE
+from legcal.vision import Camera, PredictedLeg, band_of_leg, predict_legs
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """The result of :func:`legcal.detect`, in the order of the files.
+
+    Attributes
+    ----------
+    dataset : Dataset
+        What was searched.
+    outlines : Outlines
+        All outlines: detected, given and edited.
+    A_base, B_base : (n_rows, n_legs, 3) array
+        Joint centres at every row, where each view sees them, in the base link [m].
+    cylinders : sequence, for each leg a sequence of Cylinder
+        What can be seen of the legs, with the radii that outlines were searched by.
+    T_base_camera : tuple of RigidTransform or None
+        The camera of every view; None where nothing is known of it.
+    rows : (n,) array of int
+        The rows that have an image.
+    unplaced : dict
+        Why the cameras of some views could not be placed, by name of the view; they are left where
+        they were expected, and no outline of theirs is here but those that were given.
+    notes : tuple of str
+        What else a reader should know.
+    """
+
+    dataset: Dataset
+    outlines: Outlines
+    A_base: Array
+    B_base: Array
+    cylinders: Sequence[Sequence[Cylinder]]
+    T_base_camera: tuple[RigidTransform | None, ...]
+    rows: IntArray
+    unplaced: dict[str, str]
+    notes: tuple[str, ...]
+
+    def view_of(self, row: int) -> str:
+        """Return the name of the view of a row."""
+        measurements = self.dataset.measurements
+        return measurements.views[int(measurements.view[row])].name
+
+    def predicted(self, row: int) -> list[PredictedLeg]:
+        """Return where the legs of a row should be seen; none where the camera is not known."""
+        measurements, legs = self.dataset.measurements, self.dataset.mechanism.legs
+        view = int(measurements.view[row])
+        T = self.T_base_camera[view]
+        if T is None:
+            return []
+        used = measurements.views[view].legs
+        found = predict_legs(
+            measurements.views[view].camera,
+            T,
+            self.A_base[row],
+            self.B_base[row],
+            self.cylinders,
+            row,
+        )
+        return [leg for leg in found if used is None or legs[leg.leg].name in used]
+
+
+_PLACES = (0.5, 0.3, 0.7, 0.15, 0.85)  # along a curve
+_ORDER = 0.02  # of the area of a text, by which an earlier place is preferred
+_ON_LINE = 0.1  # of the area of a text, that each point of a line under it costs
+_ON_TEXT, _OUTSIDE = 4.0, 10.0  # times the area on other texts, and outside the picture
+
+
+@dataclass(eq=False)
+class LabelPlaces:
+    """The texts of a picture.
+
+    Attributes
+    ----------
+    width, height : int
+        Of the picture [px].
+    lines : (n, 2) array
+        Points of all that is drawn [px].
+    boxes : list of (4,) array
+        Left, top, right and bottom of the texts that have a place.
+    """
+
+    width: int
+    height: int
+    lines: Array
+    boxes: list[Array] = field(default_factory=list)
+
+    def place(
+        self, curve: Array, size: tuple[int, int], distance: float
+    ) -> tuple[tuple[int, int], Array]:
+        """Return the left top corner of a text beside a curve, and keep its place.
+
+        Parameters
+        ----------
+        curve : (n, 2) array
+            What the text names [px].
+        size : tuple of two int
+            Width and height of the text [px].
+        distance : float
+            From the curve, at least [px].
+
+        Returns
+        -------
+        corner : tuple of two int
+        leader : (2, 2) array
+            From the curve to the text [px].
+        """
+        extent = np.array(size, dtype=np.float64)
+        candidates = []
+        for place in _PLACES:
+            i = min(int(place * len(curve)), len(curve) - 2)
+            along = curve[i + 1] - curve[i]
+            normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
+            reach = distance + 0.5 * float(np.abs(normal) @ extent)
+            for side in (reach, -reach, reach + distance, -reach - distance):
+                candidates.append((curve[i], curve[i] + side * normal - 0.5 * extent))
+        costs = [
+            self._cost(corner, extent) + _ORDER * k * extent.prod()
+            for k, (_, corner) in enumerate(candidates)
+        ]
+        anchor, best = candidates[int(np.argmin(costs))]
+        limit = np.maximum([self.width, self.height] - extent, 0.0)
+        corner = np.clip(np.rint(best), 0.0, np.floor(limit))
+        self.boxes.append(np.concatenate([corner, corner + extent]))
+        leader = np.array([anchor, np.clip(anchor, corner, corner + extent)])
+        return (int(corner[0]), int(corner[1])), leader
+
+    def _cost(self, corner: Array, extent: Array) -> float:
+        """Return what speaks against a place, as an area [px^2]."""
+        area = float(extent.prod())
+        low, high = corner, corner + extent
+        inside = np.minimum(high, [self.width, self.height]) - np.maximum(low, 0.0)
+        cost = _OUTSIDE * (area - float(np.maximum(inside, 0.0).prod()))
+        for box in self.boxes:
+            overlap = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
+            cost += _ON_TEXT * float(np.maximum(overlap, 0.0).prod())
+        under = np.all((self.lines > low) & (self.lines < high), axis=1)
+        return cost + _ON_LINE * area * float(np.count_nonzero(under))
+
+
+Kind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted"]
+N_POINTS = 40  # of a curve
+OTHER_FAILS = "other outline fails"
+
+
+@dataclass(frozen=True, eq=False)
+class Mark:
+    """A curve of the picture.
+
+    Attributes
+    ----------
+    kind : {"edge 1", "edge 2", "axis", "rejected", "predicted"}
+    points : (n, 2) array
+        Its points [px].
+    """
+
+    kind: Kind
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PartMarks:
+    """What is drawn of a part of a leg.
+
+    Attributes
+    ----------
+    name : str
+        The leg, and the part where the leg has several.
+    reason : str
+        Why an outline of it is not used, shortened; "" if both are.
+    marks : tuple of Mark
+    """
+
+    name: str
+    reason: str
+    marks: tuple[Mark, ...]
+
+
+def short_reason(reason: str) -> str:
+    """Return a reason without its figures, as it is counted and drawn."""
+    if reason.startswith("its other outline"):
+        return OTHER_FAILS
+    return reason.split(", ")[0].split(": ")[0]
+
+
+def marks_of_image(
+    camera: Camera,
+    outlines: Outlines,
+    predicted: Sequence[PredictedLeg],
+    leg_names: Sequence[str],
+) -> list[PartMarks]:
+    """Return what is drawn over an image, one entry for each part of a leg in it.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its camera.
+    outlines : Outlines
+        Those of this image.
+    predicted : sequence of PredictedLeg
+        Where its legs should be.
+    leg_names : sequence of str
+        The legs of the mechanism.
+    """
+    of_leg = {leg.leg: leg for leg in predicted}
+    several = {leg.leg for leg in predicted if len(leg.pieces) > 1}
+    pairs: dict[tuple[int, str], list[int]] = {}
+    for i, key in enumerate(zip(outlines.leg.tolist(), outlines.part, strict=True)):
+        pairs.setdefault(key, []).append(i)
+    several |= {leg for leg, _ in pairs if len([None for j, _ in pairs if j == leg]) > 1}
+    found = []
+    for (leg, part), rows in pairs.items():
+        pair = choose_outlines(outlines, np.array(rows, dtype=np.intp))
+        marks = _part_marks(camera, pair, part, of_leg.get(leg))
+        if not marks:
+            continue
+        name = leg_names[leg]
+        if leg in several:
+            name += " " + part.removeprefix(name).lstrip("_- ")
+        if "edited" in pair.source:
+            name += " (edited)"
+        found.append(PartMarks(name, _reason(pair), marks))
+    for lost in predicted:  # legs of which the table has nothing
+        if any(lost.leg == j for j, _ in pairs):
+            continue
+        parts = range(len(lost.pieces))
+        marks = tuple(mark for i in parts for mark in _prediction(camera, lost, i))
+        if marks:
+            found.append(PartMarks(leg_names[lost.leg], "", marks))
+    return found
+
+
+def _reason(pair: Outlines) -> str:
+    """Return why an outline of a part is not used."""
+    reasons = {
+        int(edge): short_reason(reason) or "rejected"
+        for edge, reason, used in zip(pair.edge, pair.reason, pair.used, strict=True)
+        if not used
+    }
+    first = {edge: reason for edge, reason in reasons.items() if reason != OTHER_FAILS} or reasons
+    if len(reasons) == len(pair) and len(set(first.values())) == 1:
+        return next(iter(first.values()))
+    return "; ".join(f"edge {edge}: {reason}" for edge, reason in sorted(first.items()))
+
+
+def _part_marks(
+    camera: Camera, pair: Outlines, part: str, leg: PredictedLeg | None
+) -> tuple[Mark, ...]:
+    """Return the outlines of a part, its axis if both are used, and where it should be if not."""
+    marks: list[Mark] = []
+    found = np.all(np.isfinite(pair.h), axis=1) & np.all(np.isfinite(pair.ends), axis=(1, 2))
+    used = pair.used & found
+    for i in np.flatnonzero(found).tolist():
+        kind: Kind = "rejected"
+        if pair.used[i]:
+            kind = "edge 1" if pair.edge[i] == 1 else "edge 2"
+        ends = camera.undistort(pair.ends[i])
+        marks.append(Mark(kind, _curve(camera, pair.h[i], ends)))
+    if np.count_nonzero(used) == 2:
+        # h1 . M = R and h2 . M = -R of all points M of the axis, eq (5): it is seen at h1 + h2.
+        ends = np.mean([camera.undistort(pair.ends[i]) for i in np.flatnonzero(used)], axis=0)
+        marks.append(Mark("axis", _curve(camera, pair.h[used].sum(axis=0), ends)))
+    if leg is not None and not np.all(found) and OUTSIDE not in pair.reason:
+        for i, piece in enumerate(leg.pieces):
+            if piece.link == part:
+                edges = [e - 1 for e, seen in zip(pair.edge, found, strict=True) if not seen]
+                marks += [mark for k, mark in enumerate(_prediction(camera, leg, i)) if k in edges]
+    return tuple(marks)
+
+
+def _curve(camera: Camera, h: Array, ends: Array) -> Array:
+    """Return a line (3,) of the sensor plane between the feet of two of its points, (n, 2) [px]."""
+    normal = h[:2] / (h[:2] @ h[:2])
+    feet = ends - (ends @ h[:2] + h[2])[:, None] * normal
+    share = np.linspace(0.0, 1.0, N_POINTS)[:, None]
+    return camera.distort(feet[0] + share * (feet[1] - feet[0]))
+
+
+def _prediction(camera: Camera, leg: PredictedLeg, i: int) -> list[Mark]:
+    """Return both predicted outlines of piece i of a leg; none where the image misses it."""
+    piece = leg.pieces[i]
+    band = band_of_leg(camera, leg.A_camera, leg.B_camera, piece.start, piece.end)
+    if band is None:
+        return []
+    t = np.linspace(0.0, band.length, N_POINTS)
+    return [
+        Mark("predicted", camera.distort(band.points(t, band.offsets(h, t))))
+        for h in leg.outlines[i]
+    ]
+
+
+Picture = NDArray[np.uint8]
+
+SCREEN = 1600  # longer side from which on a picture is not enlarged [px]
+MOST_ENLARGED = 4
+PER_LINE, PER_LETTER = 1000.0, 75.0  # longer sides in a line's width, and in a letter's height
+COLOURS: dict[Kind, tuple[int, int, int]] = {  # blue, green, red
+    "edge 1": (80, 230, 60),
+    "edge 2": (255, 170, 40),
+    "axis": (0, 225, 255),
+    "rejected": (70, 70, 255),
+    "predicted": (30, 150, 255),
+}
+_MEANING: dict[Kind, str] = {
+    "edge 1": "edge 1",
+    "edge 2": "edge 2",
+    "axis": "axis",
+    "rejected": "rejected",
+    "predicted": "expected here, not found",
+}
+_WHITE = (255, 255, 255)
+_DARK = (32, 32, 32)
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_LETTER = 22.0  # height of a letter of this font at scale 1 [px]
+_FRACTION_BITS = 4  # of coordinates that OpenCV draws at
+_SMALLER = 0.8  # letters of reasons and of the legend
+_DASH, _GAP = 9.0, 7.0  # in widths of a line
+
+
+def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Picture:
+    """Return an image with lines, names and reasons drawn over it, and a legend below.
+
+    Parameters
+    ----------
+    image : (height, width) array
+        Grey levels 0 to 255.
+    parts : sequence of PartMarks
+        What to draw.
+    caption : str
+        Stands in the legend.
+
+    Returns
+    -------
+    (height, width, 3) array of uint8
+        Blue, green, red.
+    """
+    longer = max(image.shape)
+    factor = int(np.clip(np.ceil(SCREEN / longer), 1, MOST_ENLARGED))
+    grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    if factor > 1:
+        grey = np.asarray(
+            cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), np.uint8
+        )
+    picture = np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8)
+    width = max(1, round(factor * longer / PER_LINE))
+    letter = factor * longer / PER_LETTER
+    curves = [[_enlarged(mark, factor) for mark in part.marks] for part in parts]
+    for marks in curves:
+        for mark in marks:
+            _draw_curve(picture, mark, width)
+    lines = np.concatenate([np.zeros((0, 2)), *(m.points for marks in curves for m in marks)])
+    places = LabelPlaces(picture.shape[1], picture.shape[0], lines)
+    for part, marks in zip(parts, curves, strict=True):
+        _label(picture, places, part, marks, letter)
+    return np.vstack([picture, _legend(picture.shape[1], letter, width, caption)])
+
+
+def _enlarged(mark: Mark, factor: int) -> Mark:
+    """Return a curve of the enlarged picture; pixel (0, 0) is the centre of a pixel in both."""
+    return Mark(mark.kind, (mark.points + 0.5) * factor - 0.5)
+
+
+def _draw_curve(picture: Picture, mark: Mark, width: int) -> None:
+    """Draw a curve; predictions are dashed, axes thin."""
+    colour = COLOURS[mark.kind]
+    if mark.kind == "predicted":
+        for dash in _dashes(mark.points, width):
+            _polyline(picture, dash, colour, width)
+    elif mark.kind == "axis":
+        _polyline(picture, mark.points, colour, max(1, width // 2))
+    else:
+        _polyline(picture, mark.points, colour, width)
+
+
+def _polyline(picture: Picture, points: Array, colour: tuple[int, int, int], width: int) -> None:
+    fixed = np.rint(points * 2**_FRACTION_BITS).astype(np.int32)
+    cv2.polylines(picture, [fixed], False, colour, width, cv2.LINE_AA, _FRACTION_BITS)
+
+
+def _dashes(points: Array, width: int) -> list[Array]:
+    """Return the dashes of a curve, (n, 2) each."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    starts = np.arange(0.0, along[-1], (_DASH + _GAP) * width)
+    dashes = []
+    for start in starts:
+        at = np.linspace(start, min(start + _DASH * width, along[-1]), 4)
+        dashes.append(np.column_stack([np.interp(at, along, c) for c in points.T]))
+    return dashes
+
+
+def _label(
+    picture: Picture, places: LabelPlaces, part: PartMarks, marks: Sequence[Mark], letter: float
+) -> None:
+    """Write the name of a part beside it, and why an outline of it is not used."""
+    kinds = {mark.kind for mark in marks}
+    colour = _WHITE
+    if part.reason or kinds == {"predicted"}:
+        colour = COLOURS["rejected" if "rejected" in kinds else "predicted"]
+    lines = [line for line in (part.name, part.reason) if line]
+    lettering = [_lettering(size) for size in (letter, _SMALLER * letter)]
+    widths = [
+        cv2.getTextSize(line, _FONT, *style)[0][0]
+        for line, style in zip(lines, lettering, strict=False)
+    ]
+    pad, step = round(0.3 * letter), round(1.3 * letter)
+    size = (max(widths) + 2 * pad, step * len(lines) + pad)
+    middle = min(marks, key=lambda mark: mark.kind != "axis").points
+    (x, y), leader = places.place(middle, size, 1.2 * letter)
+    _polyline(picture, leader, colour, 1 + round(letter / 40.0))
+    box = picture[y : y + size[1], x : x + size[0]]
+    box[:] = (0.35 * box).astype(np.uint8)
+    for k, (line, (scale, thick)) in enumerate(zip(lines, lettering, strict=False), start=1):
+        at = (x + pad, y + k * step - pad // 2)
+        cv2.putText(picture, line, at, _FONT, scale, colour, thick, cv2.LINE_AA)
+
+
+def _lettering(letter: float) -> tuple[float, int]:
+    """Return scale and thickness of letters of a height [px]."""
+    return letter / _LETTER, max(1, round(letter / 12.0))
+
+
+def _legend(width: int, letter: float, line: int, caption: str) -> Picture:
+    """Return the strip below a picture: what it shows, and what the colours mean."""
+    height = round(3.6 * letter)
+    strip = np.full((height, width, 3), _DARK, dtype=np.uint8)
+    scale, thick = _lettering(letter)
+    (w, _), _ = cv2.getTextSize(caption, _FONT, scale, thick)
+    fit = min(1.0, (width - 2.0 * letter) / max(w, 1))
+    base = round(1.4 * letter)
+    cv2.putText(
+        strip, caption, (round(letter), base), _FONT, fit * scale, _WHITE, thick, cv2.LINE_AA
+    )
+    x, y = letter, 2.9 * letter
+    for kind, meaning in _MEANING.items():
+        (w, _), _ = cv2.getTextSize(meaning, _FONT, _SMALLER * scale, thick)
+        start = np.array([x, y - 0.3 * letter])
+        sample = np.linspace(start, (start[0] + 3.0 * letter, start[1]), 8)
+        _draw_curve(strip, Mark(kind, sample), line)
+        at = (round(x + 3.6 * letter), round(y))
+        cv2.putText(strip, meaning, at, _FONT, _SMALLER * scale, _WHITE, thick, cv2.LINE_AA)
+        x += 3.6 * letter + w + 2.0 * letter
+    return strip

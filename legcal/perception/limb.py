@@ -1,0 +1,200 @@
+"""What a profile across an outline may look like, as sums of blurred powers of the depth.
+
+A background, flat or sloped, ends where the surface begins. What a surface of a cylinder sends to
+the camera depends on the direction of its normal: by r, the cosine between normal and line of
+sight, which is sqrt(rho (2 - rho)) at the depth rho = D / R inside the outline of a cylinder of
+half-width R. Diffuse light gives sums of 1, r and r^2, darkening towards the limb higher powers,
+and a highlight near the limb is a bump in r. So there are amplitudes of
+
+    background      outside the outline
+    its slope       outside, by the depth that is looked at
+    surface         inside, as it is seen edge-on
+    r, ..., r^4     inside
+
+expanded in powers of rho up to rho^2, which is good to a part in a hundred up to rho = 0.8.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.special import ndtr
+
+from legcal.geometry import Array, IntArray
+
+Samples = NDArray[np.float32]
+
+N_BASIS = 5
+_BEFORE, _AFTER, _PER_UNIT = 6.0, 40.0, 1024  # range of the table, and entries per unit
+
+
+def _gauss(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi))
+
+
+def _tabulate() -> Samples:
+    """Tabulate blurred functions of x, (4, n).
+
+    The step and its derivative, and sqrt(max(x, 0)) and its derivative, all blurred by a Gaussian
+    of unit width, for x in [-_BEFORE, _AFTER].
+    """
+    coarse = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / 32.0)
+    root = np.linspace(0.0, 7.0, 2801)  # substitute x = root^2: the integrands are smooth
+    kernel = 2.0 * (root[1] - root[0]) * root**2 * _gauss(coarse[:, None] - root**2)
+    x = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / _PER_UNIT)
+    value = np.interp(x, coarse, np.sum(kernel, axis=1))
+    slope = np.interp(x, coarse, np.sum(kernel * (root**2 - coarse[:, None]), axis=1))
+    return np.stack([ndtr(x), _gauss(x), value, slope]).astype(np.float32)
+
+
+_TABLE = _tabulate()
+
+
+def _look_up(x: Samples) -> list[Samples]:
+    """Return the four functions at x (n, m), from the nearest entries of the table."""
+    place = np.clip((x + _BEFORE) * _PER_UNIT + 0.5, 0.0, _TABLE.shape[1] - 1.0)
+    index = place.astype(np.intp)  # the type that needs no conversion: take is slower with others
+    return [function.take(index, mode="clip") for function in _TABLE]
+
+
+def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Samples, Samples]:
+    """Return the basis functions and their derivatives with respect to d.
+
+    Parameters
+    ----------
+    d : (n, m) array of float32
+        Distances inside the outline [px], negative outside.
+    half_width : (n, 1) array of float32
+        Half-width of the cylinder in the image [px].
+    blur : float or (n, 1) array of float32
+        Standard deviation of the blur [px].
+
+    Returns
+    -------
+    values, slopes : (n, 5, m) array of float32
+        In the order of the list above; the limb is one at the depth ``half_width``.
+    """
+    blur = np.asarray(blur, dtype=np.float32)
+    z = d / blur
+    step, peak, root, root_slope = _look_up(z)
+    depth = blur * (z * step + peak)  # the blurred ramp max(d, 0)
+    rho = depth / half_width
+    bend = np.sqrt(2.0 - np.clip(rho, 0.0, 1.0))
+    root_scale = np.sqrt(blur / half_width)
+    root *= root_scale
+    root_slope *= root_scale / blur
+    values = np.empty((len(d), N_BASIS, d.shape[1]), dtype=np.float32)
+    slopes = np.empty_like(values)
+    values[:, 0], slopes[:, 0] = 1.0, 0.0
+    values[:, 1], slopes[:, 1] = (depth - d) / half_width, (step - 1.0) / half_width
+    values[:, 2], slopes[:, 2] = step, peak / blur
+    values[:, 3] = root * bend
+    slopes[:, 3] = root_slope * bend - root * step / (2.0 * half_width * bend)
+    values[:, 4], slopes[:, 4] = rho, step / half_width
+    return values, slopes
+
+
+# Columns: 1, z, the Gaussian g(z), z g(z), and blurred powers; the last letter is the power.
+ONE, Z, GAUSS, Z_GAUSS, STEP, LESS_HALF, Z_LESS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)
+N_POWERS = 11
+
+_BEFORE_powers, _AFTER_powers, _PER_UNIT_powers = (
+    24.0,
+    24.0,
+    256,
+)  # range of the table, and entries per unit
+
+
+def _tabulate_powers() -> Array:
+    """Tabulate the functions for z in [-_BEFORE, _AFTER], (n, N_POWERS + 1)."""
+    coarse = np.arange(-_BEFORE_powers, _AFTER_powers + 1e-9, 1.0 / 32.0)
+    root = np.linspace(0.0, 7.0, 1401)  # substitute x = root^2: the integrands are smooth
+    kernel = np.exp(-0.5 * (root**2 - coarse[:, None]) ** 2) / np.sqrt(2.0 * np.pi)
+    kernel *= 2.0 * (root[1] - root[0])
+    kernel[:, 0] *= 0.5
+    z = np.arange(-_BEFORE_powers, _AFTER_powers + 1e-9, 1.0 / _PER_UNIT_powers)
+    less_half = CubicSpline(coarse, kernel.sum(axis=1))(z)
+    half = CubicSpline(coarse, kernel @ root**2)(z)
+    gauss, step = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi), ndtr(z)
+    ramp = z * step + gauss
+    three_halves, square = z * half + 0.5 * less_half, z * ramp + step
+    columns = [
+        np.ones_like(z), z, gauss, z * gauss, step, less_half, z * less_half, half, ramp,
+        three_halves, square,
+    ]  # fmt: skip
+    return np.stack([*columns, np.zeros_like(z)], axis=1)
+
+
+_TABLE_WITH_ROOM = _tabulate_powers()
+_TABLE_powers = np.ascontiguousarray(_TABLE_WITH_ROOM[:, :N_POWERS])
+
+
+def powers(z: Array) -> Array:
+    """Return the functions at distances z (...) in units of the blur, (..., N_POWERS)."""
+    return np.asarray(_TABLE_powers.take(_places(z), axis=0))
+
+
+def powers_with_room(z: Array) -> Array:
+    """Return the functions, and a column of zeros beside them, (..., N_POWERS + 1)."""
+    return np.asarray(_TABLE_WITH_ROOM.take(_places(z), axis=0))
+
+
+def _places(z: Array) -> IntArray:
+    """Return the nearest entries of the tables."""
+    place = np.clip((z + _BEFORE_powers) * _PER_UNIT_powers + 0.5, 0.0, len(_TABLE_powers) - 1.0)
+    return place.astype(np.intp)
+
+
+BACKGROUND, SLOPE, SURFACE = 0, 1, 2
+N_AMPLITUDES = 7
+
+_ROOT = float(np.sqrt(2.0))
+# Rows: r^0 to r^4 by rho^0, rho^(1/2), rho, rho^(3/2), rho^2.
+_OF_DEPTH = np.array(
+    [
+        [1.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, _ROOT, 0.0, -0.25 * _ROOT, 0.0],
+        [0.0, 0.0, 2.0, 0.0, -1.0],
+        [0.0, 0.0, 0.0, 2.0 * _ROOT, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 4.0],
+    ]
+)
+
+
+def profile_functions(half_width: Array, blur: Array, depth: float) -> tuple[Array, Array, Array]:
+    """Return what profiles are made of, as coefficients of :func:`legcal.perception.limb.powers`.
+
+    Parameters
+    ----------
+    half_width, blur : (n,) array
+        Half-widths of cylinders in the image, and the standard deviations of the blur [px].
+    depth : float
+        Distance from an outline that is looked at [px], the unit of the background's slope.
+
+    Returns
+    -------
+    values, slopes, widenings : (n, N_AMPLITUDES, N_POWERS) array
+        Of the functions above, of their derivatives with respect to the distance inside the
+        outline [1/px], and with respect to the logarithm of the blur.
+    """
+    n = len(blur)
+    values, slopes, widenings = (np.zeros((n, N_AMPLITUDES, N_POWERS)) for _ in range(3))
+    values[:, BACKGROUND, [ONE, STEP]] = 1.0, -1.0
+    slopes[:, BACKGROUND, GAUSS] = -1.0 / blur
+    widenings[:, BACKGROUND, Z_GAUSS] = 1.0
+    values[:, SLOPE, Z], values[:, SLOPE, RAMP] = blur / depth, -blur / depth
+    slopes[:, SLOPE, [ONE, STEP]] = 1.0 / depth, -1.0 / depth
+    widenings[:, SLOPE, GAUSS] = -blur / depth
+    value, slope, widening = (np.zeros((n, 5, N_POWERS)) for _ in range(3))
+    scale = blur / half_width
+    root = np.sqrt(scale)
+    value[:, 0, STEP], slope[:, 0, GAUSS], widening[:, 0, Z_GAUSS] = 1.0, 1.0 / blur, -1.0
+    value[:, 1, HALF], slope[:, 1, LESS_HALF] = root, 0.5 * root / blur
+    widening[:, 1, HALF], widening[:, 1, Z_LESS_HALF] = 0.5 * root, -0.5 * root
+    value[:, 2, RAMP], slope[:, 2, STEP], widening[:, 2, GAUSS] = scale, scale / blur, scale
+    value[:, 3, THREE_HALVES], slope[:, 3, HALF] = scale * root, 1.5 * scale * root / blur
+    widening[:, 3, LESS_HALF] = 0.75 * scale * root
+    value[:, 4, SQUARE], slope[:, 4, RAMP] = scale**2, 2.0 * scale**2 / blur
+    widening[:, 4, STEP] = 2.0 * scale**2
+    for of_surface, all_of_it in ((value, values), (slope, slopes), (widening, widenings)):
+        all_of_it[:, SURFACE:] = _OF_DEPTH @ of_surface
+    return values, slopes, widenings

@@ -1,0 +1,526 @@
+"""What ``legcal detect`` prints: the figures of every view, and what was rejected why."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import cv2
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from legcal.data import (
+    OBSERVATIONS_NAME,
+    QUALITY,
+    ImageReader,
+    Outlines,
+    choose_outlines,
+    is_edited,
+    row_names,
+    write_observations,
+)
+from legcal.errors import OutOfResources, UsageError
+from legcal.files import OutputKind, check_destination, path_problem, result_folder
+from legcal.geometry import BoolArray
+from legcal.perception.drawing import Detection, PartMarks, draw, marks_of_image, short_reason
+from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.progress import Report
+from legcal.workers import Run
+
+HIDDEN_LEG = "hidden by another leg"
+
+
+@dataclass(frozen=True)
+class ViewFigures:
+    """What was found in the images of a view.
+
+    Attributes
+    ----------
+    images : int
+    visible : int
+        Legs, counted in each image, that should be seen: neither outside nor hidden.
+    found : int
+        Those of which an outline is used.
+    outlines, used, edited : int
+        Rows of the table; those with a line or a reason, whether used or not.
+    medians : mapping
+        Of contrast [grey levels], length and residual [px] of the used outlines; None where
+        nothing is known of any.
+    rejected : mapping of str to int
+        How many outlines are not used, by the reason without its figures, the most first.
+    problem : str
+        Why its camera could not be placed, "" if it was.
+    """
+
+    images: int
+    visible: int
+    found: int
+    outlines: int
+    used: int
+    edited: int
+    medians: Mapping[str, float | None]
+    rejected: Mapping[str, int]
+    problem: str
+
+    def document(self) -> dict[str, Any]:
+        """Return the figures as JSON has them."""
+        return {
+            "images": self.images,
+            "legs_visible": self.visible,
+            "legs_found": self.found,
+            "outlines": self.outlines,
+            "used": self.used,
+            "edited": self.edited,
+            **self.medians,
+            "rejected": dict(self.rejected),
+            "problem": self.problem or None,
+        }
+
+
+def reason_class(reason: str) -> str:
+    """Return what kind of reason it is, as it is counted."""
+    return HIDDEN_LEG if reason.startswith(HIDDEN) else short_reason(reason) or "no reason given"
+
+
+def view_figures(detection: Detection) -> dict[str, ViewFigures]:
+    """Return the figures of every view that has images or outlines."""
+    measurements, outlines = detection.dataset.measurements, detection.outlines
+    found = {}
+    for v in np.unique(measurements.view).tolist():
+        name = measurements.views[v].name
+        images = int(np.count_nonzero(measurements.view[detection.rows] == v))
+        here = choose_outlines(outlines, measurements.view[outlines.row] == v)
+        found[name] = _figures(here, images, detection.unplaced.get(name, ""))
+    return found
+
+
+def _figures(outlines: Outlines, images: int, problem: str) -> ViewFigures:
+    """Return the figures of the outlines of a view."""
+    expected = np.array([_is_expected(reason) for reason in outlines.reason], dtype=np.bool_)
+    reasons = Counter(
+        reason_class(reason)
+        for reason, used in zip(outlines.reason, outlines.used, strict=True)
+        if not used
+    )
+    return ViewFigures(
+        images=images,
+        visible=_count_legs(outlines, expected | outlines.used),
+        found=_count_legs(outlines, outlines.used),
+        outlines=len(outlines),
+        used=int(np.count_nonzero(outlines.used)),
+        edited=int(np.count_nonzero(is_edited(outlines))),
+        medians={name: _median(outlines, name) for name in QUALITY},
+        rejected=dict(reasons.most_common()),
+        problem=problem,
+    )
+
+
+def _is_expected(reason: str) -> bool:
+    return reason != OUTSIDE and not reason.startswith(HIDDEN)
+
+
+def _count_legs(outlines: Outlines, chosen: BoolArray) -> int:
+    """Return in how many images legs have one of the chosen outlines, summed over the legs."""
+    places = zip(outlines.row[chosen].tolist(), outlines.leg[chosen].tolist(), strict=True)
+    return len(set(places))
+
+
+def _median(outlines: Outlines, name: str) -> float | None:
+    values = getattr(outlines, name)[outlines.used]
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else None
+
+
+_HEAD = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
+body {{ font: 15px/1.45 system-ui, sans-serif; margin: 1.5em; color: #222; }}
+table {{ border-collapse: collapse; margin: .7em 0; }}
+th, td {{ padding: .25em .8em; border-bottom: 1px solid #ddd; text-align: right; }}
+th:first-child, td:first-child, th:last-child, td:last-child {{ text-align: left; }}
+.views {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(330px, 1fr)); gap: 1em; }}
+figure {{ margin: 0; }} figcaption {{ font-size: 13px; }} img {{ width: 100%; }}
+.bad {{ color: #b00; }} .dim {{ color: #777; }}
+</style></head><body>
+"""
+_COLUMNS = ("view", "images", "legs found", "of visible", "outlines used", "of", "contrast",
+            "length [px]", "residual [px]", "rejected")  # fmt: skip
+_HOW = (
+    "To correct an outline, edit its row in observations.csv: set its verdict, or its line "
+    "(a, b, c) and ends, and its source to edited; then copy the file into the dataset."
+)
+
+
+def overlay_page(
+    detection: Detection, document: Mapping[str, Any], pictures: Mapping[int, str]
+) -> str:
+    """Return the text of ``index.html``.
+
+    Parameters
+    ----------
+    detection : Detection
+        What was found.
+    document : mapping
+        Its document.
+    pictures : mapping of int to str
+        The picture of each row, relative to the page.
+    """
+    title = f"Outlines of {detection.dataset.mechanism.name}"
+    parts = [_HEAD.format(title=escape(title)), f"<h1>{escape(title)}</h1>\n"]
+    parts.append(
+        f"<p>{document['used']} of {document['outlines']} outlines in {document['images']} images "
+        f"are used.</p>\n{_table(document['views'])}<p class=dim>{escape(_HOW)}</p>\n"
+    )
+    parts += [f"<p>{escape(note)}</p>\n" for note in document["notes"]]
+    names = row_names(detection.dataset.measurements)
+    for view, figures in document["views"].items():
+        rows = [row for row in pictures if detection.view_of(row) == view]
+        parts.append(f'<h2 id="{escape(view)}">{escape(view)}</h2>\n')
+        if figures["problem"]:
+            parts.append(f"<p class=bad>{escape(figures['problem'])}</p>\n")
+        parts.append("<div class=views>\n")
+        parts += [_figure(names[row], pictures[row], _said(detection, row)) for row in rows]
+        parts.append("</div>\n")
+    return "".join([*parts, "</body></html>\n"])
+
+
+def _table(views: Mapping[str, Any]) -> str:
+    """Return the figures of the views as a table."""
+    rows = ["<tr>" + "".join(f"<th>{name}</th>" for name in _COLUMNS) + "</tr>"]
+    for name, view in views.items():
+        rejected = ", ".join(f"{n} {escape(why)}" for why, n in view["rejected"].items())
+        cells = (
+            f'<a href="#{escape(name)}">{escape(name)}</a>',
+            view["images"],
+            view["legs_found"],
+            view["legs_visible"],
+            view["used"],
+            view["outlines"],
+            _number(view["contrast"], 1),
+            _number(view["length"], 0),
+            _number(view["residual"], 3),
+            "<span class=bad>camera not placed</span>" if view["problem"] else rejected,
+        )
+        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    return "<table>" + "\n".join(rows) + "</table>\n"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _figure(name: str, file: str, said: str) -> str:
+    """Return a picture with its name and what was found."""
+    place = quote(file)
+    return (
+        f'<figure><a href="{place}"><img loading=lazy src="{place}" alt=""></a>'
+        f"<figcaption>{escape(name)}: {said}</figcaption></figure>\n"
+    )
+
+
+def _said(detection: Detection, row: int) -> str:
+    """Return what was found in the image of a row."""
+    outlines, legs = detection.outlines, detection.dataset.mechanism.leg_names
+    here = np.flatnonzero(outlines.row == row).tolist()
+    said = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
+    wrong: dict[str, list[str]] = {}
+    for i in here:
+        if not outlines.used[i] and outlines.reason[i] != OUTSIDE:
+            name = legs[outlines.leg[i]]
+            names = wrong.setdefault(reason_class(outlines.reason[i]), [])
+            if name not in names:
+                names.append(name)
+    told = "; ".join(f"{', '.join(names)}: {why}" for why, names in wrong.items())
+    return said + (f" <span class=bad>({escape(told)})</span>" if told else "")
+
+
+DETECTION = OutputKind("detection", "detection.json", "legcal_detection")
+PAGE = "index.html"
+PICTURES = "overlays"
+QUALITY_JPEG = 88
+_SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
+_LONGEST = 80  # letters of a name
+
+
+def check_detection_destination(destination: Path, dataset: Path | None) -> None:
+    """Refuse an output folder that holds something else, or a table that was corrected.
+
+    Parameters
+    ----------
+    destination : Path
+        The output folder.
+    dataset : Path or None
+        The dataset folder, where it is known: a corrected table that was copied there is safe.
+
+    Raises
+    ------
+    UsageError
+        With what is there instead.
+    """
+    check_destination(destination, DETECTION)
+    table = destination / OBSERVATIONS_NAME
+    written = _earlier(destination).get("table")
+    with suppress(OSError):
+        content = table.read_bytes()
+        if written == hashlib.sha256(content).hexdigest():
+            return
+        if dataset is not None:
+            with suppress(OSError):
+                if (dataset / OBSERVATIONS_NAME).read_bytes() == content:
+                    return
+        raise UsageError(
+            f"{table}: the detection could not be written: found a table that was changed since "
+            "legcal wrote it, needed one to write over; copy it into the dataset, where its edited "
+            "rows are kept, or give another output folder; nothing was changed."
+        )
+
+
+def write_detection(
+    detection: Detection, destination: Path, run: Run, progress: Report
+) -> dict[str, Any]:
+    """Write the folder, all of it or nothing, and return its document.
+
+    Parameters
+    ----------
+    detection : Detection
+        What was found.
+    destination : Path
+        The output folder.
+    run : callable
+        How pictures are drawn: in turn or by several processes.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+
+    Raises
+    ------
+    UsageError
+        As :func:`check_detection_destination`.
+    OutOfResources
+        If the files cannot be written.
+    """
+    dataset = detection.dataset
+    check_detection_destination(destination, dataset.folder)
+    earlier = _own_files(destination)
+    pictures = picture_names(detection)
+    with result_folder(destination, DETECTION, earlier, replaceable=earlier) as folder:
+        table = folder / OBSERVATIONS_NAME
+        names = dataset.mechanism.leg_names
+        write_observations(table, detection.outlines, dataset.measurements, names)
+        _draw_all(detection, folder, pictures, run, progress)
+        document = detection_document(detection, pictures)
+        (folder / PAGE).write_text(
+            overlay_page(detection, document, pictures), encoding="utf-8", newline="\n"
+        )
+        files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
+        record = {
+            **document,
+            "table": hashlib.sha256(table.read_bytes()).hexdigest(),
+            "files": [*files, DETECTION.marker],
+        }
+        (folder / DETECTION.marker).write_text(json.dumps(record, indent=1) + "\n", "utf-8")
+    return document
+
+
+def detection_document(detection: Detection, pictures: Mapping[int, str]) -> dict[str, Any]:
+    """Return what ``--json`` prints; *pictures* are the files of rows, relative to the folder."""
+    figures = view_figures(detection)
+    outlines = detection.outlines
+    names = row_names(detection.dataset.measurements)
+    return {
+        "legcal_detection": 1,
+        "mechanism": detection.dataset.mechanism.name,
+        "views": {name: view.document() for name, view in figures.items()},
+        "images": len(detection.rows),
+        "outlines": len(outlines),
+        "used": int(np.count_nonzero(outlines.used)),
+        "overlays": [
+            {"view": detection.view_of(row), "image": names[row], "file": file}
+            for row, file in pictures.items()
+        ],
+        "notes": list(detection.notes),
+    }
+
+
+def picture_names(detection: Detection) -> dict[int, str]:
+    """Return the file of each row's picture, relative to the folder: by view and image."""
+    measurements = detection.dataset.measurements
+    folders = _unique([view.name for view in measurements.views])
+    found: dict[int, str] = {}
+    for v, folder in enumerate(folders):
+        rows = [row for row in detection.rows.tolist() if measurements.view[row] == v]
+        images = [measurements.image[row] for row in rows]
+        stems = [Path(image).stem for image in images]
+        if len({stem.lower() for stem in stems}) < len(stems):
+            stems = images
+        for row, stem in zip(rows, _unique(stems), strict=True):
+            found[row] = f"{PICTURES}/{folder}/{stem}.jpg"
+    return found
+
+
+def _unique(names: Sequence[str]) -> list[str]:
+    """Return names that can be those of files, each another one whatever the file system."""
+    found: list[str] = []
+    taken: set[str] = set()
+    for name in names:
+        plain = _SAFE.sub("_", name).lstrip(".")[:_LONGEST] or "_"
+        k, chosen = 1, plain
+        while chosen.lower() in taken:
+            k += 1
+            chosen = f"{plain}-{k}"
+        taken.add(chosen.lower())
+        found.append(chosen)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Gallery:
+    """What is drawn of every row, and where; it travels to worker processes."""
+
+    load: ImageReader
+    marks: tuple[tuple[PartMarks, ...], ...]
+    captions: tuple[str, ...]
+    files: tuple[Path, ...]
+
+
+def _draw_all(
+    detection: Detection, folder: Path, pictures: Mapping[int, str], run: Run, progress: Report
+) -> None:
+    """Write the picture of every row that has an image."""
+    rows = list(pictures)
+    for file in pictures.values():
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    gallery = _Gallery(
+        detection.dataset.image_reader(rows),
+        tuple(tuple(_marks(detection, row)) for row in rows),
+        tuple(_caption(detection, row) for row in rows),
+        tuple(folder / file for file in pictures.values()),
+    )
+    progress("Drawing overlays", 0, len(rows))
+    for done, _ in enumerate(run(partial(_write_picture, gallery), range(len(rows))), start=1):
+        progress("Drawing overlays", done, len(rows))
+
+
+def _write_picture(gallery: _Gallery, k: int) -> None:
+    """Draw picture k and write it."""
+    picture = draw(gallery.load(k), gallery.marks[k], gallery.captions[k])
+    ok, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY_JPEG])
+    if not ok:
+        raise OutOfResources(
+            f"{gallery.files[k].name}: the picture could not be written: found that it cannot be "
+            "encoded, needed enough memory; try again with fewer workers."
+        )
+    gallery.files[k].write_bytes(content.tobytes())
+
+
+def _marks(detection: Detection, row: int) -> list[PartMarks]:
+    """Return what is drawn over the image of a row."""
+    measurements, outlines = detection.dataset.measurements, detection.outlines
+    camera = measurements.views[int(measurements.view[row])].camera
+    return marks_of_image(
+        camera,
+        choose_outlines(outlines, outlines.row == row),
+        detection.predicted(row),
+        detection.dataset.mechanism.leg_names,
+    )
+
+
+def _caption(detection: Detection, row: int) -> str:
+    """Return what stands below the picture of a row."""
+    view, outlines = detection.view_of(row), detection.outlines
+    measurements = detection.dataset.measurements
+    here = outlines.used[outlines.row == row]
+    said = f"{np.count_nonzero(here)} of {len(here)} outlines used"
+    if view in detection.unplaced:
+        said = "the camera could not be placed"
+        if detection.T_base_camera[int(measurements.view[row])] is not None:
+            said += ": legs are drawn where it was expected"
+    text = f"{view}  {measurements.image[row]}  {said}"
+    return text.encode("ascii", "replace").decode()
+
+
+def _earlier(destination: Path) -> dict[str, Any]:
+    """Return the document of an earlier detection in a folder; empty if there is none."""
+    if not DETECTION.is_in(destination):
+        return {}
+    found: dict[str, Any] = json.loads((destination / DETECTION.marker).read_bytes())
+    return found
+
+
+def _own_files(destination: Path) -> list[Path]:
+    """Return the files of an earlier detection in a folder, relative to it."""
+    named = _earlier(destination).get("files", [])
+    names = [name for name in named if isinstance(name, str)] if isinstance(named, list) else []
+    return [
+        Path(name)
+        for name in dict.fromkeys(names)
+        if path_problem(destination, name) is None and _is_place(Path(name))
+    ]
+
+
+def _is_place(name: Path) -> bool:
+    """Say whether a path is one where a detection is written."""
+    if ".." in name.parts:
+        return False
+    own = {Path(OBSERVATIONS_NAME), Path(PAGE), Path(DETECTION.marker)}
+    return name in own or (name.parts[0] == PICTURES and name.suffix == ".jpg")
+
+
+_COLUMNS_table = ("images", "legs found", "outlines used", "contrast", "length", "residual")
+
+
+def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
+    """Return the figures of a detection as people read them.
+
+    Parameters
+    ----------
+    document : dict
+        Of :func:`legcal.perception.overview.detection_document`.
+    output : Path
+        Where it was written.
+    """
+    views = document["views"]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("view", overflow="fold")
+    for column in _COLUMNS_table:
+        table.add_column(column, justify="right")
+    for name, view in views.items():
+        table.add_row(
+            Text(name),
+            str(view["images"]),
+            f"{view['legs_found']}/{view['legs_visible']}",
+            f"{view['used']}/{view['outlines']}",
+            *(
+                "-" if view[key] is None else f"{view[key]:.{digits}f}{unit}"
+                for key, digits, unit in (
+                    ("contrast", 0, ""),
+                    ("length", 0, " px"),
+                    ("residual", 2, " px"),
+                )
+            ),
+        )
+    rejected: Counter[str] = Counter()
+    for view in views.values():
+        rejected.update(view["rejected"])
+    heading = Text.assemble(
+        (document["mechanism"], "bold"),
+        f": {document['used']} of {document['outlines']} outlines used in "
+        f"{document['images']} images",
+    )
+    lines: list[RenderableType] = [heading, Text(), table, Text()]
+    if rejected:
+        told = ", ".join(f"{n} {why}" for why, n in rejected.most_common())
+        lines += [Text(f"Not used: {told}."), Text()]
+    lines += [Text(view["problem"], style="red") for view in views.values() if view["problem"]]
+    lines += [Text(f"note: {note}", style="dim") for note in document["notes"]]
+    return Group(*lines, Text(f"Look at {output / PAGE}."))

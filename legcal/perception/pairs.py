@@ -1,0 +1,231 @@
+"""The pair of edges that are the two outlines of a part, near an aligned prediction.
+
+Both edges are looked for apart, as straight lines near their predictions on which many blocks
+of the picture have an edge; then the pair is chosen whose distance suits the radius at
+both ends. Shading inside the leg and clutter beside it make lines as well, seldom at that
+distance. Where one side of a leg is as bright as what is behind it there is no pair: an edge
+that no other line near its prediction rivals may stand alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.perception.picture import Grey, edge_sharpness, sample
+from legcal.vision import Band, Camera
+
+BLOCK_LENGTH = 8.0  # [px]
+ROWS = 4  # rows of a block
+MAX_BLOCKS = 80
+MARGIN = 6  # columns beyond the search window, to judge what an edge is
+KEPT = 8
+WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
+LEAST_SCORE = 0.15
+LONE_SCORE = 0.5  # of an edge that may stand alone
+LONE_FORETOLD = 0.35  # the same where other legs say where it is
+RIVAL = 0.6  # of its score, which no other line may reach
+RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two edges of a band.
+
+    Attributes
+    ----------
+    v : (2, 2) array
+        Offsets of edge 1 and edge 2 at both ends of the band [px], good to about a pixel.
+    found : (2,) array of bool
+        False for an edge that was not found and is put where the width of the part demands.
+    alone : (2,) array of bool
+        Whether each edge is convincing without the other.
+    """
+
+    v: Array
+    found: BoolArray
+    alone: BoolArray
+
+    def suits(self, width: Array) -> bool:
+        """Say whether both edges were found at the distance of the part's outlines (2,) [px]."""
+        off = np.abs(self.v[1] - self.v[0] - width)
+        tolerance = WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
+        return bool(np.all(self.found) and np.all(off <= tolerance))
+
+
+@dataclass(frozen=True, eq=False)
+class PairSearch:
+    """Where the outlines of a part are looked for.
+
+    Attributes
+    ----------
+    band : Band
+        Frame along the part.
+    predicted : (2, 2) array
+        Offsets v of edge 1 and edge 2 at both ends of the band [px].
+    hidden : (n_blocks,) array of bool
+        Which of the :func:`block_positions` other legs hide.
+    window : float
+        Largest distance of an edge from its prediction, at either end [px].
+    foretold : bool
+        Whether other legs vouch for the prediction, so that one edge near it is enough.
+    """
+
+    band: Band
+    predicted: Array
+    hidden: BoolArray
+    window: float
+    foretold: bool = False
+
+
+def find_pairs(grey: Grey, camera: Camera, searches: Sequence[PairSearch]) -> list[Pair | None]:
+    """Find the two outlines of parts.
+
+    Parameters
+    ----------
+    grey : Grey
+        The image.
+    camera : Camera
+        The camera.
+    searches : sequence of PairSearch
+        Where the outlines of each part are looked for.
+
+    Returns
+    -------
+    list of Pair or None
+        None where no two edges are convincing, nor one alone.
+    """
+    if not searches:
+        return []
+    lines = _edge_lines(grey, camera, searches)
+    return [_pair(*one) for one in zip(searches, lines[::2], lines[1::2], strict=True)]
+
+
+def _pair(search: PairSearch, *lines: tuple[Array, Array]) -> Pair | None:
+    """Return the two outlines of a part among lines near each of them."""
+    predicted = search.predicted
+    together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], search.window)
+    lone = [
+        _alone(*candidates, LONE_FORETOLD if search.foretold else LONE_SCORE)
+        for candidates in lines
+    ]
+    if together is not None:
+        shifts = np.stack([lines[edge][0][i] for edge, i in enumerate(together)])
+        alone = np.array([i == k for i, k in zip(together, lone, strict=True)])
+        return Pair(predicted + shifts, np.ones(2, dtype=np.bool_), alone)
+    scores = [0.0 if i is None else lines[edge][1][i] for edge, i in enumerate(lone)]
+    edge = int(np.argmax(scores))
+    i = lone[edge]
+    rivalled = max(lines[1 - edge][1], default=0.0) >= LONE_SCORE
+    if i is None or (rivalled and not search.foretold):
+        return None  # two clear edges at another distance are not those of this part
+    found = np.arange(2) == edge
+    return Pair(predicted + lines[edge][0][i], found, found)
+
+
+def _best_pair(
+    one: tuple[Array, Array], two: tuple[Array, Array], width: Array, window: float
+) -> tuple[int, int] | None:
+    """Return which of the lines near both edges are a pair, None if no two are convincing."""
+    (shift1, score1), (shift2, score2) = one, two
+    if not len(score1) or not len(score2):
+        return None
+    mismatch = (shift2[None, :, :] - shift1[:, None, :]) / (
+        WIDTH_TOLERANCE[0] + WIDTH_TOLERANCE[1] * width
+    )
+    drift = 0.5 * (shift1[:, None, :] + shift2[None, :, :]) / window
+    value = score1[:, None] + score2[None, :]
+    value = value - 0.1 * np.mean(mismatch**2, axis=-1) - 0.1 * np.mean(drift**2, axis=-1)
+    value[np.abs(mismatch).max(axis=-1) > 3.0] = -np.inf
+    i, j = np.unravel_index(int(np.argmax(value)), value.shape)
+    if not np.isfinite(value[i, j]) or min(score1[i], score2[j]) < LEAST_SCORE:
+        return None
+    return int(i), int(j)
+
+
+def _alone(shift: Array, score: Array, least: float) -> int | None:
+    """Return the best line near an edge if it has no rival."""
+    if not len(score) or score[0] < least:
+        return None
+    middle = shift.mean(axis=1)
+    other = np.abs(middle - middle[0]) > RIVAL_DISTANCE
+    return None if np.any(score[other] > RIVAL * score[0]) else 0
+
+
+def block_positions(band: Band) -> Array:
+    """Return the positions t of the blocks of a band [px]."""
+    n = int(np.clip(band.length // BLOCK_LENGTH, 4, MAX_BLOCKS))
+    return np.asarray((np.arange(n) + 0.5) * (band.length / n))
+
+
+def _edge_lines(
+    grey: Grey, camera: Camera, searches: Sequence[PairSearch]
+) -> list[tuple[Array, Array]]:
+    """Return lines near both edges of each part: shifts at both ends (n, 2) [px], scores (n,)."""
+    halves = [int(np.ceil(search.window)) for search in searches]
+    reach = max(halves) + MARGIN
+    far = np.array([-float(reach), float(reach)])
+    ends, hidden = [], []
+    for search in searches:
+        n_rows = len(search.hidden) * ROWS
+        rows = (np.arange(n_rows) + 0.5) / n_rows
+        centre = search.predicted[:, :1] + np.diff(search.predicted, axis=1) * rows
+        v = centre[..., None] + far
+        ends.append(search.band.points((rows * search.band.length)[:, None], v).reshape(-1, 2, 2))
+        hidden += [search.hidden] * 2
+    pixels = camera.distort(np.concatenate(ends))
+    # So near an edge the lens moves pixels in proportion to their distance from it.
+    part = np.linspace(0.0, 1.0, 2 * reach + 1, dtype=np.float32)
+    first, change = (
+        pixels[:, 0].astype(np.float32),
+        np.diff(pixels, axis=1)[:, 0].astype(np.float32),
+    )
+    x, y = (first[:, k : k + 1] + change[:, k : k + 1] * part for k in (0, 1))
+    values, inside = sample(grey, camera, x, y)
+    n_columns = len(part)
+    seen = inside.reshape(-1, ROWS, n_columns).all(axis=1) & ~np.concatenate(hidden)[:, None]
+    profiles = values.reshape(-1, ROWS, n_columns).mean(axis=1)
+    bounds = np.cumsum([0, *(len(one) for one in hidden)])
+    votes = edge_sharpness(profiles, seen, bounds) * seen
+    lines = []
+    for k, half in enumerate(np.repeat(halves, 2).tolist()):
+        own = slice(bounds[k], bounds[k + 1]), slice(reach - half, reach + half + 1)
+        n_seen = int(seen[bounds[k] : bounds[k + 1]].any(axis=1).sum())
+        lines.append(_lines(votes[own] / max(1, n_seen), half))
+    return lines
+
+
+def _lines(votes: Array, half: int) -> tuple[Array, Array]:
+    """Add votes (n_blocks, 2 half + 1) along lines; return shifts and scores of separate maxima."""
+    n_columns, reach = 2 * half + 1, half // 2 + 1
+    padded = np.zeros((len(votes), n_columns + 2 * reach), dtype=votes.dtype)
+    padded[:, reach:-reach] = votes
+    score = padded.take(_along_lines(len(votes), half)).sum(axis=1)
+    shifts, scores = [], []
+    for _ in range(KEPT):
+        i, j = divmod(int(score.argmax()), n_columns)
+        best = float(score[i, j])
+        if best <= 0.0:
+            break
+        middle, tilt = j - half, 0.5 * (i - half)
+        shifts.append((middle - tilt, middle + tilt))
+        scores.append(best)
+        score[max(0, i - 2) : i + 3, max(0, j - 2) : j + 3] = 0.0
+    return np.array(shifts, dtype=np.float64).reshape(-1, 2), np.array(scores)
+
+
+@lru_cache(maxsize=512)
+def _along_lines(n_blocks: int, half: int) -> IntArray:
+    """Return where votes lie along lines, by the difference of their ends and their middle.
+
+    (2 half + 1, n_blocks, 2 half + 1) places in a table (n_blocks, 2 (half + half // 2) + 3).
+    """
+    position = (np.arange(n_blocks) + 0.5) / n_blocks - 0.5
+    reach = half // 2 + 1
+    column = np.rint(np.arange(-half, half + 1)[:, None] * position).astype(np.intp) + reach
+    row = np.arange(n_blocks) * (2 * half + 1 + 2 * reach)
+    places = (row + column)[..., None] + np.arange(2 * half + 1)
+    places.setflags(write=False)
+    return places

@@ -1,0 +1,271 @@
+"""Radii that pictures contradict: how wide bars are against what the model says (section 3.1).
+
+Lines place a camera, widths hardly do; so a leg that is seen wider or thinner at its place has
+another radius than the model says. Bars of wrong edges agree on nothing: bars of most views must.
+Where light and shade meet on a leg they may agree all the same, so that only parts are asked whose
+outlines were not found.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from legcal.geometry import Array
+from legcal.machine import Cylinder
+from legcal.perception.agreement import Agreement, Picture, Poses, agreement, improved
+from legcal.vision import EQUAL_RADII
+
+FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
+TOLERANCES = (0.018, 0.018, 0.012, 0.012)  # of an axis from its bar, on the sensor plane
+MATCHED = 0.25  # agreement of a piece with its bar that counts
+PREFERRED = 1.15  # by what a farther factor must be better than a nearer one
+DIFFERENT, LEFT = (
+    0.08,
+    0.02,
+)  # from the model, as a logarithm: less does no harm, and once corrected
+SURE = 4.0  # standard errors
+FEWEST = 3  # bars of a part in a view
+TIGHT = 0.025  # robust standard deviation of their logarithms: else some are of other edges
+NOISE = 0.01  # of what a view says
+CONSISTENT = 0.09  # logarithms from views of one part, or of parts that are wrong alike
+MOST_PARTS = 0.75  # of the parts that must be wrong alike, to be all
+MOST_TURNS = 4  # of correcting radii and placing cameras by them
+
+Part = tuple[int, float]  # leg, and radius in the model [m]
+
+
+@dataclass(frozen=True, eq=False)
+class OtherRadii:
+    """What pictures say of radii.
+
+    Attributes
+    ----------
+    factor : dict of float
+        By how much radii differ from the model, by leg and radius; those that do not are left out.
+    sigma : dict of float
+        Standard error of the logarithms of these.
+    common : float
+        The factor of all parts, if they differ alike; 0 otherwise.
+    """
+
+    factor: dict[Part, float]
+    sigma: dict[Part, float]
+    common: float = 0.0
+
+    def corrected(self, cylinders: Sequence[Sequence[Cylinder]]) -> list[tuple[Cylinder, ...]]:
+        """Return the cylinders of all legs with the radii that were found."""
+        return [
+            tuple(replace(c, radius=c.radius * self.of(leg, c.radius)) for c in of_leg)
+            for leg, of_leg in enumerate(cylinders)
+        ]
+
+    def of(self, leg: int, radius: float) -> float:
+        """Return the factor of a part."""
+        for (other, r), factor in self.factor.items():
+            if other == leg and _alike(r, radius):
+                return factor
+        return self.common or 1.0
+
+    def only(self, doubtful: Collection[Part]) -> "OtherRadii":
+        """Return what is said of some parts; of all only where most of them are among these."""
+        mine = {
+            part: factor
+            for part, factor in self.factor.items()
+            if any(part[0] == leg and _alike(part[1], radius) for leg, radius in doubtful)
+        }
+        if self.common and len(mine) >= MOST_PARTS * len(self.factor):
+            return self
+        return OtherRadii(mine, self.sigma)
+
+    def of_the_same(self, step: "OtherRadii") -> "OtherRadii":
+        """Return what a step says of the parts whose radii this one has corrected."""
+        if self.common:
+            return step if step.common else NO_OTHER_RADII
+        mine = {(leg, r * factor) for (leg, r), factor in self.factor.items()}
+        return OtherRadii({part: f for part, f in step.factor.items() if part in mine}, step.sigma)
+
+    def then(self, step: "OtherRadii") -> "OtherRadii":
+        """Return both corrections, the second one of radii that the first had corrected."""
+        if not self.factor:
+            return step
+        factor = {
+            (leg, r): f * step.of(leg, r * self.of(leg, r)) for (leg, r), f in self.factor.items()
+        }
+        sigma = {
+            (leg, r): step.sigma.get((leg, r * self.of(leg, r)), s)
+            for (leg, r), s in self.sigma.items()
+        }
+        return OtherRadii(factor, sigma, self.common * (step.common or 1.0))
+
+
+def _alike(one: float, other: float) -> bool:
+    """Say whether cylinders of two radii are seen as one."""
+    return abs(one - other) <= EQUAL_RADII * other
+
+
+NO_OTHER_RADII = OtherRadii({}, {})
+
+
+def other_radii(
+    views: Iterable[tuple[int, Sequence[Picture], Poses]],
+    different: float = DIFFERENT,
+    *,
+    alone: bool = False,
+) -> OtherRadii:
+    """Return the radii that differ from the model.
+
+    Parameters
+    ----------
+    views : iterable of (int, sequence of Picture, Poses)
+        A view, pictures of it, and T_camera_base where they put the camera.
+    different : float
+        Logarithm of the factor from which on a radius is another one.
+    alone : bool
+        Whether all parts cannot differ alike.
+    """
+    samples: dict[Part, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for view, pictures, placed in views:
+        pose = _by_lines(pictures, placed)
+        for picture in pictures:
+            for part, logarithm in _logarithms(picture, pose):
+                samples[part][view].append(logarithm)
+    agreed = {part: _agreed(list(of_part.values())) for part, of_part in samples.items()}
+    known = {part: found for part, found in agreed.items() if found is not None}
+    if not known:
+        return NO_OTHER_RADII
+    sigma = {part: found[1] for part, found in known.items()}
+    common = float(np.median([value for value, _ in known.values()]))
+    alike = np.mean([abs(value - common) < CONSISTENT for value, _ in known.values()])
+    of_several = alike >= MOST_PARTS and len({leg for leg, _ in known}) > 1
+    if not alone and abs(common) > different and of_several:
+        factor = float(np.exp(common))
+        return OtherRadii(dict.fromkeys(samples, factor), sigma, factor)
+    bias = common if of_several else 0.0  # of bars, whatever the leg
+    differing = {
+        part: float(np.exp(value - bias))
+        for part, (value, sigma_value) in known.items()
+        if abs(value - bias) > max(different, SURE * sigma_value)
+    }
+    return OtherRadii(differing, {part: sigma[part] for part in differing})
+
+
+def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
+    """Return the logarithm on which views of a part agree, and its standard error.
+
+    Bars of a part that something hides, or of wrong edges, do not agree with each other.
+    """
+    middles: list[float] = []
+    asked = [np.array(values) for values in views if len(values) >= FEWEST]
+    for values in asked:
+        values = values[np.abs(values - _densest(values)) <= CONSISTENT]
+        if len(values) < FEWEST:
+            continue
+        middle = float(np.median(values))
+        spread = 1.48 * float(np.median(np.abs(values - middle)))
+        if spread < TIGHT:
+            middles.append(middle)
+    if not middles or 2 * len(middles) < len(asked) or np.ptp(middles) > CONSISTENT:
+        return None
+    sigma = max(float(np.std(middles)), NOISE) / float(np.sqrt(len(middles)))
+    return float(np.mean(middles)), sigma
+
+
+def _densest(values: Array) -> float:
+    """Return the middle of the shortest interval with more than half of the values.
+
+    Few bars of inner edges, where light and shade meet, do not move it as they move a median.
+    """
+    ordered = np.sort(values)
+    most = len(ordered) // 2 + 1
+    first = int(np.argmin(ordered[most - 1 :] - ordered[: len(ordered) - most + 1]))
+    return float(np.median(ordered[first : first + most]))
+
+
+def _by_lines(pictures: Sequence[Picture], placed: Poses) -> Poses:
+    """Return a pose by where bars are, which widths hardly move: joints stay as in the model."""
+    pose = Poses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
+    for tolerance in TOLERANCES:
+        found = [_whatever_the_width(picture, pose, tolerance) for picture in pictures]
+        pose = improved(pictures, pose, found, tolerance)
+    return pose
+
+
+def _whatever_the_width(picture: Picture, pose: Poses, tolerance: float) -> Agreement:
+    """Return the bars that suit the pieces best with some radius; farther ones need be better."""
+    targets = picture.targets
+    best = agreement(picture, pose, tolerance)
+    for factor in FACTORS[1:]:
+        scaled = replace(picture, targets=replace(targets, radius=factor * targets.radius))
+        found = agreement(scaled, pose, tolerance)
+        better = found.value > np.maximum(PREFERRED * best.value, MATCHED)
+        best = Agreement(
+            np.where(better, found.value, best.value),
+            np.where(better, found.bar, best.bar),
+            best.visible,
+        )
+    return best
+
+
+def _logarithms(picture: Picture, pose: Poses) -> list[tuple[Part, float]]:
+    """Return the logarithms of the widths of a picture's bars against the model's."""
+    targets = picture.targets
+    if len(targets) == 0 or len(picture.bars) == 0:
+        return []
+    R, t = picture.R @ pose.R[0], picture.R @ pose.t[0] + picture.t
+    found = _whatever_the_width(picture, pose, TOLERANCES[-1])
+    best, bar = found.value[0], found.bar[0]
+    best = np.where(best >= MATCHED, best, 0.0)
+    logarithms = []
+    for k in np.flatnonzero(best > 0.0).tolist():
+        if np.count_nonzero((bar == bar[k]) & (best > 0.0)) > 1:  # whose bar it is, is not known
+            continue
+        ends = targets.ends[k] @ R.T + t
+        expected = _width(ends, float(targets.radius[k]), picture.bars.middle[bar[k]])
+        seen = float(picture.bars.width[bar[k]].mean())
+        part = (int(targets.leg[k]), float(targets.radius[k]))
+        logarithms.append((part, float(np.log(seen / expected))))
+    return logarithms
+
+
+def _width(ends: Array, radius: float, middle: Array) -> float:
+    """Return how wide a cylinder along ends (2, 3) is seen where the axis is next to a point."""
+    xy = ends[:, :2] / ends[:, 2:]
+    run = xy[1] - xy[0]
+    share = float((middle - xy[0]) @ run / (run @ run))
+    inverse_depth = (1.0 - share) / ends[0, 2] + share / ends[1, 2]
+    normal = np.cross(ends[0], ends[1])
+    flat = float(np.linalg.norm(normal[:2]) / np.linalg.norm(normal))
+    return float(2.0 * radius * max(inverse_depth, 1e-9) / max(flat, 0.1))
+
+
+def radius_notes(found: OtherRadii, legs: Sequence[str]) -> list[str]:
+    """Return what is to be said of radii that differ from the model.
+
+    Parameters
+    ----------
+    found : OtherRadii
+    legs : sequence of str
+        Names of the legs.
+    """
+    if not found.factor:
+        return []
+    if found.common:
+        way = _away(found.common)
+        return [
+            f"All legs are seen {way} than their radii in the model; the radii that the images "
+            "show were used; correct those of the model, or the unit and scale of the model and "
+            "the readings if the radii are right."
+        ]
+    return [
+        f"{legs[leg]} is seen {_away(factor)} than its radius in the model: found a radius of "
+        f"about {1e3 * factor * radius:.1f} mm, given {1e3 * radius:.2f} mm; that of the images "
+        "was used; correct the model."
+        for (leg, radius), factor in sorted(found.factor.items())
+    ]
+
+
+def _away(factor: float) -> str:
+    way = "thicker" if factor > 1.0 else "thinner"
+    return f"{1e2 * abs(factor - 1.0):.0f} % {way}"

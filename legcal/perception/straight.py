@@ -1,0 +1,365 @@
+"""A straight line through the blocks of one outline, robust, with an honest covariance.
+
+Neighbouring blocks share what the limb model leaves out (texture, shading, the lens), so
+the covariance rests on the scatter and the correlation that are seen, and never falls
+below what the model is known to be good for.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.perception.limb import N_BASIS, Samples, basis
+
+BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
+BLUR_BLOCKS = 16
+BLUR_ROUNDS = 2
+DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
+# Prior precision of the amplitudes, in units of the contrast of a block.
+RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
+BEND = (0, 1, 4)  # functions of the limb model without an edge
+STEP = 0.8  # largest step of a block [px]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockFit:
+    """Where the outline lies in every block.
+
+    Attributes
+    ----------
+    shift : (n,) array
+        Distance of the outline from the current line, positive towards the inside [px].
+    variance : (n,) array
+        Its variance by the noise of the block [px^2]; infinite where nothing is seen.
+    noise : (n,) array
+        Mean square residual of the block [grey levels^2].
+    freedom : (n,) array
+        Samples of the block beyond what is fitted, at least one.
+    amplitude : (n, 5) array
+        Of the functions of the limb model [grey levels].
+    normal, right, power : (n, 5, 5), (n, 5) and (n,) array
+        Products of these functions, of them with the grey levels, and of grey levels.
+    """
+
+    shift: Array
+    variance: Array
+    noise: Array
+    freedom: Array
+    amplitude: Array
+    normal: Array
+    right: Array
+    power: Array
+
+    def contrast(self, half_width: Samples, blur: float) -> Array:
+        """Return the steps (n,) to the leg, a pixel and a half inside [grey levels]."""
+        reference = np.full((len(half_width), 1), 1.5 + blur, dtype=np.float32)
+        at, _ = basis(reference, half_width, blur)
+        return np.asarray(np.sum(at[:, 2:, 0] * self.amplitude[:, 2:], axis=1))
+
+    def sharpness(self) -> Array:
+        """Return how much chi^2 (n,) falls by there being more than a bend of the shading."""
+        kept = list(BEND)
+        part = self.normal[:, kept][:, :, kept] + 1e-3 * np.eye(len(kept))
+        right = self.right[:, kept]
+        explained = np.sum(right * np.linalg.solve(part, right[..., None])[..., 0], axis=1)
+        share = (self.power - explained) / np.maximum(self.noise, 1e-9)
+        return np.asarray(share - self.freedom)
+
+
+def fit_blocks(
+    d: Samples, grey: Samples, weight: Samples, half_width: Samples, blur: Samples | float
+) -> BlockFit:
+    """Fit the limb model to blocks, by one Gauss-Newton step from the current line.
+
+    Parameters
+    ----------
+    d, grey : (n, m) array of float32
+        Distances inside the current line [px] and grey levels, proportional to light.
+    weight : (n, m) array of float32
+        Inverse noise of the samples in some unit; zero for those that are not to be used.
+    half_width : (n, 1) array of float32
+        Half-width of the cylinder [px].
+    blur : float or (n, 1) array of float32
+        Standard deviation of the blur [px].
+    """
+    X, slopes = basis(d, half_width, blur)
+    n_samples = np.count_nonzero(weight, axis=1).astype(np.float64)
+    level = _products(grey, weight) / np.maximum(weight.sum(axis=1), 1e-3)
+    y = (grey - level.astype(np.float32)[:, None]) * weight
+    X *= weight[:, None, :]
+    normal = (X @ X.swapaxes(1, 2)).astype(np.float64)
+    right, power = _with(X, y), _products(y, y)
+    inverse = _regularised_inverse(normal, right, power, n_samples)
+    amplitude = _applied(inverse, right)
+    residual = y - _sum(X, amplitude)
+    # The outline at distance s further inside lowers d by s.
+    change = _sum(slopes, -amplitude) * weight
+    change -= _sum(X, _applied(inverse, _with(X, change)))
+    information, gradient = _products(change, change), _products(change, residual)
+    freedom = np.maximum(n_samples - N_BASIS - 1.0, 1.0)
+    seen = (information > 1e-9) & (n_samples > 4 * N_BASIS)
+    safe = np.where(seen, information, 1.0)
+    step = np.where(seen, gradient / safe, 0.0)
+    noise = np.maximum(_products(residual, residual) - step * gradient, 0.0) / freedom
+    variance = np.where(seen, noise / safe, np.inf)
+    shift = np.clip(step, -STEP, STEP)
+    return BlockFit(shift, variance, noise, freedom, amplitude, normal, right, power)
+
+
+def _products(one: Samples, other: Samples) -> Array:
+    """Return the sums of products (n,) in each block."""
+    return np.asarray(np.einsum("nm,nm->n", one, other).astype(np.float64))
+
+
+def _with(functions: Samples, values: Samples) -> Array:
+    """Return the sums of products (n, 5) of functions (n, 5, m) with values (n, m)."""
+    return np.asarray((functions @ values[..., None])[..., 0].astype(np.float64))
+
+
+def _sum(functions: Samples, amplitude: Array) -> Samples:
+    """Return functions (n, 5, m) with amplitudes (n, 5), added up, (n, m)."""
+    return np.asarray((amplitude.astype(np.float32)[:, None] @ functions)[:, 0])
+
+
+def _applied(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _regularised_inverse(normal: Array, right: Array, power: Array, n_samples: Array) -> Array:
+    """Invert normal matrices, drawing amplitudes that the noise of a block leaves open to zero."""
+    count = np.maximum(n_samples, 1.0)
+    power = power / count + 1e-3
+    free = np.linalg.solve(normal + 1e-3 * np.eye(N_BASIS), right[..., None])[..., 0]
+    unexplained = power - np.sum(right * free, axis=1) / count
+    prior = np.clip(unexplained / power, 1e-4, 1.0)[:, None] * RIDGE
+    return np.asarray(np.linalg.inv(normal + prior[:, :, None] * np.eye(N_BASIS)))
+
+
+def estimate_blur(
+    d: Samples, grey: Samples, weight: Samples, half_width: Samples, merit: Array
+) -> float:
+    """Return the blur [px] that explains the best blocks of an image best.
+
+    Parameters
+    ----------
+    d, grey, weight, half_width
+        As for :func:`fit_blocks`.
+    merit : (n,) array
+        How much each block tells, such as its contrast.
+    """
+    best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
+    d, grey, weight, half_width = d[best], grey[best], weight[best], half_width[best]
+    blurs = np.geomspace(*BLURS)
+    misfit = _misfits(d, grey, weight, half_width, blurs)
+    i = int(np.clip(np.argmin(misfit), 1, len(blurs) - 2))
+    left, middle, right = misfit[i - 1 : i + 2]
+    bend = left - 2.0 * middle + right
+    offset = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
+    return float(blurs[i] * (blurs[1] / blurs[0]) ** offset)
+
+
+def depth_for_blur(blur: float) -> float:
+    """Return how far from an outline pixels are used [px]: little more than the blur reaches."""
+    return DEPTH[0] + DEPTH[1] * blur
+
+
+def _misfits(
+    d: Samples, grey: Samples, weight: Samples, half_width: Samples, blurs: Array
+) -> Array:
+    """Return, for each of some blurs, the mean logarithm of the noise of the fitted blocks."""
+    n = len(blurs)
+    blur = np.repeat(blurs, len(d)).astype(np.float32)[:, None]
+    d, grey, weight, half_width = (np.concatenate([x] * n) for x in (d, grey, weight, half_width))
+    for _ in range(BLUR_ROUNDS):
+        fit = fit_blocks(d, grey, weight, half_width, blur)
+        d = d - fit.shift[:, None].astype(np.float32)
+    return np.asarray(np.log(fit.noise + 1e-3).reshape(n, -1).mean(axis=1))
+
+
+TUKEY = 4.0  # sigmas at which a block counts no longer
+N_ROUNDS = 10
+N_SCALES = 3  # rounds in which the scale of the scatter is estimated
+LEAST_SCATTER = 0.01  # [px]
+COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
+LEAST_BLOCKS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class StraightFit:
+    """A line through blocks.
+
+    Attributes
+    ----------
+    ends : (2,) array
+        Shift of the outline at t = 0 and at t = length [px of the band].
+    kept : (n,) array of bool
+        The blocks that lie on it.
+    agreement : float
+        Share of the blocks that show an edge at all which lie on the line.
+    position, residual, variance : (n_kept,) array
+        Places of the kept blocks as fractions of the length, their distances from the line
+        [px], and the variances of these by noise, scaled to the scatter seen [px^2].
+    """
+
+    ends: Array
+    kept: BoolArray
+    agreement: float
+    position: Array
+    residual: Array
+    variance: Array
+
+    @property
+    def first(self) -> float:
+        """Position of the first kept block, as a fraction of the length."""
+        return float(self.position.min())
+
+    @property
+    def last(self) -> float:
+        """Position of the last kept block, as a fraction of the length."""
+        return float(self.position.max())
+
+    @property
+    def scatter(self) -> float:
+        """Robust standard deviation of the blocks about the line [px]."""
+        return 1.4826 * _median(np.abs(self.residual))
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (2, 2) of the shifts at ``first`` and ``last`` [px^2]."""
+        along = (self.position - self.first) / (self.last - self.first)
+        design = np.column_stack([1.0 - along, along])
+        covariance = np.linalg.inv(design.T @ (design / self.variance[:, None]))
+        covariance *= _correlation_length(self.residual / np.sqrt(self.variance))
+        bias = COMMON_BIAS**2 * np.ones((2, 2)) + TILT_BIAS**2 * np.eye(2)
+        return np.asarray(0.5 * (covariance + covariance.T) + bias)
+
+
+def fit_straight(
+    position: Array, shift: Array, variance: Array, largest: float = np.inf
+) -> StraightFit | None:
+    """Fit a line to the shifts of blocks by iteratively reweighted least squares.
+
+    Parameters
+    ----------
+    position : (n,) array
+        Places of the blocks as fractions of the length.
+    shift : (n,) array
+        Shifts of the outline there [px].
+    variance : (n,) array
+        Their variances by noise [px^2], infinite where a block shows nothing.
+    largest : float
+        Blocks with this variance or a larger one are left out [px^2].
+
+    Returns
+    -------
+    StraightFit or None
+        None if fewer than ``LEAST_BLOCKS`` blocks agree.
+    """
+    return fit_straights(np.array([0, len(position)]), position, shift, variance, largest)[0]
+
+
+def fit_straights(
+    bounds: IntArray, position: Array, shift: Array, variance: Array, largest: float = np.inf
+) -> list[StraightFit | None]:
+    """Fit a line to each of several outlines, as :func:`fit_straight` does to one.
+
+    Parameters
+    ----------
+    bounds : (n_edges + 1,) array of int
+        The first block of each outline.
+    position, shift, variance, largest
+        Of the blocks of all outlines, one outline after the other.
+    """
+    counts = np.diff(bounds)
+    filled = np.arange(int(counts.max(initial=0))) < counts[:, None]  # (n_edges, n_most)
+
+    def padded(values: Array) -> Array:
+        table = np.zeros(filled.shape)
+        table[filled] = values
+        return table
+
+    along, moved, noise = (padded(values) for values in (position, shift, variance))
+    usable = filled & (noise < largest)
+    n_usable = np.count_nonzero(usable, axis=1)
+    fits = n_usable >= LEAST_BLOCKS
+    along, moved = np.where(usable, along, 0.0), np.where(usable, moved, 0.0)
+    floored = np.where(usable, noise + LEAST_SCATTER**2, 1.0)
+    start = _weighted_medians(np.where(usable, moved, np.inf), usable / floored)
+    ends = np.repeat(np.where(fits, start, 0.0)[:, None], 2, axis=1)
+    factor, robust = np.ones(len(counts)), np.zeros(filled.shape)
+    moving = fits.copy()
+    sigma, share = np.sqrt(floored), usable / floored
+    products = share * np.stack(
+        [(1.0 - along) ** 2, (1.0 - along) * along, along**2, (1.0 - along) * moved, along * moved]
+    )
+    for turn in range(N_ROUNDS):
+        pull = np.abs(moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along) / sigma
+        if turn < N_SCALES:
+            scatter = 1.4826 * _medians(np.where(usable, pull, np.inf), n_usable)
+            factor = np.where(fits, np.maximum(1.0, scatter), 1.0)
+        counted = usable * np.maximum(1.0 - (pull / (TUKEY * factor[:, None])) ** 2, 0.0) ** 2
+        a, b, c, p, q = np.einsum("knm,nm->kn", products, counted)
+        determinant = a * c - b * b
+        lost = (np.count_nonzero(counted, axis=1) < LEAST_BLOCKS) | (determinant < 1e-9 * a * c)
+        fits &= ~(moving & lost)
+        moving &= fits
+        safe = np.where(moving, determinant, 1.0)
+        after = np.stack([c * p - b * q, a * q - b * p], axis=1) / safe[:, None]
+        step = np.abs(after - ends).max(axis=1)
+        ends[moving], robust[moving] = after[moving], counted[moving]
+        if turn >= N_SCALES:
+            moving &= step >= 1e-4
+        if not np.any(moving):
+            break
+    on_line = robust > 0.0
+    residual = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
+    scaled = floored * factor[:, None] ** 2
+    return [
+        StraightFit(
+            ends[i],
+            on_line[i, : counts[i]],
+            float(np.count_nonzero(on_line[i]) / n_usable[i]),
+            along[i, on_line[i]],
+            residual[i, on_line[i]],
+            scaled[i, on_line[i]],
+        )
+        if fits[i]
+        else None
+        for i in range(len(counts))
+    ]
+
+
+def _correlation_length(pull: Array) -> float:
+    """Return the number of successive blocks that count as one, from their correlation."""
+    n = len(pull)
+    if n < 8:
+        return 2.0
+    pull = pull - pull.mean()
+    power = float(pull @ pull) + 1e-12
+    rho = max(0.0, *(float(pull[lag:] @ pull[:-lag]) / power for lag in (1, 2)))
+    rho = min(rho, 0.8)
+    return (1.0 + rho) / (1.0 - rho)
+
+
+def _median(values: Array) -> float:
+    """Return the middle value, the upper one of two."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
+
+
+def _medians(values: Array, n: IntArray) -> Array:
+    """Return the middle of the n (k,) smallest of each row of values (k, m), the upper of two."""
+    if values.shape[1] == 0:
+        return np.zeros(len(values))
+    return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), n // 2])
+
+
+def _weighted_medians(values: Array, weight: Array) -> Array:
+    """Return the median of each row of values (k, m) with weights."""
+    if values.shape[1] == 0:
+        return np.zeros(len(values))
+    order = np.argsort(values, axis=1, kind="stable")
+    total = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
+    at = np.count_nonzero(total < 0.5 * total[:, -1:], axis=1)
+    return np.asarray(np.take_along_axis(values, order, axis=1)[np.arange(len(values)), at])

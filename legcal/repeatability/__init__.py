@@ -1,1 +1,0 @@
-"""Section 4.2: how well repeated images of one pose agree on where the legs are."""

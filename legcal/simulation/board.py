@@ -1,0 +1,320 @@
+"""Which calibration board a simulated machine gets: one of a fitting size, or from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DatasetError
+from legcal.files import parse_yaml, read_text
+from legcal.geometry import Array, BoolArray, motion_to_xyz_quat
+from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid
+from legcal.simulation.visibility import pixels_in_image
+from legcal.vision import (
+    APRIL_TAGS,
+    Board,
+    BoardKind,
+    Camera,
+    board_document,
+    charuco_board,
+    described_board,
+    dictionary,
+)
+
+INK = 0.06  # how much of the light that white returns black does
+TAG_BORDER = 2  # modules of the black frame of a tag, as Kalibr prints it
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPrint:
+    """A print: tiles of one size, each with black and white modules.
+
+    Attributes
+    ----------
+    face : int
+        The face of the plate that is printed, as the renderer counts them.
+    middle : (2,) array
+        The middle of the plate in the board frame [m].
+    origin : (2,) array
+        Where the first tile starts, in the board frame [m].
+    pitch : float
+        From tile to tile [m].
+    first, size : float
+        Where the modules start in a tile, and how long they are together [m].
+    modules : (rows, columns, n, n) array of bool
+        Black modules of each tile, by rows along y and columns along x.
+    checked : int
+        0 or 1: tiles of that parity are black outside their modules; -1 for tags, where the
+        crossings of the gaps are black.
+    """
+
+    face: int
+    middle: Array
+    origin: Array
+    pitch: float
+    first: float
+    size: float
+    modules: NDArray[np.bool_]
+    checked: int
+
+    @classmethod
+    def of(cls, board: Board, face: int, middle: Array) -> BoardPrint:
+        """Return the print of a board on a face of a plate; the middle is the plate's."""
+        modules = _modules(board)
+        if board.kind == "aprilgrid":
+            pitch = (1.0 + board.spacing) * board.side
+            return cls(face, middle, np.zeros(2), pitch, 0.0, board.side, modules, -1)
+        origin = board.points[0, :2] - board.side
+        black = 1 if board.legacy and board.rows % 2 == 0 else 0
+        marker = board.marker or board.side
+        gap = 0.5 * (board.side - marker)
+        return cls(face, middle, origin, board.side, gap, marker, modules, black)
+
+    def reflectance(self, x: Array, y: Array) -> Array:
+        """Return how much of the light that white returns comes back from points of the plate.
+
+        Parameters
+        ----------
+        x, y : (n,) array
+            Points in the frame of the plate [m].
+        """
+        u = (x + (self.middle[0] - self.origin[0])) / self.pitch
+        v = (y + (self.middle[1] - self.origin[1])) / self.pitch
+        i, j = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
+        a, b = (u - i) * self.pitch, (v - j) * self.pitch
+        rows, columns, n, _ = self.modules.shape
+        inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
+        if self.checked < 0:
+            reach = (i >= -1) & (i < columns) & (j >= -1) & (j < rows)
+            black = reach & (a >= self.size) & (b >= self.size)
+        else:
+            black = inside & ((i + j) % 2 == self.checked)
+        k = np.floor((a - self.first) * (n / self.size)).astype(np.intp)
+        m = np.floor((b - self.first) * (n / self.size)).astype(np.intp)
+        at = np.flatnonzero(inside & (k >= 0) & (k < n) & (m >= 0) & (m < n))
+        black[at] |= self.modules[j[at], i[at], m[at], k[at]]
+        return np.where(black, np.float32(INK), np.float32(1.0))
+
+
+def _modules(board: Board) -> NDArray[np.bool_]:
+    """Return the black modules of every tile, (rows, columns, n, n)."""
+    shape = board.rows, board.columns
+    if board.kind == "chessboard":
+        return np.zeros((*shape, 1, 1), dtype=np.bool_)
+    if board.kind == "aprilgrid":
+        tags = [
+            # Kalibr's tags are upright where OpenCV's stand on their heads; rows go up.
+            np.rot90(_marker(board.dictionary, k, TAG_BORDER), 2)[::-1]
+            for k in range(board.columns * board.rows)
+        ]
+        return np.array(tags).reshape(*shape, *tags[0].shape)
+    printed = charuco_board(board)
+    found = np.zeros((*shape, *_marker(board.dictionary, 0, 1).shape), dtype=np.bool_)
+    for number, corners in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True):
+        i, j = np.floor(np.mean(corners, axis=0)[:2] / board.side).astype(int)
+        found[j, i] = _marker(board.dictionary, int(number), 1)
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _marker(name: str, number: int, border: int) -> NDArray[np.bool_]:
+    """Return the black modules of a marker, (n, n), from its top left."""
+    markers = dictionary(name)
+    n = markers.markerSize + 2 * border
+    picture = cv2.aruco.generateImageMarker(markers, number, n, borderBits=border)
+    return np.asarray(np.asarray(picture) == 0, dtype=np.bool_)
+
+
+_THICKNESS = 0.02  # of the longer side of the plate
+_RIM = 0.06  # of the longer side that stays white around the print
+_LEAST_COSINE = 0.42  # between the normal and the line of sight at which corners are seen
+_BESIDE = 0.3  # of a square around a corner that must be seen with it
+_IN_FRONT = 0.2  # of the thickness before a corner from which on a hit hides it
+_LEAST_SHARE = 0.5  # of the corners that an image must show to count
+_LEAST_CORNERS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBoard:
+    """A board in its place.
+
+    Attributes
+    ----------
+    board : Board
+        The board.
+    T_base_board : RigidTransform
+        Its pose in the base link.
+    """
+
+    board: Board
+    T_base_board: RigidTransform
+
+    def document(self) -> dict[str, Any]:
+        """Return the board as the block of ``dataset.yaml`` has it, with its pose."""
+        return board_document(self.board) | {"T_base_board": motion_to_xyz_quat(self.T_base_board)}
+
+    @property
+    def towards_viewer(self) -> float:
+        """Return 1 where the z axis of the board comes out of its print, else -1."""
+        return 1.0 if self.board.kind == "aprilgrid" else -1.0
+
+    @cached_property
+    def plate(self) -> PlacedSolid:
+        """The plate that the board is printed on."""
+        low, high = self.board.extent.min(axis=0), self.board.extent.max(axis=0)
+        longer = float((high - low).max())
+        thickness = _THICKNESS * longer
+        x, y, _ = (high - low + 2.0 * _RIM * longer).tolist()
+        middle = 0.5 * (low + high) - [0.0, 0.0, 0.5 * self.towards_viewer * thickness]
+        T_board_plate = RigidTransform.from_translation(middle)
+        face = 5 if self.towards_viewer > 0.0 else 2
+        sheet = BoardPrint.of(self.board, face, middle[:2])
+        material = Material(albedo=0.8, specular=0.0, shininess=10.0, limb=0.0, sheet=sheet)
+        T = self.T_base_board * T_board_plate
+        solid = Solid("calibration board", None, Box((x, y, thickness)), T, material)
+        return PlacedSolid(solid, T)
+
+    def beside(self, machine: PosedMachine) -> PosedMachine:
+        """Return a machine in a pose together with the plate."""
+        size = self.plate.solid.shape
+        assert isinstance(size, Box)
+        mesh = trimesh.creation.box(size.size)
+        return replace(
+            machine,
+            solids=(*machine.solids, self.plate),
+            vertices=np.concatenate(
+                [machine.vertices, self.plate.T_base_solid.apply(mesh.vertices)]
+            ),
+            faces=np.concatenate([machine.faces, mesh.faces + len(machine.vertices)]),
+        )
+
+    def runs_through(self, machine: PosedMachine) -> bool:
+        """Say whether the plate runs through a machine, or something lies right on its print."""
+        size = self.plate.solid.shape
+        assert isinstance(size, Box)
+        half = 0.5 * np.array(size.size)
+        for corner in ([-1.0, -1.0], [1.0, -1.0]):  # rays from two corners to the sides across
+            for height in (-0.5, 0.5, 2.0):  # in the plate, and above its print
+                steps = np.linspace(-1.0, 1.0, 13)
+                far = np.concatenate(
+                    [
+                        np.column_stack([steps, np.ones(13)]),
+                        np.column_stack([np.full(13, -corner[0]), steps]),
+                    ]
+                )
+                plane = np.vstack([corner, far]) * half[:2]
+                z = self.towards_viewer * height * half[2]
+                points = self.plate.T_base_solid.apply(
+                    np.column_stack([plane, np.full(len(plane), z)])
+                )
+                if machine.hidden(points[0], points[1:], np.zeros(len(far))).any():
+                    return True
+        return False
+
+    def seen(
+        self, machine: PosedMachine, camera: Camera, T_base_camera: RigidTransform
+    ) -> BoolArray:
+        """Return which corners an image shows, (n_corners,).
+
+        Parameters
+        ----------
+        machine : PosedMachine
+            The machine in its pose, with the plate.
+        camera, T_base_camera
+            The camera and its pose.
+        """
+        points = self._watched
+        base = self.T_base_board.apply(points.reshape(-1, 3))
+        centre = T_base_camera.translation
+        eye = self.T_base_board.inv().apply(centre)
+        sight = eye - points
+        cosine = self.towards_viewer * sight[..., 2] / np.linalg.norm(sight, axis=-1)
+        _, inside = pixels_in_image(camera, T_base_camera.inv().apply(base))
+        free = (inside & (cosine.ravel() > _LEAST_COSINE)).copy()
+        size = self.plate.solid.shape
+        assert isinstance(size, Box)
+        margin = np.full(int(free.sum()), _IN_FRONT * size.size[2])
+        if free.any():
+            free[free] = ~machine.hidden(centre, base[free], margin)
+        seen = np.all(free.reshape(points.shape[:2]), axis=1)
+        if self.board.kind == "chessboard" and not seen.all():
+            seen[:] = False  # it is found as a whole or not at all
+        return np.asarray(seen)
+
+    def is_enough(self, seen: BoolArray) -> bool:
+        """Say whether so many corners, as :meth:`seen` returns them, place a camera well."""
+        return int(seen.sum()) >= max(_LEAST_SHARE * len(seen), min(_LEAST_CORNERS, len(seen)))
+
+    @cached_property
+    def _watched(self) -> Array:
+        """Points (n_corners, 5, 3) in the board frame that must be seen: corners and around."""
+        step = _BESIDE * self.board.side
+        aside = step * np.array([[0, 0, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+        return np.asarray(self.board.points[:, None] + aside)
+
+
+def without_pose(document: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Return the block of a board as it is where its pose is not known."""
+    if document is None:
+        return None
+    return {key: value for key, value in document.items() if key != "T_base_board"}
+
+
+KINDS: tuple[BoardKind, ...] = ("chessboard", "charuco", "aprilgrid")
+_WIDTH = 0.42  # of the size of the machine
+_DIGITS = 3  # of a side in metres: whole millimetres
+
+
+def chosen_board(
+    choice: Board | str | Path | None, machines: Sequence[PosedMachine]
+) -> Board | None:
+    """Return the board that settings ask for.
+
+    Parameters
+    ----------
+    choice : Board, str, Path or None
+        A board; a kind, of a size that fits the machine; or a YAML file with the block ``board``
+        of a dataset.
+    machines : sequence of PosedMachine
+        The machine in its poses.
+
+    Raises
+    ------
+    DatasetError
+        If the file is malformed.
+    """
+    if choice is None or isinstance(choice, Board):
+        return choice
+    if choice not in KINDS:
+        return _from_file(Path(choice))
+    joints = np.concatenate([part for m in machines for part in (m.A, m.B)])
+    width = _WIDTH * float(np.linalg.norm(np.ptp(joints, axis=0)))
+    if choice == "aprilgrid":
+        side = max(round(width / 5.3, _DIGITS), 0.001)
+        return Board(choice, 4, 3, side, spacing=0.3, dictionary=APRIL_TAGS)
+    if choice == "charuco":
+        side = max(round(width / 7.0, _DIGITS), 0.002)
+        marker = round(0.72 * side, _DIGITS)
+        return Board("charuco", 7, 5, side, marker=marker, dictionary="DICT_4X4_50")
+    return Board("chessboard", 9, 6, max(round(width / 9.0, _DIGITS), 0.001))
+
+
+def _from_file(path: Path) -> Board:
+    """Return the board of a YAML file."""
+    found = parse_yaml(read_text(path, "board file"), path, "board file")
+    block = found.get("board")
+    if not isinstance(block, dict):
+        raise DatasetError(
+            f"{path}: the board file could not be used: found no block board, needed one as in "
+            "dataset.yaml; add it."
+        )
+    return described_board(block, path)[0]

@@ -1,0 +1,378 @@
+"""Where the model says that the legs are seen in an image."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry import Array, BoolArray, IntArray, moment
+from legcal.machine import Cylinder, main_cylinders
+from legcal.vision.camera import Camera
+from legcal.vision.cylinder import outlines_of_axis
+
+EQUAL_RADII = 0.01  # relative difference below which two cylinders look like one
+END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cylinder, in radii
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A visible stretch of one cylinder of a leg.
+
+    Attributes
+    ----------
+    link : str
+        The URDF link that names the part.
+    radius : float
+        Radius [m].
+    start, end : float
+        Distances from A along the leg between which its outline is looked for [m].
+    """
+
+    link: str
+    radius: float
+    start: float
+    end: float
+
+
+def visible_pieces(cylinders: Sequence[Cylinder], length: float) -> tuple[Piece, ...]:
+    """Return the visible piece of every part of a leg, from base to platform.
+
+    Parameters
+    ----------
+    cylinders : sequence of Cylinder
+        What the model knows of the leg.
+    length : float
+        Leg length AB [m].
+
+    Returns
+    -------
+    tuple of Piece
+        One for each part with something left to see: its longest stretch that no thicker
+        cylinder covers, shortened at the joints and beside thicker cylinders. Cylinders of
+        equal radius that touch or overlap are one part, named by the longest of them. Of
+        several cylinders of one link the longest is the part; the others only hide.
+    """
+    main = main_cylinders(cylinders)
+    parts = _merge_equal(cylinders, length)
+    pieces = []
+    for link, radius, start, end in parts:
+        cover = END_COVER * radius
+        stretches = [(max(start, cover), min(end, length - cover))]
+        for _, thicker, first, last in parts:
+            if thicker > radius:
+                gap = END_COVER * thicker
+                stretches = [
+                    stretch
+                    for low, high in stretches
+                    for stretch in ((low, min(high, first - gap)), (max(low, last + gap), high))
+                ]
+        low, high = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+        if high > low and _look_alike(radius, main[link].radius):
+            pieces.append(Piece(link, radius, low, high))
+    return tuple(sorted(pieces, key=lambda piece: (piece.start, piece.link)))
+
+
+def _merge_equal(
+    cylinders: Sequence[Cylinder], length: float
+) -> list[tuple[str, float, float, float]]:
+    """Return spans (link, radius, start, end) of cylinders, those of equal radius joined."""
+    spans = [((c.end - c.start, c.link), c.radius, *c.span(length)) for c in cylinders]
+    merged: list[tuple[tuple[float, str], float, float, float]] = []
+    for name, radius, start, end in sorted(spans, key=lambda span: (span[2], span[3], span[0])):
+        for i, (other_name, other, low, high) in enumerate(merged):
+            if _look_alike(radius, other) and start <= high + radius:
+                longest = max(name, other_name)  # of equal lengths the later name, in any pose
+                merged[i] = (longest, max(radius, other), low, max(high, end))
+                break
+        else:
+            merged.append((name, radius, start, end))
+    return [(link, radius, start, end) for (_, link), radius, start, end in merged]
+
+
+def _look_alike(one: float, two: float) -> bool:
+    """Say whether two radii are too near to show a step."""
+    return abs(one - two) <= EQUAL_RADII * max(one, two)
+
+
+N_SAMPLES = 64  # points along a leg that are tested for visibility
+NEAREST = 0.05  # points nearer to the image plane than this fraction of the leg length are cut off
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """A frame on the sensor plane.
+
+    Attributes
+    ----------
+    origin, along, normal : (2,) array
+        Point with t = v = 0, and unit directions of t and v, on the sensor plane.
+    scale : float
+        Pixels per unit of the sensor plane.
+    length : float
+        The predicted leg is visible for 0 <= t <= length [px].
+    """
+
+    origin: Array
+    along: Array
+    normal: Array
+    scale: float
+    length: float
+
+    def points(self, t: Array, v: Array) -> Array:
+        """Return the points (x, y) of the sensor plane with coordinates t, v [px], (..., 2)."""
+        along = self.origin + t[..., None] * (self.along / self.scale)
+        return np.asarray(along + v[..., None] * (self.normal / self.scale))
+
+    def coordinates(self, xy: Array) -> tuple[Array, Array]:
+        """Return t and v [px] of points (..., 2) of the sensor plane, both (...)."""
+        from_origin = self.scale * (xy - self.origin)
+        return np.asarray(from_origin @ self.along), np.asarray(from_origin @ self.normal)
+
+    def offsets(self, h: Array, t: Array) -> Array:
+        """Return the coordinate v of lines h (..., 3) of eq (2) at t (...) [px]."""
+        on_axis = self.points(t, np.zeros(()))
+        value = np.sum(h[..., :2] * on_axis, axis=-1) + h[..., 2]
+        return np.asarray(-self.scale * value / (h[..., :2] @ self.normal))
+
+    def line(self, v0: Array | float, v1: Array | float) -> Array:
+        """Return the unit (a, b, c) of the line through (0, v0) and (length, v1), eq (2).
+
+        The sign is that of eq (3): positive on the side of greater v.
+        """
+        ends = np.stack([np.asarray(v0, dtype=np.float64), np.asarray(v1, dtype=np.float64)], -1)
+        (x0, y0), (x1, y1) = np.moveaxis(
+            self.points(np.array([0.0, self.length]), ends), (-2, -1), (0, 1)
+        )
+        h = np.stack([y0 - y1, x1 - x0, x0 * y1 - x1 * y0], axis=-1)  # the vector product of rays
+        h /= np.linalg.norm(h, axis=-1, keepdims=True)
+        return np.asarray(h * np.sign(h[..., :2] @ self.normal)[..., None])
+
+
+def band_of_leg(
+    camera: Camera, A_camera: Array, B_camera: Array, start: float, end: float
+) -> Band | None:
+    """Return the band along the visible stretch of a leg, or None if the image misses it.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    A_camera, B_camera : (3,) array
+        Predicted joint centres in the camera frame [m].
+    start, end : float
+        The stretch of the axis that is of interest, as distances from A [m].
+
+    Returns
+    -------
+    Band or None
+        From the first to the last point of the longest stretch that the image shows.
+    """
+    ends = np.array([[start], [end]])
+    return bands_of_legs(camera, A_camera[None], B_camera[None], *ends)[0]
+
+
+def bands_of_legs(
+    camera: Camera, A_camera: Array, B_camera: Array, start: Array, end: Array
+) -> list[Band | None]:
+    """Return the bands along the visible stretches of legs, as :func:`band_of_leg` does for one.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    A_camera, B_camera : (n, 3) array
+        Predicted joint centres in the camera frame [m].
+    start, end : (n,) array
+        The stretches of the axes that are of interest, as distances from A [m].
+    """
+    length = np.linalg.norm(B_camera - A_camera, axis=1)
+    u = (B_camera - A_camera) / length[:, None]
+    s = start[:, None] + (end - start)[:, None] * np.linspace(0.0, 1.0, N_SAMPLES)
+    axis = A_camera[:, None] + s[..., None] * u[:, None]
+    inside = in_picture(camera, axis, NEAREST * length[:, None])
+    m = moment(u, A_camera)
+    runs = [longest_run(one) if np.count_nonzero(one) > 1 else (0, 0) for one in inside]
+    first, last = np.array(runs, dtype=np.intp).reshape(-1, 2).T
+    legs = np.arange(len(axis))
+    shown = last > first
+    ends = np.stack([axis[legs, first], axis[legs, last]], axis=1)
+    ends = ends[..., :2] / np.where(shown[:, None, None], ends[..., 2:], 1.0)
+    along = ends[:, 1] - ends[:, 0]
+    distance, offset = np.linalg.norm(along, axis=1), np.linalg.norm(m, axis=1)
+    shown &= (distance > 0.0) & (offset >= 1e-6 * length)  # others are seen end-on
+    middle = np.where(shown[:, None], ends.mean(axis=1), 0.0)
+    scale = np.sqrt(np.abs(np.linalg.det(camera.pixels_per_unit(middle))))
+    return [
+        Band(
+            ends[i, 0],
+            along[i] / distance[i],
+            m[i, :2] / np.linalg.norm(m[i, :2]),
+            float(scale[i]),
+            float(distance[i] * scale[i]),
+        )
+        if shown[i]
+        else None
+        for i in legs.tolist()
+    ]
+
+
+def in_picture(camera: Camera, P_camera: Array, nearest: Array | float) -> BoolArray:
+    """Return whether points (..., 3) are in front of the camera and inside its image, (...)."""
+    depth = P_camera[..., 2]
+    front = depth > nearest
+    xy = P_camera[..., :2] / np.where(front, depth, 1.0)[..., None]
+    inside = front & pixels_inside(camera, camera.distort(xy))
+    if camera.has_distortion:  # the polynomials fold far points back into the image
+        back = camera.undistort(camera.distort(np.where(inside[..., None], xy, 0.0)))
+        inside &= np.linalg.norm(back - np.where(inside[..., None], xy, 0.0), axis=-1) < 1e-3
+    return np.asarray(inside)
+
+
+def pixels_inside(camera: Camera, pixels: Array, margin: float = 0.0) -> BoolArray:
+    """Return whether pixels (..., 2) lie in the image, at least ``margin`` px from its border."""
+    x, y = pixels[..., 0], pixels[..., 1]
+    inside = (x >= margin) & (x <= camera.width - 1.0 - margin)
+    return np.asarray(inside & (y >= margin) & (y <= camera.height - 1.0 - margin))
+
+
+def longest_run(flags: BoolArray) -> tuple[int, int]:
+    """Return the first and the last index of the longest run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    starts, stops = edges[::2], edges[1::2]
+    longest = int(np.argmax(stops - starts))
+    return int(starts[longest]), int(stops[longest]) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedLeg:
+    """One leg as it should appear in one image.
+
+    Attributes
+    ----------
+    row, leg : int
+        The image and the leg.
+    A_camera, B_camera : (3,) array
+        Joint centres in the camera frame [m].
+    pieces : tuple of Piece
+        The parts that can be seen, from base to platform.
+    outlines : (n_pieces, 2, 3) array
+        Their outlines h1, h2, eq (3).
+    band : Band
+        The frame along the visible stretch of the whole leg.
+    """
+
+    row: int
+    leg: int
+    A_camera: Array
+    B_camera: Array
+    pieces: tuple[Piece, ...]
+    outlines: Array
+    band: Band
+
+    @cached_property
+    def u(self) -> Array:
+        """Unit direction from base to platform, (3,)."""
+        AB = self.B_camera - self.A_camera
+        return np.asarray(AB / np.linalg.norm(AB))
+
+    def distance_along(self, band: Band, t: Array) -> Array:
+        """Return the distance from A [m] of the axis points seen at t [px] of a band."""
+        ray = band.along @ band.origin + t / band.scale
+        u, A = self.u, self.A_camera
+        return np.asarray((ray * A[2] - band.along @ A[:2]) / (band.along @ u[:2] - ray * u[2]))
+
+
+def predict_legs(
+    camera: Camera,
+    T_base_camera: RigidTransform,
+    A_base: Array,
+    B_base: Array,
+    cylinders: Sequence[Sequence[Cylinder]],
+    row: int,
+) -> list[PredictedLeg]:
+    """Predict every leg that an image should show.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera of the image.
+    T_base_camera : RigidTransform
+        Its pose in the base link.
+    A_base, B_base : (n_legs, 3) array
+        Joint centres at the reading of the image, in the base link [m].
+    cylinders : sequence, for each leg a sequence of Cylinder
+        What can be seen of the legs.
+    row : int
+        Index of the image.
+
+    Returns
+    -------
+    list of PredictedLeg
+        In the order of the legs; legs outside the image are missing.
+    """
+    T_camera_base = T_base_camera.inv()
+    A_camera, B_camera = T_camera_base.apply(A_base), T_camera_base.apply(B_base)
+    length = np.linalg.norm(B_camera - A_camera, axis=1)
+    u = (B_camera - A_camera) / length[:, None]
+    pieces = [visible_pieces(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
+    ends = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in pieces]
+    bands = bands_of_legs(camera, A_camera, B_camera, *np.array(ends).reshape(-1, 2).T)
+    radius = np.array([max((piece.radius for piece in some), default=0.0) for some in pieces])
+    distance = np.linalg.norm(A_camera - u * np.sum(u * A_camera, axis=1, keepdims=True), axis=1)
+    seen = {
+        leg: band
+        for leg, band in enumerate(bands)
+        if band is not None and distance[leg] > 1.01 * radius[leg]
+    }
+    axes = [leg for leg in seen for _ in pieces[leg]]
+    radii = np.array([piece.radius for leg in seen for piece in pieces[leg]])
+    outlines = outlines_of_axis(u[axes], A_camera[axes], radii)
+    of_leg = np.split(outlines, np.cumsum([len(pieces[leg]) for leg in seen])[:-1])
+    return [
+        PredictedLeg(row, leg, A_camera[leg], B_camera[leg], pieces[leg], own, band)
+        for (leg, band), own in zip(seen.items(), of_leg, strict=False)
+    ]
+
+
+def hidden_by(
+    legs: Sequence[PredictedLeg], own: IntArray, P_camera: Array, margin: Array
+) -> IntArray:
+    """Return which other leg stands in front of points of legs.
+
+    Parameters
+    ----------
+    legs : sequence of PredictedLeg
+        The legs of one image.
+    own : (n,) array of int
+        The leg to whose outline each point belongs.
+    P_camera : (n, 3) array
+        The points [m].
+    margin : (n,) array
+        Points this near to another leg's outline count as hidden, as an angle [rad].
+
+    Returns
+    -------
+    (n,) array of int
+        Index of the leg in front, -1 where the view is free.
+    """
+    distance = np.linalg.norm(P_camera, axis=1)
+    ray = P_camera / distance[:, None]
+    u, A, B = (
+        np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in legs), strict=True)
+    )
+    length = np.linalg.norm(B - A, axis=1)
+    radius = np.array([max(piece.radius for piece in other.pieces) for other in legs])
+    # The points of the legs' axes nearest to the viewing rays, and the rays' nearest points.
+    c, to_A = ray @ u.T, ray @ A.T  # (n, n_legs)
+    sine2 = np.maximum(1.0 - c**2, 1e-12)
+    along = np.clip((c * to_A - np.sum(u * A, axis=1)) / sine2, 0.0, length)
+    depth = to_A + along * c
+    nearest = A + along[..., None] * u
+    gap = np.linalg.norm(nearest - depth[..., None] * ray[:, None], axis=-1)
+    hides = (gap < radius + margin[:, None] * depth) & (depth < distance[:, None])
+    front = np.full(len(P_camera), -1, dtype=np.intp)
+    for k, other in enumerate(legs):
+        front[hides[:, k] & (own != other.leg)] = other.leg
+    return front
