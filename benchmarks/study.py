@@ -17,8 +17,8 @@ from pathlib import Path
 _PROGRAM = """
 import json, resource, sys
 from pathlib import Path
-from legcal.studies.paper import PaperStudy
-from legcal.studies.runner import run_study
+from legcal.simulation import PaperStudy
+from legcal.simulation import run_study
 
 if __name__ == "__main__":
     n_runs, workers, folder = int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])

@@ -191,7 +191,7 @@ def test_a_mistake_of_legcal_is_called_one(
     def broken(model: str) -> None:
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("legcal.machine.load.load_mechanism", broken)
+    monkeypatch.setattr("legcal.machine.load_mechanism", broken)
     assert run(monkeypatch, "inspect", "hexapod") == 3
     err = capsys.readouterr().err
     assert "mistake in legcal" in err
@@ -204,7 +204,7 @@ def test_stopping_by_hand_is_no_mistake(
     def stopped(model: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("legcal.machine.load.load_mechanism", stopped)
+    monkeypatch.setattr("legcal.machine.load_mechanism", stopped)
     assert run(monkeypatch, "inspect", "hexapod") == 130
     assert "Stopped before the end" in capsys.readouterr().err
 

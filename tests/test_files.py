@@ -176,7 +176,7 @@ def test_killed_run_leaves_everything_as_it_was_and_does_not_disturb_the_next(ou
         f"""
         import time
         from pathlib import Path
-        from legcal.report.files import result_folder
+        from legcal.files import result_folder
         with result_folder(Path({str(out)!r})) as folder:
             (folder / "result.json").write_text("half")
             print("writing", flush=True)
