@@ -36,34 +36,19 @@ TAG_BORDER = 2  # modules of the black frame of a tag, as Kalibr prints it
 
 @dataclass(frozen=True, eq=False)
 class BoardPrint:
-    """A print: tiles of one size, each with black and white modules.
+    """A print: tiles of one size, each with black and white modules."""
 
-    Attributes
-    ----------
-    face : int
-        The face of the plate that is printed, as the renderer counts them.
-    middle : (2,) array
-        The middle of the plate in the board frame [m].
-    origin : (2,) array
-        Where the first tile starts, in the board frame [m].
-    pitch : float
-        From tile to tile [m].
-    first, size : float
-        Where the modules start in a tile, and how long they are together [m].
-    modules : (rows, columns, n, n) array of bool
-        Black modules of each tile, by rows along y and columns along x.
-    checked : int
-        0 or 1: tiles of that parity are black outside their modules; -1 for tags, where the
-        crossings of the gaps are black.
-    """
-
-    face: int
-    middle: Array
-    origin: Array
-    pitch: float
+    face: int  # the face of the plate that is printed, as the renderer counts them
+    middle: Array  # (2,) the middle of the plate in the board frame [m]
+    origin: Array  # (2,) where the first tile starts, in the board frame [m]
+    pitch: float  # from tile to tile [m]
+    # first, size: where the modules start in a tile, and how long they are together [m]
     first: float
     size: float
+    # (rows, columns, n, n) black modules of each tile, by rows along y and columns along x
     modules: NDArray[np.bool_]
+    # 0 or 1: tiles of that parity are black outside their modules; -1 for tags, where the crossings
+    # of the gaps are black
     checked: int
 
     @classmethod
@@ -80,13 +65,7 @@ class BoardPrint:
         return cls(face, middle, origin, board.side, gap, marker, modules, black)
 
     def reflectance(self, x: Array, y: Array) -> Array:
-        """Return how much of the light that white returns comes back from points of the plate.
-
-        Parameters
-        ----------
-        x, y : (n,) array
-            Points in the frame of the plate [m].
-        """
+        """Return how much of the light that white returns comes back from points of the plate."""
         u = (x + (self.middle[0] - self.origin[0])) / self.pitch
         v = (y + (self.middle[1] - self.origin[1])) / self.pitch
         i, j = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
@@ -145,18 +124,10 @@ _LEAST_CORNERS = 8
 
 @dataclass(frozen=True, eq=False)
 class PlacedBoard:
-    """A board in its place.
-
-    Attributes
-    ----------
-    board : Board
-        The board.
-    T_base_board : RigidTransform
-        Its pose in the base link.
-    """
+    """A board in its place."""
 
     board: Board
-    T_base_board: RigidTransform
+    T_base_board: RigidTransform  # its pose in the base link
 
     def document(self) -> dict[str, Any]:
         """Return the board as the block of ``dataset.yaml`` has it, with its pose."""
@@ -223,15 +194,7 @@ class PlacedBoard:
     def seen(
         self, machine: PosedMachine, camera: Camera, T_base_camera: RigidTransform
     ) -> BoolArray:
-        """Return which corners an image shows, (n_corners,).
-
-        Parameters
-        ----------
-        machine : PosedMachine
-            The machine in its pose, with the plate.
-        camera, T_base_camera
-            The camera and its pose.
-        """
+        """Return which corners an image shows, (n_corners,)."""
         points = self._watched
         base = self.T_base_board.apply(points.reshape(-1, 3))
         centre = T_base_camera.translation
@@ -277,21 +240,7 @@ _DIGITS = 3  # of a side in metres: whole millimetres
 def chosen_board(
     choice: Board | str | Path | None, machines: Sequence[PosedMachine]
 ) -> Board | None:
-    """Return the board that settings ask for.
-
-    Parameters
-    ----------
-    choice : Board, str, Path or None
-        A board; a kind, of a size that fits the machine; or a YAML file with the block ``board``
-        of a dataset.
-    machines : sequence of PosedMachine
-        The machine in its poses.
-
-    Raises
-    ------
-    DatasetError
-        If the file is malformed.
-    """
+    """Return the board that settings ask for."""
     if choice is None or isinstance(choice, Board):
         return choice
     if choice not in KINDS:

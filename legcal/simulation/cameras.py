@@ -35,21 +35,11 @@ PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a 
 
 @dataclass(frozen=True, eq=False)
 class LegCamera:
-    """A camera around a machine in memory, and the legs that it is said to see.
+    """A camera around a machine in memory, and the legs that it is said to see."""
 
-    Attributes
-    ----------
-    camera : Camera
-        Its intrinsics.
-    T_Rb_camera : RigidTransform
-        Its pose in R_b.
-    legs : tuple of int
-        The legs that its images show.
-    """
-
-    camera: Camera
-    T_Rb_camera: RigidTransform
-    legs: tuple[int, ...]
+    camera: Camera  # its intrinsics
+    T_Rb_camera: RigidTransform  # its pose in R_b
+    legs: tuple[int, ...]  # the legs that its images show
 
 
 def sample_camera() -> Camera:
@@ -72,25 +62,7 @@ def cameras_around(
     distance: float = 0.9,
     camera: Camera | None = None,
 ) -> tuple[LegCamera, ...]:
-    """Return cameras that stand around a machine, each on the side of the legs it sees.
-
-    Parameters
-    ----------
-    machine : Machine
-        The machine in its home pose.
-    rng : numpy.random.Generator
-        Source of small variations of position and roll.
-    legs : sequence of sequences of int
-        The legs that each camera sees.
-    distance : float
-        Distance of the cameras from the middle of the machine [m].
-    camera : Camera, optional
-        Intrinsics of all cameras; :func:`sample_camera` without it.
-
-    Returns
-    -------
-    tuple of LegCamera
-    """
+    """Return cameras that stand around a machine, each on the side of the legs it sees."""
     A_Rb = machine.parameters.base_joints
     B_Rb = machine.home.apply(machine.parameters.platform_joints)
     middle = 0.5 * (A_Rb + B_Rb)
@@ -113,22 +85,7 @@ def cameras_around(
 def look_at(
     position: Array, target: Array, roll: float = 0.0, *, up: Array = UPWARD
 ) -> RigidTransform:
-    """Return the pose of a camera that looks at a point, with its y axis down.
-
-    Parameters
-    ----------
-    position, target : (3,) array
-        The camera centre and the point on its optical axis, in a frame L [m].
-    roll : float
-        Turn about the optical axis [rad].
-    up : (3,) array
-        The direction in L that is up in the image; not along the optical axis.
-
-    Returns
-    -------
-    RigidTransform
-        T_L_camera.
-    """
+    """Return the pose of a camera that looks at a point, with its y axis down."""
     z = (target - position) / np.linalg.norm(target - position)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -172,13 +129,7 @@ class CamerasEntry(FileSchema):
 
 
 def read_lens(path: Path) -> Camera:
-    """Return the camera of a camera file, of a size that pictures can have.
-
-    Raises
-    ------
-    DatasetError
-        If the file is malformed, or its pictures too large.
-    """
+    """Return the camera of a camera file, of a size that pictures can have."""
     camera = read_camera(path)
     if max(camera.width, camera.height) > MOST_SIDE or camera.width * camera.height > MOST_PIXELS:
         raise DatasetError(
@@ -190,20 +141,7 @@ def read_lens(path: Path) -> Camera:
 
 
 def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTransform]]:
-    """Return the camera and T_base_camera of every view of a file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    camera : Camera
-        The camera of views that name none.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each thing that is wrong.
-    """
+    """Return the camera and T_base_camera of every view of a file."""
     found = parse_yaml(read_text(path, "cameras file"), path, "cameras file")
     entry = validate(CamerasEntry, found, path)
     return {
@@ -236,26 +174,7 @@ def places_around(
     rng: np.random.Generator,
     progress: Report = no_progress,
 ) -> tuple[RigidTransform, ...]:
-    """Return where cameras stand.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The true machine.
-    machines : sequence of PosedMachine
-        The machine in the poses that the cameras are to see.
-    cameras : sequence of Camera
-        The camera of each view.
-    rng : numpy.random.Generator
-        Source of the first sector, of roll and distance.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    tuple of RigidTransform
-        T_base_camera.
-    """
+    """Return where cameras stand."""
     return scored_places(mechanism, machines, cameras, rng, progress)[0]
 
 
@@ -267,23 +186,7 @@ def scored_places(
     progress: Report = no_progress,
     board: PlacedBoard | None = None,
 ) -> tuple[tuple[RigidTransform, ...], float]:
-    """Return where cameras stand, and how much they see.
-
-    Parameters
-    ----------
-    mechanism, machines, cameras, rng, progress
-        As for :func:`places_around`.
-    board : PlacedBoard, optional
-        A calibration board that every camera must see; the machines have it beside them.
-
-    Returns
-    -------
-    places : tuple of RigidTransform
-        T_base_camera.
-    score : float
-        The least mean length of the legs in the images of a view [px]; zero if a camera does not
-        see the board.
-    """
+    """Return where cameras stand, and how much they see."""
     reached = _reached(machines)
     tried = [machines[i] for i in np.unique(np.linspace(0, len(machines) - 1, _TRIED).astype(int))]
     up = upward(mechanism)
@@ -315,28 +218,7 @@ def place_somewhere(
     rng: np.random.Generator,
     board: PlacedBoard,
 ) -> tuple[RigidTransform, float]:
-    """Return a place by chance of a camera that is held in the hand, and how much it sees.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The true machine.
-    machine : PosedMachine
-        The machine in the pose that it is to see, with the board.
-    camera : Camera
-        The camera.
-    rng : numpy.random.Generator
-        Source of the place.
-    board : PlacedBoard
-        The board.
-
-    Returns
-    -------
-    T_base_camera : RigidTransform
-        The place.
-    score : float
-        The mean length of the legs in the image [px], zero if it does not show the board.
-    """
+    """Return a place by chance of a camera that is held in the hand, and how much it sees."""
     up = upward(mechanism)
     lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
     toward = _direction(up, rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lifts[0], lifts[-1]))
@@ -432,21 +314,11 @@ _HIDDEN = 0.9  # of what is seen of the legs that must stay seen
 
 @dataclass(frozen=True, eq=False)
 class BoardScene:
-    """A board in its place and the cameras that see it.
-
-    Attributes
-    ----------
-    placed : PlacedBoard
-        The board.
-    machines : tuple of PosedMachine
-        The machine in every pose, with the board.
-    places : tuple of RigidTransform
-        T_base_camera of every view.
-    """
+    """A board in its place and the cameras that see it."""
 
     placed: PlacedBoard
-    machines: tuple[PosedMachine, ...]
-    places: tuple[RigidTransform, ...]
+    machines: tuple[PosedMachine, ...]  # the machine in every pose, with the board
+    places: tuple[RigidTransform, ...]  # T_base_camera of every view
 
 
 def board_and_cameras(
@@ -457,20 +329,7 @@ def board_and_cameras(
     rng: np.random.Generator,
     progress: Report = no_progress,
 ) -> BoardScene:
-    """Return a board on the base of a machine, and cameras around both.
-
-    Parameters
-    ----------
-    board : Board
-        The board.
-    mechanism, machines, cameras, rng, progress
-        As for :func:`legcal.simulation.cameras.places_around`.
-
-    Raises
-    ------
-    NotVisible
-        If no place is found from which every camera sees the board and a leg.
-    """
+    """Return a board on the base of a machine, and cameras around both."""
     tried = _some(machines)
     good: list[tuple[float, PlacedBoard, tuple[RigidTransform, ...]]] = []
     for placed in _lying(board, mechanism, tried):
@@ -494,22 +353,7 @@ def board_before(
     machines: Sequence[PosedMachine],
     views: Sequence[Viewpoint],
 ) -> BoardScene:
-    """Return a board where cameras whose places are given see it.
-
-    Parameters
-    ----------
-    board : Board
-        The board.
-    mechanism, machines
-        The true machine, and it in its poses.
-    views : sequence of Viewpoint
-        The cameras.
-
-    Raises
-    ------
-    NotVisible
-        If there is no place at which all of them see it.
-    """
+    """Return a board where cameras whose places are given see it."""
     tried = _some(machines)
     towards = np.mean([view.T_base_camera.translation for view in views], axis=0)
     best: tuple[float, PlacedBoard] | None = None

@@ -65,23 +65,7 @@ def measurements_of(
     q: Array,
     sigma_q: float,
 ) -> Measurements:
-    """Return the rows of the dataset.
-
-    Parameters
-    ----------
-    images : Images
-        The images.
-    views : sequence of View
-        The cameras, with what is told about them.
-    labels : sequence of str
-        The names of all poses.
-    names : sequence of str
-        The image of each row, "" where there is none.
-    q : (n_poses, n_legs) array
-        Readings of all poses [m].
-    sigma_q : float
-        Their standard deviation [m].
-    """
+    """Return the rows of the dataset."""
     kept, pose = np.unique(images.pose, return_inverse=True)
     return Measurements(
         views=tuple(views),
@@ -103,23 +87,7 @@ def write_session(
     groups: Sequence[str] = (),
     board: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``dataset.yaml``, ``measurements.csv`` and the camera files.
-
-    Parameters
-    ----------
-    folder : Path
-        The dataset.
-    mechanism : Mechanism
-        The nominal model.
-    model : str
-        The path of its YAML in the dataset.
-    m : Measurements
-        The rows.
-    groups : sequence of str
-        The view of the file that each view belongs to where cameras are in the hand.
-    board : mapping, optional
-        The block of the calibration board.
-    """
+    """Write ``dataset.yaml``, ``measurements.csv`` and the camera files."""
     cameras = _write_cameras(folder, m.views)
     views: dict[str, Any] = {}
     for v, (view, camera) in enumerate(zip(m.views, cameras, strict=True)):
@@ -159,23 +127,7 @@ def write_truth(
     files: Sequence[str],
     board: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``truth.json``: settings, radii, cameras, poses and board as they really were.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    settings : SimulationSettings
-        The settings, with the seed.
-    mechanism : Mechanism
-        The true model.
-    views, poses, labels : sequence
-        Cameras and poses.
-    files : sequence of str
-        The other files of the dataset.
-    board : mapping, optional
-        The block of the calibration board, with its true pose.
-    """
+    """Write ``truth.json``: settings, radii, cameras, poses and board as they really were."""
     sliders = [
         (j, str(leg.prismatic))
         for j, leg in enumerate(mechanism.legs)
@@ -260,14 +212,7 @@ SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 
 def check_dataset_destination(destination: Path, *, force: bool) -> None:
-    """Refuse an output folder that holds anything; with *force* only if that was not simulated.
-
-    Raises
-    ------
-    UsageError
-        With what is there instead. With *force* also if something else than the files of the
-        simulated dataset stands where a dataset has its own.
-    """
+    """Refuse an output folder that holds anything; with *force* only if that was not simulated."""
     check_path(destination, SIMULATED)
     if destination.is_dir() and holds_files(destination) and not force:
         there = "a simulated dataset" if SIMULATED.is_in(destination) else "a folder with files"
@@ -290,20 +235,6 @@ def dataset_folder(destination: Path, *, force: bool) -> Iterator[Path]:
 
     With *force* the files of an earlier simulated dataset go, and so do the outlines that a
     calibration left there; other files beside them are kept. Nothing else is replaced.
-
-    Parameters
-    ----------
-    destination : Path
-        The folder of the dataset.
-    force : bool
-        Replace a simulated dataset that is there.
-
-    Raises
-    ------
-    UsageError
-        As :func:`check_dataset_destination`.
-    OutOfResources
-        If the files cannot be written; nothing is then changed.
     """
     check_dataset_destination(destination, force=force)
     earlier = _earlier(destination)

@@ -35,25 +35,14 @@ _GOOD, _TRIES = 3, 60  # places that see board and legs, of which the best is ta
 
 @dataclass(frozen=True, eq=False)
 class Viewing:
-    """Cameras, the machine as they see it, and the board.
+    """Cameras, the machine as they see it, and the board."""
 
-    Attributes
-    ----------
-    views : tuple of Viewpoint
-        The cameras; of one in the hand a place for each image.
-    machines : tuple of PosedMachine
-        The machine in every pose, with the board beside it; for hand-held views once for each
-        image.
-    board : PlacedBoard or None
-        The board.
-    groups : tuple of str
-        The view of ``dataset.yaml`` that each camera belongs to where cameras are in the hand;
-        empty where they stand.
-    """
-
-    views: tuple[Viewpoint, ...]
+    views: tuple[Viewpoint, ...]  # the cameras; of one in the hand a place for each image
+    # the machine in every pose, with the board beside it; for hand-held views once for each image
     machines: tuple[PosedMachine, ...]
     board: PlacedBoard | None = None
+    # the view of ``dataset.yaml`` that each camera belongs to where cameras are in the hand; empty
+    # where they stand
     groups: tuple[str, ...] = ()
 
 
@@ -68,30 +57,7 @@ def look_at_machine(
     chance: Mapping[str, np.random.Generator],
     progress: Report,
 ) -> Viewing:
-    """Return the cameras that settings ask for, and the board.
-
-    Parameters
-    ----------
-    mechanism, machines
-        The true machine, and it in its poses.
-    settings : SimulationSettings
-        What to simulate.
-    cameras : mapping of str to Camera
-        The camera of each view.
-    places : mapping of str to RigidTransform
-        T_base_camera of each view where they are given; empty to look for them.
-    shared : bool
-        Whether all views see all poses.
-    chance : mapping of str to numpy.random.Generator
-        Source of ``cameras``.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Raises
-    ------
-    DatasetError, NotVisible
-        If a file is malformed, or no place is found.
-    """
+    """Return the cameras that settings ask for, and the board."""
     board = chosen_board(settings.board, machines)
     if not settings.hand_held or board is None:
         return _standing(mechanism, machines, cameras, places, board, chance, progress)
@@ -162,15 +128,7 @@ def _hand_held(
 def numbered(
     images: Images, views: Sequence[Viewpoint], groups: Sequence[str]
 ) -> tuple[Images, tuple[Viewpoint, ...], tuple[str, ...]]:
-    """Return hand-held views counted anew by the images that are left, one for each of them.
-
-    Parameters
-    ----------
-    images : Images
-        The images that the dataset has rows for.
-    views, groups : sequence
-        Cameras in the hand, and the views of ``dataset.yaml`` that they belong to.
-    """
+    """Return hand-held views counted anew by the images that are left, one for each of them."""
     counts: dict[str, int] = {}
     left, names = [], []
     for v in images.view.tolist():
@@ -225,35 +183,19 @@ def _in_the_hand(
 
 @dataclass(frozen=True, eq=False)
 class ImagedMachine:
-    """A true machine, its poses and its images.
+    """A true machine, its poses and its images."""
 
-    Attributes
-    ----------
-    truth : Mechanism
-        The true machine.
-    poses, labels, machines : sequence
-        Its poses, their names, and the machine in each of them.
-    views : tuple of Viewpoint
-        The cameras.
-    images : Images
-        The images that the dataset has rows for.
-    left_out : int
-        Images that show no leg, which a dataset of axes or outlines has no row for.
-    board : PlacedBoard or None
-        The calibration board on the base.
-    groups : tuple of str
-        The view of ``dataset.yaml`` that each camera belongs to where cameras are in the hand;
-        empty where they stand.
-    """
-
-    truth: Mechanism
+    truth: Mechanism  # the true machine
+    # poses, labels, machines: its poses, their names, and the machine in each of them
     poses: Configurations
     labels: tuple[str, ...]
     machines: tuple[PosedMachine, ...]
     views: tuple[Viewpoint, ...]
-    images: Images
-    left_out: int
-    board: PlacedBoard | None = None
+    images: Images  # the images that the dataset has rows for
+    left_out: int  # images that show no leg, which a dataset of axes or outlines has no row for
+    board: PlacedBoard | None = None  # the calibration board on the base
+    # the view of ``dataset.yaml`` that each camera belongs to where cameras are in the hand; empty
+    # where they stand
     groups: tuple[str, ...] = ()
 
 
@@ -264,24 +206,7 @@ def image_machine(
     chance: Mapping[str, np.random.Generator],
     progress: Report,
 ) -> ImagedMachine:
-    """Return a machine in its poses and what its cameras show of it.
-
-    Parameters
-    ----------
-    truth, nominal : Mechanism
-        The machine, and the model of it.
-    settings : SimulationSettings
-        What to simulate.
-    chance : mapping of str to numpy.random.Generator
-        Sources of ``poses`` and ``cameras``.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Raises
-    ------
-    UsageError, DatasetError, DidNotConverge, NotVisible
-        As :func:`legcal.simulation.session.simulate` does.
-    """
+    """Return a machine in its poses and what its cameras show of it."""
     cameras, places = _cameras(settings)
     n_views = len(cameras)
     shared = settings.shared_poses or isinstance(settings.poses, Path)

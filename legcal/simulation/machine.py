@@ -17,30 +17,14 @@ from legcal.simulation.poses import near_ends
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """A 6-SPU hexapod, or any n-leg platform with point-like joints and motors on all legs.
+    """A 6-SPU hexapod, or any n-leg platform with point-like joints and motors on all legs."""
 
-    Attributes
-    ----------
-    parameters : KinematicParameters
-        Its parameters xi, in R_b and R_e.
-    sign : (n_legs,) array of int
-        Leg length = sign * q + q0.
-    frame_legs : tuple of 3 int
-        The legs whose joint centres define R_b and R_e.
-    radius : (n_legs,) array
-        Radii of the legs [m].
-    travel : (n_legs, 2) array
-        Shortest and longest leg [m].
-    home : RigidTransform
-        T_Rb_Re of a pose in the assembly mode.
-    """
-
-    parameters: KinematicParameters
-    sign: IntArray
-    frame_legs: tuple[int, ...]
-    radius: Array
-    travel: Array
-    home: RigidTransform
+    parameters: KinematicParameters  # its parameters xi, in R_b and R_e
+    sign: IntArray  # (n_legs,) leg length = sign * q + q0
+    frame_legs: tuple[int, ...]  # the legs whose joint centres define R_b and R_e
+    radius: Array  # (n_legs,) radii of the legs [m]
+    travel: Array  # (n_legs, 2) shortest and longest leg [m]
+    home: RigidTransform  # T_Rb_Re of a pose in the assembly mode
 
     @property
     def n_legs(self) -> int:
@@ -92,19 +76,7 @@ def hexapod(scale: float = 1.0) -> Machine:
 def perturb(
     machine: Machine, rng: np.random.Generator, half_width: float, *, coplanar: bool = False
 ) -> Machine:
-    """Return the machine with uniform errors on every parameter.
-
-    Parameters
-    ----------
-    machine : Machine
-        The machine to disturb.
-    rng : numpy.random.Generator
-        Source of the errors.
-    half_width : float
-        Errors are uniform in [-half_width, half_width] [m].
-    coplanar : bool
-        Leave the z coordinates as they are.
-    """
+    """Return the machine with uniform errors on every parameter."""
     vector = to_vector(machine.parameters, machine.frame_legs)
     vector = vector + rng.uniform(-half_width, half_width, vector.shape)
     parameters = from_vector(vector, machine.n_legs, machine.frame_legs)
@@ -155,19 +127,13 @@ _STEPS = 6  # from home
 
 
 class Followed(NamedTuple):
-    """Where a machine came to from home.
+    """Where a machine came to from home."""
 
-    Attributes
-    ----------
-    R, t : (n, 3, 3) and (n, 3) array
-        Poses of R_e in R_b [m]; where the lengths were not reached, the last one on the way.
-    reached : (n,) array of bool
-        Which have the lengths that were asked for.
-    """
-
+    # R, t: (n, 3, 3) poses of R_e in R_b [m]; where the lengths were not reached, the last one on
+    # the way
     R: Array
     t: Array
-    reached: BoolArray
+    reached: BoolArray  # (n,) which have the lengths that were asked for
 
     @property
     def T_Rb_Re(self) -> RigidTransform:
@@ -178,27 +144,7 @@ class Followed(NamedTuple):
 def solve_poses(
     parameters: KinematicParameters, lengths: Array, start: RigidTransform
 ) -> RigidTransform:
-    """Return the platform poses with given leg lengths that Newton's method finds from a start.
-
-    Parameters
-    ----------
-    parameters : KinematicParameters
-        Joint centres in R_b and R_e.
-    lengths : (n_poses, 6) array
-        Leg lengths [m].
-    start : RigidTransform, n_poses of them
-        T_Rb_Re near the answers.
-
-    Returns
-    -------
-    RigidTransform
-        T_Rb_Re, n_poses of them.
-
-    Raises
-    ------
-    DidNotConverge
-        If the legs cannot reach some row of lengths from its start.
-    """
+    """Return the platform poses with given leg lengths that Newton's method finds from a start."""
     R, t, error = _newton(parameters, lengths, start.rotation.as_matrix(), start.translation)
     if not np.all(error == 0.0):
         raise DidNotConverge(
@@ -212,17 +158,6 @@ def follow_from_home(machine: Machine, lengths: Array) -> Followed:
     """Return the poses with given leg lengths that are reached from home in small steps.
 
     They are in the assembly mode of home; those beyond or beside a singularity are not reached.
-
-    Parameters
-    ----------
-    machine : Machine
-        The machine.
-    lengths : (n_poses, n_legs) array
-        Leg lengths [m].
-
-    Returns
-    -------
-    Followed
     """
     n = len(lengths)
     R = np.tile(machine.home.rotation.as_matrix(), (n, 1, 1))
@@ -292,25 +227,6 @@ def extreme_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> R
 
     Poses are followed from home in small steps, so that they stay in its assembly mode; those
     that cannot be reached or pass near a singularity are drawn again.
-
-    Parameters
-    ----------
-    machine : Machine
-        The machine.
-    n_poses : int
-        Number of poses.
-    rng : numpy.random.Generator
-        Source of the poses.
-
-    Returns
-    -------
-    RigidTransform
-        T_Rb_Re, n_poses of them.
-
-    Raises
-    ------
-    DidNotConverge
-        If too few are reached.
     """
     n = machine.n_legs
     return _drawn(machine, n_poses, lambda: near_ends(rng.integers(0, 2, n), rng.random(n)))

@@ -15,18 +15,10 @@ from legcal.vision import Camera
 
 @dataclass(frozen=True)
 class OutlineNoise:
-    """White noise of the edge points of an outline.
+    """White noise of the edge points of an outline."""
 
-    Attributes
-    ----------
-    sigma_px : float
-        Standard deviation of each point [px].
-    n_points : int
-        Points of each outline, equally spaced.
-    """
-
-    sigma_px: float = 0.1
-    n_points: int = 300
+    sigma_px: float = 0.1  # standard deviation of each point [px]
+    n_points: int = 300  # points of each outline, equally spaced
 
     @property
     def covariance(self) -> Array:
@@ -39,28 +31,7 @@ class OutlineNoise:
 def exact_outlines(
     camera: Camera, u: Array, M: Array, length: Array, radius: Array, *, margin: float = 0.15
 ) -> tuple[Array, Array]:
-    """Return the outlines of legs without noise.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    u, M : (n, 3) array
-        Directions and base joint centres in the camera frame [m].
-    length : (n,) array
-        Leg lengths [m].
-    radius : (n,) array
-        Radii [m].
-    margin : float
-        The part of the leg that is not seen at each end.
-
-    Returns
-    -------
-    h : (n, 2, 3) array
-        Unit normals of edges 1 and 2.
-    ends : (n, 2, 2, 2) array
-        Ends of both edges, the first nearer to the base [px].
-    """
+    """Return the outlines of legs without noise."""
     h, offsets = silhouette(u, M, radius)
     parts = np.array([margin, 1.0 - margin])
     axis_points = M[:, None] + (length[:, None] * parts)[..., None] * u[:, None]
@@ -68,22 +39,7 @@ def exact_outlines(
 
 
 def shifted_outlines(camera: Camera, h: Array, ends: Array, offsets: Array) -> tuple[Array, Array]:
-    """Return outlines whose ends are moved across the line by offsets in pixels.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    h : (..., 3) array
-        Unit normals.
-    ends, offsets : (..., 2, 2) and (..., 2) array
-        Ends and their offsets, positive where h . (x, y, 1) > 0 [px].
-
-    Returns
-    -------
-    h : (..., 3) array
-    ends : (..., 2, 2) array
-    """
+    """Return outlines whose ends are moved across the line by offsets in pixels."""
     xy = camera.undistort(ends)
     J = camera.pixels_per_unit(xy)
     ab = np.broadcast_to(h[..., None, :2], xy.shape)

@@ -36,39 +36,14 @@ from legcal.progress import Report, no_progress
 
 @dataclass(frozen=True, eq=False)
 class GivenReadings:
-    """Readings of the motors.
+    """Readings of the motors."""
 
-    Attributes
-    ----------
-    where : tuple of str
-        The place of each row, for messages.
-    readings : (n_poses, n_motors) array
-        In the order of ``mechanism.motors`` [m].
-    """
-
-    where: tuple[str, ...]
-    readings: Array
+    where: tuple[str, ...]  # the place of each row, for messages
+    readings: Array  # (n_poses, n_motors) in the order of ``mechanism.motors`` [m]
 
 
 def read_readings(path: Path, mechanism: Mechanism) -> GivenReadings:
-    """Read a CSV of poses.
-
-    Parameters
-    ----------
-    path : Path
-        The file: actuated joints in the header, in any order, readings below [m].
-    mechanism : Mechanism
-        The machine.
-
-    Returns
-    -------
-    GivenReadings
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each thing that is wrong, naming row and column.
-    """
+    """Read a CSV of poses."""
     motors = [mechanism.legs[j] for j in mechanism.motors]
     joints = [str(leg.prismatic) for leg in motors]
     table = read_table(
@@ -112,32 +87,12 @@ JITTER = 0.12  # of the travel, by which extreme lengths stay away from its ends
 
 
 def near_ends(end: IntArray, chance: Array) -> Array:
-    """Return places in the travel, 0 the shortest and 1 the longest, near given ends of it.
-
-    Parameters
-    ----------
-    end : (n_legs,) array of int
-        0 or 1, the end.
-    chance : (n_legs,) array
-        How far away from it, in parts of the most that there is.
-
-    Returns
-    -------
-    (n_legs,) array
-    """
+    """Return places in the travel, 0 the shortest and 1 the longest, near given ends of it."""
     return np.asarray(np.abs(end - JITTER * chance))
 
 
 def are_extreme(mechanism: Mechanism, readings: Array) -> BoolArray:
-    """Say in which poses every motor is near an end of its travel, (n_poses,).
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-    readings : (n_poses, n_legs) array
-        Joint value of every leg [m].
-    """
+    """Say in which poses every motor is near an end of its travel, (n_poses,)."""
     motors = list(mechanism.motors)
     lower, upper = np.array([mechanism.legs[j].travel for j in motors]).reshape(-1, 2).T
     part = (readings[:, motors] - lower) / (upper - lower)
@@ -145,13 +100,7 @@ def are_extreme(mechanism: Mechanism, readings: Array) -> BoolArray:
 
 
 class Clearance:
-    """The cylinders of a machine, two by two.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine, with its home.
-    """
+    """The cylinders of a machine, two by two."""
 
     def __init__(self, mechanism: Mechanism) -> None:
         self._mechanism = mechanism
@@ -190,20 +139,7 @@ class Clearance:
 
 
 def segment_distance(start_1: Array, span_1: Array, start_2: Array, span_2: Array) -> Array:
-    """Return the distance of pairs of straight pieces start + s span, 0 <= s <= 1.
-
-    Parameters
-    ----------
-    start_1, start_2 : (n, 3) array
-        Where the pieces start [m].
-    span_1, span_2 : (n, 3) array
-        From their start to their end [m], not zero.
-
-    Returns
-    -------
-    (n,) array
-        Distances [m].
-    """
+    """Return the distance of pairs of straight pieces start + s span, 0 <= s <= 1."""
     between = start_1 - start_2
     a, e, b = _dot(span_1, span_1), _dot(span_2, span_2), _dot(span_1, span_2)
     c, f = _dot(span_1, between), _dot(span_2, between)
@@ -225,18 +161,7 @@ ROUNDING = 1e-9  # [rad]
 
 
 class Admission:
-    """What a configuration is held against: travel, joint limits, singularities, other legs.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-
-    Raises
-    ------
-    ModelError
-        If a revolute joint is outside its limits at home already.
-    """
+    """What a configuration is held against: travel, joint limits, singularities, other legs."""
 
     def __init__(self, mechanism: Mechanism) -> None:
         self._mechanism = mechanism
@@ -303,27 +228,7 @@ SHORTEST = 0.25  # of such a part; what is harder to reach is drawn again
 
 
 class Draws:
-    """Draws of configurations, and what stood against those that were none.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-    rng : numpy.random.Generator
-        Source of chance.
-    extreme : bool
-        Whether readings are drawn near the ends of the travel, and not anywhere in it.
-
-    Attributes
-    ----------
-    problems : Counter of str
-        How often what stood in the way.
-
-    Raises
-    ------
-    ModelError
-        If a joint is outside its limits at home already.
-    """
+    """Draws of configurations, and what stood against those that were none."""
 
     def __init__(self, mechanism: Mechanism, rng: np.random.Generator, *, extreme: bool) -> None:
         self._mechanism, self._rng, self._extreme = mechanism, rng, extreme
@@ -413,35 +318,7 @@ def draw_poses(
     sampling: Sampling | str = Sampling.EXTREME,
     progress: Report = no_progress,
 ) -> Configurations:
-    """Return random poses of a machine.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The true machine.
-    n_poses : int
-        Number of poses.
-    rng : numpy.random.Generator
-        Source of the poses.
-    sampling : Sampling
-        How they are drawn. Where the motors do not determine the pose the machine takes a random
-        walk in either case.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    Configurations
-
-    Raises
-    ------
-    DidNotConverge
-        If too few poses are reached.
-    ModelError
-        If a joint is outside its limits at home already.
-    UsageError
-        If there is no pose to draw, or no such sampling.
-    """
+    """Return random poses of a machine."""
     if n_poses < 1 or sampling not in list(Sampling):
         raise UsageError(
             f"Poses could not be drawn: found {n_poses} poses and the sampling '{sampling}', "
@@ -471,28 +348,6 @@ def given_poses(mechanism: Mechanism, path: Path) -> Configurations:
     """Return the poses at the readings of a CSV: actuated joints in its header, [m] below.
 
     Each is followed from the nearest one that is reached already, or from home.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The true machine.
-    path : Path
-        The CSV.
-
-    Returns
-    -------
-    Configurations
-        In the order of the rows.
-
-    Raises
-    ------
-    DatasetError
-        If the file is malformed or has readings outside the travel, or if the machine cannot
-        stand at those of a row; one sentence for each.
-    UsageError
-        If readings do not tell the pose of this machine.
-    ModelError
-        If a joint is outside its limits at home already.
     """
     if not mechanism.is_determined:
         raise UsageError(
@@ -563,24 +418,6 @@ def commanded_poses(
     A controller plans with the nominal model. Beside a singularity small errors decide whether
     legs of some lengths meet at all, and poses there are drawn again. Where motors do not
     determine the pose, nothing is asked of the nominal model.
-
-    Parameters
-    ----------
-    truth, nominal : Mechanism
-        The machine, and the model of it.
-    n_poses : int
-        Number of poses.
-    rng : numpy.random.Generator
-        Source of the poses.
-    sampling : Sampling
-        How they are drawn.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Raises
-    ------
-    DidNotConverge
-        If too few are found.
     """
     kept: list[Configurations] = []
     missing = n_poses

@@ -50,17 +50,6 @@ def outlines_of_images(
 
     Every pixel along an outline gives one edge point with white noise, and a line is fitted to
     them: the covariance of its offsets at the ends is known.
-
-    Parameters
-    ----------
-    images : Images
-        The images.
-    machines, viewpoints : sequence
-        The machine in every pose, and the cameras.
-    sigma_px : float
-        Standard deviation of an edge point [px].
-    rng : numpy.random.Generator or None
-        Source of the noise; None leaves the outlines exact.
     """
     claimed = max(sigma_px, EXACT_PX)
     rows, stretches, h, ends, covariances = [], [], [], [], []
@@ -108,15 +97,6 @@ def axes_of_images(
     """Return the table of the axes of all legs that images show, by row and leg.
 
     A leg parallel to the image x axis has no point M_LS = (x, 0, z) and is left out.
-
-    Parameters
-    ----------
-    images, machines, viewpoints
-        As in :func:`outlines_of_images`.
-    noise : TableNoise
-        What disturbs the axes.
-    rng : numpy.random.Generator
-        Source of the noise.
     """
     row, leg, u, A = [], [], [], []
     for r in range(len(images)):
@@ -167,21 +147,7 @@ def corners_of_images(
     sigma_px: float,
     rng: np.random.Generator | None,
 ) -> Corners:
-    """Return the corners of the board that images show, by row and number.
-
-    Parameters
-    ----------
-    images : Images
-        The images.
-    machines, viewpoints : sequence
-        The machine in every pose, with the board beside it, and the cameras.
-    placed : PlacedBoard
-        The board.
-    sigma_px : float
-        Standard deviation of each coordinate [px].
-    rng : numpy.random.Generator or None
-        Source of the noise; None leaves the corners exact.
-    """
+    """Return the corners of the board that images show, by row and number."""
     P_base = placed.T_base_board.apply(placed.board.points)
     found = []
     for row in range(len(images)):
@@ -205,17 +171,7 @@ _OFTEN = 0.5  # of the photographs of a view that show a leg which its hint name
 def recorded(
     imaged: ImagedMachine, settings: SimulationSettings, chance: Mapping[str, np.random.Generator]
 ) -> Measurements:
-    """Return the rows of the dataset: readings with their errors, and what is told of cameras.
-
-    Parameters
-    ----------
-    imaged : ImagedMachine
-        The machine and its images.
-    settings : SimulationSettings
-        What to simulate.
-    chance : mapping of str to numpy.random.Generator
-        Sources of ``readings`` and ``hints``.
-    """
+    """Return the rows of the dataset: readings with their errors, and what is told of cameras."""
     legs, images = imaged.truth.leg_names, imaged.images
     # Tables say themselves what is seen; in photographs nobody looks for a leg that often hides.
     least = _OFTEN if settings.level is Level.PHOTOGRAPHS else 0.0
@@ -244,19 +200,7 @@ def write_tables(
     settings: SimulationSettings,
     chance: Mapping[str, np.random.Generator],
 ) -> None:
-    """Write the tables that the level asks for, and exact outlines and corners beside the truth.
-
-    Parameters
-    ----------
-    folder : Path
-        The dataset.
-    imaged, settings
-        As in :func:`recorded`.
-    m : Measurements
-        The rows.
-    chance : mapping of str to numpy.random.Generator
-        Sources of ``observations`` and ``corners``.
-    """
+    """Write the tables that the level asks for, and exact outlines and corners beside the truth."""
     images, machines, views = imaged.images, imaged.machines, imaged.views
     legs = imaged.truth.leg_names
     if imaged.board is not None:

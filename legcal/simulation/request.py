@@ -35,20 +35,7 @@ from legcal.simulation.truth import LARGEST, Distribution, ParameterErrors, Spre
 
 
 def read_appearance(path: Path) -> Appearance:
-    """Return the appearance that a file describes.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each value that cannot be read.
-    UsageError
-        If a number makes no sense.
-    """
+    """Return the appearance that a file describes."""
     found = parse_yaml(read_text(path, "appearance file"), path, "appearance file")
     entry = validate(_schema(), found, path)
     values = {name: getattr(entry, name) for name in entry.model_fields_set}
@@ -103,37 +90,16 @@ _NUMBER = re.compile(r"[-+]?[\d.]+")
 
 @dataclass(frozen=True)
 class Request:
-    """The options of ``legcal simulate``, named as on the command line; None where not given.
+    """The options of ``legcal simulate``, named as on the command line; None where not given."""
 
-    Attributes
-    ----------
-    level : str
-        ``photographs``, ``outlines`` or ``axes``.
-    seed : int
-        What all chance comes from.
-    error : tuple of str
-        ``joints=2mm``, ``axes=0.1deg:normal`` or ``none``; each replaces the default of its kind.
-    coplanar : bool
-        Keep joints in the plane that they are nominally in.
-    poses : str
-        A number or the path of a CSV.
-    sampling, shared_poses, images, views, cameras, camera, board, board_pose, hand_held, hints
-        As in :class:`legcal.simulation.settings.SimulationSettings`; at most one of ``views`` and
-        the file ``cameras``.
-    tell_gamma : bool or None
-        The same; None for True.
-    pixel_noise, table_noise, encoder_noise : str
-        ``0.1px``; ``degrees`` or ``radians``; ``2um`` or ``2um:uniform``.
-    appearance : Path or None
-        A YAML file of an appearance.
-    blur, clutter, bits, colour
-        Fields of the appearance that replace those of the file.
-    """
-
-    level: str = "photographs"
-    seed: int = 0
+    level: str = "photographs"  # ``photographs``, ``outlines`` or ``axes``
+    seed: int = 0  # what all chance comes from
+    # ``joints=2mm``, ``axes=0.1deg:normal`` or ``none``; each replaces the default of its kind
     error: tuple[str, ...] = ()
-    coplanar: bool = False
+    coplanar: bool = False  # keep joints in the plane that they are nominally in
+    # A number or the path of a CSV. sampling, shared_poses, images, views, cameras, camera, board,
+    # board_pose, hand_held, hints As in :class:`legcal.simulation.settings.SimulationSettings`; at
+    # most one of ``views`` and the file ``cameras``
     poses: str = "15"
     sampling: str | None = None
     shared_poses: bool | None = None
@@ -145,10 +111,14 @@ class Request:
     board_pose: bool = False
     hand_held: bool = False
     hints: bool = True
-    tell_gamma: bool | None = None
+    tell_gamma: bool | None = None  # the same; None for True
+    # pixel_noise, table_noise, encoder_noise: ``0.1px``; ``degrees`` or ``radians``; ``2um`` or
+    # ``2um:uniform``
     pixel_noise: str | None = None
     table_noise: str | None = None
     encoder_noise: str = "2um"
+    # A YAML file of an appearance. blur, clutter, bits, colour Fields of the appearance that
+    # replace those of the file
     appearance: Path | None = None
     blur: float | None = None
     clutter: int | None = None
@@ -157,15 +127,7 @@ class Request:
 
 
 def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
-    """Return the settings that options ask for.
-
-    Raises
-    ------
-    UsageError
-        If an option cannot be understood, contradicts another, or has no effect.
-    DatasetError
-        If the file of the appearance is malformed.
-    """
+    """Return the settings that options ask for."""
     given = _poses(request.poses)
     _refuse_contradictions(request, given, nominal)
     _refuse_other_levels(request)

@@ -62,28 +62,6 @@ def take_photographs(
 
     What stands around the machine is drawn once for each view, the noise of the sensor for each
     image: images do not depend on how many processes make them.
-
-    Parameters
-    ----------
-    folder : Path
-        The dataset.
-    names : sequence of str
-        The file of each image, relative to it.
-    images, machines, viewpoints
-        The images, the machine in every pose, and the cameras.
-    appearance : Appearance
-        How the photographs look.
-    rng : numpy.random.Generator
-        Source of surroundings and noise.
-    workers : int
-        Number of processes.
-    progress : callable
-        Told of finished photographs.
-
-    Raises
-    ------
-    OutOfResources
-        If a file cannot be written.
     """
     of_views, of_images = rng.spawn(len(viewpoints)), rng.spawn(len(images))
     (folder / "images").mkdir()
@@ -299,13 +277,7 @@ def _streams(seed: int) -> dict[str, np.random.Generator]:
 
 
 def summary_document(made: SimulatedDataset) -> dict[str, Any]:
-    """Return the document of ``legcal simulate --json``.
-
-    Parameters
-    ----------
-    made : SimulatedDataset
-        The dataset.
-    """
+    """Return the document of ``legcal simulate --json``."""
     views = {}
     for v, view in enumerate(made.measurements.views):
         rows = made.measurements.view == v

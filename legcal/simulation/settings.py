@@ -201,13 +201,7 @@ class SimulationSettings:
             raise UsageError(problems)
 
     def check_images(self, n_views: int, n_poses: int) -> None:
-        """Refuse more images than a dataset may have.
-
-        Parameters
-        ----------
-        n_views, n_poses : int
-            Number of views, and of poses in each of them.
-        """
+        """Refuse more images than a dataset may have."""
         found = n_views * n_poses * self.images
         if found > MOST_IMAGES:
             raise UsageError(
@@ -234,13 +228,7 @@ def _choice(choices: type[StrEnum], name: str, found: str) -> StrEnum:
 
 
 def whole_number(name: str, found: object, least: int, most: int | None = None) -> int:
-    """Return a whole number between limits, of whatever type.
-
-    Raises
-    ------
-    UsageError
-        If it is none, or outside.
-    """
+    """Return a whole number between limits, of whatever type."""
     try:
         number = least - 1 if isinstance(found, bool) else operator.index(found)  # type: ignore[arg-type]
     except TypeError:

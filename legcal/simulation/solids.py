@@ -22,58 +22,32 @@ from legcal.machine import COAXIAL, Configurations, Leg, Mechanism, Urdf, number
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A closed cylinder about the z axis, its middle at the origin.
+    """A closed cylinder about the z axis, its middle at the origin."""
 
-    Attributes
-    ----------
-    radius, length : float
-        Its size [m].
-    """
-
-    radius: float
+    radius: float  # radius, length: its size [m]
     length: float
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere about the origin.
+    """A sphere about the origin."""
 
-    Attributes
-    ----------
-    radius : float
-        Its size [m].
-    """
-
-    radius: float
+    radius: float  # its size [m]
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box along the axes, its middle at the origin.
+    """A box along the axes, its middle at the origin."""
 
-    Attributes
-    ----------
-    size : tuple of float
-        Its whole lengths along x, y, z [m].
-    """
-
-    size: tuple[float, float, float]
+    size: tuple[float, float, float]  # its whole lengths along x, y, z [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A surface of triangles.
+    """A surface of triangles."""
 
-    Attributes
-    ----------
-    vertices : (n, 3) array
-        Points [m].
-    faces : (m, 3) array of int
-        The corners of each triangle.
-    """
-
-    vertices: Array
-    faces: IntArray
+    vertices: Array  # (n, 3) points [m]
+    faces: IntArray  # (m, 3) the corners of each triangle
 
 
 Shape = Cylinder | Sphere | Box | Mesh
@@ -92,13 +66,7 @@ class Visual(NamedTuple):
 
 
 def visuals(urdf: Urdf) -> list[Visual]:
-    """Return all visuals of a tree in the order of the file.
-
-    Raises
-    ------
-    ModelError
-        If a shape has no size, or if a mesh is missing or has no triangles; all of them at once.
-    """
+    """Return all visuals of a tree in the order of the file."""
     robot = parse_robot(urdf.path, urdf.content)
     named = {m.get("name", ""): _rgb(m) for m in robot.findall("material")}
     problems: list[str] = []
@@ -246,13 +214,7 @@ def _rgb(material: etree._Element) -> tuple[float, float, float] | None:
 
 
 class Sheet(Protocol):
-    """What is printed on a face of a box.
-
-    Attributes
-    ----------
-    face : int
-        The face: -x, -y, -z, x, y, z.
-    """
+    """What is printed on a face of a box."""
 
     @property
     def face(self) -> int:
@@ -264,35 +226,20 @@ class Sheet(Protocol):
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface returns light; everything in linear light, not in grey levels.
+    """How a surface returns light; everything in linear light, not in grey levels."""
 
-    Attributes
-    ----------
-    albedo : float
-        Share of light that is scattered evenly, 0 to 1.
-    specular : float
-        Strength of the highlight; 0 for a dull surface, about 1 for polished steel.
-    shininess : float
-        Exponent of the highlight: the larger, the narrower.
-    limb : float
-        How much darker the surface is where it is seen edge-on, 0 to 1: the scattered light is
-        times 1 - limb (1 - cos), with the angle between the normal and the line of sight. On a
-        cylinder the cosine grows like the square root of the depth inside the outline.
-    texture : float
-        Standard deviation of a mottled pattern on it, as a part of the albedo.
-    tint : tuple of float
-        Factors of red, green, blue; used in pictures in colour only.
-    sheet : Sheet or None
-        What is printed on one of its faces, if it is a box.
-    """
-
-    albedo: float = 0.5
+    albedo: float = 0.5  # share of light that is scattered evenly, 0 to 1
+    # strength of the highlight; 0 for a dull surface, about 1 for polished steel
     specular: float = 0.1
-    shininess: float = 20.0
+    shininess: float = 20.0  # exponent of the highlight: the larger, the narrower
+    # how much darker the surface is where it is seen edge-on, 0 to 1: the scattered light is times
+    # 1 - limb (1 - cos), with the angle between the normal and the line of sight. On a cylinder the
+    # cosine grows like the square root of the depth inside the outline
     limb: float = 0.3
-    texture: float = 0.0
+    texture: float = 0.0  # standard deviation of a mottled pattern on it, as a part of the albedo
+    # factors of red, green, blue; used in pictures in colour only
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    sheet: Sheet | None = None
+    sheet: Sheet | None = None  # what is printed on one of its faces, if it is a box
 
 
 TUBE = Material(albedo=0.70, specular=0.25, shininess=40.0, limb=0.35)
@@ -302,33 +249,17 @@ PART = Material(albedo=0.30, specular=0.05, shininess=15.0, limb=0.20)
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A solid that moves with a link.
+    """A solid that moves with a link."""
 
-    Attributes
-    ----------
-    name : str
-        Its name.
-    link : str or None
-        The URDF link; None where it stands in the base frame and is no part of the machine.
-    shape : Cylinder, Sphere, Box or Mesh
-        Its shape.
-    T_link_solid : RigidTransform
-        Its pose in the link, or in the base frame.
-    material : Material
-        Its surface.
-    leg : int or None
-        The leg whose axis it is coaxial with, as an index into ``mechanism.legs``.
-    part : str or None
-        The link that names it as a part of that leg in observations.
-    """
-
-    name: str
+    name: str  # its name
+    # the URDF link; None where it stands in the base frame and is no part of the machine
     link: str | None
-    shape: Shape
-    T_link_solid: RigidTransform
-    material: Material = PART
+    shape: Shape  # its shape
+    T_link_solid: RigidTransform  # its pose in the link, or in the base frame
+    material: Material = PART  # its surface
+    # the leg whose axis it is coaxial with, as an index into ``mechanism.legs``
     leg: int | None = None
-    part: str | None = None
+    part: str | None = None  # the link that names it as a part of that leg in observations
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,18 +271,7 @@ class PlacedSolid:
 
 
 def solids_of(mechanism: Mechanism) -> tuple[Solid, ...]:
-    """Return the visuals of a mechanism, those that are coaxial with legs marked as such.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The mechanism.
-
-    Raises
-    ------
-    ModelError
-        If a visual has no size or its mesh is missing or has no triangles.
-    """
+    """Return the visuals of a mechanism, those that are coaxial with legs marked as such."""
     shown = visuals(mechanism.urdf)
     poses = link_poses(mechanism, mechanism.home_configuration)
     lines = _leg_lines(mechanism)
@@ -446,16 +366,6 @@ def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
     more, a round plate that carries them on posts, on the side away from the legs. Both plates of a
     planar machine are below its legs, that of the base lowest, so that the legs are seen from
     above.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The mechanism.
-
-    Raises
-    ------
-    ModelError
-        As :func:`solids_of` does.
     """
     shown = solids_of(mechanism)
     bare = {mechanism.base, mechanism.platform} - {s.link for s in shown if s.leg is None}
@@ -514,23 +424,7 @@ def _end(
 
 
 def _away(joints_base: Array, mechanism: Mechanism, side: float) -> Array | None:
-    """Return the normal of the plane of joint centres, away from the legs, in the base frame.
-
-    Parameters
-    ----------
-    joints_base : (n_legs, 3) array
-        Joint centres of one end at home.
-    mechanism : Mechanism
-        The mechanism.
-    side : float
-        -1 for the base, +1 for the platform: from A to B times this is away from the legs. Of no
-        account for planar machines.
-
-    Returns
-    -------
-    (3,) array or None
-        None where the joints lie on a line and no plate carries them.
-    """
+    """Return the normal of the plane of joint centres, away from the legs, in the base frame."""
     if mechanism.base_normal is not None:
         return -mechanism.base_normal
     spread = joints_base - joints_base.mean(axis=0)
@@ -560,36 +454,16 @@ _FLAT_posed_machine = 1e-3  # thickness of joint centres that lie in a plane, of
 
 @dataclass(frozen=True, eq=False)
 class PosedMachine:
-    """A machine in one pose.
+    """A machine in one pose."""
 
-    Attributes
-    ----------
-    A, B : (n_legs, 3) array
-        Joint centres in the base link [m].
-    solids : tuple of PlacedSolid
-        What is seen of it, in the base link.
-    vertices, faces : (n, 3) array and (m, 3) array of int
-        The same as triangles, in the base link [m].
-    """
-
-    A: Array
+    A: Array  # A, B: (n_legs, 3) joint centres in the base link [m]
     B: Array
-    solids: tuple[PlacedSolid, ...]
-    vertices: Array
+    solids: tuple[PlacedSolid, ...]  # what is seen of it, in the base link
+    vertices: Array  # vertices, faces: (n, 3) the same as triangles, in the base link [m]
     faces: IntArray
 
     def hidden(self, centre: Array, points: Array, margin: Array) -> BoolArray:
-        """Return which points something stands before, seen from a centre.
-
-        Parameters
-        ----------
-        centre : (3,) array
-            The camera centre in the base link [m].
-        points : (n, 3) array
-            Points in the base link [m].
-        margin : (n,) array
-            What is hit this near to a point, or behind it, does not hide it [m].
-        """
+        """Return which points something stands before, seen from a centre."""
         ray = points - centre
         distance = np.linalg.norm(ray, axis=-1)
         ray = ray / distance[:, None]
@@ -620,17 +494,7 @@ class PosedMachine:
 def pose_machine(
     mechanism: Mechanism, solids: Sequence[Solid], poses: Configurations
 ) -> tuple[PosedMachine, ...]:
-    """Return a machine in every pose.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The true machine.
-    solids : sequence of Solid
-        What is seen of it.
-    poses : Configurations
-        Its poses.
-    """
+    """Return a machine in every pose."""
     meshes = [_triangles(solid.shape) for solid in solids]
     faces, first = [], 0
     for mesh in meshes:

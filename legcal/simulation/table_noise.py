@@ -45,18 +45,11 @@ class TableNoise:
 
 @dataclass(frozen=True, eq=False)
 class AxisTable:
-    """Axes of legs as Table 1 states them.
+    """Axes of legs as Table 1 states them."""
 
-    Attributes
-    ----------
-    row, leg : (n,) array of int
-        Indices of the image and of the leg.
-    values, sigmas : (n, 4) array
-        psi, theta, x, z and their standard deviations [rad, rad, m, m].
-    """
-
-    row: IntArray
+    row: IntArray  # row, leg: (n,) indices of the image and of the leg
     leg: IntArray
+    # values, sigmas: (n, 4) psi, theta, x, z and their standard deviations [rad, rad, m, m]
     values: Array
     sigmas: Array
 
@@ -67,21 +60,6 @@ def table_of_lines(u: Array, A: Array) -> Array:
     The direction u is at 90 deg - psi to the optical axis, and its picture u_y - i u_x as a complex
     number is at theta to the image's y axis. M_LS is in the plane y = 0 and has the moment of
     the line, M x u = A x u. The method finds the same by other ways, so that a mistake shows.
-
-    Parameters
-    ----------
-    u, A : (n, 3) array
-        Directions, and a point of each line [m], in the camera frame.
-
-    Returns
-    -------
-    (n, 4) array
-        psi, theta [rad] and x, z [m].
-
-    Raises
-    ------
-    NotVisible
-        If a line is parallel to the plane y = 0, where M_LS does not exist.
     """
     u_x, u_y, u_z = u.T
     if np.any(np.abs(u_y) < _LEAST_UPRIGHT):
@@ -105,28 +83,7 @@ def observe_axes(
     noise: TableNoise,
     rng: np.random.Generator | None,
 ) -> AxisTable:
-    """Return the table of the axes of legs as images show them.
-
-    Parameters
-    ----------
-    row, leg : (n,) array of int
-        Indices of the image and of the leg.
-    u, A : (n, 3) array
-        True directions, and a point of each axis [m], in the camera frame.
-    noise : TableNoise
-        What disturbs the axes, and the standard deviations that they carry.
-    rng : numpy.random.Generator or None
-        Source of the noise; None leaves the axes exact.
-
-    Returns
-    -------
-    AxisTable
-
-    Raises
-    ------
-    NotVisible
-        If an axis is parallel to the image x axis, where M_LS does not exist.
-    """
+    """Return the table of the axes of legs as images show them."""
     values = table_of_lines(u, A)
     if rng is not None:
         values += rng.normal(size=values.shape) * noise.sigmas

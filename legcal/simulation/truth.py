@@ -139,20 +139,6 @@ def draw_errors(
     Every parameter of the class takes its chance in the same order, however large its error is:
     errors of one kind do not depend on those of another. B of a leg that is fixed to the platform
     then slides along the leg to where models put it, the foot of the platform link's origin.
-
-    Parameters
-    ----------
-    nominal : Mechanism
-        The nominal model.
-    errors : ParameterErrors
-        How large the errors are.
-    rng : numpy.random.Generator
-        Source of the errors.
-
-    Raises
-    ------
-    UsageError
-        If an error is negative, not finite or beyond reason.
     """
     _check(errors)
     found, legs = parametrization_of(nominal, twists=True), geometries(nominal)
@@ -198,28 +184,7 @@ _ALIKE = 1e-9  # [m]; cylinders of one leg with one radius are one tube and stay
 def draw_radii(
     nominal: Mechanism, spread: Spread, rng: np.random.Generator
 ) -> dict[tuple[str, int], float]:
-    """Return the radii of the true legs.
-
-    Parameters
-    ----------
-    nominal : Mechanism
-        The nominal model.
-    spread : Spread
-        How large the errors are [m].
-    rng : numpy.random.Generator
-        Source of the errors.
-
-    Returns
-    -------
-    dict
-        By link and number of the cylinder among the visual cylinders of that link [m]; all that
-        are coaxial with legs, none if there are no errors.
-
-    Raises
-    ------
-    UsageError
-        If an error may leave nothing of a leg.
-    """
+    """Return the radii of the true legs."""
     if spread.size == 0.0:
         return {}
     counts: dict[str, int] = {}
@@ -263,31 +228,6 @@ def write_true_model(
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine with errors, and load it.
 
     Errors with which the machine does not close, or closes into another mechanism, are drawn again.
-
-    Parameters
-    ----------
-    nominal : Mechanism
-        The nominal model.
-    errors : ParameterErrors
-        How large the errors are.
-    rng : numpy.random.Generator
-        Source of the errors.
-    folder : Path
-        The folder that gets ``models`` and ``urdf``.
-
-    Returns
-    -------
-    Mechanism
-        The true machine, as loaded from these files.
-
-    Raises
-    ------
-    UsageError
-        If an error is negative, not finite or beyond reason.
-    ModelError
-        If no machine with such errors closes.
-    OutOfClass
-        If the tree of the URDF does not let its legs move one by one.
     """
     problems: Counter[str] = Counter()
     of_radii = rng.spawn(1)[0]
@@ -326,26 +266,7 @@ def write_model_with(
     folder: Path,
     radii: Mapping[tuple[str, int], float],
 ) -> Path:
-    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism with other numbers.
-
-    Parameters
-    ----------
-    nominal : Mechanism
-        The nominal model.
-    legs : sequence of LegGeometry
-        The legs in R_b and R_e, see :func:`legcal.machine.written.write_urdf`.
-    home : RigidTransform
-        T_base_platform of a pose in which they close.
-    folder : Path
-        The folder that gets ``models`` and ``urdf``.
-    radii : mapping
-        Of cylinders, as from :func:`draw_radii` [m]; the others keep theirs.
-
-    Returns
-    -------
-    Path
-        The YAML.
-    """
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism with other numbers."""
     yaml_path, urdf_path = _places(nominal, folder)
     for path in (yaml_path, urdf_path):
         path.parent.mkdir(parents=True, exist_ok=True)

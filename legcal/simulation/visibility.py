@@ -23,23 +23,6 @@ def contact_offsets(u: Array, A: Array, radius: Array) -> Array:
 
     A circle of radius R whose centre is at a distance d is touched at R^2 / d before its centre
     and R sqrt(1 - R^2 / d^2) beside it, whatever point of the axis they are counted from.
-
-    Parameters
-    ----------
-    u, A : (..., 3) array
-        Unit directions from base to platform, and a point of each axis, in the camera frame [m].
-    radius : (...) array
-        Radii [m].
-
-    Returns
-    -------
-    (..., 2, 3) array
-        For edges 1 (epsilon +1) and 2 (epsilon -1), in the camera frame [m].
-
-    Raises
-    ------
-    NotVisible
-        If the camera centre is inside a cylinder or on its surface.
     """
     centre = A - u * np.sum(u * A, axis=-1, keepdims=True)
     d = np.linalg.norm(centre, axis=-1, keepdims=True)
@@ -58,21 +41,10 @@ def contact_offsets(u: Array, A: Array, radius: Array) -> Array:
 
 
 def silhouette(u: Array, A: Array, radius: Array) -> tuple[Array, Array]:
-    """Return the outlines of cylinders and the steps to their generating lines.
+    """Return outlines (..., 2, 3) of cylinders and offsets (..., 2, 3) of their generating lines.
 
-    Parameters
-    ----------
-    u, A, radius : array
-        As in :func:`contact_offsets`.
-
-    Returns
-    -------
-    h : (..., 2, 3) array
-        Unit normals of the planes through the camera centre and the generating lines, signed as
-        the moment u x P of a point P of each, eq (3).
-    offsets : (..., 2, 3) array
-        As from :func:`contact_offsets`: the point A + s u of the axis is beside the point
-        A + s u + offset of the generating line.
+    An outline is the unit normal of the plane through the camera centre and the generating line,
+    signed as the moment u x P of a point P of that line, eq (3).
     """
     offsets = contact_offsets(u, A, radius)
     moments = np.cross(u[..., None, :], A[..., None, :] + offsets)
@@ -91,44 +63,22 @@ _IN_FRONT = 0.1  # radii before an outline from which on a hit hides it
 
 @dataclass(frozen=True)
 class Stretch:
-    """A visible stretch of one cylinder of a leg.
-
-    Attributes
-    ----------
-    leg : int
-        The leg.
-    part : str
-        The URDF link of the cylinder.
-    radius : float
-        Its radius [m].
-    start, end : float
-        Distances from A along the leg [m].
-    """
+    """A visible stretch of one cylinder of a leg."""
 
     leg: int
-    part: str
-    radius: float
-    start: float
+    part: str  # the URDF link of the cylinder
+    radius: float  # its radius [m]
+    start: float  # start, end: distances from A along the leg [m]
     end: float
 
 
 @dataclass(frozen=True)
 class LegView:
-    """What an image shows of one leg.
+    """What an image shows of one leg."""
 
-    Attributes
-    ----------
-    share : float
-        The longest unbroken stretch, as part of the leg's length.
-    length_px : float
-        Its length in the image [px].
-    stretches : tuple of Stretch
-        The longest stretch of each cylinder, from base to platform.
-    """
-
-    share: float
-    length_px: float
-    stretches: tuple[Stretch, ...]
+    share: float  # the longest unbroken stretch, as part of the leg's length
+    length_px: float  # its length in the image [px]
+    stretches: tuple[Stretch, ...]  # the longest stretch of each cylinder, from base to platform
 
     @property
     def is_seen(self) -> bool:
@@ -153,21 +103,7 @@ def legs_in_image(
     *,
     samples: int = SAMPLES,
 ) -> tuple[LegView, ...]:
-    """Return what an image shows of every leg.
-
-    Parameters
-    ----------
-    legs : sequence of Leg
-        The legs of the true machine.
-    machine : PosedMachine
-        The machine in its pose.
-    camera : Camera
-        The camera.
-    T_base_camera : RigidTransform
-        Its pose; outside the machine.
-    samples : int
-        Points along each leg.
-    """
+    """Return what an image shows of every leg."""
     length = np.linalg.norm(machine.B - machine.A, axis=-1)
     u = (machine.B - machine.A) / length[:, None]
     skins = [_skin(leg.cylinders, float(L), samples) for leg, L in zip(legs, length, strict=True)]
@@ -285,38 +221,22 @@ def field_of_view(camera: Camera) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A simulated camera and where it stands.
-
-    Attributes
-    ----------
-    name : str
-        The view.
-    camera : Camera
-        Its intrinsics.
-    T_base_camera : RigidTransform
-        Its true pose in the base link.
-    """
+    """A simulated camera and where it stands."""
 
     name: str
-    camera: Camera
-    T_base_camera: RigidTransform
+    camera: Camera  # its intrinsics
+    T_base_camera: RigidTransform  # its true pose in the base link
 
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """The images of a dataset, in the order of its rows.
+    """The images of a dataset, in the order of its rows."""
 
-    Attributes
-    ----------
-    view, pose, repeat : (n_rows,) array of int
-        Indices; ``repeat`` counts the images of one pose in one view.
-    shown : tuple, for each row a tuple of LegView, one for each leg
-        What the images show. Images of one pose in one view show the same.
-    """
-
+    # view, pose, repeat: (n_rows,) indices; ``repeat`` counts the images of one pose in one view
     view: IntArray
     pose: IntArray
     repeat: IntArray
+    # what the images show. Images of one pose in one view show the same
     shown: tuple[tuple[LegView, ...], ...]
 
     def __len__(self) -> int:
@@ -348,31 +268,7 @@ def take_images(
     shared_poses: bool,
     progress: Report = no_progress,
 ) -> Images:
-    """Return the images that cameras take of a machine in its poses.
-
-    Parameters
-    ----------
-    legs : sequence of Leg
-        The legs of the true machine.
-    machines : sequence of PosedMachine
-        The machine in every pose: those of all views, or those of the first view, then those of
-        the second, and so on.
-    viewpoints : sequence of Viewpoint
-        The cameras.
-    n_images : int
-        Images of each pose in each view.
-    shared_poses : bool
-        Every view sees all poses.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Raises
-    ------
-    UsageError
-        If a camera is inside the machine.
-    NotVisible
-        If a view shows no leg.
-    """
+    """Return the images that cameras take of a machine in its poses."""
     own = len(machines) // len(viewpoints)
     of_view = [
         range(len(machines)) if shared_poses else range(v * own, (v + 1) * own)

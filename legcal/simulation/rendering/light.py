@@ -26,34 +26,16 @@ _SPARE = 1e-4  # [m] for rounding
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
-    """A light in the camera frame.
+    """A light in the camera frame."""
 
-    Attributes
-    ----------
-    position : (3,) array
-        Where it stands [m].
-    power : float
-        Radiance of a white surface that faces it, times its squared distance [m^2].
-    radius : float
-        Its size [m].
-    shadows : bool
-        Whether solids cast shadows of it.
-    """
-
-    position: Array
-    power: float
-    radius: float
-    shadows: bool
+    position: Array  # (3,) where it stands [m]
+    power: float  # radiance of a white surface that faces it, times its squared distance [m^2]
+    radius: float  # its size [m]
+    shadows: bool  # whether solids cast shadows of it
 
 
 class Occluders:
-    """Solids that stand between points and lamps: long ones around a line, others in a ball.
-
-    Parameters
-    ----------
-    solids : sequence of SolidInView
-        The solids.
-    """
+    """Solids that stand between points and lamps: long ones around a line, others in a ball."""
 
     def __init__(self, solids: Sequence[SolidInView]) -> None:
         long = [isinstance(s.shape, Cylinder) and s.shape.length > s.shape.radius for s in solids]
@@ -72,13 +54,6 @@ class Occluders:
 
         The way l from a point to the lamp at O passes the line (u, w) at the distance
         l . (u x (O - w)) / |l x u|, and the ball about c at |l x (O - c)| / |l|.
-
-        Parameters
-        ----------
-        lamp : Lamp
-            The lamp.
-        to_lamp : (3, n) array
-            From the points to the lamp [m].
         """
         l2 = np.einsum("in,in->n", to_lamp, to_lamp)
         spare = lamp.radius + _SPARE
@@ -101,17 +76,6 @@ def seen_of_lamp(lamp: Lamp, P: Single, occluders: Occluders, own: IntArray | in
 
     The half-shadow is that of a straight edge: it goes smoothly from none to all over the
     apparent size of the lamp. That of a box or a mesh is hard.
-
-    Parameters
-    ----------
-    lamp : Lamp
-        The lamp.
-    P : (3, n) array
-        Points in the camera frame [m].
-    occluders : Occluders
-        What may stand between.
-    own : int or (n,) array of int, optional
-        The solid that the points are on, which does not shade itself.
     """
     seen = np.ones(P.shape[1], dtype=np.float32)
     own = np.broadcast_to(own, seen.shape)
@@ -201,29 +165,15 @@ _SHARP = 0.3  # strength of highlights from which a surface mirrors its surround
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """The light of a view, in the camera frame.
+    """The light of a view, in the camera frame."""
 
-    Attributes
-    ----------
-    lamps : tuple of Lamp
-        The lamps.
-    ambient : float
-        Radiance of a white surface by light from everywhere.
-    up : (3,) array
-        Away from the floor.
-    limb, specular, texture : float
-        Factors on what the materials say.
-    colour : bool
-        Whether there are three channels.
-    """
-
-    lamps: tuple[Lamp, ...]
-    ambient: float
-    up: Array
-    limb: float
+    lamps: tuple[Lamp, ...]  # the lamps
+    ambient: float  # radiance of a white surface by light from everywhere
+    up: Array  # (3,) away from the floor
+    limb: float  # limb, specular, texture: factors on what the materials say
     specular: float
     texture: float
-    colour: bool
+    colour: bool  # whether there are three channels
 
     @property
     def n_channels(self) -> int:
@@ -233,24 +183,12 @@ class Lighting:
 
 @dataclass(frozen=True, eq=False)
 class Shaded:
-    """Light from points of a surface, apart by where it comes from.
+    """Light from points of a surface, apart by where it comes from."""
 
-    Attributes
-    ----------
-    P : (3, n) array
-        The points in the camera frame [m].
-    fixed : (n_channels, n) array
-        What no shadow takes away.
-    of_lamp : list of (n_channels, n) array
-        The light of each lamp, without shadows.
-    faces_lamp : list of (n,) array of bool
-        Whether the surface faces the lamp.
-    """
-
-    P: Single
-    fixed: Single
-    of_lamp: list[Single]
-    faces_lamp: list[BoolArray]
+    P: Single  # (3, n) the points in the camera frame [m]
+    fixed: Single  # (n_channels, n) what no shadow takes away
+    of_lamp: list[Single]  # (n_channels, n) the light of each lamp, without shadows
+    faces_lamp: list[BoolArray]  # (n,) whether the surface faces the lamp
 
 
 def shade(
@@ -262,19 +200,7 @@ def shade(
     light: Lighting,
     ink: Single | None = None,
 ) -> Shaded:
-    """Return the light that points of a solid send to the camera.
-
-    Parameters
-    ----------
-    solid : SolidInView
-        The solid.
-    x, y, z, face : (n,) array
-        Rays (x, y, 1), depths [m] and faces.
-    light : Lighting
-        The light.
-    ink : (n,) array, optional
-        Factors of the albedo by what is printed on the solid.
-    """
+    """Return the light that points of a solid send to the camera."""
     material = solid.material
     P = np.stack([x * z, y * z, z])
     n = normals(solid, P, face)
@@ -335,17 +261,7 @@ _STEP = 4  # [px] between traced pixels
 
 
 class CoarseSurface:
-    """A large surface: the points of it that are traced.
-
-    Parameters
-    ----------
-    rays : PixelRays
-        The camera's rays.
-    pixels : (n,) array of int
-        The pixels that show the surface, in order.
-    z : (n,) array
-        Their depths [m].
-    """
+    """A large surface: the points of it that are traced."""
 
     def __init__(self, rays: PixelRays, pixels: IntArray, z: Single) -> None:
         is_traced = np.zeros((rays.height, rays.width), dtype=np.bool_)
@@ -358,22 +274,7 @@ class CoarseSurface:
         self._P: Single = np.stack([x * depth, y * depth, depth])
 
     def seen(self, lamp: Lamp, occluders: Occluders, own: int = -1) -> Single:
-        """Return the share of a lamp that the surface sees, (width * height,).
-
-        Parameters
-        ----------
-        lamp : Lamp
-            The lamp.
-        occluders : Occluders
-            What may stand between.
-        own : int, optional
-            The surface's own solid among them.
-
-        Returns
-        -------
-        (width * height,) array
-            For all pixels; what does not show the surface has some number between 0 and 1.
-        """
+        """Return the share of a lamp that the surface sees, (width * height,)."""
         shape = -(-self._rays.height // _STEP), -(-self._rays.width // _STEP)
         share, known = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         share[self._where] = seen_of_lamp(lamp, self._P, occluders, own)
@@ -394,23 +295,12 @@ _LARGE = 20_000  # pixels of a solid from which its shadows are traced coarsely
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What is seen of one solid.
+    """What is seen of one solid."""
 
-    Attributes
-    ----------
-    solid : int
-        The solid, as an index.
-    pixels : (n_pixels,) array of int
-        The pixels that show it, in order.
-    shaded : Shaded
-        The light from its points.
-    first : (n_pixels,) array of int or None
-        The first point of each pixel where a pixel has several.
-    """
-
-    solid: int
-    pixels: IntArray
-    shaded: Shaded
+    solid: int  # the solid, as an index
+    pixels: IntArray  # (n_pixels,) the pixels that show it, in order
+    shaded: Shaded  # the light from its points
+    # (n_pixels,) the first point of each pixel where a pixel has several
     first: IntArray | None = None
 
     def faces(self, lamp: int) -> BoolArray:
@@ -419,15 +309,7 @@ class Part:
         return faces if self.first is None else np.logical_or.reduceat(faces, self.first)
 
     def radiance(self, seen: Sequence[Single | None], n_terms: int) -> Single:
-        """Return the light of its pixels, (n_terms, n_channels, n_pixels), a sum over their points.
-
-        Parameters
-        ----------
-        seen : sequence of (n_pixels,) array or None
-            The share of each lamp that is seen; None for all of it.
-        n_terms : int
-            1 for the sum of all light, or one term more than lamps to have it apart.
-        """
+        """Return the light summed over points, (n_terms, n_channels, n_pixels)."""
         lit = [
             light if share is None else light * self._spread(share)
             for light, share in zip(self.shaded.of_lamp, seen, strict=True)

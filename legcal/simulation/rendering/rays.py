@@ -26,11 +26,6 @@ class PixelRays:
     """The points (x, y) of the sensor plane seen at every pixel, and between pixels.
 
     In single precision: 3e-8 of the sensor plane, 1e-4 px of a long lens.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -47,13 +42,6 @@ class PixelRays:
 
         They are a Fibonacci lattice, shifted differently in each pixel, so that the share of
         them on one side of an edge is an unbiased estimate of the pixel's area there.
-
-        Parameters
-        ----------
-        pixels : (n,) array of int
-            Pixels as row * width + column.
-        samples : int
-            A Fibonacci number.
         """
         rows, columns = np.divmod(pixels, self.width)
         du, dv = _offsets(samples)
@@ -112,28 +100,14 @@ def _offsets(samples: int) -> tuple[Single, Single]:
 
 @dataclass(frozen=True, eq=False)
 class SolidInView:
-    """A solid at its place in the camera frame.
+    """A solid at its place in the camera frame."""
 
-    Attributes
-    ----------
-    shape : Cylinder, Sphere, Box or Mesh
-        Its shape.
-    material : Material
-        Its surface.
-    R, w : (3, 3) and (3,) array
-        Rotation and translation [m] of T_camera_solid.
-    centre : (3,) array
-        The middle of a sphere that holds it [m].
-    reach : float
-        The radius of that sphere [m].
-    """
-
-    shape: Shape
-    material: Material
-    R: Array
+    shape: Shape  # its shape
+    material: Material  # its surface
+    R: Array  # R, w: (3, 3) rotation and translation [m] of T_camera_solid
     w: Array
-    centre: Array
-    reach: float
+    centre: Array  # (3,) the middle of a sphere that holds it [m]
+    reach: float  # the radius of that sphere [m]
 
 
 def in_view(solids: Sequence[PlacedSolid], T_camera_base: RigidTransform) -> list[SolidInView]:
@@ -201,22 +175,7 @@ _TINY = 1e-12
 
 
 def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:
-    """Return where rays enter a solid.
-
-    Parameters
-    ----------
-    solid : SolidInView
-        A solid that the camera is not inside of.
-    x, y : (n,) array
-        Rays (x, y, 1).
-
-    Returns
-    -------
-    z : (n,) array
-        Depth [m]; infinite where the ray passes.
-    face : (n,) array of int
-        The face of the solid that is met, of a mesh the triangle.
-    """
+    """Return where rays enter a solid."""
     shape = solid.shape
     if isinstance(shape, Cylinder):
         return _cylinder(solid, shape, x, y)
@@ -228,17 +187,7 @@ def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:
 
 
 def normals(solid: SolidInView, P: Single, face: Faces) -> Single:
-    """Return the outward unit normals at points of a solid's faces, (3, n).
-
-    Parameters
-    ----------
-    solid : SolidInView
-        The solid.
-    P : (3, n) array
-        Points of its surface in the camera frame [m].
-    face : (n,) array of int
-        Their faces.
-    """
+    """Return the outward unit normals at points of a solid's faces, (3, n)."""
     shape = solid.shape
     w = solid.w.astype(np.float32)[:, None]
     if isinstance(shape, Sphere):
@@ -336,18 +285,6 @@ def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
 
     The hull of points around the solid is cut to the part of the sensor plane that the picture
     shows, where the lens is known, before it is distorted.
-
-    Parameters
-    ----------
-    rays : PixelRays
-        The camera's rays.
-    solid : SolidInView
-        The solid.
-
-    Returns
-    -------
-    (n,) array of int
-        Pixels as row * width + column, in order.
     """
     points = surrounding_points(solid)
     in_front = points[:, 2] > NEAR
@@ -434,15 +371,7 @@ _PIXELS = 8192  # at a time
 
 
 def printed(solid: SolidInView, x: Single, y: Single, face: Faces) -> Single | None:
-    """Return factors (n,) of the albedo where rays meet a solid; None if nothing is printed on it.
-
-    Parameters
-    ----------
-    solid : SolidInView
-        The solid.
-    x, y, face : (n,) array
-        Rays (x, y, 1), and the faces that they meet.
-    """
+    """Return factors (n,) of the albedo where rays meet a solid; None without a print."""
     sheet = solid.material.sheet
     if sheet is None or not isinstance(solid.shape, Box):
         return None
@@ -462,19 +391,7 @@ def printed(solid: SolidInView, x: Single, y: Single, face: Faces) -> Single | N
 def printed_inside(
     solid: SolidInView, rays: PixelRays, pixels: IntArray, face: Faces, samples: int
 ) -> Single | None:
-    """Return the mean of :func:`printed` over each of some pixels, (n,); None without a print.
-
-    Parameters
-    ----------
-    solid : SolidInView
-        The solid.
-    rays : PixelRays
-        The camera's rays.
-    pixels, face : (n,) array
-        Pixels that show one face of the solid, and which.
-    samples : int
-        Rays of each pixel.
-    """
+    """Return the mean of :func:`printed` over each of some pixels, (n,); None without a print."""
     if solid.material.sheet is None:
         return None
     means = []

@@ -51,23 +51,12 @@ _CABLE = Material(albedo=0.04, specular=0.15, shininess=15.0, limb=0.2)
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What does not move, in the base frame.
+    """What does not move, in the base frame."""
 
-    Attributes
-    ----------
-    centre : (3,) array
-        The middle of the machine [m].
-    radius : float
-        The radius of a sphere around the machine [m].
-    up : (3,) array
-        The side of the base on which the machine stands.
-    floor, clutter, cables : tuple of PlacedSolid
-        Below, behind and around, and in front of the machine.
-    """
-
-    centre: Array
-    radius: float
-    up: Array
+    centre: Array  # (3,) the middle of the machine [m]
+    radius: float  # the radius of a sphere around the machine [m]
+    up: Array  # (3,) the side of the base on which the machine stands
+    # floor, clutter, cables: below, behind and around, and in front of the machine
     floor: tuple[PlacedSolid, ...]
     clutter: tuple[PlacedSolid, ...]
     cables: tuple[PlacedSolid, ...]
@@ -80,19 +69,7 @@ def draw_surroundings(
     appearance: Appearance,
     rng: np.random.Generator,
 ) -> Surroundings:
-    """Draw what stands around a machine in one view.
-
-    Parameters
-    ----------
-    placed : sequence of PlacedSolid
-        The machine in some pose.
-    camera, T_base_camera
-        The camera and its pose: clutter stands where it looks.
-    appearance : Appearance
-        How much there is.
-    rng : numpy.random.Generator
-        Source.
-    """
+    """Draw what stands around a machine in one view."""
     centre, radius = _around(placed)
     up = np.array([0.0, 0.0, 1.0])
     eye = T_base_camera.translation
@@ -225,22 +202,7 @@ def _tint(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def develop(radiance: Single, appearance: Appearance, rng: np.random.Generator) -> Image:
-    """Return the image of a radiance: blur, saturation, noise, gamma, rounding.
-
-    Parameters
-    ----------
-    radiance : (height, width) or (height, width, 3) array
-        Linear light, 1 at full scale.
-    appearance : Appearance
-        Lens and sensor.
-    rng : numpy.random.Generator
-        Source of the noise.
-
-    Returns
-    -------
-    array of uint8 or uint16
-        The image.
-    """
+    """Return the image of a radiance: blur, saturation, noise, gamma, rounding."""
     level = radiance * np.float32(appearance.exposure)
     if appearance.blur > 0.0:
         level = np.asarray(cv2.GaussianBlur(level, (0, 0), appearance.blur))
@@ -268,32 +230,16 @@ _FACES = 8  # that are told apart in the search for edges
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """A picture being painted.
+    """A picture being painted."""
 
-    Attributes
-    ----------
-    z : (n,) array
-        Depth of what every pixel's centre shows [m]; infinite for the background.
-    terms : (n_terms, n_channels, n) array
-        Radiance: the sum, or apart what no shadow takes away and the light of each lamp.
-    """
-
-    z: Single
+    z: Single  # (n,) depth of what every pixel's centre shows [m]; infinite for the background
+    # (n_terms, n_channels, n) radiance: the sum, or apart what no shadow takes away and the light
+    # of each lamp
     terms: Single
 
 
 class Painter:
-    """Paints solids with one light and one camera.
-
-    Parameters
-    ----------
-    rays : PixelRays
-        The camera's rays.
-    light : Lighting
-        The light.
-    samples : int
-        Rays of each pixel on an edge.
-    """
+    """Paints solids with one light and one camera."""
 
     def __init__(self, rays: PixelRays, light: Lighting, samples: int) -> None:
         self.rays, self.light, self.samples = rays, light, samples
@@ -301,17 +247,7 @@ class Painter:
     def paint(
         self, canvas: Canvas, solids: Sequence[SolidInView], bystanders: Sequence[SolidInView] = ()
     ) -> None:
-        """Paint solids over a picture, where they are in front of what it shows.
-
-        Parameters
-        ----------
-        canvas : Canvas
-            The picture; changed in place.
-        solids : sequence of SolidInView
-            What to paint.
-        bystanders : sequence of SolidInView
-            What is not painted but casts shadows.
-        """
+        """Paint solids over a picture, where they are in front of what it shows."""
         behind = canvas.z.copy()
         occluders = Occluders([*solids, *bystanders])
         feet = [footprint(self.rays, solid) for solid in solids]
@@ -472,47 +408,20 @@ def _thickness(solid: SolidInView) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A camera in front of its surroundings, painted once for all images of a view.
+    """A camera in front of its surroundings, painted once for all images of a view."""
 
-    Attributes
-    ----------
-    T_camera_base : RigidTransform
-        Pose of the base frame in the camera.
-    appearance : Appearance
-        The looks.
-    surroundings : Surroundings
-        What stands around.
-    painter : Painter
-        Paints with the camera and the light.
-    canvas : Canvas
-        The surroundings, their light apart by lamp.
-    bystanders, foreground : tuple of SolidInView
-        What stands around and casts shadows on the machine, and what hangs in front of it.
-    """
-
-    T_camera_base: RigidTransform
+    T_camera_base: RigidTransform  # pose of the base frame in the camera
     appearance: Appearance
-    surroundings: Surroundings
-    painter: Painter
-    canvas: Canvas
+    surroundings: Surroundings  # what stands around
+    painter: Painter  # paints with the camera and the light
+    canvas: Canvas  # the surroundings, their light apart by lamp
+    # bystanders, foreground: what stands around and casts shadows on the machine, and what hangs in
+    # front of it
     bystanders: tuple[SolidInView, ...]
     foreground: tuple[SolidInView, ...]
 
     def render(self, placed: Sequence[PlacedSolid], rng: np.random.Generator) -> Image:
-        """Return a photograph of solids in this scene.
-
-        Parameters
-        ----------
-        placed : sequence of PlacedSolid
-            The machine.
-        rng : numpy.random.Generator
-            Source of the sensor's noise.
-
-        Returns
-        -------
-        (height, width) array of uint8 or uint16
-            Grey levels, or blue, green, red along a third axis.
-        """
+        """Return a photograph of solids in this scene."""
         rays = self.painter.rays
         solids = [*in_view(placed, self.T_camera_base), *self.foreground]
         canvas = Canvas(self.canvas.z.copy(), self._backdrop(solids))
@@ -550,27 +459,7 @@ def prepare_scene(
     appearance: Appearance,
     rng: np.random.Generator,
 ) -> Scene:
-    """Return the scene of a view: its surroundings drawn, lit and painted.
-
-    Parameters
-    ----------
-    placed : sequence of PlacedSolid
-        The machine in some pose: what stands around keeps away from it, and lights and table are
-        placed around it.
-    camera : Camera
-        The camera.
-    T_base_camera : RigidTransform
-        Its pose.
-    appearance : Appearance
-        The looks.
-    rng : numpy.random.Generator
-        Source of the surroundings.
-
-    Returns
-    -------
-    Scene
-        The scene, for any number of images.
-    """
+    """Return the scene of a view: its surroundings drawn, lit and painted."""
     rays = pixel_rays(camera)
     T_camera_base = T_base_camera.inv()
     surroundings = draw_surroundings(placed, camera, T_base_camera, appearance, rng)
@@ -598,20 +487,7 @@ def render(
     appearance: Appearance,
     rng: np.random.Generator,
 ) -> Image:
-    """Return one photograph; :func:`prepare_scene` saves half of the time for more of a view.
-
-    Parameters
-    ----------
-    placed, camera, T_base_camera, appearance
-        As for :func:`prepare_scene`.
-    rng : numpy.random.Generator
-        Source of the surroundings and the noise.
-
-    Returns
-    -------
-    (height, width) array of uint8 or uint16
-        Grey levels, or blue, green, red along a third axis.
-    """
+    """Return one photograph; :func:`prepare_scene` saves half of the time for more of a view."""
     return prepare_scene(placed, camera, T_base_camera, appearance, rng).render(placed, rng)
 
 

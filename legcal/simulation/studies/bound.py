@@ -41,35 +41,20 @@ NSE = (0.97, 1.03)
 
 @dataclass(frozen=True, eq=False)
 class BoundStatistics:
-    """What the runs on one machine found.
-
-    Attributes
-    ----------
-    machine : str
-        The machine.
-    bound : Bound
-        Its bound.
-    n : int
-        Number of runs that did not fail.
-    failures : dict of str to int
-        The others, by kind of error.
-    ratio, nse, coverage : (n_parameters,) array
-        Of every parameter the root mean square error over the bound, the mean squared error over
-        the stated variance, and the part of the stated 95 % intervals that hold the truth.
-    band : tuple of float
-        Where 99.9 % of all ratios are if the bound is reached.
-    pooled : tuple of Figure
-        Ratio, normalised squared error and coverage of all parameters together.
-    """
+    """What the runs on one machine found."""
 
     machine: str
-    bound: Bound
-    n: int
-    failures: dict[str, int]
+    bound: Bound  # its bound
+    n: int  # number of runs that did not fail
+    failures: dict[str, int]  # the others, by kind of error
+    # ratio, nse, coverage: (n_parameters,) of every parameter the root mean square error over the
+    # bound, the mean squared error over the stated variance, and the part of the stated 95 %
+    # intervals that hold the truth
     ratio: Array
     nse: Array
     coverage: Array
-    band: tuple[float, float]
+    band: tuple[float, float]  # where 99.9 % of all ratios are if the bound is reached
+    # ratio, normalised squared error and coverage of all parameters together
     pooled: tuple[Figure, ...]
 
     @property
@@ -109,15 +94,7 @@ class BoundStatistics:
 
 
 class BoundTally:
-    """Takes the runs on one machine one by one.
-
-    Parameters
-    ----------
-    machine : str
-        The machine.
-    bound : Bound
-        Its bound.
-    """
+    """Takes the runs on one machine one by one."""
 
     def __init__(self, machine: str, bound: Bound) -> None:
         self._machine, self._bound = machine, bound

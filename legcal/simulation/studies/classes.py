@@ -58,24 +58,13 @@ _ERRORS = {"rank", "nse", "of_bound", "of_sigma"}
 
 @dataclass(frozen=True, eq=False)
 class FitErrors:
-    """The errors of the kinematic parameters of one fit.
+    """The errors of the kinematic parameters of one fit."""
 
-    Attributes
-    ----------
-    rank : int
-        How many directions are determined; the others are held.
-    nse : float
-        Normalised squared error for each of them, by the covariance that the fit states.
-    of_bound : float
-        The same by the Cramer-Rao bound.
-    of_sigma : (k,) array
-        Errors of the parameters that are estimated each for itself, over the standard deviations
-        that the fit states.
-    """
-
-    rank: int
-    nse: float
-    of_bound: float
+    rank: int  # how many directions are determined; the others are held
+    nse: float  # normalised squared error for each of them, by the covariance that the fit states
+    of_bound: float  # the same by the Cramer-Rao bound
+    # (k,) errors of the parameters that are estimated each for itself, over the standard deviations
+    # that the fit states
     of_sigma: Array
 
 
@@ -127,24 +116,13 @@ LARGEST_RATIO = 1.05
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What one estimator made of the sessions of a machine.
+    """What one estimator made of the sessions of a machine."""
 
-    Attributes
-    ----------
-    n : int
-        How often it found something.
-    platform : Misses or None
-        Errors of the platform: means over poses and over these sessions; None without any.
-    failures : dict of str to int
-        How often it failed, by kind of error.
-    reasons : dict of str to str
-        What the first of each kind says.
-    """
-
-    n: int
+    n: int  # how often it found something
+    # errors of the platform: means over poses and over these sessions; None without any
     platform: Misses | None
-    failures: dict[str, int]
-    reasons: dict[str, str]
+    failures: dict[str, int]  # how often it failed, by kind of error
+    reasons: dict[str, str]  # what the first of each kind says
 
     def document(self) -> dict[str, Any]:
         """Return it as a JSON document."""
@@ -161,24 +139,15 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class ClassStatistics:
-    """What the sessions of one machine showed.
-
-    Attributes
-    ----------
-    machine : str
-        The machine.
-    rank, of : int
-        Directions of the kinematic parameters that fits determined, and all of them.
-    estimators : dict of str to Estimates
-        By name, of :data:`legcal.simulation.studies.classes.ESTIMATORS`.
-    figures : tuple of Figure
-        Error over bound, normalised squared error and coverage; none without a fit.
-    """
+    """What the sessions of one machine showed."""
 
     machine: str
+    # rank, of: directions of the kinematic parameters that fits determined, and all of them
     rank: int
     of: int
+    # by name, of :data:`legcal.simulation.studies.classes.ESTIMATORS`
     estimators: dict[str, Estimates]
+    # error over bound, normalised squared error and coverage; none without a fit
     figures: tuple[Figure, ...]
 
     @property
@@ -233,15 +202,7 @@ class _Estimator:
 
 
 class ClassTally:
-    """Takes the records of one machine one by one.
-
-    Parameters
-    ----------
-    machine : str
-        The machine.
-    n_parameters : int
-        Number of its kinematic parameters.
-    """
+    """Takes the records of one machine one by one."""
 
     def __init__(self, machine: str, n_parameters: int) -> None:
         self._machine, self._of = machine, n_parameters
@@ -440,24 +401,7 @@ class ClassesJudge:
 def errors_of_fit(
     design: OutlineDesign, session: OutlineSession, solution: Solution, noise: Noise
 ) -> FitErrors:
-    """Return the errors of a fit, judged on what is determined.
-
-    Parameters
-    ----------
-    design : OutlineDesign
-        The truth.
-    session : OutlineSession
-        What was measured: the solution counts axes from its nominal ones.
-    solution : Solution
-        What was found.
-    noise : Noise
-        What was measured how well.
-
-    Raises
-    ------
-    DidNotConverge
-        If the truth does not stand where the fit holds what is open.
-    """
+    """Return the errors of a fit, judged on what is determined."""
     parametrization, n_held = design.parametrization, len(solution.held_basis)
     there = standing_where_held(design, session, solution)
     best = _bound_of(there, noise, n_held) if n_held == 0 else _bound(there, noise, n_held)

@@ -38,17 +38,7 @@ _PLACES = ("before", "after", "predicted")
 
 
 def fit_record(worst: float, before: Misses, after: Misses, predicted: Misses) -> Record:
-    """Return the record of a fit that ended.
-
-    Parameters
-    ----------
-    worst : float
-        Largest error of a parameter, in standard deviations that the fit states.
-    before, after : Misses
-        Errors of the platform of the nominal and of the found model.
-    predicted : Misses
-        One standard deviation of the latter.
-    """
+    """Return the record of a fit that ended."""
     found = {"before": before, "after": after, "predicted": predicted}
     return {"worst": worst, **{key: list(misses) for key, misses in found.items()}}
 
@@ -76,28 +66,16 @@ ENOUGH = 0.99  # of the runs must be right
 
 @dataclass(frozen=True, eq=False)
 class Outcomes:
-    """Where the fits of one machine ended.
-
-    Attributes
-    ----------
-    machine : str
-        The machine.
-    right, wrong : int
-        Numbers of fits.
-    refused : dict of str to int
-        The others, by kind of error.
-    worst : float
-        Largest error of a parameter of all that are right, in standard deviations.
-    before, after, predicted : (2,) array
-        Displacement [m] and rotation [rad] of the platform, root mean squares over all that ended:
-        of the nominal model, of the found one, and one standard deviation of that.
-    """
+    """Where the fits of one machine ended."""
 
     machine: str
-    right: int
+    right: int  # right, wrong: numbers of fits
     wrong: int
-    refused: dict[str, int]
-    worst: float
+    refused: dict[str, int]  # the others, by kind of error
+    worst: float  # largest error of a parameter of all that are right, in standard deviations
+    # before, after, predicted: (2,) displacement [m] and rotation [rad] of the platform, root mean
+    # squares over all that ended: of the nominal model, of the found one, and one standard
+    # deviation of that
     before: Array
     after: Array
     predicted: Array

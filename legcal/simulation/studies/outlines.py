@@ -66,21 +66,11 @@ from legcal.vision import Camera
 
 @dataclass(frozen=True, eq=False)
 class RunErrors:
-    """The errors of one run.
+    """The errors of one run."""
 
-    Attributes
-    ----------
-    error : (n,) array
-        Of the parameters, axes as angles from the true ones [m, rad].
-    of_sigma : (n,) array
-        The same over the standard deviations that the estimator states.
-    nse : float
-        Normalised squared error per parameter by the covariance that it states.
-    """
-
-    error: Array
-    of_sigma: Array
-    nse: float
+    error: Array  # (n,) of the parameters, axes as angles from the true ones [m, rad]
+    of_sigma: Array  # (n,) the same over the standard deviations that the estimator states
+    nse: float  # normalised squared error per parameter by the covariance that it states
 
 
 def errors_record(errors: RunErrors) -> Record:
@@ -135,13 +125,7 @@ MOST_LEGS = dict.fromkeys(_SIX_LEGS, 4)  # that a view is said to see, as in the
 
 
 def true_mechanism(name: str) -> Mechanism:
-    """Return a true machine of the studies.
-
-    Parameters
-    ----------
-    name : str
-        One of ``MACHINES``, or a shipped model.
-    """
+    """Return a true machine of the studies."""
     if name not in (COPLANAR, NONCOPLANAR):
         return load_mechanism(name)
     flat = load_mechanism("hexapod")
@@ -157,12 +141,7 @@ def true_mechanism(name: str) -> Mechanism:
 
 
 def check_machines(names: tuple[str, ...], known: tuple[str, ...]) -> None:
-    """Refuse machines that a study does not have, and those that are named twice.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse machines that a study does not have, and those that are named twice."""
     if not names or len(set(names)) < len(names) or not set(names) <= set(known):
         raise UsageError(
             f"The study could not be run: found the machines {', '.join(names) or 'none'}, needed "
@@ -175,53 +154,23 @@ _SEED = 2002
 
 @dataclass(frozen=True, eq=False)
 class OutlineDesign:
-    """A true machine, its poses, its cameras and its outlines without noise.
+    """A true machine, its poses, its cameras and its outlines without noise."""
 
-    Attributes
-    ----------
-    leg_names : tuple of str
-        Names of the legs.
-    legs : tuple of LegGeometry
-        The true legs in R_b and R_e.
-    sign : (n_legs,) array of int
-        Leg length = sign * q + q0.
-    frame_legs : tuple of int
-        The legs that define R_b and R_e.
-    radii : dict
-        True radius [m] of each (leg index, part).
-    home : RigidTransform
-        T_Rb_Re of the pose that the model calls home.
-    R, t : (n_poses, 3, 3) and (n_poses, 3) array
-        The true poses of R_e in R_b [m].
-    q : (n_poses, n_legs) array
-        Exact readings [m]; zero for constant legs, NaN for passive ones.
-    camera : Camera
-        Intrinsics of all cameras.
-    T_Rb_camera : tuple of RigidTransform
-        Their true poses.
-    seen : tuple of tuple of str, or None
-        The legs that each view is said to see; None for all.
-    view, pose : (n_rows,) array of int
-        View and pose of each image.
-    outlines : Outlines
-        What the images show, exactly, with the covariance of the noise.
-    """
-
-    leg_names: tuple[str, ...]
-    legs: tuple[LegGeometry, ...]
-    sign: IntArray
-    frame_legs: tuple[int, ...]
-    radii: dict[tuple[int, str], float]
-    home: RigidTransform
-    R: Array
+    leg_names: tuple[str, ...]  # names of the legs
+    legs: tuple[LegGeometry, ...]  # the true legs in R_b and R_e
+    sign: IntArray  # (n_legs,) leg length = sign * q + q0
+    frame_legs: tuple[int, ...]  # the legs that define R_b and R_e
+    radii: dict[tuple[int, str], float]  # true radius [m] of each (leg index, part)
+    home: RigidTransform  # T_Rb_Re of the pose that the model calls home
+    R: Array  # R, t: (n_poses, 3, 3) the true poses of R_e in R_b [m]
     t: Array
-    q: Array
-    camera: Camera
-    T_Rb_camera: tuple[RigidTransform, ...]
-    seen: tuple[tuple[str, ...] | None, ...]
-    view: IntArray
+    q: Array  # (n_poses, n_legs) exact readings [m]; zero for constant legs, NaN for passive ones
+    camera: Camera  # intrinsics of all cameras
+    T_Rb_camera: tuple[RigidTransform, ...]  # their true poses
+    seen: tuple[tuple[str, ...] | None, ...]  # the legs that each view is said to see; None for all
+    view: IntArray  # view, pose: (n_rows,) view and pose of each image
     pose: IntArray
-    outlines: Outlines
+    outlines: Outlines  # what the images show, exactly, with the covariance of the noise
 
     @property
     def parametrization(self) -> Parametrization:
@@ -243,19 +192,7 @@ class OutlineDesign:
 
 @lru_cache(maxsize=32)  # a study goes through all of its machines in every run
 def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> OutlineDesign:
-    """Return the design of a machine; the same one in all processes.
-
-    Parameters
-    ----------
-    name : str
-        The machine, one of those of :mod:`legcal.simulation.studies.outlines`.
-    n_views : int
-        Number of cameras.
-    n_poses : int
-        Poses that each of them sees; no two see the same.
-    sigma_px : float
-        Standard deviation of an edge point [px]; every pixel along an outline has one.
-    """
+    """Return the design of a machine; the same one in all processes."""
     mechanism = true_mechanism(name)
     rng = np.random.default_rng(_SEED)
     lens = mild_lens()
@@ -364,97 +301,49 @@ def _arrays(poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class StartErrors:
-    """How wrong the nominal model and the rough camera poses are.
+    """How wrong the nominal model and the rough camera poses are."""
 
-    Attributes
-    ----------
-    length : float
-        Of every coordinate of the joints, every offset and constant length [m].
-    angle : float
-        Of every axis [rad].
-    camera_shift, camera_turn : float
-        Of every camera, in any direction and about any axis [m], [rad].
-    full : bool
-        Whether all errors have this size, up or down, in any direction; else it is the most that
-        they have, and they are uniform.
-    """
-
-    length: float
-    angle: float
+    length: float  # of every coordinate of the joints, every offset and constant length [m]
+    angle: float  # of every axis [rad]
+    # camera_shift, camera_turn: of every camera, in any direction and about any axis [m], [rad]
     camera_shift: float
     camera_turn: float
+    # whether all errors have this size, up or down, in any direction; else it is the most that they
+    # have, and they are uniform
     full: bool
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What is measured how well.
+    """What is measured how well."""
 
-    Attributes
-    ----------
-    sigma_px : float
-        Standard deviation of an edge point [px]; every pixel along an outline has one.
-    sigma_q : float
-        Standard deviation of a reading [m].
-    radius_sigma : float
-        Standard deviation of the nominal radii, as a part of the true ones.
-    """
-
+    # standard deviation of an edge point [px]; every pixel along an outline has one
     sigma_px: float = 0.1
-    sigma_q: float = 2e-6
+    sigma_q: float = 2e-6  # standard deviation of a reading [m]
+    # standard deviation of the nominal radii, as a part of the true ones
     radius_sigma: float = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class OutlineSession:
-    """What was measured, and what was known before.
+    """What was measured, and what was known before."""
 
-    Attributes
-    ----------
-    measurements : Measurements
-        Images, readings and rough camera poses. The base link's frame is R_b.
-    outlines : Outlines
-        Outlines in the images, with their covariances.
-    leg_names : tuple of str
-        Names of the legs.
-    nominal : tuple of LegGeometry
-        The nominal legs in R_b and R_e.
-    sign : (n_legs,) array of int
-        Leg length = sign * q + q0.
-    frame_legs : tuple of int
-        The legs that define R_b and R_e.
-    radii : dict
-        Nominal radius [m] of each (leg index, part).
-    home : RigidTransform
-        T_Rb_Re of the pose that the nominal model calls home; its legs meet near it.
-    """
-
+    # images, readings and rough camera poses. The base link's frame is R_b
     measurements: Measurements
-    outlines: Outlines
-    leg_names: tuple[str, ...]
-    nominal: tuple[LegGeometry, ...]
-    sign: IntArray
-    frame_legs: tuple[int, ...]
-    radii: dict[tuple[int, str], float]
+    outlines: Outlines  # outlines in the images, with their covariances
+    leg_names: tuple[str, ...]  # names of the legs
+    nominal: tuple[LegGeometry, ...]  # the nominal legs in R_b and R_e
+    sign: IntArray  # (n_legs,) leg length = sign * q + q0
+    frame_legs: tuple[int, ...]  # the legs that define R_b and R_e
+    radii: dict[tuple[int, str], float]  # nominal radius [m] of each (leg index, part)
+    # T_Rb_Re of the pose that the nominal model calls home; its legs meet near it
     home: RigidTransform
 
 
 def draw_session(
     design: OutlineDesign, noise: Noise, errors: StartErrors, rng: np.random.Generator
 ) -> OutlineSession:
-    """Return a measurement of a design.
-
-    Parameters
-    ----------
-    design : OutlineDesign
-        What is true; its outlines carry the covariance of their noise.
-    noise : Noise
-        What is measured how well.
-    errors : StartErrors
-        How wrong what is known before is.
-    rng : numpy.random.Generator
-        Source of all errors.
-    """
+    """Return a measurement of a design."""
     step = _parameter_errors(design.parametrization, errors, rng)
     return OutlineSession(
         measurements=_measurements(design, noise, errors, rng),
@@ -533,25 +422,6 @@ def standing_where_held(
 
     It is fitted to the exact outlines and readings, from the solution: without noise nothing is
     left of what is determined, and what is open stays.
-
-    Parameters
-    ----------
-    design : OutlineDesign
-        The true machine.
-    session : OutlineSession
-        What was measured of it.
-    solution : Solution
-        What was found.
-
-    Returns
-    -------
-    OutlineDesign
-        With other legs, radii, cameras and poses, and the same outlines and readings.
-
-    Raises
-    ------
-    DidNotConverge
-        If no such machine is found.
     """
     if not solution.held:
         return design
@@ -589,19 +459,12 @@ _DETERMINED = 1e-12  # of the largest eigenvalue of the scaled information
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """The bound of a design.
+    """The bound of a design."""
 
-    Attributes
-    ----------
-    names, units : tuple of str
-        The kinematic parameters, then the radii that are observed; ``m`` or ``rad``.
-    covariance : (n, n) array
-        [m^2], [m rad], [rad^2]; axes count as angles from the true ones.
-    """
-
+    # names, units: the kinematic parameters, then the radii that are observed; ``m`` or ``rad``
     names: tuple[str, ...]
     units: tuple[str, ...]
-    covariance: Array
+    covariance: Array  # (n, n) [m^2], [m rad], [rad^2]; axes count as angles from the true ones
 
     @property
     def sigma(self) -> Array:
@@ -610,41 +473,14 @@ class Bound:
 
 
 def bound_of(design: OutlineDesign, sigma_q: float, radius_sigma: float) -> Bound:
-    """Return the Cramer-Rao bound of all outlines, all readings and what is known of the radii.
-
-    Parameters
-    ----------
-    design, sigma_q, radius_sigma
-        As in :func:`information_of`.
-
-    Raises
-    ------
-    NotIdentifiable
-        If the data do not determine a parameter.
-    """
+    """Return the Cramer-Rao bound of all outlines, all readings and what is known of the radii."""
     rows = information_of(design, sigma_q, radius_sigma)
     units = (*design.parametrization.units, *("m" for _ in design.parts))
     return Bound(design.names, units, _inverse(rows, design.names))
 
 
 def information_of(design: OutlineDesign, sigma_q: float, radius_sigma: float) -> Array:
-    """Return what all outlines, all readings and what is known of the radii say of a machine.
-
-    Parameters
-    ----------
-    design : OutlineDesign
-        What is measured.
-    sigma_q : float
-        Standard deviation of a reading [m].
-    radius_sigma : float
-        Standard deviation of what is known of a radius, as a part of it.
-
-    Returns
-    -------
-    (m, n) array
-        Whitened rows: their squares are the Fisher matrix of the kinematic parameters and then the
-        radii, cameras and poses unknown [1/m], [1/rad].
-    """
+    """Return what all outlines, all readings and what is known of the radii say of a machine."""
     parts = design.parts
     n_cameras, n_parameters = 6 * len(design.T_Rb_camera), len(design.parametrization)
     rows = [*_rows_of_poses(design, sigma_q)]
@@ -787,18 +623,10 @@ def _inverse(rows: Array, names: Sequence[str]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Determined:
-    """Independent parts of the errors of the kinematic parameters, and their covariance.
+    """Independent parts of the errors of the kinematic parameters, and their covariance."""
 
-    Attributes
-    ----------
-    parts : (r, p) array
-        What errors [m, rad] are multiplied with.
-    covariance : (r, r) array
-        Of the products.
-    """
-
-    parts: Array
-    covariance: Array
+    parts: Array  # (r, p) what errors [m, rad] are multiplied with
+    covariance: Array  # (r, r) of the products
 
     @property
     def rank(self) -> int:
@@ -825,22 +653,7 @@ def as_stated(design: OutlineDesign, solution: Solution) -> Determined:
 def at_best(
     design: OutlineDesign, sigma_q: float, radius_sigma: float, n_held: int = 0
 ) -> Determined:
-    """Return the Cramer-Rao bound of a machine of which some directions are held.
-
-    Parameters
-    ----------
-    design : OutlineDesign
-        The machine, and what is measured of it.
-    sigma_q, radius_sigma : float
-        As in :func:`legcal.simulation.studies.outlines.information_of`.
-    n_held : int
-        How many directions are: those that data and radii say least of.
-
-    Returns
-    -------
-    Determined
-        Of errors that count axes as angles from the true ones.
-    """
+    """Return the Cramer-Rao bound of a machine of which some directions are held."""
     n, unit = len(design.parametrization), _unit(design)
     rows = information_of(design, sigma_q, radius_sigma)
     radii_first = np.concatenate([rows[:, n:], rows[:, :n] * unit], axis=1)
@@ -867,20 +680,7 @@ def _unit(design: OutlineDesign) -> Array:
 
 
 def one_fit(session: OutlineSession, radius_sigma: float) -> Solution:
-    """Return what one fit of everything finds from the nominal model and rough cameras.
-
-    Parameters
-    ----------
-    session : OutlineSession
-        What was measured, and what was known before.
-    radius_sigma : float
-        Standard deviation of the nominal radii, as a part of them.
-
-    Raises
-    ------
-    NotIdentifiable, DidNotConverge
-        As :func:`legcal.estimation.joint_fit.refine` does.
-    """
+    """Return what one fit of everything finds from the nominal model and rough cameras."""
     legs = FittedLegs(
         session.leg_names, session.nominal, session.sign, session.frame_legs, session.radii
     )
@@ -898,22 +698,7 @@ def nominal_start(session: OutlineSession, legs: FittedLegs) -> Start:
 
 
 def errors_of(design: OutlineDesign, session: OutlineSession, solution: Solution) -> RunErrors:
-    """Return the errors of what was found.
-
-    Parameters
-    ----------
-    design : OutlineDesign
-        The truth.
-    session : OutlineSession
-        What was measured: the solution counts axes from its nominal ones.
-    solution : Solution
-        What was found.
-
-    Raises
-    ------
-    NotIdentifiable
-        If a parameter was held or fixed.
-    """
+    """Return the errors of what was found."""
     missing = [name for name in design.names if solution.status.get(name) != "estimated"]
     if missing:
         raise NotIdentifiable(
@@ -937,18 +722,10 @@ def errors_of(design: OutlineDesign, session: OutlineSession, solution: Solution
 
 
 class Misses(NamedTuple):
-    """Root mean square errors of the platform over poses.
+    """Root mean square errors of the platform over poses."""
 
-    Attributes
-    ----------
-    displacement : float
-        Of the origin of R_e [m].
-    rotation : float
-        Angle [rad].
-    """
-
-    displacement: float
-    rotation: float
+    displacement: float  # of the origin of R_e [m]
+    rotation: float  # angle [rad]
 
 
 def platform_misses(design: OutlineDesign, legs: Sequence[LegGeometry]) -> Misses:
@@ -961,21 +738,7 @@ def platform_misses(design: OutlineDesign, legs: Sequence[LegGeometry]) -> Misse
 
 
 def platform_errors(design: OutlineDesign, legs: Sequence[LegGeometry]) -> tuple[Array, Array]:
-    """Return how far from the truth legs put the platform at the exact readings.
-
-    Parameters
-    ----------
-    design : OutlineDesign
-        The truth.
-    legs : sequence of LegGeometry
-        Nominal or found, in R_b and R_e. Where they cannot have these readings, the platform
-        stands where it misses them least.
-
-    Returns
-    -------
-    shift, turn : (n_poses,) array
-        Displacement of the origin of R_e [m] and angle [rad].
-    """
+    """Return how far from the truth legs put the platform at the exact readings."""
     together = RigidTransform.from_components(design.t, Rotation.from_matrix(design.R))
     poses = tuple(together[k] for k in range(len(design.t)))
     lengths = design.sign * design.q + np.array([leg.q0 for leg in legs])
@@ -989,13 +752,7 @@ def platform_errors(design: OutlineDesign, legs: Sequence[LegGeometry]) -> tuple
 
 
 def predicted_misses(design: OutlineDesign, solution: Solution) -> Misses:
-    """Return what the covariance of a solution says of them.
-
-    Raises
-    ------
-    NotIdentifiable
-        If the readings do not determine a pose.
-    """
+    """Return what the covariance of a solution says of them."""
     follow = pose_sensitivity(
         solution.legs, solution.parametrization, design.frame_legs, design.R, design.t
     )
@@ -1015,26 +772,15 @@ _TOGETHER = 10  # runs: what is believed of the spread of coverage before any, s
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure over all parameters, and what it must be.
+    """A figure over all parameters, and what it must be."""
 
-    Attributes
-    ----------
-    name : str
-        ``ratio``, ``nse`` or ``coverage``.
-    value : float
-        What it is.
-    low, high : float
-        Its limits: those that are asked for, or those of chance where the runs are so few that
-        chance leads beyond them.
-    by_chance : bool
-        Whether the limits are those of chance.
-    """
-
-    name: str
-    value: float
+    name: str  # ``ratio``, ``nse`` or ``coverage``
+    value: float  # what it is
+    # low, high: its limits: those that are asked for, or those of chance where the runs are so few
+    # that chance leads beyond them
     low: float
     high: float
-    by_chance: bool
+    by_chance: bool  # whether the limits are those of chance
 
     @property
     def is_met(self) -> bool:
@@ -1089,18 +835,7 @@ def nse_figure(value: float, n: int, n_parameters: int, limits: tuple[float, flo
 
 
 def coverage_figure(value: float, spread: float, n: int) -> Figure:
-    """Return the figure of all intervals; intervals of one run hold the truth together or not.
-
-    Parameters
-    ----------
-    value : float
-        Part of all intervals that hold the truth.
-    spread : float
-        Standard deviation, over runs, of the part of a run. Few runs may show none: it counts
-        beside some in which all intervals of a run hold the truth together.
-    n : int
-        Number of runs.
-    """
+    """Return the figure of all intervals; intervals of one run hold the truth together or not."""
     together = COVERED * (1.0 - COVERED)
     variance = (n * spread**2 + _TOGETHER * together) / (n + _TOGETHER)
     half = _WIDE * np.sqrt(variance / max(n, 1))
@@ -1110,20 +845,7 @@ def coverage_figure(value: float, spread: float, n: int) -> Figure:
 
 
 def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[LegGeometry, ...]:
-    """Return the legs that the four steps find from the axes which the outlines give.
-
-    Parameters
-    ----------
-    session : OutlineSession
-        What was measured, and what was known before. Rough camera poses are not looked at.
-    criteria : {"default", "literal"}
-        legcal's criteria, or those that are printed.
-
-    Raises
-    ------
-    NotIdentifiable, NotVisible, DidNotConverge
-        As :func:`legcal.paper.four_steps.run_steps` does.
-    """
+    """Return the legs that the four steps find from the axes which the outlines give."""
     radii = {part: radius for (_, part), radius in session.radii.items()}
     axes = axes_from_outlines(session.outlines, session.measurements, radii)
     mechanism = NominalMechanism(
@@ -1181,33 +903,15 @@ RecordOf = Callable[[OutlineDesign, OutlineSession], Record]
 
 @dataclass(frozen=True)
 class OutlineExperiment:
-    """Calibrations from outlines whose covariance is known.
+    """Calibrations from outlines whose covariance is known."""
 
-    Attributes
-    ----------
-    errors : StartErrors
-        How wrong the nominal model and the rough camera poses are.
-    machines : tuple of str
-        Which machines.
-    noise : Noise
-        What is measured how well.
-    n_views, n_poses : int
-        Cameras, and the poses that each of them sees; no two see the same.
-    known : tuple of str
-        The machines to choose from.
-
-    Raises
-    ------
-    UsageError
-        If there is no such machine.
-    """
-
-    errors: StartErrors
-    machines: tuple[str, ...] = MACHINES
-    noise: Noise = field(default_factory=Noise)
+    errors: StartErrors  # how wrong the nominal model and the rough camera poses are
+    machines: tuple[str, ...] = MACHINES  # which machines
+    noise: Noise = field(default_factory=Noise)  # what is measured how well
+    # n_views, n_poses: cameras, and the poses that each of them sees; no two see the same
     n_views: int = 3
     n_poses: int = 15
-    known: tuple[str, ...] = MACHINES
+    known: tuple[str, ...] = MACHINES  # the machines to choose from
 
     def __post_init__(self) -> None:
         check_machines(self.machines, self.known)
@@ -1303,18 +1007,10 @@ class Judge(Protocol[F]):
 
 @dataclass(frozen=True)
 class OutlineStudy(Generic[F]):
-    """Many sessions of every machine before one judge.
+    """Many sessions of every machine before one judge."""
 
-    Attributes
-    ----------
-    judge : Judge
-        What is asked.
-    experiment : OutlineExperiment
-        The sessions.
-    """
-
-    judge: Judge[F]
-    experiment: OutlineExperiment
+    judge: Judge[F]  # what is asked
+    experiment: OutlineExperiment  # the sessions
 
     @property
     def name(self) -> str:
@@ -1348,21 +1044,11 @@ class OutlineStudy(Generic[F]):
 
 @dataclass(frozen=True, eq=False)
 class OutlineSummary(Generic[F]):
-    """What a study of outlines hands back.
+    """What a study of outlines hands back."""
 
-    Attributes
-    ----------
-    judge : Judge
-        What was asked.
-    machines : tuple of Finding
-        What was found, in the order in which machines were asked for.
-    readings : tuple of str
-        How the experiment was made, one sentence each.
-    """
-
-    judge: Judge[F]
-    machines: tuple[F, ...]
-    readings: tuple[str, ...]
+    judge: Judge[F]  # what was asked
+    machines: tuple[F, ...]  # what was found, in the order in which machines were asked for
+    readings: tuple[str, ...]  # how the experiment was made, one sentence each
 
     def document(self) -> dict[str, Any]:
         """Return the document of ``--json``."""

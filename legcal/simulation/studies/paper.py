@@ -88,42 +88,19 @@ def noncoplanar_hexapod() -> Machine:
 
 @dataclass(frozen=True)
 class PlatformErrors:
-    """Means over poses of eq (20).
+    """Means over poses of eq (20)."""
 
-    Attributes
-    ----------
-    dX : float
-        Displacement of B_1 from A_1, which are the origins of R_e and R_b [m].
-    dE : float
-        Norm of the Euler angles of the rotation between both orientations, as printed [rad].
-    angle : float
-        Angle of that rotation [rad]: the norm of Euler angles is near it while both are small.
-    """
-
-    dX: float
+    dX: float  # displacement of B_1 from A_1, which are the origins of R_e and R_b [m]
+    # norm of the Euler angles of the rotation between both orientations, as printed [rad]
     dE: float
+    # angle of that rotation [rad]: the norm of Euler angles is near it while both are small
     angle: float
 
 
 def platform_errors(
     machine: Machine, parameters: KinematicParameters, T_Rb_Re: RigidTransform
 ) -> PlatformErrors:
-    """Return the errors of eq (20) that parameters cause at poses of the true machine.
-
-    Parameters
-    ----------
-    machine : Machine
-        The true machine: its readings are given to the parameters.
-    parameters : KinematicParameters
-        Identified parameters.
-    T_Rb_Re : RigidTransform, n_poses of them
-        True poses.
-
-    Raises
-    ------
-    DidNotConverge
-        If the parameters cannot have these readings.
-    """
+    """Return the errors of eq (20) that parameters cause at poses of the true machine."""
     found = poses_of_readings(machine, parameters, T_Rb_Re)
     turn = T_Rb_Re.rotation.inv() * found.rotation
     displacement = np.linalg.norm(found.translation - T_Rb_Re.translation, axis=-1)
@@ -136,44 +113,14 @@ def platform_errors(
 def poses_of_readings(
     machine: Machine, parameters: KinematicParameters, T_Rb_Re: RigidTransform
 ) -> RigidTransform:
-    """Return the poses that other parameters compute from the readings of true poses.
-
-    Parameters
-    ----------
-    machine : Machine
-        The true machine.
-    parameters : KinematicParameters
-        Other parameters.
-    T_Rb_Re : RigidTransform, n_poses of them
-        True poses.
-
-    Returns
-    -------
-    RigidTransform
-        T_Rb_Re of the other parameters, n_poses of them.
-
-    Raises
-    ------
-    DidNotConverge
-        If they cannot have these readings.
-    """
+    """Return the poses that other parameters compute from the readings of true poses."""
     lengths = np.linalg.norm(leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
     changed = lengths - machine.parameters.offsets + parameters.offsets
     return solve_poses(parameters, changed, T_Rb_Re)
 
 
 def expected_errors(machine: Machine, covariance: Array, T_Rb_Re: RigidTransform) -> PlatformErrors:
-    """Return the expected errors of eq (20) for Gaussian errors of the parameters, to first order.
-
-    Parameters
-    ----------
-    machine : Machine
-        The true machine.
-    covariance : (n, n) array
-        Covariance of its parameters, in the order of ``parameters.to_vector`` [m^2].
-    T_Rb_Re : RigidTransform, n_poses of them
-        True poses.
-    """
+    """Return the errors of eq (20) to expect of Gaussian parameters, to first order."""
     follow = platform_by_parameters(machine, T_Rb_Re)
     of_pose = follow @ covariance @ np.swapaxes(follow, -1, -2)
     dX = float(expected_norm(of_pose[:, :3, :3]).mean())
@@ -185,10 +132,6 @@ def platform_by_parameters(machine: Machine, T_Rb_Re: RigidTransform) -> Array:
     """Return d (translation, rotation vector in R_b) / d parameters at fixed readings.
 
     The legs keep their lengths but for the offsets: u . (dt + w x R B + R dB - dA) = dq0.
-
-    Returns
-    -------
-    (n_poses, 6, n_parameters) array
     """
     R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
     J = length_jacobian(machine.parameters, R, t)
@@ -218,30 +161,16 @@ def expected_norm(covariance: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSession:
-    """Measurements of a simulated machine, and what is true of it.
+    """Measurements of a simulated machine, and what is true of it."""
 
-    Attributes
-    ----------
-    measurements : Measurements
-        Images, readings and rough camera poses. The base link's frame is R_b.
-    outlines : Outlines or None
-        Outlines in the images; None where Table 1 gave the noise of the axes.
-    axes : LegAxes
-        Axes of the legs.
-    machine : Machine
-        The true machine.
-    cameras : tuple of LegCamera
-        The true cameras.
-    T_Rb_Re : RigidTransform, n_poses of them
-        The true platform poses, by index of pose.
-    """
-
+    # images, readings and rough camera poses. The base link's frame is R_b
     measurements: Measurements
+    # outlines in the images; None where Table 1 gave the noise of the axes
     outlines: Outlines | None
-    axes: LegAxes
-    machine: Machine
-    cameras: tuple[LegCamera, ...]
-    T_Rb_Re: RigidTransform
+    axes: LegAxes  # axes of the legs
+    machine: Machine  # the true machine
+    cameras: tuple[LegCamera, ...]  # the true cameras
+    T_Rb_Re: RigidTransform  # the true platform poses, by index of pose
 
 
 def simulate_session(
@@ -257,35 +186,7 @@ def simulate_session(
     n_images: int = 1,
     share_poses: bool = False,
 ) -> SimulatedSession:
-    """Simulate readings and observations of a machine (section 4.3).
-
-    Parameters
-    ----------
-    machine : Machine
-        The true machine.
-    cameras : sequence of LegCamera
-        The true cameras and the legs that they see.
-    rng : numpy.random.Generator
-        Source of poses and noise.
-    noise : OutlineNoise or TableNoise
-        What disturbs the observations, and the covariance that they carry.
-    noisy : bool
-        False leaves observations, readings and rough camera poses exact; the covariances stay.
-    sigma_q : float
-        Standard deviation of the readings [m].
-    uniform_readings : bool
-        Errors of readings are uniform (of that standard deviation) instead of normal.
-    n_poses : int
-        Platform poses for each view.
-    n_images : int
-        Images of each pose in each view.
-    share_poses : bool
-        Every view sees the same poses (several cameras at once) instead of its own.
-
-    Returns
-    -------
-    SimulatedSession
-    """
+    """Simulate readings and observations of a machine (section 4.3)."""
     n_views = len(cameras)
     T_Rb_Re = extreme_poses(machine, n_poses if share_poses else n_views * n_poses, rng)
     view = np.repeat(np.arange(n_views), n_poses * n_images)
@@ -327,30 +228,7 @@ def observe_session(
     noise: OutlineNoise | TableNoise,
     rng: np.random.Generator | None,
 ) -> tuple[Outlines | None, LegAxes]:
-    """Return what all images of a session show.
-
-    Parameters
-    ----------
-    machine : Machine
-        The true machine.
-    cameras : sequence of LegCamera
-        The true cameras and the legs that they see.
-    T_Rb_Re : RigidTransform, n_poses of them
-        The true platform poses, by index of pose.
-    measurements : Measurements
-        The view and the pose of each image; images of one view stand together.
-    noise : OutlineNoise or TableNoise
-        What disturbs the observations, and the covariance that they carry.
-    rng : numpy.random.Generator or None
-        Source of the noise; None leaves the observations exact.
-
-    Returns
-    -------
-    Outlines or None
-        Outlines; None where Table 1 gives the noise of the axes.
-    LegAxes
-        Axes, by image and then by leg.
-    """
+    """Return what all images of a session show."""
     seen = [np.array(cameras[v].legs, dtype=np.intp) for v in measurements.view]
     legs = [
         _legs_in_camera(machine, camera, T_Rb_Re[measurements.pose[measurements.view == v]])
@@ -399,26 +277,7 @@ _CLOSED = 1e-13  # [m]
 def closed_poses(
     legs: Sequence[LegGeometry], frame_legs: Sequence[int], R: Array, t: Array
 ) -> tuple[Array, Array]:
-    """Return the nearest poses at which everything holds that legs demand without a reading.
-
-    Parameters
-    ----------
-    legs : sequence of LegGeometry
-        The legs in R_b and R_e.
-    frame_legs : sequence of int
-        The legs that define R_b and R_e: three in space, two in a plane.
-    R, t : (k, 3, 3) and (k, 3) array
-        Poses nearby of R_e in R_b [m].
-
-    Returns
-    -------
-    R, t : (k, 3, 3) and (k, 3) array
-
-    Raises
-    ------
-    DidNotConverge
-        If the legs meet nowhere nearby.
-    """
+    """Return the nearest poses at which everything holds that legs demand without a reading."""
     columns = list(freedoms(frame_legs))
     if len(columns) < 6:
         R, t = _in_plane(legs, R, t)
@@ -498,20 +357,7 @@ def one_fit(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
 
 
 def bound_covariance(session: SimulatedSession, exact: LegAxes) -> Array:
-    """Return the Cramer-Rao bound of the parameters from all axes and all readings.
-
-    Parameters
-    ----------
-    session : SimulatedSession
-        What was measured, and the truth.
-    exact : LegAxes
-        The axes of all its images without noise, with the covariance of the noise.
-
-    Returns
-    -------
-    (n, n) array
-        In the order of ``parameters.to_vector`` [m^2]; cameras and platform poses are unknown.
-    """
+    """Return the Cramer-Rao bound of the parameters from all axes and all readings."""
     axes = average_images(exact, session.measurements)
     legs = _legs(session.machine)
     problem = build_fit(legs, session.measurements, no_outlines(), axes=axes)
@@ -585,40 +431,25 @@ BOUND = "bound"
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """Means of one estimator's errors over the runs in which it did not fail.
+    """Means of one estimator's errors over the runs in which it did not fail."""
 
-    Attributes
-    ----------
-    machine, estimator : str
-        Whose they are.
-    n : int
-        Number of these runs.
-    failures : dict of str to int
-        The others, by kind of error.
-    dX, dE, angle : float
-        Means of eq (20) [m], [rad]; zero without any run, as all others.
-    of_bound : float
-        Root mean square of d' inv(C) d / n for errors d of the n parameters, C being the covariance
-        of the Cramer-Rao bound of the same run: 1 for an estimator that reaches it. Its spread
-        is far smaller than that of dX.
-    dX_uncertainty, dE_uncertainty, of_bound_uncertainty : float
-        Standard deviations of these means [m], [rad], [1].
-    parameters : (n_parameters,) array
-        Mean absolute error of every parameter [m].
-    """
-
-    machine: str
+    machine: str  # machine, estimator: whose they are
     estimator: str
-    n: int
-    failures: dict[str, int]
-    dX: float
+    n: int  # number of these runs
+    failures: dict[str, int]  # the others, by kind of error
+    dX: float  # dX, dE, angle: means of eq (20) [m], [rad]; zero without any run, as all others
     dE: float
     angle: float
+    # root mean square of d' inv(C) d / n for errors d of the n parameters, C being the covariance
+    # of the Cramer-Rao bound of the same run: 1 for an estimator that reaches it. Its spread is far
+    # smaller than that of dX
     of_bound: float
+    # dX_uncertainty, dE_uncertainty, of_bound_uncertainty: standard deviations of these means [m],
+    # [rad], [1]
     dX_uncertainty: float
     dE_uncertainty: float
     of_bound_uncertainty: float
-    parameters: Array
+    parameters: Array  # (n_parameters,) mean absolute error of every parameter [m]
 
     def document(self) -> dict[str, Any]:
         """Return a row of ``--json``; null where every run failed."""
@@ -641,21 +472,11 @@ class Means:
 
 @dataclass(frozen=True, eq=False)
 class PaperMeans:
-    """Errors before and after calibration, of every estimator on either machine.
+    """Errors before and after calibration, of every estimator on either machine."""
 
-    Attributes
-    ----------
-    means : tuple of Means
-        By machine, and then: initial, the estimators, the bound.
-    names : tuple of str
-        Names of the parameters.
-    truths : dict of str to (n_parameters,) array
-        True values of each machine [m].
-    """
-
-    means: tuple[Means, ...]
-    names: tuple[str, ...]
-    truths: dict[str, Array]
+    means: tuple[Means, ...]  # by machine, and then: initial, the estimators, the bound
+    names: tuple[str, ...]  # names of the parameters
+    truths: dict[str, Array]  # (n_parameters,) true values of each machine [m]
 
     def of(self, machine: str) -> tuple[Means, ...]:
         """Return the means of one machine."""
@@ -727,22 +548,13 @@ def means_of(records: Iterable[Record], machines: Mapping[str, Machine]) -> Pape
 
 @dataclass(frozen=True)
 class Printed:
-    """Figures of section 4.3 as printed.
+    """Figures of section 4.3 as printed."""
 
-    Attributes
-    ----------
-    dX_mm, dE_deg : float
-        Means of (20).
-    parameters_mm : tuple of float, optional
-        The least and the largest mean error of a parameter.
-    runs : int, optional
-        Number of calibrations.
-    """
-
-    dX_mm: float
+    dX_mm: float  # dX_mm, dE_deg: means of (20)
     dE_deg: float
+    # the least and the largest mean error of a parameter
     parameters_mm: tuple[float, float] | None = None
-    runs: int | None = None
+    runs: int | None = None  # number of calibrations
 
     def document(self) -> dict[str, Any]:
         """Return what there is as a JSON document."""
@@ -1031,18 +843,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PaperSummary:
-    """The paper's evaluation, before and after, for every estimator.
+    """The paper's evaluation, before and after, for every estimator."""
 
-    Attributes
-    ----------
-    found : PaperMeans
-        The means over all runs.
-    in_radians : bool
-        Whether Table 1 was read in radians.
-    """
-
-    found: PaperMeans
-    in_radians: bool
+    found: PaperMeans  # the means over all runs
+    in_radians: bool  # whether Table 1 was read in radians
 
     @property
     def readings(self) -> tuple[str, ...]:
@@ -1079,31 +883,17 @@ MACHINES = {"coplanar": coplanar_hexapod, "noncoplanar": noncoplanar_hexapod}
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """The simulation of section 4.3, for coplanar and for non-coplanar joints.
+    """The simulation of section 4.3, for coplanar and for non-coplanar joints."""
 
-    Attributes
-    ----------
-    noise : TableNoise
-        Noise of the axes; ``TableNoise.in_radians()`` reads Table 1 to the letter.
-    initial_error : float
-        Half width of the uniform errors of the initial parameters [m].
-    reading_error : float
-        Half width of the uniform errors of the readings [m].
-    n_poses, n_images : int
-        Extreme poses of each camera position, and images of each pose.
-    n_checked : int
-        Random poses of eq (20).
-    estimators : tuple of str
-        Which are compared, of ``ESTIMATORS``.
-    """
-
+    # noise of the axes; ``TableNoise.in_radians()`` reads Table 1 to the letter
     noise: TableNoise = field(default_factory=TableNoise)
-    initial_error: float = 0.002
-    reading_error: float = 3e-6
+    initial_error: float = 0.002  # half width of the uniform errors of the initial parameters [m]
+    reading_error: float = 3e-6  # half width of the uniform errors of the readings [m]
+    # n_poses, n_images: extreme poses of each camera position, and images of each pose
     n_poses: int = 15
     n_images: int = 3
-    n_checked: int = 10
-    estimators: tuple[str, ...] = tuple(ESTIMATORS)
+    n_checked: int = 10  # random poses of eq (20)
+    estimators: tuple[str, ...] = tuple(ESTIMATORS)  # which are compared, of ``ESTIMATORS``
 
     @property
     def name(self) -> str:

@@ -169,15 +169,7 @@ _NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keep
 
 
 class Checkpoint:
-    """The runs of a study that are done, in a file.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    offsets : dict of int to int
-        Where the line of each run begins, by the number of the run.
-    """
+    """The runs of a study that are done, in a file."""
 
     def __init__(
         self,
@@ -195,13 +187,7 @@ class Checkpoint:
         self._writer = writer
 
     def append(self, lines: Sequence[dict[str, Any]]) -> None:
-        """Add the lines of some runs; they are on the disk when this returns.
-
-        Raises
-        ------
-        OutOfResources
-            If they cannot be written, as on a full disk.
-        """
+        """Add the lines of some runs; they are on the disk when this returns."""
         place = self._writer.seek(0, os.SEEK_END)
         places, content = {}, [encoded(line) for line in lines]
         for line, text in zip(lines, content, strict=True):
@@ -238,27 +224,7 @@ class Checkpoint:
 def open_checkpoint(
     path: Path, expected: dict[str, Any], is_record: IsRecord, *, kept: bool = True
 ) -> Iterator[Checkpoint]:
-    """Open the checkpoint of a study, or begin it.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its folder exists.
-    expected : dict
-        Its first line, from :func:`header`.
-    is_record : callable
-        Tells what the study records from anything else.
-    kept : bool
-        Whether the file is still there afterwards, for messages.
-
-    Raises
-    ------
-    UsageError
-        If it belongs to another study, or is no checkpoint, or is damaged, or is being
-        written by another process. It is left as it was.
-    OutOfResources
-        If it cannot be read or written.
-    """
+    """Open the checkpoint of a study, or begin it."""
     with ExitStack() as files:
         try:
             writer = files.enter_context(open(path, "ab", buffering=0))
@@ -350,29 +316,6 @@ def lines_of_runs(
     """Return the lines of runs, chunk by chunk, in the order in which they are finished.
 
     Chunks are handed out as processes get free, so that memory does not grow with their number.
-
-    Parameters
-    ----------
-    study : Study
-        What a run does.
-    seed : int
-        Seed of the study.
-    runs : sequence of int
-        Numbers of the runs.
-    workers : int
-        Number of processes, as many as there are runs and a few for each core at most; one means
-        this one.
-
-    Yields
-    ------
-    list of dict
-        ``{"run": number, "record": ...}`` or ``{"run": number, "failure": {"kind": ...,
-        "message": ...}}``.
-
-    Raises
-    ------
-    OutOfResources
-        If a process is ended from outside.
     """
     workers = min(workers, max(len(runs), 1), _PROCESSES * processors())
     chunks = _chunks(runs, workers)
@@ -456,28 +399,14 @@ MOST_RUNS = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """A finished study.
+    """A finished study."""
 
-    Attributes
-    ----------
-    study : str
-        Its name.
-    settings : dict
-        Its settings.
-    seed, n_runs : int
-        Seed and number of runs.
-    failures : dict of str to int
-        How many runs failed as a whole, by kind of error.
-    summary : Summary
-        What the others found.
-    """
-
-    study: str
-    settings: dict[str, Any]
-    seed: int
+    study: str  # its name
+    settings: dict[str, Any]  # its settings
+    seed: int  # seed, n_runs: seed and number of runs
     n_runs: int
-    failures: dict[str, int]
-    summary: Summary
+    failures: dict[str, int]  # how many runs failed as a whole, by kind of error
+    summary: Summary  # what the others found
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal study --json`` prints."""
