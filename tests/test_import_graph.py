@@ -104,8 +104,10 @@ def test_rooms_are_used_through_their_facades() -> None:
     past = set()
     for module in _of(*rooms, *OUTSIDE):
         for node in ast.walk(ast.parse(_modules()[module].read_text())):
-            name = node.module if isinstance(node, ast.ImportFrom) else None
-            if name and name.startswith("legcal.") and _room(name) in rooms - {_room(module)}:
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            name = node.module or ""
+            if name.startswith("legcal.") and _room(name) in rooms - {_room(module)}:
                 inside = name.count(".") > 1 or any(
                     f"{name}.{alias.name}" in _modules() for alias in node.names
                 )
