@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.workpiece import nominal_poses
+from legcal.calibration.run import nominal_poses
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.machine.leg import Cylinder as Visible
@@ -364,7 +364,7 @@ def _measurements(
 def _nominal_joints(nominal: Mechanism, measurements: Measurements) -> tuple[Array, Array]:
     """Return A and B of every image by the nominal model, (n_images, n_legs, 3) [m]."""
     back = nominal.T_platform_Re.inv()
-    reached = nominal_poses(nominal, measurements).T_Rb_Re
+    reached = nominal_poses(nominal, measurements)[0]
     platforms = [nominal.T_base_Rb * T * back for T in reached]
     B = np.array([T.apply(nominal.B_platform) for T in platforms])
     return np.broadcast_to(nominal.A_base, B.shape).copy(), B

@@ -99,7 +99,7 @@ def test_images_are_not_looked_at(tmp_path: Path) -> None:
     write_axes_dataset(tmp_path / "set", n_poses=5, images=True)
     stages: list[str] = []
     calibrate(tmp_path / "set", progress=lambda stage, done, total: stages.append(stage))
-    assert set(stages) == {"Four steps", "Fit of everything"}
+    assert set(stages) == {"Four steps", "Joint fit"}
 
 
 def test_the_order_of_rows_changes_nothing(dataset: Path) -> None:

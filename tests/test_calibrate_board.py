@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
-from legcal.calibration.starts import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
 from legcal.calibration.verdict import Calibration
 from legcal.data.corners import found_corners
 from legcal.data.measurements import Measurements, View
@@ -122,20 +122,18 @@ def test_a_board_and_cameras_that_contradict_each_other_are_refused() -> None:
     corners = found_corners(none.astype(np.intp), none.astype(np.intp), np.zeros((0, 2)), none)
     board = BoardViews(Board("chessboard", 7, 6, 0.03), corners, shown, ())
     place = RigidTransform.from_translation([0.3, 0.0, 0.0])
-    work: Any = SimpleNamespace(
-        dataset=SimpleNamespace(T_base_board=place, yaml_path="dataset.yaml")
-    )
+    dataset: Any = SimpleNamespace(T_base_board=place, yaml_path="dataset.yaml")
     camera = RigidTransform.from_translation([0.3, 0.04, -1.0])
     near, far = ((T, None) for T in (camera, camera * camera))
-    assert base_of_board(work, board, (None, None)) is place
-    assert base_of_board(work, board, near) is place
+    assert base_of_board(dataset, board, (None, None)) is place
+    assert base_of_board(dataset, board, near) is place
     with pytest.raises(DatasetError, match=r"T_base_board and the T_base_camera .* found the boa"):
-        base_of_board(work, board, far)
-    work.dataset.T_base_board = None
-    found = base_of_board(work, board, near)
+        base_of_board(dataset, board, far)
+    dataset.T_base_board = None
+    found = base_of_board(dataset, board, near)
     assert found is not None
     np.testing.assert_allclose(found.translation, [0.3, 0.04, 0.0], atol=1e-12)
-    assert base_of_board(work, board, (None, camera)) is None
+    assert base_of_board(dataset, board, (None, camera)) is None
 
 
 def test_one_wrong_pose_of_a_camera_turns_no_other() -> None:
@@ -146,15 +144,13 @@ def test_one_wrong_pose_of_a_camera_turns_no_other() -> None:
     place = RigidTransform.from_translation([0.3, 0.0, 0.0])
     turned = RigidTransform.from_rotation(Rotation.from_euler("z", 90.0, degrees=True))
     hints = (turned * place * shown[0], place * shown[1], place * shown[2])
-    work: Any = SimpleNamespace(
-        dataset=SimpleNamespace(T_base_board=None, yaml_path="dataset.yaml")
-    )
-    found = base_of_board(work, board, hints)
+    dataset: Any = SimpleNamespace(T_base_board=None, yaml_path="dataset.yaml")
+    found = base_of_board(dataset, board, hints)
     assert found is not None
     np.testing.assert_allclose(found.as_matrix(), place.as_matrix(), atol=1e-12)
-    work.dataset.T_base_board = place
-    assert base_of_board(work, board, hints) is place
-    assert base_of_board(work, board, (*hints[:1], None, *hints[2:])) is place
+    dataset.T_base_board = place
+    assert base_of_board(dataset, board, hints) is place
+    assert base_of_board(dataset, board, (*hints[:1], None, *hints[2:])) is place
 
 
 def test_a_board_of_other_squares_is_refused(in_the_hand: Path, tmp_path: Path) -> None:
@@ -201,8 +197,8 @@ def test_views_that_lost_the_board_are_named() -> None:
     corner = np.zeros(2, dtype=np.intp)
     corners = found_corners(np.array([0, 1]), corner, np.zeros((2, 2)), np.ones(2))
     solution: Any = SimpleNamespace(T_Rb_board=None)
-    assert board_notes(dataset, solution, corners) == ()
-    assert board_notes(dataset, solution, None) == ()
+    assert board_notes(dataset, solution, corners) == []
+    assert board_notes(dataset, solution, None) == []
     lost = replace(corners, used=np.array([True, False]))
     (note,) = board_notes(dataset, solution, lost)
     assert note.startswith("No image of c2 shows the calibration board")
@@ -222,10 +218,10 @@ def test_only_views_in_the_hand_need_the_board() -> None:
     order = SimpleNamespace(rows=rows, legs=rows[:1], views=rows)
     dataset = SimpleNamespace(board=board, corners=corners, yaml_path="dataset.yaml")
     work: Any = SimpleNamespace(dataset=dataset, measurements=m, order=order)
-    found = observe_board(work, lambda *_: None)
+    found = observe_board(work)
     assert found is not None
     assert found.T_board_camera[0] is not None
     assert found.T_board_camera[1] is None
     work.measurements = replace(m, views=(camera, replace(views[1], hand_held=True)))
     with pytest.raises(NotVisible, match="view c2"):
-        observe_board(work, lambda *_: None)
+        observe_board(work)

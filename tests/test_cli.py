@@ -98,7 +98,7 @@ def test_calibrate_prints_the_table_and_the_verdict(
     assert "leg4.platform.z" in captured.out
     assert "four steps alone" in captured.out
     assert "Calibrated:" in captured.out
-    assert "Fit of everything" in captured.err
+    assert "Joint fit" in captured.err
     assert (tmp_path / "out/calibrated.urdf").exists()
 
 

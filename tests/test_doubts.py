@@ -13,8 +13,9 @@ from hexapod_example import Run
 from spoiled import Picture, Spoiled, spoiled
 
 from legcal import calibrate, detect, load_dataset
-from legcal.calibration.fitting import disagreeing_images
-from legcal.calibration.workpiece import Workpiece, workpiece
+from legcal.calibration.disagreement import disagreeing_images
+from legcal.calibration.fitting import rough_scene
+from legcal.calibration.run import CalibrationRun, start_run
 from legcal.errors import NotIdentifiable
 from legcal.estimation.choices import Choices
 from legcal.estimation.rounds import DISAGREES
@@ -23,7 +24,7 @@ from legcal.perception.drawing import Detection
 from legcal.perception.examine import NOTHING_LIKE, OutlineCount, _usual, judged, observe, rejected
 from legcal.perception.exposure import Exposure, expose, image_defects
 from legcal.perception.hints import hint_notes
-from legcal.perception.photographs import Placement, scene_at_poses
+from legcal.perception.photographs import Placement
 from legcal.perception.picture import to_grey
 from legcal.progress import no_progress
 from legcal.workers import in_turn
@@ -163,13 +164,14 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
             assert detected.outlines.used[own].mean() > 0.5
 
 
-def _work(made: Spoiled) -> Workpiece:
-    return workpiece(load_dataset(made.write()), in_turn, None, Choices(), use_cache=False)
+def _work(made: Spoiled) -> CalibrationRun:
+    dataset = load_dataset(made.write())
+    return start_run(dataset, in_turn, no_progress, Choices(), use_cache=False)
 
 
 def _observed(made: Spoiled) -> Placement:
     work = _work(made)
-    scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
+    scene, _ = rough_scene(work)
     return observe(work.photographs, scene, no_progress).placement
 
 
@@ -177,7 +179,7 @@ def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: 
     made = spoiled(tmp_path / "read", 4, ("c1", "c2"))
     del made.entry["views"]["c2"]["T_base_camera"]
     work = _work(made)
-    scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
+    scene, _ = rough_scene(work)
     photographs, read = work.photographs, list[int]()
 
     def load(row: int) -> Any:

@@ -19,7 +19,7 @@ from legcal.calibration.changes import (
 )
 from legcal.calibration.earlier import EarlierResult, read_result
 from legcal.calibration.fitting import observe_and_fit
-from legcal.calibration.workpiece import workpiece
+from legcal.calibration.run import start_run
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.estimation import (
@@ -248,17 +248,17 @@ def check(
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     dataset = _as_calibrated(dataset, earlier)
     known = _known(dataset, earlier)
-    with worker_pool(workers) as run:
-        choices = _choices(dataset, earlier, known)
-        work = workpiece(dataset, run, None, choices, use_cache=True, every_leg=False)
-        found = observe_and_fit(work, np.arange(dataset.measurements.n_rows), progress)
+    choices = _choices(dataset, earlier, known)
+    with worker_pool(workers) as pool:
+        run = start_run(dataset, pool, progress, choices, use_cache=True, every_leg=False)
+        found = observe_and_fit(run, np.arange(dataset.measurements.n_rows))
     if dataset.axes is None and not found.outlines.used.any():
         refusal = (
             f"{dataset.folder}: the earlier result could not be tested: found no used outline in "
             "any image, needed some; take images that show the legs."
         )
         raise NotVisible([refusal, *found.notes])
-    solution = in_file_order(found.solution, found.part.order, dataset)
+    solution = in_file_order(found.solution, found.part.own_order, dataset)
     tested = _compare(dataset, earlier, solution, known, significance)
     notes = (*dataset.notes, *found.notes, *found.doubts, *solution.notes)
     return replace(tested, notes=tuple(dict.fromkeys(notes)))

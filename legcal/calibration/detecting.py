@@ -7,13 +7,13 @@ written beside the dataset.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.starts import base_of_board, observe_board
-from legcal.calibration.workpiece import Workpiece, workpiece
+from legcal.calibration.fitting import rough_scene
+from legcal.calibration.run import CalibrationRun, start_run
 from legcal.data import (
     Dataset,
     Outlines,
@@ -38,7 +38,6 @@ from legcal.perception import (
     given_outlines,
     hint_notes,
     observe,
-    scene_at_poses,
     write_detection,
 )
 from legcal.progress import Report, no_progress
@@ -87,12 +86,12 @@ def detect(
         folder = source.folder if isinstance(source, Dataset) else _folder(Path(source))
         check_detection_destination(output_path(output, DETECTION), folder)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    rows = _rows_with_image(dataset)
-    with worker_pool(workers) as run:
-        work = workpiece(dataset, run, None, Choices(), use_cache=False)
-        detection = _in_file_order(work, rows, _observed(work, progress))
+    images = _rows_with_image(dataset)
+    with worker_pool(workers) as pool:
+        run = start_run(dataset, pool, progress, Choices(), use_cache=False)
+        detection = _detected(run, images)
         if output is not None:
-            write_detection(detection, Path(output), run, progress)
+            write_detection(detection, Path(output), pool, progress)
     return detection
 
 
@@ -114,95 +113,66 @@ def _rows_with_image(dataset: Dataset) -> IntArray:
     return np.array(rows, dtype=np.intp)
 
 
-@dataclass(frozen=True, eq=False)
-class _Observed:
-    """What the images show, in the order of work.
-
-    Attributes
-    ----------
-    outlines : Outlines
-        All of them.
-    scene : Scene
-        Where the images put everything.
-    cylinders : tuple, for each leg a tuple of Cylinder
-        With the radii that the outlines were searched by.
-    unplaced : dict of str
-        Why views could not be placed, by name.
-    notes : tuple of str
-        What else a reader should know.
-    """
-
-    outlines: Outlines
-    scene: Scene
-    cylinders: tuple[tuple[Cylinder, ...], ...]
-    unplaced: dict[str, str]
-    notes: tuple[str, ...]
-
-
-def _observed(work: Workpiece, progress: Report) -> _Observed:
-    """Return what the images show."""
-    photographs = work.photographs
-    scene = scene_at_poses(work.mechanism, work.measurements, work.nominal_poses)
-    board = observe_board(work, progress)
-    if board is not None:
-        T_base_board = base_of_board(work, board, scene.T_base_camera)
-        if T_base_board is not None:
-            cameras = board.cameras(T_base_board, scene.T_base_camera)
-            scene = replace(scene, T_base_camera=cameras)
+def _detected(run: CalibrationRun, images: IntArray) -> Detection:
+    """Recognise and measure, and return what was found in the order of the files."""
+    photographs = run.photographs
+    scene, board = rough_scene(run)
     if len(photographs.detect) == 0:
-        return _Observed(given_outlines(photographs), scene, photographs.cylinders, {}, ())
-    joined = None if board is None else board.T_board_camera
-    observed = observe(photographs, scene, progress, joined)
-    placement = observed.placement
+        return _in_file_order(
+            run, images, given_outlines(photographs), scene, photographs.cylinders, {}, ()
+        )
+    T_board_camera = None if board is None else board.T_board_camera
+    seen = observe(photographs, scene, run.progress, T_board_camera)
+    placement, cameras = seen.placement, seen.placement.scene.T_base_camera
     # Legs of a view that could not be placed are drawn where its rough pose has them.
     drawn = tuple(
-        T if T is not None else rough
-        for T, rough in zip(placement.scene.T_base_camera, scene.T_base_camera, strict=True)
+        T if T is not None else rough for T, rough in zip(cameras, scene.T_base_camera, strict=True)
     )
-    scene = replace(placement.scene, T_base_camera=drawn)
-    placed = np.array([T is not None for T in placement.scene.T_base_camera])
-    searched = placed[work.measurements.view[observed.outlines.row]]
-    kept = searched | ~np.isin(observed.outlines.row, photographs.detect)
-    found = choose_outlines(observed.outlines, kept)
-    views = work.measurements.views
-    hints = [view.T_base_camera for view in views]
-    cameras = placement.scene.T_base_camera
-    notes = hint_notes([view.name for view in views], hints, cameras, BEFORE_FIT)
-    return _Observed(
-        found,
-        scene,
-        observed.photographs.cylinders,
+    placed = np.array([T is not None for T in cameras])
+    row = seen.outlines.row
+    kept = placed[run.measurements.view[row]] | ~np.isin(row, photographs.detect)
+    views = run.measurements.views
+    hints = hint_notes(
+        [view.name for view in views], [view.T_base_camera for view in views], cameras, BEFORE_FIT
+    )
+    untold = [view.name for view in views if not view.camera.gamma_is_told]
+    gamma = (
+        f"The gamma of {few_views(untold)} is not told and was taken as 1: outlines of a camera "
+        "that encodes light lie off by up to half of the blur; write gamma of the views in "
+        "dataset.yaml, or let legcal calibrate estimate it.",
+    )
+    return _in_file_order(
+        run,
+        images,
+        choose_outlines(seen.outlines, kept),
+        replace(placement.scene, T_base_camera=drawn),
+        seen.photographs.cylinders,
         placement.unplaced,
-        (*notes, *placement.notes, *_untold_gammas(work)),
+        (*hints, *placement.notes, *(gamma if untold else ())),
     )
 
 
-def _untold_gammas(work: Workpiece) -> list[str]:
-    """Return what is to be said of cameras of which nobody told how they encode light."""
-    views = [view.name for view in work.measurements.views if not view.camera.gamma_is_told]
-    if not views:
-        return []
-    return [
-        f"The gamma of {few_views(views)} is not told and was taken "
-        "as 1: outlines of a camera that encodes light lie off by up to half of the blur; write "
-        "gamma of the views in dataset.yaml, or let legcal calibrate look for it."
-    ]
-
-
-def _in_file_order(work: Workpiece, images: IntArray, found: _Observed) -> Detection:
+def _in_file_order(
+    run: CalibrationRun,
+    images: IntArray,
+    outlines: Outlines,
+    scene: Scene,
+    cylinders: tuple[tuple[Cylinder, ...], ...],
+    unplaced: dict[str, str],
+    notes: tuple[str, ...],
+) -> Detection:
     """Return what was found in the order of the files."""
-    dataset, order = work.dataset, work.order
+    dataset, order = run.dataset, run.order
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
-    restored, scene = restore_outlines(found.outlines, order), found.scene
-    names = dataset.mechanism.leg_names
+    restored = restore_outlines(outlines, order)
     return Detection(
         dataset=dataset,
-        outlines=reject_unused_legs(restored, dataset.measurements, names),
+        outlines=reject_unused_legs(restored, dataset.measurements, dataset.mechanism.leg_names),
         A_base=scene.A_base[rows][:, legs],
         B_base=scene.B_base[rows][:, legs],
-        cylinders=tuple(found.cylinders[leg] for leg in legs.tolist()),
+        cylinders=tuple(cylinders[leg] for leg in legs.tolist()),
         T_base_camera=tuple(scene.T_base_camera[v] for v in views.tolist()),
         rows=images,
-        unplaced=found.unplaced,
-        notes=(*dataset.notes, *found.notes, *work.reached.notes(work.measurements)),
+        unplaced=unplaced,
+        notes=(*dataset.notes, *notes, *run.unreached_notes()),
     )

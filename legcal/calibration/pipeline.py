@@ -1,8 +1,4 @@
-"""From photographs and readings to a calibrated mechanism: the whole method in one place.
-
-The images are searched and fitted in :mod:`legcal.calibration.fitting`, in an order of rows, views
-and legs that does not depend on the files.
-"""
+"""From photographs and readings to a calibrated mechanism: the whole method in one place."""
 
 from __future__ import annotations
 
@@ -12,19 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
+from legcal.calibration.board import board_notes
 from legcal.calibration.fitting import Found, observe_and_fit
 from legcal.calibration.identify.analysis import check_identifiable
 from legcal.calibration.result import write_result
-from legcal.calibration.starts import board_notes
+from legcal.calibration.run import CalibrationRun, start_run
 from legcal.calibration.verdict import Calibration, judge
-from legcal.calibration.workpiece import Workpiece, workpiece
 from legcal.data import (
     Dataset,
     Split,
     Wish,
-    check_fraction,
     dataset_at,
-    inverse,
     load_dataset,
     outlines_at,
     reject_unused_legs,
@@ -45,6 +39,7 @@ from legcal.estimation import (
     resolve,
 )
 from legcal.files import check_destination, output_path
+from legcal.geometry import IntArray
 from legcal.paper import Criteria, Transformation
 from legcal.progress import Report, no_progress
 from legcal.workers import worker_pool
@@ -93,10 +88,10 @@ def calibrate(
     fixed : sequence of str
         Names or patterns of parameters left at nominal, or ``NAME=VALUE``.
     free : sequence of str
-        Names or patterns of parameters to look for that are fixed otherwise (intrinsics), and of
-        radii and twists to look for without a prior.
+        Names or patterns of parameters to estimate that are fixed otherwise (intrinsics), and of
+        radii and twists to estimate without a prior.
     holdout : float, optional
-        Keep this part of the images aside, and tell how well the fit of the others foretells them.
+        Keep this part of the images aside, and tell how well the fit of the others predicts them.
 
     Returns
     -------
@@ -119,77 +114,82 @@ def calibrate(
     """
     if output is not None:
         check_destination(output_path(output))
-    if holdout is not None:
-        check_fraction(holdout)
     wishes = wishes_of_call(priors, fixed, free)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     choices = _choices(dataset, wishes)
-    rows = np.arange(dataset.measurements.n_rows)
-    if holdout is not None and dataset.axes is not None:
-        raise UsageError(
-            f"{dataset.folder}: no images could be kept aside: found a table of axes, needed "
-            "images or outlines, in which a fit is compared with what it did not see; leave out "
-            "--holdout."
-        )
-    split = Split(rows, rows[:0]) if holdout is None else split_images(dataset, holdout)
+    split = _split(dataset, holdout)
     fitted = dataset_at(dataset, split.fitted)
     left_open = check_identifiable(fitted, choices)
-    with worker_pool(workers) as run:
-        work = workpiece(
-            dataset, run, criteria, choices, use_cache=use_cache, transformation=transformation
+    with worker_pool(workers) as pool:
+        run = start_run(
+            dataset,
+            pool,
+            progress,
+            choices,
+            use_cache=use_cache,
+            criteria=criteria,
+            transformation=transformation,
         )
-        found = observe_and_fit(work, split.fitted, progress)
-    kept = [] if found.other_radii else work.keep_outlines(found.outlines, found.notes)
-    unreached = found.part.reached.notes(found.part.measurements)
-    notes = [
+        found = observe_and_fit(run, split.fitted)
+    kept = [] if found.other_radii else run.keep_outlines(found.outlines, found.notes)
+    # From here on in the order of the files.
+    solution = in_file_order(found.solution, found.part.own_order, fitted)
+    corners = None if found.corners is None else restore_corners(found.corners, run.order)
+    notes = (
         *dataset.notes,
         *found.notes,
         *found.doubts,
         *choices.notes,
         *left_open,
         *kept,
-        *unreached,
-    ]
-    order = found.part.order
-    corners = None if found.corners is None else restore_corners(found.corners, work.order)
-    calibration = judge(
-        fitted,
-        in_file_order(found.solution, order, fitted),
-        found.steps.in_file_order(order),
-        (
-            *notes,
-            *board_notes(dataset, found.solution, corners),
-            *found.solution.notes,
-            *_camera_notes(dataset, found.solution),
-        ),
+        *found.part.unreached_notes(),
+        *board_notes(dataset, solution, corners),
+        *solution.notes,
+        *_camera_notes(dataset, solution),
     )
-    calibration = replace(calibration, corners=corners)
-    if len(split.kept_aside):
-        held_out = _compare_held_out(work, found, split)
-        calibration = replace(calibration, held_out=held_out)
+    held_out = _compare_held_out(run, found, split.kept_aside) if len(split.kept_aside) else None
+    steps = found.steps.in_file_order(found.part.order)
+    calibration = replace(judge(fitted, solution, steps, notes), corners=corners, held_out=held_out)
     if output is not None:
         write_result(calibration, Path(output))
     return calibration
 
 
 def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
-    """Return what dataset and run choose of the parameters.
+    """Return what dataset and call choose of the parameters.
 
-    Twists that nobody chooses anything of are looked for with a prior: no leg is built without an
-    error of its twist, and one that was left at nominal would spoil what is told of the others.
+    Twists that nobody chooses anything of are estimated with a prior: no leg is built without an
+    error of its twist, and one that was left at nominal would spoil the others.
     """
-    views, axes_given = dataset.measurements.views, dataset.axes is not None
     known = known_parameters(
-        dataset.mechanism, views, axes_given=axes_given, with_board=dataset.board is not None
+        dataset.mechanism,
+        dataset.measurements.views,
+        axes_given=dataset.axes is not None,
+        with_board=dataset.board is not None,
     )
     choices = resolve([*dataset.wishes, *wishes], known)
     twists = {
         name: Prior(parameter.nominal, TWIST_SIGMA)
         for name, parameter in known.by_name.items()
-        if name.endswith(".twist") and choices.holds(name, by_default=True)
+        if name.endswith(".twist")
+        and choices.holds(name, by_default=True)
+        and name not in choices.fixed
     }
-    twists = {name: prior for name, prior in twists.items() if name not in choices.fixed}
     return replace(choices, priors={**twists, **choices.priors})
+
+
+def _split(dataset: Dataset, holdout: float | None) -> Split:
+    """Return which images to fit and which to keep aside."""
+    if holdout is None:
+        rows = np.arange(dataset.measurements.n_rows)
+        return Split(rows, rows[:0])
+    if dataset.axes is not None:
+        raise UsageError(
+            f"{dataset.folder}: no images could be kept aside: found a table of axes, needed "
+            "images or outlines, in which a fit is compared with what it did not see; leave out "
+            "--holdout."
+        )
+    return split_images(dataset, holdout)
 
 
 def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
@@ -202,11 +202,10 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
     ]
 
 
-def _compare_held_out(work: Workpiece, found: Found, split: Split) -> HeldOut:
+def _compare_held_out(run: CalibrationRun, found: Found, file_rows: IntArray) -> HeldOut:
     """Return what the images that were kept aside say of the fit."""
-    aside, solution = work.part(split.kept_aside), found.solution
-    rows = inverse(work.order.rows)[split.kept_aside[aside.order.rows]]
-    outlines = outlines_at(found.outlines, rows)
+    aside, solution = run.part(run.here(file_rows)), found.solution
+    outlines = outlines_at(found.outlines, aside.rows)
     outlines = reject_unused_legs(outlines, aside.measurements, aside.mechanism.leg_names)
     poses = aside.poses_by(solution.legs)
     return compare_held_out(

@@ -26,7 +26,6 @@ from .dataset import Wish as Wish
 from .dataset import load_dataset as load_dataset
 from .dataset import wishes_of_call as wishes_of_call
 from .holdout import Split as Split
-from .holdout import check_fraction as check_fraction
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images
 from .measurements import Measurements as Measurements
@@ -35,9 +34,11 @@ from .measurements import check_travel as check_travel
 from .measurements import few as few
 from .measurements import few_views as few_views
 from .order import Order as Order
+from .order import axes_at as axes_at
 from .order import canonical_order as canonical_order
 from .order import corners_at as corners_at
 from .order import inverse as inverse
+from .order import measurements_at as measurements_at
 from .order import outlines_at as outlines_at
 from .order import reorder_axes as reorder_axes
 from .order import reorder_corners as reorder_corners

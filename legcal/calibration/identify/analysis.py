@@ -34,7 +34,7 @@ from legcal.calibration.identify.session import (
     random_poses,
     travel_of,
 )
-from legcal.calibration.workpiece import nominal_poses
+from legcal.calibration.run import nominal_poses
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.estimation import NO_CHOICES, Choices, components
@@ -77,7 +77,7 @@ def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
     home = to_Rb * mechanism.home * from_Re
     legs, length, rng = machine_near(mechanism, home)
     if mechanism.is_determined:
-        R, t = components(nominal_poses(mechanism, m).T_Rb_Re)
+        R, t = components(nominal_poses(mechanism, m)[0])
     else:
         travel = travel_of(mechanism)
         R, t = random_poses(legs, mechanism.frame_legs, home, travel, m.n_poses, rng)

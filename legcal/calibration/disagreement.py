@@ -1,0 +1,148 @@
+"""Images most of which the joint fit rejects, and what is probably wrong with each.
+
+The outlines of such an image alone give the platform's pose, and with it the readings that it
+shows: those of another image were exchanged with its own, one that differs is wrong, and where they
+suit it the camera was moved.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.data import Measurements
+from legcal.estimation import DISAGREES, Solution
+from legcal.geometry import Array, IntArray
+from legcal.machine import Mechanism
+
+MANY, SOME_LEGS = 0.34, 2  # of an image's outlines that the fit rejected, and legs altogether
+MOST = 0.67  # of them, if the readings suit the image
+SUITED = "its readings suit it, so check that nobody moved the camera"
+LEAST_OUTLINES, LEAST_LEGS = 6, 3  # by which a pose is known
+LEAST_NOISE = 5e-5  # of an outline at its leg [m]
+SURE = 5.0  # standard deviations
+LEAST_OFF = 3e-4  # of a reading, to be spoken of [m]
+SAME = 1e-3  # readings that are those of another image [m]
+SHOWN = 4  # legs that are named
+
+
+def disagreeing_images(
+    measurements: Measurements, mechanism: Mechanism, solution: Solution
+) -> dict[int, str]:
+    """Return a note on every fitted image most of which the fit has rejected, by row."""
+    o = solution.outlines
+    rejected = np.array([why.startswith(DISAGREES) for why in o.reason], dtype=np.bool_)
+    notes = {}
+    for row in np.unique(o.row[rejected]).tolist():
+        judged = np.flatnonzero((o.row == row) & (rejected | o.used))
+        wrong = judged[rejected[judged]]
+        legs = [
+            leg for leg in np.unique(o.leg[wrong]) if np.all(rejected[judged[o.leg[judged] == leg]])
+        ]
+        if len(wrong) < MANY * len(judged) or len(legs) < SOME_LEGS:
+            continue
+        view = measurements.views[int(measurements.view[row])]
+        name = f"view {view.name}, image {measurements.image[row] or f'of row {row + 1}'}"
+        readings = _readings(measurements, mechanism, solution, row, judged)
+        explanation = _explanation(measurements, mechanism, row, readings)
+        if not explanation and len(wrong) < MOST * len(judged):
+            continue  # what is wrong there is not of this image
+        notes[row] = (
+            f"{name}: {len(wrong)} of its {len(judged)} outlines disagree with the fit and were "
+            f"left out; {explanation or SUITED}."
+        )
+    return notes
+
+
+def _readings(
+    measurements: Measurements,
+    mechanism: Mechanism,
+    solution: Solution,
+    row: int,
+    chosen: IntArray,
+) -> tuple[Array, Array] | None:
+    """Return the readings that the outlines of an image show and their sigmas (n_legs,) [m].
+
+    None if the outlines do not show the pose.
+    """
+    o = solution.outlines
+    chosen = chosen[np.isfinite(o.h[chosen]).all(axis=1)]
+    legs = o.leg[chosen]
+    if len(chosen) < LEAST_OUTLINES or len(np.unique(legs)) < LEAST_LEGS:
+        return None
+    T_camera_Rb = solution.T_camera_Rb[int(measurements.view[row])]
+    begin = solution.T_Rb_Re[int(measurements.pose[row])]
+    A = np.array([leg.A for leg in solution.legs])
+    B = np.array([leg.B for leg in solution.legs])
+    radius = np.array([solution.radii[int(o.leg[i]), o.part[i]] for i in chosen.tolist()])
+    signed = np.where(o.edge[chosen] == 1, radius, -radius)
+
+    def moved(x: Array) -> Array:
+        turn = Rotation.from_rotvec(x[:3]) * begin.rotation
+        return RigidTransform.from_components(begin.translation + x[3:], turn).apply(B)
+
+    def residuals(x: Array) -> Array:
+        ends = T_camera_Rb.apply(moved(x))[legs]
+        return np.asarray(np.sum(o.h[chosen] * ends, axis=1) - signed)
+
+    def lengths(x: Array) -> Array:
+        return np.asarray(np.linalg.norm(moved(x) - A, axis=1))
+
+    solved = least_squares(residuals, np.zeros(6), loss="soft_l1", f_scale=4.0 * LEAST_NOISE)
+    J_outlines = np.asarray(solved.jac, dtype=np.float64)
+    normal = J_outlines.T @ J_outlines
+    if not solved.success or np.linalg.cond(normal) > 1e12:
+        return None
+    noise = max(LEAST_NOISE, 1.48 * float(np.median(np.abs(residuals(solved.x)))))
+    step = 1e-6 * np.eye(6)
+    J = np.stack([(lengths(solved.x + d) - lengths(solved.x - d)) / 2e-6 for d in step], axis=1)
+    variance = np.einsum("ja,ab,jb->j", J, noise**2 * np.linalg.inv(normal), J)
+    q0 = np.array([leg.q0 for leg in solution.legs])
+    sign = np.array([leg.sign for leg in mechanism.legs])
+    return sign * (lengths(solved.x) - q0), np.sqrt(variance)
+
+
+def _explanation(
+    measurements: Measurements,
+    mechanism: Mechanism,
+    row: int,
+    readings: tuple[Array, Array] | None,
+) -> str:
+    """Return what to check; nothing where the readings suit the image."""
+    motors = list(mechanism.motors)
+    if readings is None or not motors:
+        return "check its reading and that nobody moved camera or machine"
+    given = measurements.q[row, motors]
+    shown, sigma = readings[0][motors], readings[1][motors]
+    off = shown - given
+    wrong = np.flatnonzero(np.abs(off) > np.maximum(SURE * sigma, LEAST_OFF))
+    if len(wrong) == 0:
+        return ""
+    distance = np.abs(measurements.q[:, motors] - shown)
+    alike = [
+        other
+        for other in range(measurements.n_rows)
+        if measurements.image[other]
+        and measurements.pose[other] != measurements.pose[row]
+        and np.all(distance[other] < np.maximum(SURE * sigma, SAME))
+    ]
+    if alike:
+        nearest = min(alike, key=lambda other: float(distance[other].max()))
+        return (
+            f"it shows the reading given for image {measurements.image[nearest]}; check which "
+            "image belongs to which row"
+        )
+    names = [mechanism.leg_names[motors[k]] for k in wrong]
+    if len(wrong) == 1:
+        k = int(wrong[0])
+        return (
+            f"it shows a reading of {names[0]} of {1e3 * shown[k]:.2f} +- {1e3 * sigma[k]:.2f} mm, "
+            f"given {1e3 * given[k]:.2f} mm; check that reading"
+        )
+    worst = 1e3 * float(np.abs(off[wrong]).max())
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return (
+        f"it shows another pose than its reading says, with readings of {', '.join(names[:SHOWN])}"
+        f"{more} off by up to {worst:.1f} mm; check that it was taken there"
+    )
