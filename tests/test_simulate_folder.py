@@ -220,7 +220,7 @@ def test_photographs_tell_the_gamma_of_their_camera(tmp_path: Path) -> None:
 def test_the_python_of_the_description_of_simulated_datasets_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    text = (Path(__file__).parents[1] / "docs" / "simulate.md").read_text()
     code = text[
         text.index("    settings = legcal.Sim") : text.index("Metres and radians; `errors`")
     ]
