@@ -134,7 +134,7 @@ def test_the_readme_tells_the_accuracy_that_is_measured(example_run: Run) -> Non
     # Processors round differently, and a block of an edge more or less moves the fit a little.
     for label, model, within in (
         ("nominal model", HEXAPOD / "models/hexapod.yaml", 0.01),
-        ("one fit of everything", example_run.output / "calibrated.yaml", 0.3),
+        ("joint fit of all outlines", example_run.output / "calibrated.yaml", 0.3),
     ):
         told = re.search(rf"\| {label}[^|]*\| {number} \| {number} \|", readme)
         assert told is not None, label
