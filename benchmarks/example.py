@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from legcal import calibrate, load_dataset, load_mechanism
+from legcal.calibration.joint_fit.constraints import platform_poses
 from legcal.calibration.verdict import Calibration
 from legcal.data.axes import axes_from_outlines
-from legcal.estimation.constraints import platform_poses
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.leg import KinematicParameters, point_like_legs, to_vector
 from legcal.paper.four_steps import run_steps

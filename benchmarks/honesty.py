@@ -21,9 +21,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import calibrate, load_mechanism
+from legcal.calibration.joint_fit.biases import KINDS
+from legcal.calibration.joint_fit.state import components
 from legcal.calibration.verdict import Calibration
-from legcal.estimation.biases import KINDS
-from legcal.estimation.state import components
 from legcal.geometry.types import Array
 from legcal.machine.model import Mechanism
 from legcal.machine.parameters import geometries, vector_of

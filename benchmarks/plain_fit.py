@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.sparse import coo_array, csr_array
 
-from legcal.estimation.problem import FitProblem
-from legcal.estimation.state import State
+from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.state import State
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine.leg import free_coordinates
 

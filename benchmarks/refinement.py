@@ -26,10 +26,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from hexapod_session import disturbed_start, noisy_outlines, noisy_readings, simulate
 from plain_fit import PlainFit
 
-from legcal.estimation.build import build_fit
-from legcal.estimation.joint_fit import solve_fit
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.fit import solve_fit
+from legcal.calibration.joint_fit.solver import minimise
 from legcal.estimation.noise import NoiseModel
-from legcal.estimation.solver import minimise
 
 SIZES = (45, 450, 4500)
 REPEATS = 5

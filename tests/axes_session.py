@@ -5,11 +5,11 @@ from functools import cache
 
 import numpy as np
 
+from legcal.calibration.joint_fit.constraints import Start, start_from
+from legcal.calibration.joint_fit.solution import joints_of
+from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
 from legcal.data.measurements import Measurements
-from legcal.estimation.constraints import Start, start_from
-from legcal.estimation.solution import joints_of
-from legcal.estimation.state import FittedLegs
 from legcal.geometry.types import Array
 from legcal.machine.leg import KinematicParameters, from_vector, point_like_legs, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around

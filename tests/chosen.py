@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from legcal import load_mechanism
+from legcal.calibration.joint_fit.choices import Choices
+from legcal.calibration.joint_fit.parameters import KnownParameters, known_parameters, resolve
 from legcal.data.dataset import wishes_of_call
 from legcal.data.measurements import View
-from legcal.estimation.choices import Choices
-from legcal.estimation.parameters import KnownParameters, known_parameters, resolve
 from legcal.vision.camera import Camera
 
 K = np.array([[1290.0, 0.0, 511.0], [0.0, 1285.0, 380.0], [0.0, 0.0, 1.0]])

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.estimation.constraints import on_constraints, pose_rows
-from legcal.estimation.problem import FitProblem, Linearization, linearize
-from legcal.estimation.residuals import Places, Rows
-from legcal.estimation.state import State
+from legcal.calibration.joint_fit.constraints import on_constraints, pose_rows
+from legcal.calibration.joint_fit.problem import FitProblem, Linearization, linearize
+from legcal.calibration.joint_fit.residuals import Places, Rows
+from legcal.calibration.joint_fit.state import State
 from legcal.geometry.types import Array
 
 STEP = 1e-6

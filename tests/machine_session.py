@@ -9,10 +9,10 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.calibration.joint_fit.constraints import Start, start_from
+from legcal.calibration.joint_fit.state import FittedLegs, components, fitted_legs, motions
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
-from legcal.estimation.constraints import Start, start_from
-from legcal.estimation.state import FittedLegs, components, fitted_legs, motions
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import LegGeometry, LegKind

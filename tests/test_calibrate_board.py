@@ -14,11 +14,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.joint_fit.parameters import BOARD_SCALE
 from legcal.calibration.verdict import Calibration
 from legcal.data.corners import found_corners
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.estimation.parameters import BOARD_SCALE
 from legcal.machine.parameters import geometries, vector_of
 from legcal.simulation.settings import Level
 from legcal.vision.board import Board

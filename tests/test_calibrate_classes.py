@@ -10,8 +10,8 @@ import pytest
 from simulated import settings
 
 from legcal import calibrate, evaluate
+from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.errors import LegcalError, NotIdentifiable, NotVisible
-from legcal.estimation.platform import poses_at_readings
 from legcal.machine.kinematics import pose_differences
 from legcal.machine.load import load_mechanism
 from legcal.machine.parameters import geometries

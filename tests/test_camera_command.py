@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from legcal import calibrate_camera, cli
 from legcal.calibration.camera import CameraCalibration
+from legcal.calibration.joint_fit.choices import Prior
+from legcal.calibration.joint_fit.parameters import known_parameters, resolve
 from legcal.data.dataset import wishes_of_call
 from legcal.data.measurements import View
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
-from legcal.estimation.choices import Prior
-from legcal.estimation.parameters import known_parameters, resolve
 from legcal.geometry.types import Array, IntArray
 from legcal.machine.load import load_mechanism
 from legcal.vision.board import Board, board_of

@@ -9,11 +9,11 @@ from machine_session import machine_session
 from simulated import settings
 
 from legcal import calibrate, check
+from legcal.calibration.joint_fit.fit import refine
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import choose_outlines
 from legcal.errors import NotIdentifiable
-from legcal.estimation.joint_fit import refine
 from legcal.geometry.types import Array, IntArray
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.session import simulate

@@ -7,9 +7,9 @@ import pytest
 from chosen import HEXAPOD, choose, known
 
 from legcal import load_mechanism
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Prior
+from legcal.calibration.joint_fit.parameters import resolve
 from legcal.data.dataset import wishes_of_call
-from legcal.estimation.choices import NO_CHOICES, Prior
-from legcal.estimation.parameters import resolve
 from legcal.machine.parameters import parametrization_of
 
 

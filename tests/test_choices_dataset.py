@@ -9,10 +9,10 @@ import pytest
 from dataset_folder import Folder, folder
 
 from legcal import calibrate, cli
+from legcal.calibration.joint_fit.choices import Choices, Prior
+from legcal.calibration.joint_fit.parameters import known_parameters, resolve
 from legcal.data.dataset import load_dataset, wishes_of_call
 from legcal.errors import DatasetError, UsageError
-from legcal.estimation.choices import Choices, Prior
-from legcal.estimation.parameters import known_parameters, resolve
 
 __all__ = ["folder"]
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from chosen import HEXAPOD, choose, known
 
+from legcal.calibration.joint_fit.parameters import resolve
 from legcal.data.dataset import wishes_of_call
 from legcal.errors import DatasetError, UsageError
-from legcal.estimation.parameters import resolve
 
 
 @pytest.mark.parametrize(

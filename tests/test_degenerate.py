@@ -15,9 +15,9 @@ from simulated import settings
 
 import legcal
 from legcal import calibrate, simulate
+from legcal.calibration.joint_fit.parameters import known_parameters
 from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.estimation.parameters import known_parameters
 from legcal.machine.model import Mechanism
 
 LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]

@@ -15,10 +15,10 @@ from spoiled import Picture, Spoiled, spoiled
 from legcal import calibrate, detect, load_dataset
 from legcal.calibration.disagreement import disagreeing_images
 from legcal.calibration.fitting import rough_scene
+from legcal.calibration.joint_fit.choices import Choices
+from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.run import CalibrationRun, start_run
 from legcal.errors import NotIdentifiable
-from legcal.estimation.choices import Choices
-from legcal.estimation.rounds import DISAGREES
 from legcal.perception.doubts import Explanation, _best
 from legcal.perception.drawing import Detection
 from legcal.perception.examine import NOTHING_LIKE, OutlineCount, _usual, judged, observe, rejected

@@ -8,9 +8,9 @@ from hexapod_session import LENS, RADIUS, Session, disturbed_start, moved_outlin
 from machine_session import LENS as LENS_OF_MACHINES
 from machine_session import machine_session
 
-from legcal.estimation.choices import NO_CHOICES, Choices, Prior
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.solution import Solution
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array
 from legcal.machine.parameters import moved_legs
 from legcal.vision.camera import Camera, with_intrinsics

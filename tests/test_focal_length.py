@@ -14,11 +14,11 @@ from hexapod_session import (
     simulate,
 )
 
+from legcal.calibration.joint_fit.choices import Choices
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
-from legcal.estimation.choices import Choices
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.solution import Solution
 from legcal.vision.camera import Camera, with_intrinsics
 
 

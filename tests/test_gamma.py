@@ -20,11 +20,8 @@ from simulated import settings
 
 import legcal
 from legcal.calibration.detecting import detect
-from legcal.data.dataset import load_dataset
-from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines
-from legcal.errors import DatasetError
-from legcal.estimation.gammas import (
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.gammas import (
     FEIGNED,
     LARGEST_STEP,
     RANGE,
@@ -33,8 +30,11 @@ from legcal.estimation.gammas import (
     EstimatedGamma,
     next_gammas,
 )
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.observations import known_gammas
+from legcal.calibration.joint_fit.observations import known_gammas
+from legcal.data.dataset import load_dataset
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
+from legcal.errors import DatasetError
 from legcal.simulation.session import simulate as simulate_folder
 from legcal.vision.cylinder import EPSILON
 

@@ -9,21 +9,21 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
-from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines
-from legcal.estimation import held_out as pose_by_outlines
-from legcal.estimation.biases import N_KINDS, possible_shifts
-from legcal.estimation.build import build_fit
-from legcal.estimation.constraints import Start
-from legcal.estimation.held_out import (
+from legcal.calibration.joint_fit import held_out as pose_by_outlines
+from legcal.calibration.joint_fit.biases import N_KINDS, possible_shifts
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.constraints import Start
+from legcal.calibration.joint_fit.held_out import (
     HeldOut,
     Posterior,
     ShownPoses,
     compare_held_out,
     poses_by_outlines,
 )
+from legcal.calibration.joint_fit.state import FittedLegs, motions
+from legcal.data.measurements import Measurements
+from legcal.data.outlines import Outlines
 from legcal.estimation.noise import NoiseModel
-from legcal.estimation.state import FittedLegs, motions
 from legcal.machine.leg import LegGeometry
 from legcal.simulation.studies.outlines import Noise, StartErrors, design_of, draw_session
 

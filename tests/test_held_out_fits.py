@@ -16,12 +16,12 @@ from hexapod_session import (
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
+from legcal.calibration.joint_fit.constraints import start_from
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
 from legcal.data.measurements import Measurements
 from legcal.data.order import outlines_at
 from legcal.data.outlines import Outlines
-from legcal.estimation.constraints import start_from
-from legcal.estimation.held_out import HeldOut, compare_held_out
-from legcal.estimation.joint_fit import refine
 from legcal.geometry.types import Array, IntArray
 
 N_SEEDS = 4

@@ -124,8 +124,23 @@ def test_a_facade_hands_out_what_its_modules_define(room: str) -> None:
 
 
 def test_four_steps_and_joint_fit_do_not_know_each_other() -> None:
-    for here, there in (("paper", "estimation"), ("estimation", "paper")):
-        assert not {o for m in _of(here) for o in _reachable(m) if _room(o) == there}
+    rooms = ("legcal.paper", "legcal.estimation"), ("legcal.paper", "legcal.calibration.joint_fit")
+    for pair in rooms:
+        for here, there in (pair, pair[::-1]):
+            of_here = [m for m in _modules() if f"{m}.".startswith(f"{here}.")]
+            assert of_here
+            assert not {
+                o for m in of_here for o in _reachable(m) if f"{o}.".startswith(f"{there}.")
+            }
+
+
+def test_estimation_knows_no_images_and_no_robot() -> None:
+    assert {_room(other) for m in _of("estimation") for other in _reachable(m)} <= {
+        "errors",
+        "files",
+        "geometry",
+        "estimation",
+    }
 
 
 def test_geometry_knows_no_robot_and_no_camera() -> None:

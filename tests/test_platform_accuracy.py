@@ -9,8 +9,8 @@ from parameter_steps import random_covariance, written_with
 from thinned import thinned
 
 from legcal import evaluate
-from legcal.estimation.platform import PlatformAccuracy, platform_accuracy
-from legcal.estimation.solution import Sensitivity
+from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
+from legcal.calibration.joint_fit.solution import Sensitivity
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
 from legcal.machine.load import load_mechanism

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from parameter_steps import random_covariance, written_with
 
-from legcal.errors import NotIdentifiable
-from legcal.estimation.platform import (
+from legcal.calibration.joint_fit.platform import (
     PlatformError,
     expected_error,
     moved_by,
     platform_by_parameters,
     predict_platform_error,
 )
+from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine.kinematics import forward_kinematics_many, platform_in_base
 from legcal.machine.leg import LegKind

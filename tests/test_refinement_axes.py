@@ -8,16 +8,16 @@ from axes_session import AxesSession, axes_session
 from hexapod_session import disturbed_start, joint_errors, simulate
 from thinned import thinned
 
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.cramer_rao import average_images, bound
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.observations import observed_axes
+from legcal.calibration.joint_fit.problem import FitProblem, linearize
+from legcal.calibration.joint_fit.solution import Solution, joints_of
 from legcal.data.axes import LegAxes, axes_from_outlines, choose_axes
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.estimation.build import build_fit
-from legcal.estimation.cramer_rao import average_images, bound
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.observations import observed_axes
-from legcal.estimation.problem import FitProblem, linearize
-from legcal.estimation.solution import Solution, joints_of
 
 
 @pytest.fixture(scope="module")

@@ -7,15 +7,15 @@ import pytest
 from board_session import BOARD, SIGMA_PX, corners_of, place_of_board, with_board
 from machine_session import LENS, MachineSession, machine_session
 
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.choices import Choices, Prior
+from legcal.calibration.joint_fit.constraints import Start
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.parameters import BOARD_SCALE
+from legcal.calibration.joint_fit.problem import corner_rows
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DidNotConverge
-from legcal.estimation.build import build_fit
-from legcal.estimation.choices import Choices, Prior
-from legcal.estimation.constraints import Start
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.parameters import BOARD_SCALE
-from legcal.estimation.problem import corner_rows
-from legcal.estimation.solution import Solution
 from legcal.geometry.types import Array
 from legcal.machine.parameters import vector_of
 from legcal.vision.board import Board

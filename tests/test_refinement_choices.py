@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from machine_session import LENS, MachineSession, machine_session
 
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices, Prior
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import View
 from legcal.errors import DidNotConverge, NotIdentifiable
-from legcal.estimation.choices import NO_CHOICES, Choices, Prior
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.solution import Solution
 from legcal.vision.camera import with_intrinsics
 
 

@@ -8,10 +8,10 @@ from machine_session import MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
-from legcal.estimation.constraints import Start
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.solution import Solution
-from legcal.estimation.state import FittedLegs
+from legcal.calibration.joint_fit.constraints import Start
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.machine.leg import LegGeometry
 from legcal.machine.parameters import moved_legs
 

@@ -9,18 +9,18 @@ from machine_session import SHIPPED, MachineSession, machine_session
 
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session
-from legcal.estimation.build import build_fit
-from legcal.estimation.choices import Choices, Prior
-from legcal.estimation.constraints import with_values
-from legcal.estimation.cramer_rao import bound
-from legcal.estimation.determinacy import open_directions
-from legcal.estimation.joint_fit import refine
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.choices import Choices, Prior
+from legcal.calibration.joint_fit.constraints import with_values
+from legcal.calibration.joint_fit.cramer_rao import bound
+from legcal.calibration.joint_fit.determinacy import open_directions
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.normal import information
+from legcal.calibration.joint_fit.problem import linearize, named_values
+from legcal.calibration.joint_fit.rounds import first_minimum
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, FittedLegs, State, components
 from legcal.estimation.noise import NoiseModel
-from legcal.estimation.normal import information
-from legcal.estimation.problem import linearize, named_values
-from legcal.estimation.rounds import first_minimum
-from legcal.estimation.solution import Solution
-from legcal.estimation.state import DEFAULT_SETTINGS, FittedLegs, State, components
 from legcal.geometry.types import Array
 from legcal.machine.leg import radius_name
 from legcal.machine.parameters import parametrize

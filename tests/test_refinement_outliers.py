@@ -8,8 +8,8 @@ import pytest
 from machine_session import MachineSession, machine_session, shifted
 from thinned import thinned
 
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.solution import Solution
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array, BoolArray
 
 SHARE = 0.2

@@ -20,11 +20,11 @@ from hexapod_session import (
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
+from legcal.calibration.joint_fit.fit import refine, refine_from_best
+from legcal.calibration.joint_fit.solution import Solution, joints_of
+from legcal.calibration.joint_fit.state import FittedLegs, RefinementSettings
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
-from legcal.estimation.joint_fit import refine, refine_from_best
-from legcal.estimation.solution import Solution, joints_of
-from legcal.estimation.state import FittedLegs, RefinementSettings
 from legcal.geometry.types import Array
 from legcal.machine.leg import KinematicParameters
 

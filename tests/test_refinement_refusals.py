@@ -17,12 +17,12 @@ from hexapod_session import (
     simulate,
 )
 
+from legcal.calibration.joint_fit.constraints import cameras_from_hints, platform_poses, start_from
+from legcal.calibration.joint_fit.fit import refine, refine_from_best
+from legcal.calibration.joint_fit.state import fitted_legs
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.estimation.constraints import cameras_from_hints, platform_poses, start_from
-from legcal.estimation.joint_fit import refine, refine_from_best
-from legcal.estimation.state import fitted_legs
 from legcal.geometry.motions import motion_from_xyz_quat
 from legcal.machine.leg import LegKind
 from legcal.machine.load import load_mechanism

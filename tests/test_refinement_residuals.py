@@ -7,11 +7,10 @@ import pytest
 from hexapod_session import FRAME_LEGS, LENS, PINHOLE, Session, disturbed_start, simulate
 from scipy.spatial.transform import Rotation
 
-from legcal.estimation.build import build_fit
-from legcal.estimation.constraints import Start
-from legcal.estimation.loss import cost_of, efficiency, weights, width_to_k
-from legcal.estimation.problem import FitProblem, linearize, offsets_of
-from legcal.estimation.residuals import (
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.constraints import Start
+from legcal.calibration.joint_fit.problem import FitProblem, linearize, offsets_of
+from legcal.calibration.joint_fit.residuals import (
     Residual,
     Rows,
     axis_residual,
@@ -19,7 +18,8 @@ from legcal.estimation.residuals import (
     outline_residual,
     prior_residual,
 )
-from legcal.estimation.state import State, cayley, turned
+from legcal.calibration.joint_fit.state import State, cayley, turned
+from legcal.estimation.loss import cost_of, efficiency, weights, width_to_k
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis

@@ -8,23 +8,23 @@ from dense_fit import allowed, by_differences, jacobian, kept_move, residuals, v
 from machine_session import LENS, PINHOLE, MachineSession, machine_session
 from thinned import thinned
 
-from legcal.data.axes import axes_from_outlines
-from legcal.estimation import solver
-from legcal.estimation.biases import N_KINDS, SharedShifts
-from legcal.estimation.build import build_fit
-from legcal.estimation.choices import Choices, Prior
-from legcal.estimation.constraints import on_constraints, tangent
-from legcal.estimation.noise import NoiseModel
-from legcal.estimation.normal import normal_equations
-from legcal.estimation.problem import (
+from legcal.calibration.joint_fit import solver
+from legcal.calibration.joint_fit.biases import N_KINDS, SharedShifts
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.choices import Choices, Prior
+from legcal.calibration.joint_fit.constraints import on_constraints, tangent
+from legcal.calibration.joint_fit.normal import normal_equations
+from legcal.calibration.joint_fit.problem import (
     FitProblem,
     linearize,
     named_jacobian,
     named_values,
     with_biases,
 )
-from legcal.estimation.residuals import Rows
-from legcal.estimation.state import State
+from legcal.calibration.joint_fit.residuals import Rows
+from legcal.calibration.joint_fit.state import State
+from legcal.data.axes import axes_from_outlines
+from legcal.estimation.noise import NoiseModel
 from legcal.geometry.types import Array
 
 K = 0.1

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hexapod_session import PINHOLE, Session, disturbed_start, moved_outlines, simulate
 
+from legcal.calibration.joint_fit.fit import refine
 from legcal.data.outlines import Outlines
-from legcal.estimation.joint_fit import refine
 
 
 @pytest.fixture(scope="module")

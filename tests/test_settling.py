@@ -13,13 +13,13 @@ from hexapod_session import (
 )
 from thinned import thinned
 
+from legcal.calibration.joint_fit.biases import possible_shifts
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.observations import observed_outlines
+from legcal.calibration.joint_fit.rounds import NO_CHANGES, Changes, unsettled
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, RefinementSettings
 from legcal.errors import DidNotConverge
-from legcal.estimation.biases import possible_shifts
-from legcal.estimation.joint_fit import refine
-from legcal.estimation.observations import observed_outlines
-from legcal.estimation.rounds import NO_CHANGES, Changes, unsettled
-from legcal.estimation.solution import Solution
-from legcal.estimation.state import DEFAULT_SETTINGS, RefinementSettings
 
 
 @pytest.fixture(scope="module")

@@ -15,14 +15,14 @@ from hexapod_session import (
     simulate,
 )
 
+from legcal.calibration.joint_fit.biases import KINDS, N_KINDS, estimated_shifts, possible_shifts
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.influence import scores_of_shifts, with_shifts
+from legcal.calibration.joint_fit.observations import ObservedOutlines, observed_outlines
+from legcal.calibration.joint_fit.problem import linearize, with_biases
 from legcal.data.outlines import Outlines
-from legcal.estimation.biases import KINDS, N_KINDS, estimated_shifts, possible_shifts
-from legcal.estimation.build import build_fit
-from legcal.estimation.influence import scores_of_shifts, with_shifts
-from legcal.estimation.joint_fit import refine
 from legcal.estimation.noise import NoiseModel
-from legcal.estimation.observations import ObservedOutlines, observed_outlines
-from legcal.estimation.problem import linearize, with_biases
 from legcal.estimation.variances import Effects, estimate_variances
 from legcal.geometry.types import Array
 

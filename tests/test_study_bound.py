@@ -11,9 +11,9 @@ from rich.console import Console
 from test_cli import run
 from thinned import thinned
 
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.estimation.solution import Solution
-from legcal.estimation.state import FittedLegs
 from legcal.machine.leg import LegKind
 from legcal.machine.parameters import vector_of
 from legcal.simulation.studies import bound as bound_study

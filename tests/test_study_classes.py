@@ -13,10 +13,10 @@ from machine_session import machine_session, shown_outlines
 from rich.console import Console
 from test_cli import run
 
+from legcal.calibration.joint_fit.constraints import Start
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.state import components, motions
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.estimation.constraints import Start
-from legcal.estimation.solution import Solution
-from legcal.estimation.state import components, motions
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import platform_in_base
 from legcal.machine.leg import LegGeometry

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit import SeenBoard, Solution
 from legcal.calibration.run import CalibrationRun
 from legcal.data import (
     CORNERS_NAME,
@@ -25,7 +26,6 @@ from legcal.data import (
     reorder_corners,
 )
 from legcal.errors import DatasetError, NotVisible
-from legcal.estimation import SeenBoard, Solution
 from legcal.geometry import IntArray
 from legcal.perception import FAR_OFF, camera_poses, detect_corners, require_board
 from legcal.vision import Board

@@ -19,10 +19,7 @@ from legcal.calibration.changes import (
 )
 from legcal.calibration.earlier import EarlierResult, read_result
 from legcal.calibration.fitting import observe_and_fit
-from legcal.calibration.run import start_run
-from legcal.data import Dataset, load_dataset
-from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.estimation import (
+from legcal.calibration.joint_fit import (
     Choices,
     PlatformPair,
     Prior,
@@ -31,6 +28,9 @@ from legcal.estimation import (
     in_file_order,
     known_parameters,
 )
+from legcal.calibration.run import start_run
+from legcal.data import Dataset, load_dataset
+from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.geometry import Array
 from legcal.machine import (
     Mechanism,

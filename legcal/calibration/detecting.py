@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from legcal.calibration.fitting import rough_scene
+from legcal.calibration.joint_fit import Choices
 from legcal.calibration.run import CalibrationRun, start_run
 from legcal.data import (
     Dataset,
@@ -25,7 +26,6 @@ from legcal.data import (
     restore_outlines,
 )
 from legcal.errors import DatasetError
-from legcal.estimation import Choices
 from legcal.files import output_path
 from legcal.geometry import IntArray
 from legcal.machine import Cylinder

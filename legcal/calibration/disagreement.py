@@ -11,8 +11,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.calibration.joint_fit import DISAGREES, Solution
 from legcal.data import Measurements
-from legcal.estimation import DISAGREES, Solution
 from legcal.geometry import Array, IntArray
 from legcal.machine import Mechanism
 

@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from legcal.calibration.joint_fit import BOARD_SCALE, KINDS
 from legcal.errors import DatasetError, ModelError, OutOfClass
-from legcal.estimation import BOARD_SCALE, KINDS, NoiseModel
+from legcal.estimation import NoiseModel
 from legcal.files import Number, Version, describe, read_text, validate
 from legcal.geometry import Array
 from legcal.machine import (

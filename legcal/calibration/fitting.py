@@ -24,6 +24,16 @@ from scipy.spatial.transform import RigidTransform
 from legcal.calibration.board import BoardViews, Poses, base_of_board, in_one_camera, observe_board
 from legcal.calibration.disagreement import disagreeing_images
 from legcal.calibration.identify.analysis import check_identifiable
+from legcal.calibration.joint_fit import (
+    ROUNDS,
+    EstimatedGamma,
+    Solution,
+    Start,
+    known_gammas,
+    next_gammas,
+    refine_from_best,
+    start_from,
+)
 from legcal.calibration.run import CalibrationRun
 from legcal.calibration.verdict import Steps
 from legcal.data import (
@@ -36,16 +46,6 @@ from legcal.data import (
     reject_unused_legs,
 )
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
-from legcal.estimation import (
-    ROUNDS,
-    EstimatedGamma,
-    Solution,
-    Start,
-    known_gammas,
-    next_gammas,
-    refine_from_best,
-    start_from,
-)
 from legcal.geometry import IntArray
 from legcal.machine import Cylinder, Mechanism, geometries
 from legcal.paper import nominal_mechanism, run_base_steps, run_platform_steps

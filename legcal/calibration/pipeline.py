@@ -11,6 +11,17 @@ import numpy as np
 from legcal.calibration.board import board_notes
 from legcal.calibration.fitting import Found, observe_and_fit
 from legcal.calibration.identify.analysis import check_identifiable
+from legcal.calibration.joint_fit import (
+    DEFAULT_SETTINGS,
+    Choices,
+    HeldOut,
+    Prior,
+    Solution,
+    compare_held_out,
+    in_file_order,
+    known_parameters,
+    resolve,
+)
 from legcal.calibration.result import write_result
 from legcal.calibration.run import CalibrationRun, start_run
 from legcal.calibration.verdict import Calibration, judge
@@ -27,17 +38,6 @@ from legcal.data import (
     wishes_of_call,
 )
 from legcal.errors import UsageError
-from legcal.estimation import (
-    DEFAULT_SETTINGS,
-    Choices,
-    HeldOut,
-    Prior,
-    Solution,
-    compare_held_out,
-    in_file_order,
-    known_parameters,
-    resolve,
-)
 from legcal.files import check_destination, output_path
 from legcal.geometry import IntArray
 from legcal.paper import Criteria, Transformation

@@ -11,6 +11,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit import (
+    BOARD_SCALE,
+    HeldOut,
+    PlatformAccuracy,
+    PlatformError,
+    known_parameters,
+)
 from legcal.calibration.verdict import Calibration
 from legcal.data import (
     CORNERS_NAME,
@@ -20,13 +27,6 @@ from legcal.data import (
     write_observations,
 )
 from legcal.errors import DidNotConverge
-from legcal.estimation import (
-    BOARD_SCALE,
-    HeldOut,
-    PlatformAccuracy,
-    PlatformError,
-    known_parameters,
-)
 from legcal.files import result_folder
 from legcal.geometry import motion_to_xyz_quat
 from legcal.machine import (

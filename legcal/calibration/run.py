@@ -14,6 +14,15 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit import (
+    Choices,
+    FittedLegs,
+    components,
+    fitted_legs,
+    platform_poses,
+    pose_rows,
+    start_from,
+)
 from legcal.data import (
     Dataset,
     DetectionPlan,
@@ -35,15 +44,6 @@ from legcal.data import (
     store_outlines,
 )
 from legcal.errors import DatasetError
-from legcal.estimation import (
-    Choices,
-    FittedLegs,
-    components,
-    fitted_legs,
-    platform_poses,
-    pose_rows,
-    start_from,
-)
 from legcal.geometry import Array, IntArray
 from legcal.machine import (
     LegGeometry,

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Corners, Dataset, Order, inverse
-from legcal.estimation import (
+from legcal.calibration.joint_fit import (
     FOCAL_PART,
     HeldOut,
     PlatformAccuracy,
@@ -17,6 +16,7 @@ from legcal.estimation import (
     known_parameters,
     platform_accuracy,
 )
+from legcal.data import Corners, Dataset, Order, inverse
 from legcal.machine import LegGeometry
 
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations

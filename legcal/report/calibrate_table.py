@@ -13,11 +13,12 @@ from rich.text import Text
 from legcal.calibration import (
     Calibration,
     ParameterRow,
+    PlatformError,
     board_lines,
     held_out_lines,
     parameter_rows,
+    poses_at_readings,
 )
-from legcal.estimation import PlatformError, poses_at_readings
 from legcal.machine import describe_direction, pose_differences
 
 _SHOWN = {  # what tables show a unit in: its size, its name, and digits

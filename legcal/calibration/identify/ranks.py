@@ -9,8 +9,8 @@ from itertools import combinations, combinations_with_replacement
 import numpy as np
 
 from legcal.calibration.identify.session import Across, Session, at_base_joints, at_platform_joints
+from legcal.calibration.joint_fit import Choices
 from legcal.errors import NotIdentifiable
-from legcal.estimation import Choices
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.machine import (
     SHOWN,

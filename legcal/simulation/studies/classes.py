@@ -18,8 +18,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from legcal.calibration import Solution
 from legcal.errors import LegcalError
-from legcal.estimation import Solution
 from legcal.geometry import Array
 from legcal.machine import LegGeometry, vector_of
 from legcal.paper import Criteria

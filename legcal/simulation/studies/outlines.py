@@ -19,10 +19,7 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm
 
-from legcal.calibration import compress, eliminate
-from legcal.data import Measurements, Outlines, View, axes_from_outlines
-from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable, UsageError
-from legcal.estimation import (
+from legcal.calibration import (
     Choices,
     FittedLegs,
     RefinementSettings,
@@ -30,10 +27,14 @@ from legcal.estimation import (
     Start,
     cameras_from_hints,
     components,
+    compress,
+    eliminate,
     platform_poses,
     refine,
     start_from,
 )
+from legcal.data import Measurements, Outlines, View, axes_from_outlines
+from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable, UsageError
 from legcal.geometry import Array, IntArray
 from legcal.machine import (
     LegGeometry,

@@ -16,6 +16,16 @@ from rich.text import Text
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import elliprg
 
+from legcal.calibration import (
+    FittedLegs,
+    Start,
+    average_images,
+    bound,
+    build_fit,
+    cameras_from_hints,
+    refine,
+    start_from,
+)
 from legcal.data import (
     LegAxes,
     Measurements,
@@ -26,16 +36,6 @@ from legcal.data import (
     no_outlines,
 )
 from legcal.errors import DidNotConverge, LegcalError
-from legcal.estimation import (
-    FittedLegs,
-    Start,
-    average_images,
-    bound,
-    build_fit,
-    cameras_from_hints,
-    refine,
-    start_from,
-)
 from legcal.geometry import Array
 from legcal.machine import (
     Demand,

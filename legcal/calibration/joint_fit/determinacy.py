@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import null_space
 
+from legcal.calibration.joint_fit.constraints import with_values
+from legcal.calibration.joint_fit.normal import NormalEquations, inverse_on_range
+from legcal.calibration.joint_fit.problem import FitProblem, named_jacobian
+from legcal.calibration.joint_fit.state import State
 from legcal.errors import NotIdentifiable
-from legcal.estimation.constraints import with_values
-from legcal.estimation.normal import NormalEquations, inverse_on_range
-from legcal.estimation.problem import FitProblem, named_jacobian
-from legcal.estimation.state import State
 from legcal.geometry import Array, BoolArray
 from legcal.machine import (
     SHOWN,
@@ -66,7 +66,7 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
         Without anything held.
     state : State
     normal : NormalEquations
-        From :func:`legcal.estimation.normal.information` at the state.
+        From :func:`legcal.calibration.joint_fit.normal.information` at the state.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def refuse_lost(problem: FitProblem, state: State, normal: NormalEquations, held
     state : State
         Where the fit ended.
     normal : NormalEquations
-        From :func:`legcal.estimation.normal.information` there.
+        From :func:`legcal.calibration.joint_fit.normal.information` there.
     held : Held
         What :func:`open_directions` found before any outline was rejected.
 
@@ -255,7 +255,7 @@ def held_spread(problem: FitProblem, state: State, held: Held) -> Array:
     Returns
     -------
     (n_kinematic, n_kinematic) array
-        In the steps of :attr:`legcal.estimation.solution.Solution.kinematic_covariance`.
+        In the steps of :attr:`legcal.calibration.joint_fit.solution.Solution.kinematic_covariance`.
     """
     layout, legs = problem.layout, problem.legs
     n = layout.n_kinematic

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.errors import DidNotConverge
-from legcal.estimation.biases import (
+from legcal.calibration.joint_fit.biases import (
     KINDS,
     N_KINDS,
     SharedShifts,
@@ -15,13 +14,19 @@ from legcal.estimation.biases import (
     possible_shifts,
     with_gamma,
 )
-from legcal.estimation.influence import explained_share, scores_of_shifts, with_shifts
-from legcal.estimation.loss import width_to_k
-from legcal.estimation.noise import NoiseModel, estimate_noise, noise_of_the_median
-from legcal.estimation.normal import information
-from legcal.estimation.problem import FitProblem, couple, linearize, offsets_of, with_biases
-from legcal.estimation.solver import Minimum, minimise, robust_cost, steadied
-from legcal.estimation.state import RefinementSettings, State
+from legcal.calibration.joint_fit.influence import explained_share, scores_of_shifts, with_shifts
+from legcal.calibration.joint_fit.normal import information
+from legcal.calibration.joint_fit.problem import (
+    FitProblem,
+    couple,
+    linearize,
+    offsets_of,
+    with_biases,
+)
+from legcal.calibration.joint_fit.solver import Minimum, minimise, robust_cost, steadied
+from legcal.calibration.joint_fit.state import RefinementSettings, State
+from legcal.errors import DidNotConverge
+from legcal.estimation import NoiseModel, estimate_noise, noise_of_the_median, width_to_k
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.vision import EPSILON
 

@@ -12,30 +12,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.estimation.build import with_choices
-from legcal.estimation.choices import Prior
-from legcal.estimation.constraints import Start, following
-from legcal.estimation.determinacy import (
+from legcal.calibration.joint_fit.build import with_choices
+from legcal.calibration.joint_fit.choices import Prior
+from legcal.calibration.joint_fit.constraints import Start, following
+from legcal.calibration.joint_fit.determinacy import (
     Held,
     held_at_nominal,
     mean_length,
     of_values,
     open_directions,
 )
-from legcal.estimation.influence import reduced_jacobian, response
-from legcal.estimation.loss import efficiency, width_to_k
-from legcal.estimation.normal import (
+from legcal.calibration.joint_fit.influence import reduced_jacobian, response
+from legcal.calibration.joint_fit.normal import (
     NormalEquations,
     information,
     inverse_on_range,
     normal_equations,
 )
-from legcal.estimation.parameters import BOARD_SCALE
-from legcal.estimation.problem import FitProblem, Linearization, named_values, offsets_of
-from legcal.estimation.rounds import Fit, first_minimum, fit_in_rounds
-from legcal.estimation.solution import Sensitivity
-from legcal.estimation.state import RefinementSettings, State, intrinsic_of
+from legcal.calibration.joint_fit.parameters import BOARD_SCALE
+from legcal.calibration.joint_fit.problem import FitProblem, Linearization, named_values, offsets_of
+from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.solution import Sensitivity
+from legcal.calibration.joint_fit.state import RefinementSettings, State, intrinsic_of
+from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
+from legcal.estimation import efficiency, width_to_k
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import radius_name
 from legcal.vision import intrinsic_names, intrinsic_unit, shared_cameras, undistort_derivatives
@@ -57,7 +57,7 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
     state : State
         A minimum.
     normal : NormalEquations
-        From :func:`legcal.estimation.normal.information` there.
+        From :func:`legcal.calibration.joint_fit.normal.information` there.
 
     Raises
     ------
@@ -441,7 +441,7 @@ def refuse_other_board(
     state : State
         A first minimum.
     normal : NormalEquations
-        There: :func:`legcal.estimation.normal.information`.
+        There: :func:`legcal.calibration.joint_fit.normal.information`.
     settings : RefinementSettings
 
     Raises
@@ -544,7 +544,7 @@ def sensitivities(
     linear : Linearization
         There.
     normal : NormalEquations
-        There: :func:`legcal.estimation.normal.information`.
+        There: :func:`legcal.calibration.joint_fit.normal.information`.
     whitening : (n_outlines, 2, 2) array
         What *linear* was taken with.
     k : float

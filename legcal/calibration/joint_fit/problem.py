@@ -13,11 +13,10 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from legcal.data import Measurements
-from legcal.estimation.biases import SharedShifts
-from legcal.estimation.choices import Choices
-from legcal.estimation.constraints import Start, n_bonds, with_values
-from legcal.estimation.observations import (
+from legcal.calibration.joint_fit.biases import SharedShifts
+from legcal.calibration.joint_fit.choices import Choices
+from legcal.calibration.joint_fit.constraints import Start, n_bonds, with_values
+from legcal.calibration.joint_fit.observations import (
     ObservedAxes,
     ObservedBoard,
     ObservedOutlines,
@@ -26,7 +25,7 @@ from legcal.estimation.observations import (
     observed_axes,
     readings,
 )
-from legcal.estimation.residuals import (
+from legcal.calibration.joint_fit.residuals import (
     Places,
     Rows,
     axis_residual,
@@ -36,7 +35,8 @@ from legcal.estimation.residuals import (
     places,
     prior_residual,
 )
-from legcal.estimation.state import FittedLegs, Layout, State, components, intrinsic_of
+from legcal.calibration.joint_fit.state import FittedLegs, Layout, State, components, intrinsic_of
+from legcal.data import Measurements
 from legcal.geometry import Array, IntArray
 from legcal.machine import LegGeometry, freedoms, tied_twist, tied_twist_slope, turn_slope
 from legcal.vision import (

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.data import Corners, LegAxes, Measurements, Outlines
 from legcal.errors import DatasetError
-from legcal.estimation.state import FittedLegs
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import LegKind
 from legcal.vision import EPSILON, Board, Camera, shared_cameras

@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
+from legcal.calibration.joint_fit.choices import Choices, Prior
 from legcal.data import Action, View, Wish
 from legcal.errors import DatasetError, UsageError
-from legcal.estimation.choices import Choices, Prior
 from legcal.files import closest
 from legcal.machine import (
     Leg,

@@ -13,7 +13,7 @@ darker, and sideways shifts count twice (:data:`SIDEWAYS`).
 
 Where the gamma of a camera is not told, its outlines move together, each by its own amount, with
 the logarithm of that gamma over the one with which they were measured
-(:mod:`legcal.estimation.gammas`). How far that may be off is known beforehand.
+(:mod:`legcal.calibration.joint_fit.gammas`). How far that may be off is known beforehand.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.estimation.observations import ObservedOutlines
-from legcal.estimation.variances import Effects, estimate_variances
+from legcal.calibration.joint_fit.observations import ObservedOutlines
+from legcal.estimation import Effects, estimate_variances
 from legcal.geometry import Array, IntArray
 
 KINDS = (

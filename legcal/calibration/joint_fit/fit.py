@@ -10,29 +10,33 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from legcal.data import LegAxes, Measurements, Outlines
-from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
-from legcal.estimation.assembly import assemble_solution, comparable_cost
-from legcal.estimation.build import build_fit
-from legcal.estimation.choices import NO_CHOICES, Choices
-from legcal.estimation.constraints import Start, on_constraints
-from legcal.estimation.contradictions import (
+from legcal.calibration.joint_fit.assembly import assemble_solution, comparable_cost
+from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices
+from legcal.calibration.joint_fit.constraints import Start, on_constraints
+from legcal.calibration.joint_fit.contradictions import (
     blaming_what_was_stated,
     refuse_contradicted_priors,
     refuse_contradicted_values,
     refuse_other_board,
     rejected_notes,
 )
-from legcal.estimation.determinacy import held_at_nominal, open_directions, refuse_lost
-from legcal.estimation.loss import width_to_k
-from legcal.estimation.noise import NoiseModel, noise_of_the_median
-from legcal.estimation.normal import information
-from legcal.estimation.observations import SeenBoard
-from legcal.estimation.problem import FitProblem, linearize, offsets_of
-from legcal.estimation.rounds import first_minimum, fit_in_rounds
-from legcal.estimation.solution import Solution
-from legcal.estimation.solver import Minimum
-from legcal.estimation.state import DEFAULT_SETTINGS, FittedLegs, RefinementSettings, State
+from legcal.calibration.joint_fit.determinacy import held_at_nominal, open_directions, refuse_lost
+from legcal.calibration.joint_fit.normal import information
+from legcal.calibration.joint_fit.observations import SeenBoard
+from legcal.calibration.joint_fit.problem import FitProblem, linearize, offsets_of
+from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
+from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.solver import Minimum
+from legcal.calibration.joint_fit.state import (
+    DEFAULT_SETTINGS,
+    FittedLegs,
+    RefinementSettings,
+    State,
+)
+from legcal.data import LegAxes, Measurements, Outlines
+from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
+from legcal.estimation import NoiseModel, noise_of_the_median, width_to_k
 
 _LARGEST_RADIUS_CHANGE = 0.5
 _EQUAL_COSTS = 1e-6  # relative: the same minimum
@@ -54,7 +58,7 @@ def refine(
     Parameters
     ----------
     legs : FittedLegs
-        The mechanism (:func:`legcal.estimation.state.fitted_legs`).
+        The mechanism (:func:`legcal.calibration.joint_fit.state.fitted_legs`).
     measurements : Measurements
         Views, poses and readings [m].
     outlines : Outlines

@@ -12,22 +12,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Measurements, Outlines
-from legcal.errors import NotIdentifiable, NotVisible
-from legcal.estimation.biases import SharedShifts, possible_shifts
-from legcal.estimation.constraints import on_constraints
-from legcal.estimation.influence import explained_share
-from legcal.estimation.noise import NoiseModel
-from legcal.estimation.normal import NormalEquations, of_one_kind
-from legcal.estimation.observations import observed_outlines, of_parts, seen_by
-from legcal.estimation.problem import (
+from legcal.calibration.joint_fit.biases import SharedShifts, possible_shifts
+from legcal.calibration.joint_fit.constraints import on_constraints
+from legcal.calibration.joint_fit.influence import explained_share
+from legcal.calibration.joint_fit.normal import NormalEquations, of_one_kind
+from legcal.calibration.joint_fit.observations import observed_outlines, of_parts, seen_by
+from legcal.calibration.joint_fit.problem import (
     FitProblem,
     Linearization,
     linearize,
     offsets_of,
     with_measurements,
 )
-from legcal.estimation.state import State, components, turned
+from legcal.calibration.joint_fit.state import State, components, turned
+from legcal.data import Measurements, Outlines
+from legcal.errors import NotIdentifiable, NotVisible
+from legcal.estimation import NoiseModel
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import pose_differences
 

@@ -8,9 +8,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit.state import (
+    FittedLegs,
+    Layout,
+    State,
+    components,
+    motions,
+    turned,
+)
 from legcal.data import Measurements
 from legcal.errors import DatasetError, DidNotConverge
-from legcal.estimation.state import FittedLegs, Layout, State, components, motions, turned
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     Demand,

@@ -1,7 +1,7 @@
 """Which parameters the fit looks for, which it leaves as they are, and what is known of them.
 
 Without a choice the fit looks for all kinematic parameters except twists, and for radii with the
-prior of :class:`legcal.estimation.state.RefinementSettings`; intrinsics are fixed.
+prior of :class:`legcal.calibration.joint_fit.state.RefinementSettings`; intrinsics are fixed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Choices:
         What gave way to what.
     least_shared_px : mapping
         Standard deviations that errors which outlines share have at least, by what they are
-        (:data:`legcal.estimation.biases.KINDS`) [px].
+        (:data:`legcal.calibration.joint_fit.biases.KINDS`) [px].
     """
 
     fixed: frozenset[str] = frozenset()

@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit.gammas import EstimatedGamma
+from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.calibration.joint_fit.normal import WeakDirection
 from legcal.data import Outlines
-from legcal.estimation.gammas import EstimatedGamma
-from legcal.estimation.held_out import Posterior
-from legcal.estimation.noise import NoiseModel
-from legcal.estimation.normal import WeakDirection
+from legcal.estimation import NoiseModel
 from legcal.geometry import Array
 from legcal.machine import KinematicParameters, LegGeometry, LegKind, Parametrization
 from legcal.vision import Camera
@@ -115,7 +115,7 @@ class Solution:
         Shifts of outlines that several share, by name [px]: those that the residuals show.
     shared_px : mapping
         Standard deviations of these shifts by what they are, one of
-        :data:`legcal.estimation.biases.KINDS` [px]; empty where residuals show none.
+        :data:`legcal.calibration.joint_fit.biases.KINDS` [px]; empty where residuals show none.
     sensitivities : tuple of Sensitivity
         What mistakes in cameras and radii would do.
     outlines : Outlines

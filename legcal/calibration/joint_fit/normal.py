@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, null_space
 
+from legcal.calibration.joint_fit.constraints import Tangent, tangent
+from legcal.calibration.joint_fit.problem import FitProblem, Linearization, named_jacobian
+from legcal.calibration.joint_fit.residuals import Rows, Sums, summed
+from legcal.calibration.joint_fit.state import State
 from legcal.errors import NotIdentifiable
-from legcal.estimation.constraints import Tangent, tangent
-from legcal.estimation.loss import efficiency
-from legcal.estimation.problem import FitProblem, Linearization, named_jacobian
-from legcal.estimation.residuals import Rows, Sums, summed
-from legcal.estimation.state import State
+from legcal.estimation import efficiency
 from legcal.geometry import Array, BoolArray
 
 _RANGE = 1e-13  # eigenvalues below this part of the largest are rounding
@@ -31,7 +31,7 @@ class NormalEquations:
     """N x = -g with N = [[U, W], [W^T, V]]: kept unknowns first, then one block for each pose.
 
     Poses move inside their constraints: V, W and g_pose belong to coordinates y of
-    :class:`legcal.estimation.constraints.Tangent`.
+    :class:`legcal.calibration.joint_fit.constraints.Tangent`.
 
     Attributes
     ----------
@@ -308,7 +308,7 @@ def named_covariance(problem: FitProblem, state: State, covariance: Array) -> Ar
     problem : FitProblem
     state : State
     covariance : (n_kept, n_kept) array
-        Of all unknowns but poses, as :func:`legcal.estimation.normal.information` has them.
+        Of all unknowns but poses, as :func:`information` has them.
     """
     n = problem.layout.n_named
     by_x = named_jacobian(state, problem.layout, problem.legs)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.estimation.biases import SharedShifts
-from legcal.estimation.normal import NormalEquations, inverse_on_range, normal_equations
-from legcal.estimation.problem import FitProblem, linearize, with_biases
-from legcal.estimation.residuals import Places, Rows
-from legcal.estimation.state import State
+from legcal.calibration.joint_fit.biases import SharedShifts
+from legcal.calibration.joint_fit.normal import NormalEquations, inverse_on_range, normal_equations
+from legcal.calibration.joint_fit.problem import FitProblem, linearize, with_biases
+from legcal.calibration.joint_fit.residuals import Places, Rows
+from legcal.calibration.joint_fit.state import State
 from legcal.geometry import Array
 
 
@@ -116,7 +116,7 @@ def scores_of_shifts(
     possible : SharedShifts
         The shifts that are asked for.
     asked : FitProblem
-        The same problem with all of these, :func:`legcal.estimation.build.with_biases`.
+        The same problem with all of these, :func:`legcal.calibration.joint_fit.build.with_biases`.
 
     Returns
     -------

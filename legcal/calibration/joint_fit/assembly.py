@@ -7,27 +7,32 @@ from dataclasses import replace
 
 import numpy as np
 
-from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements, restore_outlines
-from legcal.estimation.biases import GAMMA_SUFFIX
-from legcal.estimation.contradictions import (
+from legcal.calibration.joint_fit.biases import GAMMA_SUFFIX
+from legcal.calibration.joint_fit.contradictions import (
     focal_lengths,
     refuse_contradicted_priors,
     rejected_notes,
     scale_notes,
     sensitivities,
 )
-from legcal.estimation.determinacy import Held, held_spread, named_units
-from legcal.estimation.gammas import estimated_gammas
-from legcal.estimation.held_out import Posterior
-from legcal.estimation.loss import width_to_k
-from legcal.estimation.noise import NoiseModel
-from legcal.estimation.normal import information, named_covariance, worst_directions
-from legcal.estimation.parameters import known_parameters
-from legcal.estimation.problem import FitProblem, Linearization, linearize, named_values, offsets_of
-from legcal.estimation.rounds import Fit, corner_notes, rejection_reasons
-from legcal.estimation.solution import Solution, Status
-from legcal.estimation.solver import robust_cost
-from legcal.estimation.state import RefinementSettings, State
+from legcal.calibration.joint_fit.determinacy import Held, held_spread, named_units
+from legcal.calibration.joint_fit.gammas import estimated_gammas
+from legcal.calibration.joint_fit.held_out import Posterior
+from legcal.calibration.joint_fit.normal import information, named_covariance, worst_directions
+from legcal.calibration.joint_fit.parameters import known_parameters
+from legcal.calibration.joint_fit.problem import (
+    FitProblem,
+    Linearization,
+    linearize,
+    named_values,
+    offsets_of,
+)
+from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
+from legcal.calibration.joint_fit.solution import Solution, Status
+from legcal.calibration.joint_fit.solver import robust_cost
+from legcal.calibration.joint_fit.state import RefinementSettings, State
+from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements, restore_outlines
+from legcal.estimation import NoiseModel, width_to_k
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import footed, parametrize, radius_name
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from legcal.calibration.joint_fit.biases import GAMMA_SUFFIX
+from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.state import State
 from legcal.data import Outlines, few_views
-from legcal.estimation.biases import GAMMA_SUFFIX
-from legcal.estimation.problem import FitProblem
-from legcal.estimation.state import State
 from legcal.geometry import Array
 
 SEEN_SHARE = 0.5  # of how far a gamma is off that a fit sees, about

@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from legcal.data import LegAxes, Measurements, Outlines
-from legcal.estimation.choices import NO_CHOICES, Choices
-from legcal.estimation.normal import check_counts
-from legcal.estimation.observations import (
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices
+from legcal.calibration.joint_fit.normal import check_counts
+from legcal.calibration.joint_fit.observations import (
     ObservedAxes,
     ObservedBoard,
     ObservedOutlines,
@@ -21,8 +20,8 @@ from legcal.estimation.observations import (
     readings,
     seen_by,
 )
-from legcal.estimation.parameters import BOARD_SCALE
-from legcal.estimation.problem import (
+from legcal.calibration.joint_fit.parameters import BOARD_SCALE
+from legcal.calibration.joint_fit.problem import (
     FirstValues,
     FitProblem,
     Priors,
@@ -30,13 +29,14 @@ from legcal.estimation.problem import (
     couple,
     unknown_intrinsics,
 )
-from legcal.estimation.state import (
+from legcal.calibration.joint_fit.state import (
     DEFAULT_SETTINGS,
     FittedLegs,
     Layout,
     RefinementSettings,
     lay_out,
 )
+from legcal.data import LegAxes, Measurements, Outlines
 from legcal.machine import radius_name
 from legcal.vision import Camera, intrinsic_unit, shared_cameras
 
@@ -56,7 +56,7 @@ def build_fit(
     Parameters
     ----------
     legs : FittedLegs
-        The mechanism (:func:`legcal.estimation.state.fitted_legs`).
+        The mechanism (:func:`legcal.calibration.joint_fit.state.fitted_legs`).
     measurements : Measurements
         Views, poses and readings [m].
     outlines : Outlines

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from legcal.calibration.joint_fit.constraints import Start
+from legcal.calibration.joint_fit.determinacy import open_directions
+from legcal.calibration.joint_fit.normal import information, named_covariance
+from legcal.calibration.joint_fit.problem import FitProblem, linearize
 from legcal.data import LegAxes, Measurements, join_axes
-from legcal.estimation.constraints import Start
-from legcal.estimation.determinacy import open_directions
-from legcal.estimation.noise import NoiseModel
-from legcal.estimation.normal import information, named_covariance
-from legcal.estimation.problem import FitProblem, linearize
+from legcal.estimation import NoiseModel
 from legcal.geometry import Array
 
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from legcal.calibration.joint_fit.constraints import on_constraints
+from legcal.calibration.joint_fit.determinacy import mean_length, named_units
+from legcal.calibration.joint_fit.normal import normal_equations
+from legcal.calibration.joint_fit.problem import FitProblem, Linearization, Priors, linearize
+from legcal.calibration.joint_fit.state import State
 from legcal.errors import DidNotConverge
-from legcal.estimation.constraints import on_constraints
-from legcal.estimation.determinacy import mean_length, named_units
-from legcal.estimation.loss import cost_of, width_to_k
-from legcal.estimation.normal import normal_equations
-from legcal.estimation.problem import FitProblem, Linearization, Priors, linearize
-from legcal.estimation.state import State
+from legcal.estimation import cost_of, width_to_k
 from legcal.geometry import Array
 
 _FIRST_DAMPING = 1e-6
@@ -74,7 +74,7 @@ def minimise(
     state : State
         Where to start.
     whitening : (n_outlines, 2, 2) array
-        Weights of the outlines, as in :func:`legcal.estimation.problem.linearize`.
+        Weights of the outlines, as in :func:`legcal.calibration.joint_fit.problem.linearize`.
     width : float
         Whitened distance at which the loss turns from quadratic to linear; infinite for none.
     max_iterations : int

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit.constraints import platform_poses
+from legcal.calibration.joint_fit.solution import Sensitivity
+from legcal.calibration.joint_fit.state import components
 from legcal.errors import DidNotConverge
-from legcal.estimation.constraints import platform_poses
-from legcal.estimation.solution import Sensitivity
-from legcal.estimation.state import components
 from legcal.geometry import Array
 from legcal.machine import (
     LegGeometry,
