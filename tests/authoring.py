@@ -8,7 +8,7 @@ import yaml
 
 from legcal.machine.assembly import create_model
 from legcal.machine.description import Description
-from legcal.machine.description_table import read_table
+from legcal.machine.description_table import read_description
 from legcal.machine.leg import LegKind, main_cylinders
 from legcal.machine.model import Mechanism
 
@@ -38,7 +38,7 @@ def write_table(folder: Path, **changes: Any) -> Path:
 
 
 def described(folder: Path, **changes: Any) -> Description:
-    return read_table(write_table(folder, **changes))
+    return read_description(write_table(folder, **changes))
 
 
 def made(folder: Path, **changes: Any) -> Mechanism:

@@ -10,7 +10,7 @@ import yaml
 
 from legcal.data.axes import write_axes
 from legcal.data.measurements import Measurements
-from legcal.geometry.motions import motion_to_xyz_quat
+from legcal.files import motion_to_xyz_quat
 from legcal.machine.load import load_mechanism
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb

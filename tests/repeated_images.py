@@ -12,7 +12,7 @@ import yaml
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry.motions import motion_to_xyz_quat
+from legcal.files import motion_to_xyz_quat
 from legcal.geometry.types import Array
 from legcal.machine.load import load_mechanism
 from legcal.machine.model import Mechanism

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.motions import roll_pitch_yaw
 from legcal.machine.assembly import assemble, create_model, urdf_text, yaml_text
-from legcal.machine.description_table import read_table
+from legcal.machine.description_table import read_description
 from legcal.machine.files import shipped_names
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import LegKind
@@ -44,7 +44,7 @@ def test_every_shipped_model_has_a_table_of_its_name() -> None:
 
 @pytest.mark.parametrize("table", [*TABLES, REAL / "table.yaml"], ids=lambda path: path.stem)
 def test_shipped_models_are_what_their_tables_give_byte_for_byte(table: Path) -> None:
-    machine = assemble(read_table(table))
+    machine = assemble(read_description(table))
     top = REAL if table.parent == REAL else ROOT
     for path, text in (
         (top / "models" / f"{machine.name}.yaml", yaml_text(machine)),
@@ -60,7 +60,7 @@ def test_shipped_models_are_what_their_tables_give_byte_for_byte(table: Path) ->
 @pytest.mark.parametrize("table", TABLES, ids=lambda path: path.stem)
 def test_shipped_models_are_as_told_and_far_from_singular(table: Path) -> None:
     mechanism = load_mechanism(table.stem)
-    check_same(mechanism, read_table(table))
+    check_same(mechanism, read_description(table))
     types, mobility = EXPECTED[table.stem]
     assert " ".join(leg.type for leg in mechanism.legs) == types
     assert mechanism.mobility == mobility == len(mechanism.motors)
@@ -296,7 +296,7 @@ def test_a_csv_gives_the_same_files_as_the_yaml(tmp_path: Path) -> None:
     ):
         rows.append(f"RPS,{x},{y},{bx},{by},380,0,150,14,9,mm")
     path.write_text("\n".join(rows))
-    in_csv = assemble(read_table(path))
+    in_csv = assemble(read_description(path))
     assert urdf_text(in_csv) == urdf_text(in_yaml)
     assert yaml_text(in_csv) == yaml_text(in_yaml)
     assert write_table(tmp_path).exists()

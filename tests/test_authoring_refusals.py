@@ -10,7 +10,7 @@ from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, U
 from legcal.machine import assembly as create
 from legcal.machine.assembly import Family, assemble, create_model, describe_family
 from legcal.machine.assembly import described as asked
-from legcal.machine.description_table import read_table
+from legcal.machine.description_table import read_description
 
 SPS = {"type": "SPS"}
 ROD = {"type": None, "types": ["SPU", "SPU", "SS"]}
@@ -149,25 +149,29 @@ def test_all_problems_of_a_table_are_told_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "unit", "message"),
     [
-        ("type,base_x\n", "mm", r"found 1 lines, needed a header and one line for each leg"),
+        ("type,base_x\n", "mm", r"found a header and no row, needed one row for each leg"),
         ("type,base_x\nRPS,1\n", "mm", r"found no column 'base_y', needed it"),
-        ("{h},bse_z\n{r},0\n", "mm", r"column 'bse_z' .* did you mean 'base_z'"),
-        ("{h},type\n{r},RPS\n", "mm", r"the column 'type' could not be used: found it twice"),
-        ("{h}\n{r},1\n", "mm", r"line 2: the leg could not be read: found 6 cells, needed 5"),
-        ("{h}\nRPS,1,x,3,4\n", "mm", r"line 2: base_y could not be read: found 'x', needed a num"),
+        ("{h},bse_z\n{r},0\n", "mm", r"unknown column 'bse_z', .* did you mean 'base_z'"),
+        ("{h},type\n{r},RPS\n", "mm", r"found the column 'type' 2 times, needed it once"),
+        ("{h}\n{r},1\n", "mm", r"\(line 2\): the row could not be used: found 6 cells, needed 5"),
+        (
+            "{h}\nRPS,1,x,3,4\n",
+            "mm",
+            r"line 2\), column base_y: the leg could .* found 'x', needed a",
+        ),
         ("{h}\n{r}\n", None, r"found no unit, needed m or mm; add a column 'unit', or give --unit"),
         ("{h},unit\n{r},mm\n{r},m\n", None, r"found m and mm, needed the same in all lines"),
         ("{h},unit\n{r},mm\n{r},mm\n", "m", r"found --unit m and 'mm' in the table"),
-        ("{h}\n{r}\nRPS,,2,3,4\n", "mm", r"line 3: base_x could not be read: found nothing"),
+        ("{h}\n{r}\nRPS,,2,3,4\n", "mm", r"line 3\), column base_x: .* found an empty cell"),
         ("{h}\n{r}\n,1,2,3,4\n", "mm", r"types.1 could not be used: found the leg type nothing"),
         ("{h},travel_low\n{r},0\n{r},0\n", "mm", r"travel could not be used"),
-        ("{h}\nRPS,nan,2,3,4\n{r}\n", "mm", r"line 2: base_x could not be read: found 'nan'"),
-        ("type;base_x\nRPS;1\n", "mm", r"found ';' between the columns, needed ',' there"),
-        ("type\tbase_x\nRPS\t1\n", "mm", r"found tabs between the columns, needed ',' there"),
+        ("{h}\nRPS,nan,2,3,4\n{r}\n", "mm", r"line 2\), column base_x: .* found 'nan'"),
+        ("type;base_x\nRPS;1\n", "mm", r"found 'type;base_x' in one column, needed commas"),
+        ("type\tbase_x\nRPS\t1\n", "mm", r"found '.*' in one column, needed commas"),
         (
             "{h},radius,rod\n{r},9,8\n",
             "mm",
-            r"line 2: the radius could not be decided",
+            r"line 2\), columns radius, tube, rod: the radius could",
         ),
     ],
 )
@@ -176,32 +180,32 @@ def test_what_a_csv_cannot_say(tmp_path: Path, text: str, unit: str | None, mess
     header, row = "type,base_x,base_y,platform_x,platform_y", "RPS,1,2,3,4"
     path.write_text(text.format(h=header, r=row))
     with pytest.raises(ModelError, match=message):
-        read_table(path, unit)
+        read_description(path, unit)
 
 
 def test_a_csv_whose_file_name_is_no_name_asks_for_one(tmp_path: Path) -> None:
     path = tmp_path / "my machine (2).csv"
     path.write_text("type,base_x,base_y,platform_x,platform_y\n" + "SS,1,2,3,4\nSS,5,6,7,8\n")
     with pytest.raises(ModelError, match=r"found 'my machine \(2\)', needed letters.* --name NAME"):
-        read_table(path, "mm")
-    assert read_table(path, "mm", "mine").name == "mine"
+        read_description(path, "mm")
+    assert read_description(path, "mm", "mine").name == "mine"
 
 
 def test_a_unit_may_be_told_beside_the_table(tmp_path: Path) -> None:
-    machine = read_table(write_table(tmp_path, unit=None), unit="mm")
+    machine = read_description(write_table(tmp_path, unit=None), unit="mm")
     assert machine.legs[0].offset == 0.38
     with pytest.raises(ModelError, match="found --unit m and 'mm' in the table"):
-        read_table(write_table(tmp_path), unit="m")
+        read_description(write_table(tmp_path), unit="m")
 
 
 def test_tables_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="found no such file"):
-        read_table(tmp_path / "none.yaml")
+        read_description(tmp_path / "none.yaml")
     with pytest.raises(ModelError, match="found no such file"):
-        read_table(tmp_path / "none.csv")
+        read_description(tmp_path / "none.csv")
     (tmp_path / "list.yaml").write_text("- 1\n")
     with pytest.raises(ModelError, match="needed 'key: value' lines"):
-        read_table(tmp_path / "list.yaml")
+        read_description(tmp_path / "list.yaml")
 
 
 GOOD = Family("6-UPS", "mm", 300.0, 150.0, 400.0)
@@ -285,7 +289,7 @@ def test_a_model_that_does_not_load_leaves_nothing_behind(
     def refuse(path: Path) -> None:
         raise OutOfClass(f"{path}: this machine is outside the method.")
 
-    machine = read_table(write_table(tmp_path))
+    machine = read_description(write_table(tmp_path))
     monkeypatch.setattr(create, "load_mechanism", refuse)
     with pytest.raises(LegcalError, match=r"table.yaml: models/tripod.yaml: this machine"):
         create_model(machine, tmp_path / "new" / "folder")

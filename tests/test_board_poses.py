@@ -7,7 +7,7 @@ import pytest
 from boards import APRILGRID, CHARUCO, CHESSBOARD, LENS, before, seen_at
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data.corners import Corners, choose_corners, found_corners, join_corners
+from legcal.data.corners import Corners, found_corners, join_corners
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry.types import Array
@@ -108,7 +108,7 @@ def test_a_view_without_the_board_has_no_pose_and_is_refused_only_where_it_is_ne
 
 def test_corners_on_a_line_give_no_pose() -> None:
     corners = _corners(CHARUCO, [before(CHARUCO)], np.random.default_rng(0))
-    line = choose_corners(corners, corners.corner < CHARUCO.grid[0])
+    line = corners.choose(corners.corner < CHARUCO.grid[0])
     assert camera_poses(line, CHARUCO, _measurements((1,))).views == (None,)
 
 

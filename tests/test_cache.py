@@ -16,12 +16,10 @@ from legcal.data.cache import fingerprint, plan_dataset, plan_detection, store_o
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset, load_dataset
 from legcal.data.outlines import (
     Outlines,
-    choose_outlines,
     is_edited,
     join_outlines,
     merge_edited,
     no_outlines,
-    outline_keys,
     write_observations,
 )
 from legcal.errors import DatasetError
@@ -120,9 +118,9 @@ def test_given_rows_that_the_user_removed_are_detected() -> None:
 def test_edited_rows_win_over_detected_ones() -> None:
     detected, by_hand = outlines_of(1), edited(outlines_of(2, rows=(1,), legs=(0, 2)))
     merged = merge_edited(detected, by_hand)
-    assert outline_keys(merged) == outline_keys(detected)
-    assert_same(choose_outlines(merged, is_edited(merged)), by_hand)
-    others = choose_outlines(merged, ~is_edited(merged))
+    assert merged.row_keys() == detected.row_keys()
+    assert_same(merged.choose(is_edited(merged)), by_hand)
+    others = merged.choose(~is_edited(merged))
     assert len(others) == len(detected) - len(by_hand)
 
 

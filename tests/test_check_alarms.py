@@ -12,7 +12,6 @@ from legcal import calibrate, check
 from legcal.calibration.joint_fit.fit import refine
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.measurements import Measurements
-from legcal.data.outlines import choose_outlines
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
@@ -98,7 +97,7 @@ def planar(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _of_one_leg(dataset: Dataset) -> Dataset:
     assert dataset.observations is not None
-    shown = choose_outlines(dataset.observations, dataset.observations.leg == 0)
+    shown = dataset.observations.choose(dataset.observations.leg == 0)
     return replace(dataset, observations=shown)
 
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from legcal.data.corners import (
     COLUMNS,
     Corners,
-    choose_corners,
     format_corners,
     found_corners,
     join_corners,
@@ -20,7 +19,7 @@ from legcal.data.corners import (
     write_corners,
 )
 from legcal.data.measurements import Measurements, View
-from legcal.data.order import canonical_order, corners_at, reorder_corners, restore_corners
+from legcal.data.rows import canonical_order
 from legcal.errors import DatasetError
 
 HEAD = ",".join(COLUMNS)
@@ -70,15 +69,15 @@ def test_corners_are_read_as_they_were_written(corners: Corners) -> None:
 @given(tables())
 def test_order_of_work_and_back_is_the_order_of_rows_and_numbers(corners: Corners) -> None:
     order = canonical_order(MEASUREMENTS, ["leg1"])
-    back = restore_corners(reorder_corners(corners, order), order)
-    assert _same(back, choose_corners(corners, np.lexsort([corners.corner, corners.row])))
+    back = order.restore(order.reorder(corners))
+    assert _same(back, corners.choose(np.lexsort([corners.corner, corners.row])))
 
 
 def test_corners_of_some_rows_are_theirs() -> None:
     corners = found_corners(
         np.array([0, 1, 2]), np.array([3, 4, 5]), np.ones((3, 2)), np.full(3, 0.1)
     )
-    some = corners_at(join_corners([corners]), np.array([2, 0]))
+    some = join_corners([corners]).at(np.array([2, 0]))
     assert some.row.tolist() == [1, 0]
     assert some.corner.tolist() == [3, 5]
 
@@ -113,8 +112,8 @@ def test_an_edited_corner_wins_over_the_detected_one(tmp_path: Path) -> None:
         ("c2,a.png,3,1,,0.1,used,,detected", "column v: .* found an empty cell"),
         ("c2,a.png,3,1,nan,0.1,used,,detected", "column v: .* found 'nan'"),
         ("c2,a.png,3,470,2,0.1,used,,detected", "column u: .* found 470 px, .* inside the image"),
-        ("c2,a.png,3,1,2,0,used,,detected", "column sigma: .* found 0, needed a standard dev"),
-        ("c2,a.png,3,1,2,-0.1,used,,detected", "column sigma: .* found -0.1"),
+        ("c2,a.png,3,1,2,0,used,,detected", "column sigma: .* found '0', needed a standard dev"),
+        ("c2,a.png,3,1,2,-0.1,used,,detected", "column sigma: .* found '-0.1'"),
         ("c2,a.png,3,1,2,0.1,good,,detected", "column verdict: .* needed used or rejected"),
         ("c2,a.png,3,1,2,0.1,used,,me", "column source: .* needed detected or edited"),
         ("c2,a.png,3,1,2,0.1,used", "found 7 cells, needed 9"),

@@ -8,16 +8,13 @@ from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, assert_same, outlines_of, recorded
 
 from legcal.data.measurements import Measurements
-from legcal.data.order import (
+from legcal.data.rows import (
     Order,
     canonical_order,
     inverse,
     reorder_measurements,
-    reorder_outlines,
-    restore_outlines,
     sort_rows,
 )
-from legcal.data.outlines import sort_outlines
 
 FAST = settings(deadline=None, max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -81,13 +78,13 @@ def test_reordered_rows_keep_their_views_labels_poses_and_readings(seed: int) ->
 def test_restored_outlines_are_those_before_reordering(seed: int) -> None:
     outlines, order = outlines_of(seed), shuffled(seed)
     order = replace(order, rows=np.random.default_rng(seed).permutation(4))
-    assert_same(restore_outlines(reorder_outlines(outlines, order), order), sort_outlines(outlines))
+    assert_same(order.restore(order.reorder(outlines)), outlines.sort())
 
 
 def test_reordered_outlines_stay_with_their_image_and_leg() -> None:
     outlines = outlines_of(1, rows=(0, 1))
     order = Order(np.array([1, 0]), np.array([1, 0]), np.array([2, 0, 1]))
-    found = reorder_outlines(outlines, order)
+    found = order.reorder(outlines)
     assert found.part[0] == "leg, C_rod"
     assert (found.row[0], found.leg[0]) == (0, 0)
     np.testing.assert_array_equal(found.h[0], outlines.h[10])

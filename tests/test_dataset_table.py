@@ -71,7 +71,7 @@ def test_rows_of_one_label_with_other_readings_are_refused(folder: Folder) -> No
     folder.rows[1].update(dict(zip(JOINTS, readings(0), strict=True)))
     folder.rows[1][JOINTS[2]] += 1e-4
     message = refused(folder)
-    assert "row 1 (line 2), column leg3_prismatic: pose p could not be used" in message
+    assert "row 1 (line 2), column leg3_prismatic: the pose p could not be used" in message
     assert "differ by 0.0001 m, needed one reading within 10 sigma (2e-05 m)" in message
 
 
@@ -81,10 +81,13 @@ def test_rows_of_one_label_with_other_readings_are_refused(folder: Folder) -> No
         (["view", "image", *JOINTS, "leg7_prismatic"], "found the unknown column 'leg7_prismatic'"),
         (
             ["view", "image", *JOINTS, "Pose"],
-            "found the unknown column 'Pose', needed view, image,",
+            "found the unknown column 'Pose', needed those of a table of measurements; did you",
         ),
-        (["view", "image", *JOINTS[:5]], "found no column 'leg6_prismatic', needed the readings"),
-        (["image", *JOINTS], "found no column 'view', needed one; add the column"),
+        (
+            ["view", "image", *JOINTS[:5]],
+            "found no column 'leg6_prismatic', needed it (reading, in",
+        ),
+        (["image", *JOINTS], "found no column 'view', needed it; add the column"),
         (["view", "image", *JOINTS, JOINTS[0]], "found the column 'leg1_prismatic' 2 times"),
         (["view", "image", *JOINTS, ""], "found the unknown column ''"),
     ],

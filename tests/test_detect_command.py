@@ -16,8 +16,8 @@ from outline_tables import assert_same
 from repeated_images import SIZE, RepeatedImages, repeated_images
 
 from legcal import cli, detect, load_dataset
-from legcal.data.order import canonical_order
 from legcal.data.outlines import QUALITY, read_observations
+from legcal.data.rows import canonical_order
 from legcal.errors import DatasetError, UsageError
 from legcal.perception.drawing import Detection
 from legcal.perception.examine import Observed, observe

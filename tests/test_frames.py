@@ -6,14 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.motions import (
-    frame_on_points,
-    motion_from_xyz_quat,
-    motion_of,
-    motion_to_xyz_quat,
-    product,
-)
-from legcal.geometry.types import Array
+from legcal.files import motion_from_xyz_quat, motion_to_xyz_quat
+from legcal.geometry import Array, frame_on_points, motion_of, product
 
 FAST = settings(deadline=None, max_examples=50)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -20,7 +20,6 @@ from legcal.calibration.joint_fit.constraints import start_from
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
 from legcal.data.measurements import Measurements
-from legcal.data.order import outlines_at
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
 
@@ -63,7 +62,7 @@ def _of_rows(
     images = tuple(m.image[i] for i in rows.tolist())
     some = replace(m, image=images, view=m.view[rows], pose=np.arange(len(rows)), q=m.q[rows])
     poses = disturbed_start(session).T_Rb_Re
-    return some, outlines_at(outlines, rows), tuple(poses[k] for k in m.pose[rows].tolist())
+    return some, outlines.at(rows), tuple(poses[k] for k in m.pose[rows].tolist())
 
 
 def _ratios(session: Session, level: float) -> Array:

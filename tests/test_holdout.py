@@ -11,7 +11,7 @@ from outline_tables import outlines_of
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at, split_images
 from legcal.data.measurements import Measurements
-from legcal.data.order import Order, measurements_at, outlines_at, reorder_measurements
+from legcal.data.rows import Order, measurements_at, reorder_measurements
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry.types import IntArray
 
@@ -92,7 +92,7 @@ def test_poses_and_labels_of_a_part_follow_its_rows() -> None:
     assert part.pose.tolist() == [0, 0, 1, 1]
     assert part.pose_labels == ("p2", "p5")
     assert part.image == tuple(m.image[row] for row in (17, 2, 5, 35))
-    assert len(outlines_at(outlines_of(3, range(4)), np.zeros(0, dtype=np.intp))) == 0
+    assert len(outlines_of(3, range(4)).at(np.zeros(0, dtype=np.intp))) == 0
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.2, 20.0, float("nan"), float("inf")])

@@ -8,8 +8,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = (
-    "files",
     "geometry",
+    "files",
     "machine",
     "vision",
     "data",

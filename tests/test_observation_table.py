@@ -10,16 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
 
-from legcal.data.measurements import View
+from legcal.data.measurements import View, row_names
 from legcal.data.outlines import (
-    COLUMNS,
     ENCODING,
     QUALITY,
     Outlines,
     no_outlines,
     read_observations,
     reject_unused_legs,
-    row_names,
     write_observations,
 )
 from legcal.errors import DatasetError
@@ -71,7 +69,7 @@ def test_table_without_quality_is_read(tmp_path: Path) -> None:
     outlines = outlines_of(3)
     path = written(tmp_path, outlines)
     with path.open(newline="") as file:
-        lines = [cells[: len(COLUMNS)] for cells in csv.reader(file)]
+        lines = [cells[: -len(QUALITY) - len(ENCODING)] for cells in csv.reader(file)]
     with path.open("w", newline="") as file:
         csv.writer(file).writerows(lines)
     found = read(path)
@@ -100,7 +98,10 @@ def test_quality_that_is_no_number_is_refused(tmp_path: Path, cell: str) -> None
     [
         ({"gamma": "0"}, "column gamma: .*found '0', needed a number above 0"),
         ({"by_gamma": "nan"}, "column by_gamma: .*found 'nan', needed a finite number"),
-        ({"by_gamma": ""}, "columns gamma, by_gamma: .*found one of them, needed both or none"),
+        (
+            {"by_gamma": ""},
+            "column by_gamma: .*found an empty cell, needed a finite number beside gamma",
+        ),
     ],
 )
 def test_gamma_that_cannot_be_is_refused(tmp_path: Path, cells: dict[str, str], words: str) -> None:
@@ -210,7 +211,7 @@ def test_rows_without_image_are_named_by_label_or_else_by_number() -> None:
         ({"a": "0", "b": "0", "c": "0"}, "found a vector of norm 0, needed a unit vector"),
         (
             {"u0": "5", "u1": "5", "v0": "7", "v1": "7"},
-            "columns u0 to v1: .* found both ends at the same pixel",
+            "columns u0, v0, u1, v1: .* found both ends at the same pixel",
         ),
         ({"s00": "-1"}, "columns s00, s01, s11: .* not positive definite"),
         ({"s00": "1", "s01": "2", "s11": "1"}, r"not positive definite \(1, 2, 1\)"),

@@ -14,7 +14,7 @@ from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.observations import observed_axes
 from legcal.calibration.joint_fit.problem import FitProblem, linearize
 from legcal.calibration.joint_fit.solution import Solution, joints_of
-from legcal.data.axes import LegAxes, axes_from_outlines, choose_axes
+from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
@@ -73,7 +73,7 @@ def test_exact_axes_give_the_truth(joints: float, coplanar: bool) -> None:
 
 def test_legs_that_no_image_shows_are_found_from_their_encoders() -> None:
     session = axes_session(15)
-    shown = choose_axes(session.axes, np.flatnonzero(session.axes.leg != 2))
+    shown = session.axes.choose(np.flatnonzero(session.axes.leg != 2))
     found = refine(session.legs, session.measurements, no_outlines(), session.start(), axes=shown)
     assert np.abs(session.errors(found.parameters)).max() < 1e-9
 
@@ -162,6 +162,6 @@ def test_axes_in_degrees_are_refused(session: AxesSession) -> None:
 def test_fewer_equations_than_unknowns_are_refused_with_their_numbers(
     session: AxesSession,
 ) -> None:
-    few = choose_axes(session.axes, np.arange(8))
+    few = session.axes.choose(np.arange(8))
     with pytest.raises(NotIdentifiable, match=r"24 images with 8 axes and 144 readings give 176"):
         _fit(session, session.measurements, few)

@@ -23,7 +23,7 @@ from legcal.calibration.joint_fit.state import fitted_legs
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
-from legcal.geometry.motions import motion_from_xyz_quat
+from legcal.files import motion_from_xyz_quat
 from legcal.machine.leg import LegKind
 from legcal.machine.load import load_mechanism
 

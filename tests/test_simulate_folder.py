@@ -7,18 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from outline_tables import LEG_NAMES, outlines_of, recorded
 from rich.console import Console
 from simulated import files_of, settings, small_camera
 
 import legcal
+from legcal.data.outlines import format_observations
 from legcal.errors import OutOfResources, UsageError
 from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
 from legcal.simulation.session import simulate, summary_table
 
 FEW = settings(poses=1, views=1)
 OWN = ("dataset.yaml", "images/c1_p01.png", "models/a.yaml", "truth/models/a.yaml")
-EDITED = "view,source\nc1,edited\n"
-DETECTED = "view,source\nc1,detected\n"
+DETECTED = format_observations(outlines_of(1), recorded(), LEG_NAMES)
+EDITED = DETECTED.replace("detected", "edited", 1)
 
 
 def write(folder: Path, files: dict[str, str]) -> None:

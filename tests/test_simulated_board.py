@@ -12,7 +12,7 @@ from boards import CHARUCO
 
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.geometry.motions import motion_from_xyz_quat
+from legcal.files import motion_from_xyz_quat
 from legcal.machine.load import load_mechanism
 from legcal.machine.model import Mechanism
 from legcal.perception.boards import camera_poses

@@ -300,7 +300,7 @@ HEAD = "leg1_prismatic,leg2_prismatic,leg3_prismatic\n"
         (HEAD, "found a header and no row"),
         (HEAD.replace(",", ";") + "0;0;0\n", "needed commas between columns"),
         (HEAD.replace("leg2", "leg9") + "0,0,0\n", "unknown column 'leg9_prismatic'"),
-        (HEAD.replace("leg2", "leg9") + "0,0,0\n", "'leg2_prismatic' 0 times"),
+        (HEAD.replace("leg2", "leg9") + "0,0,0\n", "no column 'leg2_prismatic'"),
         (HEAD.replace("leg2", "leg1") + "0,0,0\n", "'leg1_prismatic' 2 times"),
         (HEAD + "0,0,0\n0,0\n", r"row 2 \(line 3\): the row could not be used: found 2 cells"),
         (HEAD + "0,0,\n", r"row 1 \(line 2\), column leg3_prismatic: .* found an empty cell"),

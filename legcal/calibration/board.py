@@ -22,8 +22,6 @@ from legcal.data import (
     Dataset,
     LegAxes,
     Measurements,
-    corners_at,
-    reorder_corners,
 )
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry import IntArray
@@ -45,7 +43,7 @@ class BoardViews:
 
     def seen(self, rows: IntArray) -> SeenBoard:
         """Return the board in some of the images."""
-        return SeenBoard(self.board, corners_at(self.corners, rows))
+        return SeenBoard(self.board, self.corners.at(rows))
 
     def judged(self, solution: Solution) -> Corners:
         """Return the corners of all images, those that a fit left out rejected."""
@@ -118,7 +116,7 @@ def observe_board(run: CalibrationRun) -> BoardViews | None:
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
     needed = {view.name for view in used if view.hand_held}
     if dataset.corners is not None:
-        corners = reorder_corners(dataset.corners, run.order)
+        corners = run.order.reorder(dataset.corners)
     else:
         rows = [row for row, image in enumerate(measurements.image) if image]
         load = dataset.image_reader(run.order.rows.tolist())

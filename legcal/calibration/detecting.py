@@ -18,12 +18,10 @@ from legcal.calibration.run import CalibrationRun, start_run
 from legcal.data import (
     Dataset,
     Outlines,
-    choose_outlines,
     few_views,
     inverse,
     load_dataset,
     reject_unused_legs,
-    restore_outlines,
 )
 from legcal.errors import DatasetError
 from legcal.files import output_path
@@ -144,7 +142,7 @@ def _detected(run: CalibrationRun, images: IntArray) -> Detection:
     return _in_file_order(
         run,
         images,
-        choose_outlines(seen.outlines, kept),
+        seen.outlines.choose(kept),
         replace(placement.scene, T_base_camera=drawn),
         seen.photographs.cylinders,
         placement.unplaced,
@@ -164,7 +162,7 @@ def _in_file_order(
     """Return what was found in the order of the files."""
     dataset, order = run.dataset, run.order
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
-    restored = restore_outlines(outlines, order)
+    restored = order.restore(outlines)
     return Detection(
         dataset=dataset,
         outlines=reject_unused_legs(restored, dataset.measurements, dataset.mechanism.leg_names),

@@ -42,7 +42,6 @@ from legcal.data import (
     axes_from_outlines,
     dataset_at,
     few_views,
-    outlines_at,
     reject_unused_legs,
 )
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
@@ -135,7 +134,7 @@ def rough_scene(run: CalibrationRun) -> tuple[Scene, BoardViews | None]:
 
 def _fit(part: CalibrationRun, outlines: Outlines, scene: Scene, board: BoardViews | None) -> Found:
     """Run the four steps, then the joint fit, with the outlines of all images."""
-    seen = outlines_at(outlines, part.rows)
+    seen = outlines.at(part.rows)
     seen = reject_unused_legs(seen, part.measurements, part.mechanism.leg_names)
     if part.every_leg:
         _refuse_unseen_legs(part, seen)

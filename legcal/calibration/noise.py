@@ -28,7 +28,6 @@ from legcal.data import (
     canonical_order,
     load_dataset,
     no_outlines,
-    outline_keys,
     reorder_measurements,
 )
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
@@ -153,9 +152,9 @@ def outline_differences(
         The legs, in the order of the measurements.
     """
     group_of = {row: k for k, group in enumerate(repeats) for row in group.rows.tolist()}
-    place = {key: i for i, key in enumerate(outline_keys(second)) if second.used[i]}
+    place = {key: i for i, key in enumerate(second.row_keys()) if second.used[i]}
     found: dict[tuple[int, int, str, int], list[Array]] = {}
-    for i, (row, leg, part, edge) in enumerate(outline_keys(first)):
+    for i, (row, leg, part, edge) in enumerate(first.row_keys()):
         j = place.get((row, leg, part, edge))
         if j is None or not first.used[i]:
             continue

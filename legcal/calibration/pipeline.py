@@ -31,9 +31,7 @@ from legcal.data import (
     Wish,
     dataset_at,
     load_dataset,
-    outlines_at,
     reject_unused_legs,
-    restore_corners,
     split_images,
     wishes_of_call,
 )
@@ -134,7 +132,7 @@ def calibrate(
     kept = [] if found.other_radii else run.keep_outlines(found.outlines, found.notes)
     # From here on in the order of the files.
     solution = in_file_order(found.solution, found.part.own_order, fitted)
-    corners = None if found.corners is None else restore_corners(found.corners, run.order)
+    corners = None if found.corners is None else run.order.restore(found.corners)
     notes = (
         *dataset.notes,
         *found.notes,
@@ -205,7 +203,7 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
 def _compare_held_out(run: CalibrationRun, found: Found, file_rows: IntArray) -> HeldOut:
     """Return what the images that were kept aside say of the fit."""
     aside, solution = run.part(run.here(file_rows)), found.solution
-    outlines = outlines_at(found.outlines, aside.rows)
+    outlines = found.outlines.at(aside.rows)
     outlines = reject_unused_legs(outlines, aside.measurements, aside.mechanism.leg_names)
     poses = aside.poses_by(solution.legs)
     return compare_held_out(

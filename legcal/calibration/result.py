@@ -27,8 +27,7 @@ from legcal.data import (
     write_observations,
 )
 from legcal.errors import DidNotConverge
-from legcal.files import result_folder
-from legcal.geometry import motion_to_xyz_quat
+from legcal.files import motion_to_xyz_quat, result_folder
 from legcal.machine import (
     LegGeometry,
     LegKind,

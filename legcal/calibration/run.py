@@ -30,16 +30,12 @@ from legcal.data import (
     Measurements,
     Order,
     Outlines,
-    axes_at,
     canonical_order,
     fingerprint,
     inverse,
     measurements_at,
     plan_dataset,
-    reorder_axes,
     reorder_measurements,
-    reorder_outlines,
-    restore_outlines,
     row_names,
     store_outlines,
 )
@@ -90,7 +86,7 @@ class CalibrationRun:
             load=self.dataset.image_reader(self.order.rows.tolist()),
             run=self.pool,
             detect=np.sort(inverse(self.order.rows)[self.plan.detect]),
-            keep=reorder_outlines(self.plan.keep, self.order),
+            keep=self.order.reorder(self.plan.keep),
         )
 
     @cached_property
@@ -137,7 +133,7 @@ class CalibrationRun:
         return replace(
             self,
             measurements=measurements_at(self.measurements, rows),
-            axes=None if self.axes is None else axes_at(self.axes, rows),
+            axes=None if self.axes is None else self.axes.at(rows),
             rows=self.rows[rows],
         )
 
@@ -158,7 +154,7 @@ class CalibrationRun:
         """Leave outlines and notes on images beside the dataset; return a note if that fails."""
         if len(self.plan.detect) == 0:
             return []
-        restored = restore_outlines(outlines, self.order)
+        restored = self.order.restore(outlines)
         note = store_outlines(self.dataset, restored, self.fingerprint, self.plan.given, notes)
         return [note] if note else []
 
@@ -186,7 +182,7 @@ def start_run(
         fingerprint=current,
         mechanism=dataset.mechanism.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
-        axes=None if dataset.axes is None else reorder_axes(dataset.axes, order),
+        axes=None if dataset.axes is None else order.reorder(dataset.axes),
         rows=np.arange(dataset.measurements.n_rows),
         pool=pool,
         progress=progress,

@@ -7,8 +7,6 @@ standard deviations, which are taken for true. Angles in radians, lengths in met
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,10 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.data.measurements import Measurements
-from legcal.data.outlines import Outlines, number_in, place_in_measurements, row_names, rows_by_name
-from legcal.errors import DatasetError, NotVisible
-from legcal.files import describe, read_named_rows, write_atomically
+from legcal.data.measurements import (
+    Measurements,
+    find_legs,
+    find_rows,
+    places,
+    refuse_unknown_legs,
+    refuse_unknown_rows,
+)
+from legcal.data.outlines import Outlines
+from legcal.data.rows import Rows
+from legcal.errors import NotVisible
+from legcal.files import Column, format_table, read_table, write_atomically
 from legcal.geometry import Array, IntArray, normal_basis
 from legcal.vision import (
     Camera,
@@ -30,43 +36,66 @@ from legcal.vision import (
     point_with_zero_y,
 )
 
+VALUES = ("psi", "theta", "x", "z")
+SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
+LARGEST_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
+ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
+LARGEST_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
+SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
+LEAST_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
+COLUMNS = (
+    *(Column(name, "text") for name in ("view", "image", "leg")),
+    *(
+        Column(
+            name,
+            least=-most - ANGLE_ROUNDING,
+            most=most + ANGLE_ROUNDING,
+            needed=f"an angle from {-most:.4f} to {most:.4f} rad",
+            remedy="write radians, not degrees, or remove the row",
+        )
+        for name, most in LARGEST_ANGLE.items()
+    ),
+    *(
+        Column(
+            name,
+            least=-LARGEST_DISTANCE,
+            most=LARGEST_DISTANCE,
+            needed=f"a coordinate from {-LARGEST_DISTANCE:g} to {LARGEST_DISTANCE:g} m",
+            remedy="correct it, write metres, or remove the row",
+        )
+        for name in ("x", "z")
+    ),
+    *(
+        Column(
+            name,
+            least=SIGMA_RANGE[0],
+            most=SIGMA_RANGE[1],
+            needed=f"a standard deviation from {SIGMA_RANGE[0]:g} to {SIGMA_RANGE[1]:g} {unit}",
+            remedy=f"give it in {unit}, or remove the row",
+        )
+        for name, unit in zip(SIGMAS, ("rad", "rad", "m", "m"), strict=True)
+    ),
+)
+
 _FLOOR_PX = 1e-3  # no outline is known better: keeps weights finite, whatever a file claims
 
 
 @dataclass(frozen=True, eq=False)
-class LegAxes:
+class LegAxes(Rows):
     """Axes of legs in camera frames, oriented from base to platform: the input of steps 1 to 4.
 
-    Attributes
-    ----------
-    row, leg : (n,) array of int
-        Indices of the image and of the leg.
-    u : (n, 3) array
-        Unit directions in the camera frame, from base to platform.
-    M : (n, 3) array
-        A point of each axis in the camera frame [m].
-    basis : (n, 2, 3) array
-        Unit vectors e1, e2 normal to u, in which the covariance is written.
-    covariance : (n, 4, 4) array
-        Covariance of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m], where the axis is known
-        as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
+    An axis is known as ``u + alpha1 e1 + alpha2 e2`` through ``M + beta1 e1 + beta2 e2``.
     """
 
-    row: IntArray
-    leg: IntArray
-    u: Array
-    M: Array
-    basis: Array
-    covariance: Array
+    leg: IntArray  # (n,)
+    u: Array  # (n, 3) unit directions in the camera
+    M: Array  # (n, 3) a point of each axis in the camera [m]
+    basis: Array  # (n, 2, 3) unit vectors e1, e2 normal to u
+    covariance: Array  # (n, 4, 4) of (alpha1, alpha2, beta1, beta2) [rad, rad, m, m]
 
-    def __len__(self) -> int:
-        return len(self.row)
-
-
-def choose_axes(axes: LegAxes, index: IntArray) -> LegAxes:
-    """Return some of the axes, by their indices in a new order."""
-    parts = (axes.u, axes.M, axes.basis, axes.covariance)
-    return LegAxes(axes.row[index], axes.leg[index], *(part[index] for part in parts))
+    def row_keys(self) -> list[tuple[int, int]]:
+        """Return image row and leg of each axis."""
+        return list(zip(self.row.tolist(), self.leg.tolist(), strict=True))
 
 
 def axes_from_outlines(
@@ -359,39 +388,12 @@ def _table_derivative(basis: Array, psi: Array, theta: Array) -> Array:
     return derivative
 
 
-VALUES = ("psi", "theta", "x", "z")
-SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
-COLUMNS = ("view", "image", "leg", *VALUES, *SIGMAS)
-
-LARGEST_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
-ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
-LARGEST_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
-SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
-LEAST_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
-
-
 def write_axes(
     path: Path, axes: LegAxes, measurements: Measurements, leg_names: Sequence[str]
 ) -> None:
-    """Write axes, the file complete or not at all.
+    """Write axes, the file complete or not at all; correlations of angles and point are left out.
 
-    Parameters
-    ----------
-    path : Path
-        ``axes.csv``.
-    axes : LegAxes
-        What to write. Correlations between angles and point are left out.
-    measurements : Measurements
-        The rows they belong to, in the order of the file.
-    leg_names : sequence of str
-        The legs of the mechanism.
-
-    Raises
-    ------
-    NotVisible
-        If an axis has no point M_LS.
-    OSError
-        If the file cannot be written.
+    Raises NotVisible if an axis has no point M_LS, OSError if the file cannot be written.
     """
     write_axis_table(path, axes.row, axes.leg, *table_of_axes(axes), measurements, leg_names)
 
@@ -400,125 +402,50 @@ def write_axis_table(
     path: Path,
     row: IntArray,
     leg: IntArray,
-    values: Array,
-    sigmas: Array,
+    values: Array,  # (n, 4) psi, theta, x, z [rad, rad, m, m]
+    sigmas: Array,  # (n, 4) of them
     measurements: Measurements,
     leg_names: Sequence[str],
 ) -> None:
-    """Write axes that are given as the table has them, the file complete or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        ``axes.csv``.
-    row, leg : (n,) array of int
-        Indices of the image and of the leg.
-    values, sigmas : (n, 4) array
-        psi, theta, x, z and their standard deviations [rad, rad, m, m].
-    measurements, leg_names
-        As in :func:`write_axes`.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
-    names = row_names(measurements)
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    """Write axes that are given as the table has them, the file complete or not at all."""
+    names = places(measurements)
     numbers = np.hstack([values, sigmas]).tolist()
-    for r, j, cells in zip(row.tolist(), leg.tolist(), numbers, strict=True):
-        view = measurements.views[measurements.view[r]].name
-        writer.writerow([view, names[r], leg_names[j], *(repr(x) for x in cells)])
-    write_atomically(path, text.getvalue().encode())
+    rows = (
+        [*names[r], leg_names[j], *cells]
+        for r, j, cells in zip(row.tolist(), leg.tolist(), numbers, strict=True)
+    )
+    text = format_table([column.name for column in COLUMNS], rows)
+    write_atomically(path, text.encode())
 
 
 def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) -> LegAxes:
-    """Read ``axes.csv``.
+    """Return the table ``axes.csv`` in the order of the file.
 
-    Parameters
-    ----------
-    path : Path
-        The table.
-    leg_names : sequence of str
-        The legs of the mechanism.
-    measurements : Measurements
-        The rows that axes belong to, in the order of the file.
-
-    Returns
-    -------
-    LegAxes
-        In the order of the file.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each thing that is wrong, naming row and column.
+    Raises DatasetError with one sentence for each thing that is wrong.
     """
-    problems: list[str] = []
-    needed = (
-        "the axes of the legs in every image; add them, or delete the file to have images searched"
+    table = read_table(
+        path,
+        "table of axes",
+        "axis",
+        COLUMNS,
+        needed="the axes of the legs in every image; add them, or delete the file to have images "
+        "searched",
     )
-    rows = read_named_rows(
-        path, "table of axes", COLUMNS, "correct the header", problems, needed=needed
-    )
-    places = rows_by_name(measurements)
-    first: dict[tuple[int, int], str] = {}
-    numbers = []
-    for where, cells in rows:
-        place, unknown = place_in_measurements(where, cells, places, leg_names, "axis")
-        found, wrong = _numbers(where, cells)
-        problems += [*unknown, *wrong]
-        numbers.append(found)
-        earlier = where if unknown else first.setdefault(place, where)
-        if earlier != where:
-            problems.append(
-                f"{where}: the axis could not be used: found the same image and leg in "
-                f"{earlier.rsplit(', ', 1)[-1]}, needed it once; remove one of them."
-            )
-    if problems:
-        raise DatasetError(problems)
-    row, leg = np.array(list(first), dtype=np.intp).T
-    table = np.array(numbers)
-    return axes_of_table(row, leg, table[:, :4], table[:, 4:])
-
-
-def _numbers(where: str, cells: Mapping[str, str]) -> tuple[list[float], list[str]]:
-    """Return the eight numbers of a row, and what is wrong with them."""
-    found = {name: number_in(cells[name]) for name in (*VALUES, *SIGMAS)}
-    start = "the axis could not be used: found"
-    problems = [
-        f"{where}, column {name}: {start} "
-        f"{describe(cells[name]) if cells[name] else 'an empty cell'}, needed a finite number; "
-        "correct it or remove the row."
-        for name, x in found.items()
-        if not math.isfinite(x)
-    ]
-    problems += [
-        f"{where}, column {name}: {start} {found[name]:g}, needed an angle from {-limit:.4f} to "
-        f"{limit:.4f} rad; write radians, not degrees."
-        for name, limit in LARGEST_ANGLE.items()
-        if math.isfinite(found[name]) and abs(found[name]) > limit + ANGLE_ROUNDING
-    ]
-    problems += [
-        f"{where}, column {name}: {start} {found[name]:g}, needed a coordinate from "
-        f"{-LARGEST_DISTANCE:g} to {LARGEST_DISTANCE:g} m; correct it, or write metres."
-        for name in ("x", "z")
-        if math.isfinite(found[name]) and abs(found[name]) > LARGEST_DISTANCE
-    ]
-    least, most = SIGMA_RANGE
-    problems += [
-        f"{where}, column {name}: {start} {found[name]:g}, needed a standard deviation from "
-        f"{least:g} to {most:g}; give it in {'rad' if name in SIGMAS[:2] else 'm'}."
-        for name in SIGMAS
-        if math.isfinite(found[name]) and not least <= found[name] <= most
-    ]
-    upright = math.cos(found["psi"]) * math.cos(found["theta"]) if not problems else 1.0
-    if abs(upright) < LEAST_UPRIGHT:
-        problems.append(
-            f"{where}, columns psi, theta: {start} an axis parallel to the plane of the camera's x "
-            "and z axes, needed one that crosses it: the point (x, 0, z) does not exist; remove "
-            "the row, or give outlines instead."
+    row, leg = find_rows(table, measurements), find_legs(table, leg_names)
+    refuse_unknown_rows(table, row, measurements)
+    refuse_unknown_legs(table, leg, leg_names)
+    values, sigmas = table.numbers(VALUES), table.numbers(SIGMAS)
+    upright = np.cos(values[:, 0]) * np.cos(values[:, 1])
+    for i in np.flatnonzero(np.abs(upright) < LEAST_UPRIGHT).tolist():
+        table.refuse(
+            i,
+            "an axis parallel to the plane of the camera's x and z axes",
+            "one that crosses it: the point (x, 0, z) does not exist; remove the row, or give "
+            "outlines instead",
+            "psi",
+            "theta",
         )
-    return list(found.values()), problems
+    keys = zip(row.tolist(), leg.tolist(), strict=True)
+    table.once([None if -1 in key else key for key in keys], "the same image and leg")
+    table.check()
+    return axes_of_table(row, leg, values, sigmas)

@@ -16,15 +16,14 @@ import numpy as np
 from pydantic import ValidationError
 
 from legcal.data.dataset import CACHE_NAME, OBSERVATIONS_NAME, Dataset
-from legcal.data.order import canonical_order, reorder_measurements
+from legcal.data.measurements import places
 from legcal.data.outlines import (
     Outlines,
-    choose_outlines,
     is_edited,
     no_outlines,
-    row_names,
     write_observations,
 )
+from legcal.data.rows import canonical_order, reorder_measurements
 from legcal.files import FileSchema, write_atomically
 from legcal.geometry import BoolArray, IntArray
 from legcal.version import __version__
@@ -109,7 +108,7 @@ def plan_detection(
     if recorded == current:
         return DetectionPlan(np.zeros(0, dtype=np.intp), table, given)
     detect = has_image & ~(given & listed)
-    keep = choose_outlines(table, edited | ~detect[table.row])
+    keep = table.choose(edited | ~detect[table.row])
     return DetectionPlan(np.flatnonzero(detect), keep, given & listed)
 
 
@@ -133,7 +132,7 @@ def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
         [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
     )
     given_names = set(entry.given) if entry else set()
-    given = np.array([name in given_names for name in _places(dataset)], dtype=np.bool_)
+    given = np.array([name in given_names for name in places(dataset.measurements)], dtype=np.bool_)
     recorded = entry.fingerprint if entry else None  # the format is part of the fingerprint
     plan = plan_detection(dataset.observations, has_image, recorded, current, given)
     if entry is None or recorded != current or len(plan.detect):
@@ -234,13 +233,11 @@ def store_outlines(
         A note if the folder cannot be written to: detection is repeated next time. None if
         the outlines were written.
     """
-    places = [
-        list(name) for name, is_given in zip(_places(dataset), given, strict=True) if is_given
-    ]
+    names = zip(places(dataset.measurements), given, strict=True)
     entry = {
         "format": FORMAT,
         "fingerprint": current,
-        "given": sorted(places),
+        "given": sorted(list(name) for name, is_given in names if is_given),
         "notes": list(notes),
     }
     path = dataset.folder / OBSERVATIONS_NAME
@@ -253,13 +250,6 @@ def store_outlines(
             "that can be written to; the images will be searched again next time."
         )
     return None
-
-
-def _places(dataset: Dataset) -> Sequence[tuple[str, str]]:
-    """Return view and image name of every row."""
-    measurements = dataset.measurements
-    views = [measurements.views[v].name for v in measurements.view.tolist()]
-    return list(zip(views, row_names(measurements), strict=True))
 
 
 def _read_entry(path: Path) -> CacheEntry | None:

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, field_validator
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data.axes import LegAxes, choose_axes, read_axes
+from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.measurements import Measurements, View, read_measurements
 from legcal.data.outlines import Outlines, read_observations
@@ -20,6 +20,7 @@ from legcal.errors import DatasetError, UsageError
 from legcal.files import (
     EXAMPLE,
     FileSchema,
+    MotionEntry,
     Name,
     Number,
     Stated,
@@ -33,7 +34,7 @@ from legcal.files import (
     read_value,
     validate,
 )
-from legcal.geometry import Image, MotionEntry
+from legcal.geometry import Image
 from legcal.machine import DATASET_YAML, Mechanism, load_mechanism, shipped_folders, shipped_names
 from legcal.vision import Board, Camera, image_problem, read_board, read_camera, read_image
 
@@ -75,7 +76,7 @@ def read_given_axes(
         )
     left_out = len(axes) - len(used)
     note = f"{path}: {left_out} axes of legs that their views leave out are not used."
-    return choose_axes(axes, used), [note] if left_out else []
+    return axes.choose(used), [note] if left_out else []
 
 
 def rows_without_axes(table_path: Path, measurements: Measurements, axes: LegAxes) -> list[str]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.data.dataset import Dataset
-from legcal.data.order import axes_at, canonical_order, corners_at, measurements_at, outlines_at
+from legcal.data.rows import canonical_order, measurements_at
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.geometry import BoolArray, IntArray
 
@@ -97,9 +97,9 @@ def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
     return replace(
         dataset,
         measurements=measurements_at(dataset.measurements, rows),
-        observations=None if observations is None else outlines_at(observations, rows),
-        axes=None if axes is None else axes_at(axes, rows),
-        corners=None if corners is None else corners_at(corners, rows),
+        observations=None if observations is None else observations.at(rows),
+        axes=None if axes is None else axes.at(rows),
+        corners=None if corners is None else corners.at(rows),
     )
 
 

@@ -2,82 +2,56 @@
 
 The header is ``view,image,<actuated joint>,...`` with an optional ``pose``, in any order.
 Readings are in metres. Rows with the same pose label, in any view, share one platform pose
-and one reading (their mean); a row without a label is a pose of its own.
+and one reading (their mean); a row without a label is a pose of its own. Tables of what images
+show name their rows by view and image, see :func:`row_names`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DatasetError
-from legcal.files import Row, closest, describe, path_problem, read_table
+from legcal.files import Column, Table, closest, describe, path_problem, place_in, read_table
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Leg, LegKind
 from legcal.vision import Camera
 
+MOST_NAMED = 5  # views or other things, in one sentence
+TRAVEL_MARGIN = 0.05  # of the travel: a reading further outside is an error
+SAME_READING = 10.0  # sigma by which rows of one pose may differ
+_SHOWN = 3  # readings quoted in a sentence about many
+
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One position of a calibrated camera.
+    """One position of a calibrated camera."""
 
-    Attributes
-    ----------
-    name : str
-        The name in ``dataset.yaml``.
-    camera : Camera
-        Its intrinsics.
-    T_base_camera : RigidTransform or None
-        A rough pose of the camera in the base link, good to 2 cm and 2 degrees.
-    legs : tuple of str or None
-        Use only these legs in this view; None for all.
-    hand_held : bool
-        Whether this is one image of a camera in the hand, which only the board can place.
-    """
-
-    name: str
+    name: str  # in dataset.yaml
     camera: Camera
-    T_base_camera: RigidTransform | None = None
-    legs: tuple[str, ...] | None = None
-    hand_held: bool = False
+    T_base_camera: RigidTransform | None = None  # rough: good to 2 cm and 2 degrees
+    legs: tuple[str, ...] | None = None  # use only these legs in this view; None for all
+    hand_held: bool = False  # one image of a camera in the hand, which only the board can place
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """The rows of ``measurements.csv``: one for each image.
 
-    Attributes
-    ----------
-    views : tuple of View
-        The camera positions.
-    image : tuple of str, length n_rows
-        The image of each row, relative to the dataset; "" where only outlines are given.
-    view : (n_rows,) array of int
-        Index into ``views``.
-    pose : (n_rows,) array of int
-        Index of the platform pose, 0 to n_poses - 1; rows that share it share one pose.
-    q : (n_rows, n_legs) array
-        Encoder readings in the order of the mechanism's legs [m]; zero for constant-length
-        legs, NaN for passive ones.
-    sigma_q : float
-        Standard deviation of a reading [m].
-    pose_labels : tuple of str, length n_poses
-        What the optional column ``pose`` calls each pose; "" for a pose without a label.
-        Empty where there is no such column.
+    Rows that share a pose index share one platform pose, and its readings.
     """
 
     views: tuple[View, ...]
-    image: tuple[str, ...]
-    view: IntArray
-    pose: IntArray
-    q: Array
-    sigma_q: float
-    pose_labels: tuple[str, ...] = ()
+    image: tuple[str, ...]  # relative to the dataset; "" where only outlines are given
+    view: IntArray  # (n_rows,) index into views
+    pose: IntArray  # (n_rows,) 0 to n_poses - 1, numbered as they first appear
+    q: Array  # (n_rows, n_legs) readings [m]; zero for constant-length legs, NaN for passive ones
+    sigma_q: float  # of a reading [m]
+    pose_labels: tuple[str, ...] = ()  # of each pose, "" without; empty without that column
 
     @property
     def n_rows(self) -> int:
@@ -95,13 +69,71 @@ class Measurements:
         return int(self.pose.max()) + 1 if len(self.pose) else 0
 
 
-MOST = 5  # that are named
+def row_names(measurements: Measurements) -> tuple[str, ...]:
+    """Return what the image column of other tables calls each row of the measurements."""
+    names = list(measurements.image)
+    for v in range(len(measurements.views)):
+        rows = np.flatnonzero(measurements.view == v).tolist()
+        blank = [i for i in rows if not names[i]]
+        taken = {names[i] for i in rows}
+        labels = [
+            measurements.pose_labels[measurements.pose[i]] if measurements.pose_labels else ""
+            for i in blank
+        ]
+        if not all(labels) or len(set(labels)) < len(labels) or set(labels) & taken:
+            labels = [str(i + 1) for i in blank]
+        for i, label in zip(blank, labels, strict=True):
+            names[i] = label
+    return tuple(names)
+
+
+def places(measurements: Measurements) -> list[tuple[str, str]]:
+    """Return the view and the name in the image column of every row."""
+    views = [measurements.views[v].name for v in measurements.view.tolist()]
+    return list(zip(views, row_names(measurements), strict=True))
+
+
+def find_rows(table: Table, measurements: Measurements) -> IntArray:
+    """Return the row of the measurements that each row of a table names, -1 where unknown."""
+    index = {place: row for row, place in enumerate(places(measurements))}
+    found = zip(table.text("view"), table.text("image"), strict=True)
+    return np.array([index.get(place, -1) for place in found], dtype=np.intp)
+
+
+def refuse_unknown_rows(table: Table, row: IntArray, measurements: Measurements) -> None:
+    """Refuse rows of a table of which :func:`find_rows` knew none."""
+    names = places(measurements)
+    views = list(dict.fromkeys(view for view, _ in names))
+    found = list(zip(table.text("view"), table.text("image"), strict=True))
+    for i in np.flatnonzero(row < 0).tolist():
+        view, image = found[i]
+        if view not in views:
+            needed = f"a view with measurements; {closest(view, views)}"
+            table.refuse(i, f"the unknown view {describe(view)}", needed, "view")
+        else:
+            near = closest(image, [name for v, name in names if v == view])
+            needed = f"an image of view {view} in the measurements; {near}"
+            table.refuse(i, describe(image), needed, "image")
+
+
+def find_legs(table: Table, leg_names: Sequence[str]) -> IntArray:
+    """Return the leg that each row of a table names, -1 where unknown."""
+    index = {name: j for j, name in enumerate(leg_names)}
+    return np.array([index.get(name, -1) for name in table.text("leg")], dtype=np.intp)
+
+
+def refuse_unknown_legs(table: Table, leg: IntArray, leg_names: Sequence[str]) -> None:
+    """Refuse rows of a table of which :func:`find_legs` knew none."""
+    names = table.text("leg")
+    for i in np.flatnonzero(leg < 0).tolist():
+        needed = f"a leg of the mechanism; {closest(names[i], leg_names)}"
+        table.refuse(i, f"the unknown leg {describe(names[i])}", needed, "leg")
 
 
 def few(names: Sequence[str]) -> str:
     """Return names one after the other, not more than a few: ``c1, c2 and 3 more``."""
-    more = len(names) - MOST
-    return ", ".join(names[:MOST]) + f" and {more} more" * (more > 0)
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + f" and {more} more" * (more > 0)
 
 
 def few_views(names: Sequence[str]) -> str:
@@ -109,43 +141,31 @@ def few_views(names: Sequence[str]) -> str:
     return f"view{'s' * (len(names) > 1)} {few(names)}"
 
 
-TRAVEL_MARGIN = 0.05  # of the travel: a reading further outside is an error
+def reading_columns(legs: Sequence[Leg]) -> list[Column]:
+    """Return the columns of readings of the actuated legs, in the order of the legs."""
+    return [
+        Column(str(leg.prismatic), what="reading", unit="metres")
+        for leg in legs
+        if leg.kind is LegKind.ACTUATED
+    ]
 
-_SHOWN = 3  # readings quoted in a sentence about many
 
+def readings_in(table: Table, legs: Sequence[Leg]) -> tuple[Array, tuple[str, ...]]:
+    """Return the readings in a table (n_rows, n_actuated) [m], and notes on odd ones.
 
-def check_travel(
-    path: Path, wheres: Sequence[str], legs: Sequence[Leg], readings: Array
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what is wrong with readings outside their travel, and what is only odd.
-
-    Parameters
-    ----------
-    path : Path
-        The table, for the message.
-    wheres : sequence of str, length n_rows
-        The place of each row, for the message.
-    legs : sequence of Leg
-        The actuated legs.
-    readings : (n_rows, n_actuated) array
-        Their readings [m]; NaN is passed over.
-
-    Returns
-    -------
-    problems : tuple of str
-        One sentence for each column with readings outside by more than 5 % of the travel.
-    notes : tuple of str
-        One sentence for each other column with readings outside by less.
+    Readings outside their travel by more than 5 % of it are refused, others are noted.
     """
-    problems, notes = [], []
-    for leg, column in zip(legs, readings.T, strict=True):
+    actuated = [leg for leg in legs if leg.kind is LegKind.ACTUATED]
+    readings = table.numbers(str(leg.prismatic) for leg in actuated)
+    notes = []
+    for leg, column in zip(actuated, readings.T, strict=True):
         lower, upper = leg.travel
         margin = TRAVEL_MARGIN * (upper - lower)
         if not (np.isfinite(margin) and margin > 0.0):
             continue
         outside = (column < lower) | (column > upper)
         far = (column < lower - margin) | (column > upper + margin)
-        start = f"{path}, column {leg.prismatic}"
+        start = f"{table.path}, column {leg.prismatic}"
         travel = f"{lower:g} to {upper:g} m (the joint limits of the model)"
         if np.any(far):
             remedy = (
@@ -154,14 +174,14 @@ def check_travel(
                 and _look_like_millimetres(column[far], lower, upper)
                 else "correct the readings or the limits"
             )
-            problems.append(
-                f"{start}: readings are outside the travel: found {_some(wheres, column, far)}, "
+            table.refuse_file(
+                f"{start}: readings are outside the travel: found {_some(table, column, far)}, "
                 f"needed {travel} with a margin of {TRAVEL_MARGIN:.0%}; {remedy}."
             )
         elif np.any(outside):
-            found = _some(wheres, column, outside)
+            found = _some(table, column, outside)
             notes.append(f"{start}: readings are a little outside the travel {travel}: {found}.")
-    return tuple(problems), tuple(notes)
+    return readings, tuple(notes)
 
 
 def _look_like_millimetres(readings: Array, lower: float, upper: float) -> bool:
@@ -172,149 +192,84 @@ def _look_like_millimetres(readings: Array, lower: float, upper: float) -> bool:
     return bool(np.all(fit & far))
 
 
-def _some(wheres: Sequence[str], column: Array, chosen: BoolArray) -> str:
+def _some(table: Table, column: Array, chosen: BoolArray) -> str:
     """Return the first of some readings with their rows, and how many more there are."""
     index = np.flatnonzero(chosen).tolist()
-    shown = ", ".join(f"{column[i]:g} m in {_row(wheres[i])}" for i in index[:_SHOWN])
+    shown = ", ".join(f"{column[i]:g} m in {place_in(table.where[i])}" for i in index[:_SHOWN])
     return shown + (f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else "")
-
-
-def _row(where: str) -> str:
-    """Return a place without its file."""
-    return where.rsplit(", ", 1)[-1]
-
-
-SAME_READING = 10.0  # sigma by which rows of one pose may differ
-
-_FIXED_COLUMNS = ("view", "image", "pose")
 
 
 def read_measurements(
     path: Path, folder: Path, views: Sequence[View], legs: Sequence[Leg], sigma_q: float
 ) -> tuple[Measurements, tuple[str, ...]]:
-    """Read ``measurements.csv``.
+    """Return the table ``measurements.csv`` in the order of the file, and notes on odd readings.
 
-    Parameters
-    ----------
-    path, folder : Path
-        The table, and the dataset folder that images are relative to.
-    views : sequence of View
-        The views of the dataset.
-    legs : sequence of Leg
-        The legs of the mechanism; their actuated joints name the columns.
-    sigma_q : float
-        Standard deviation of a reading [m].
-
-    Returns
-    -------
-    measurements : Measurements
-        With the rows in the order of the file.
-    notes : tuple of str
-        What is odd but allowed: readings a little outside their travel.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each thing that is wrong, naming row and column. Whether the
-        images exist is not looked at.
+    Images are relative to ``folder``; whether they exist is not looked at. Raises DatasetError
+    with one sentence for each thing that is wrong.
     """
-    joints = [leg.prismatic or "" for leg in legs if leg.kind is LegKind.ACTUATED]
-    table = read_table(path, "table of measurements", "one row for each image; record measurements")
-    problems = _header_problems(path, table.header, joints)
-    if problems:
-        raise DatasetError(problems)
-    rows = table.rows(problems)
+    texts = [
+        Column("view", "text"),
+        Column("image", "text"),
+        Column("pose", "text", required=False),
+    ]
+    table = read_table(
+        path,
+        "table of measurements",
+        "row",
+        [*texts, *reading_columns(legs)],
+        needed="one row for each image; record measurements",
+    )
     view_index = {view.name: i for i, view in enumerate(views)}
-    problems += _view_problems(rows, view_index) + _image_problems(rows, folder)
-    readings = np.array(
-        [[row.number(joint, "reading", "metres", problems) for joint in joints] for row in rows],
-        dtype=np.float64,
-    ).reshape(len(rows), len(joints))
-    pose, labels = _poses(rows)
-    actuated = [leg for leg in legs if leg.kind is LegKind.ACTUATED]
-    outside, notes = check_travel(path, [row.where for row in rows], actuated, readings)
-    problems += outside
-    readings = _shared_readings(rows, pose, joints, readings, sigma_q, problems)
-    if problems:
-        raise DatasetError(problems)
+    view_names, images = table.text("view"), table.text("image")
+    for row, name in enumerate(view_names):
+        if name not in view_index:
+            needed = f"a view of the dataset file; {closest(name, view_index)}"
+            table.refuse(row, f"the unknown view {describe(name)}", needed, "view")
+    _refuse_images(table, images, folder)
+    readings, notes = readings_in(table, legs)
+    pose, labels = _poses(table.text("pose"))
+    q = np.full((len(table), len(legs)), math.nan)
+    q[:, [leg.kind is LegKind.CONSTANT for leg in legs]] = 0.0
+    q[:, [leg.kind is LegKind.ACTUATED for leg in legs]] = _shared_readings(
+        table, legs, pose, readings, sigma_q
+    )
+    table.check()
     measurements = Measurements(
         views=tuple(views),
-        image=tuple(row.cells["image"] for row in rows),
-        view=np.array([view_index[row.cells["view"]] for row in rows], dtype=np.intp),
+        image=images,
+        view=np.array([view_index[name] for name in view_names], dtype=np.intp),
         pose=pose,
-        q=_by_leg(legs, joints, readings),
+        q=q,
         sigma_q=sigma_q,
-        pose_labels=labels if "pose" in table.header else (),
+        pose_labels=labels if "pose" in table else (),
     )
     return measurements, notes
 
 
-def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -> list[str]:
-    """Return what is wrong with the columns."""
-    start = f"{path}, header: the columns could not be used: found"
-    known = [*_FIXED_COLUMNS, *joints]
-    problems = [
-        f"{start} the column '{name}' {header.count(name)} times, needed it once; remove one."
-        for name in dict.fromkeys(header)
-        if header.count(name) > 1
-    ]
-    problems += [
-        f"{start} the unknown column '{name}', needed view, image, pose or an actuated joint of "
-        f"the mechanism; {closest(name, known)}"
-        for name in dict.fromkeys(header)
-        if name not in known
-    ]
-    problems += [
-        f"{start} no column '{name}', needed {'the readings of that joint [m]' * (name in joints)}"
-        f"{'one' * (name not in joints)}; add the column."
-        for name in ("view", "image", *joints)
-        if name not in header
-    ]
-    return problems
-
-
-def _view_problems(rows: Sequence[Row], view_index: Mapping[str, int]) -> list[str]:
-    """Return the rows whose view the dataset does not have."""
-    return [
-        f"{row.where}, column view: the row could not be used: found the unknown view "
-        f"{describe(row.cells['view'])}, needed a view of the dataset file; "
-        f"{closest(row.cells['view'], view_index)}"
-        for row in rows
-        if row.cells["view"] not in view_index
-    ]
-
-
-def _image_problems(rows: Sequence[Row], folder: Path) -> list[str]:
-    """Return images that are named twice or lie outside the dataset folder."""
-    problems = []
-    first: dict[Path, str] = {}
-    for row in rows:
-        image = row.cells["image"]
+def _refuse_images(table: Table, images: Sequence[str], folder: Path) -> None:
+    """Refuse images that are named twice or lie outside the dataset folder."""
+    first: dict[Path, int] = {}
+    for row, image in enumerate(images):
         if not image:
             continue
-        found = path_problem(folder, image)
-        if found:
-            problems.append(
-                f"{row.where}, column image: {image} could not be used: found {found}, needed a "
-                "relative path inside it; move the image there."
-            )
+        problem = path_problem(folder, image)
+        if problem:
+            needed = "a relative path inside it; move the image there"
+            table.refuse(row, problem, needed, "image", what=f"image {image}")
             continue
-        earlier = first.setdefault((folder / image).resolve(), row.where)
-        if earlier != row.where:
-            problems.append(
-                f"{row.where}, column image: {image} could not be used: found it also in "
-                f"{earlier.rsplit(', ', 1)[-1]}, needed one row an image; remove one of them."
-            )
-    return problems
+        earlier = first.setdefault((folder / image).resolve(), row)
+        if earlier != row:
+            found = f"it also in {place_in(table.where[earlier])}"
+            needed = "one row an image; remove one of them"
+            table.refuse(row, found, needed, "image", what=f"image {image}")
 
 
-def _poses(rows: Sequence[Row]) -> tuple[IntArray, tuple[str, ...]]:
+def _poses(names: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
     """Return the pose of each row, numbered as they first appear, and the label of each pose."""
     labels: list[str] = []
     index: dict[str, int] = {}
     pose = []
-    for row in rows:
-        label = row.cells.get("pose", "")
+    for label in names:
         if not label or label not in index:
             index[label] = len(labels)
             labels.append(label)
@@ -323,39 +278,27 @@ def _poses(rows: Sequence[Row]) -> tuple[IntArray, tuple[str, ...]]:
 
 
 def _shared_readings(
-    rows: Sequence[Row],
-    pose: IntArray,
-    joints: Sequence[str],
-    readings: Array,
-    sigma_q: float,
-    problems: list[str],
+    table: Table, legs: Sequence[Leg], pose: IntArray, readings: Array, sigma_q: float
 ) -> Array:
     """Return the readings with those of one pose replaced by their mean."""
+    joints = [column.name for column in reading_columns(legs)]
+    labels = table.text("pose")
     shared = readings.copy()
     for p in np.unique(pose):
         members = np.flatnonzero(pose == p)
         if len(members) == 1:
             continue
+        first = int(members[0])
         spread = np.ptp(readings[members], axis=0)
         for j in np.flatnonzero(spread > SAME_READING * sigma_q).tolist():
-            problems.append(
-                f"{rows[members[0]].where}, column {joints[j]}: pose "
-                f"{rows[members[0]].cells['pose']} could not be used: found readings of its "
-                f"{len(members)} rows that differ by {spread[j]:.3g} m, needed one reading within "
-                f"{SAME_READING:g} sigma ({SAME_READING * sigma_q:.3g} m); give rows of different "
-                "poses different labels."
+            table.refuse(
+                first,
+                f"readings of its {len(members)} rows that differ by {spread[j]:.3g} m",
+                f"one reading within {SAME_READING:g} sigma ({SAME_READING * sigma_q:.3g} m); give "
+                "rows of different poses different labels",
+                joints[j],
+                what=f"pose {labels[first]}",
             )
         # fsum rounds once, so that the mean does not depend on the order of the rows.
         shared[members] = [math.fsum(c) / len(members) for c in readings[members].T.tolist()]
     return shared
-
-
-def _by_leg(legs: Sequence[Leg], joints: Sequence[str], readings: Array) -> Array:
-    """Return the readings in the order of the legs: zero for constant legs, NaN for passive."""
-    columns = [
-        readings[:, joints.index(leg.prismatic or "")]
-        if leg.kind is LegKind.ACTUATED
-        else np.full(len(readings), 0.0 if leg.kind is LegKind.CONSTANT else math.nan)
-        for leg in legs
-    ]
-    return np.column_stack(columns)

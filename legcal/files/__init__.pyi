@@ -11,6 +11,12 @@ from .folder import path_problem as path_problem
 from .folder import result_folder as result_folder
 from .folder import temporary_folder as temporary_folder
 from .folder import write_atomically as write_atomically
+from .motions import QUATERNION_TOLERANCE as QUATERNION_TOLERANCE
+from .motions import MotionEntry as MotionEntry
+from .motions import Quaternion as Quaternion
+from .motions import Vector as Vector
+from .motions import motion_from_xyz_quat as motion_from_xyz_quat
+from .motions import motion_to_xyz_quat as motion_to_xyz_quat
 from .quantity import ANGLE as ANGLE
 from .quantity import EXAMPLE as EXAMPLE
 from .quantity import LENGTH as LENGTH
@@ -32,8 +38,9 @@ from .schema import parse_yaml as parse_yaml
 from .schema import plain_name as plain_name
 from .schema import read_text as read_text
 from .schema import validate as validate
-from .table import Row as Row
-from .table import finite_number as finite_number
-from .table import read_lines as read_lines
-from .table import read_named_rows as read_named_rows
+from .table import Column as Column
+from .table import Table as Table
+from .table import format_table as format_table
+from .table import number_in as number_in
+from .table import place_in as place_in
 from .table import read_table as read_table

@@ -1,38 +1,298 @@
-"""CSV files that people edit: read strictly, every line with its number."""
+"""Tables in CSV, which people edit: the one reader and the one writer of them.
+
+A table is declared by its columns. Reading is strict (just these columns, complete rows, cells that
+hold what their column says) and refuses a file with all of its problems at once:
+:func:`read_table` collects what single cells tell, the reader of that table adds with
+:meth:`Table.refuse` what rows tell together, and :meth:`Table.check` raises them in the order of
+the lines.
+"""
+
+from __future__ import annotations
 
 import csv
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal
+
+import numpy as np
 
 from legcal.errors import DatasetError
-from legcal.files.schema import describe, read_text
-
-Line = tuple[int, list[str]]
+from legcal.files.schema import closest, describe, read_text
+from legcal.geometry import Array, BoolArray
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_WHOLE = re.compile(r"\d{1,15}", re.ASCII)
 
 
-def read_lines(path: Path, what: str) -> list[Line]:
-    """Return the lines of a CSV file that are not blank, numbered from 1, cells stripped.
+@dataclass(frozen=True)
+class Column:
+    """A column: what its header and its cells have to be."""
 
-    A byte-order mark and either kind of line end are accepted.
+    name: str
+    kind: Literal["text", "number", "whole"] = "number"
+    what: str = ""  # what a number is, for messages; "" for what the whole row is
+    unit: str = ""  # in words, for messages
+    least: float = -math.inf  # of a number
+    most: float = math.inf
+    needed: str = ""  # says the range in words
+    remedy: str = "correct it or remove the row"
+    choices: tuple[str, ...] = ()  # the only texts
+    required: bool = True  # in the header
+    blank: bool = False  # a cell may be empty; a number is then NaN
+    group: str = ""  # columns of a group stand together, in the header and in each row
+
+    def problem(self, text: str) -> str:
+        """Return what a cell needs that it is not, or "" if it is good."""
+        if not text and self.blank:
+            return ""
+        if self.kind == "text":
+            return " or ".join(self.choices) if self.choices and text not in self.choices else ""
+        value = number_in(text)
+        if self.kind == "whole" and not _WHOLE.fullmatch(text):
+            value = math.nan
+        if self.least <= value <= self.most and math.isfinite(value):
+            return ""
+        unit = f" in {self.unit}" if self.unit else ""
+        needed = "a whole number" if self.kind == "whole" else f"a finite number{unit}"
+        if self.needed and (math.isfinite(value) or self.kind == "whole"):
+            needed = self.needed
+        return needed + ", or an empty cell" * self.blank
+
+
+class Table:
+    """The complete rows of a CSV file, their cells stripped, and what is wrong with them.
+
+    ``where[i]`` names row i in a message; ``name in table`` says whether a column is there.
+    """
+
+    def __init__(self, path: Path, thing: str, columns: Sequence[Column]) -> None:
+        self.path = path
+        self.thing = thing  # what a row is, for messages
+        self.columns = {column.name: column for column in columns}  # that the header has
+        self.where: list[str] = []
+        self._lines: list[int] = []
+        self._cells: list[list[str]] = []
+        self._problems: list[tuple[int, str]] = []
+
+    def __len__(self) -> int:
+        return len(self.where)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def text(self, name: str) -> tuple[str, ...]:
+        """Return the cells of a column; empty ones of a column that is not there."""
+        if name not in self.columns:
+            return ("",) * len(self)
+        place = list(self.columns).index(name)
+        return tuple(cells[place] for cells in self._cells)
+
+    def number(self, name: str) -> Array:
+        """Return the numbers of a column, (n_rows,); NaN where there is none."""
+        return np.array([number_in(text) for text in self.text(name)], dtype=np.float64)
+
+    def numbers(self, names: Iterable[str]) -> Array:
+        """Return the numbers of some columns, (n_rows, n_names); NaN where there is none."""
+        columns = [self.number(name) for name in names]
+        return np.column_stack(columns) if columns else np.zeros((len(self), 0))
+
+    def refuse(self, row: int, found: str, needed: str, *columns: str, what: str = "") -> None:
+        """Add a sentence about a row, about cells of some columns or about all of it."""
+        where = self.where[row]
+        if columns:
+            where += f", column{'s' * (len(columns) > 1)} {', '.join(columns)}"
+        self._problems.append(
+            (
+                self._lines[row],
+                f"{where}: the {what or self.thing} could not be used: found {found}, needed "
+                f"{needed}.",
+            )
+        )
+
+    def refuse_cell(self, row: int, name: str, needed: str) -> None:
+        """Add a sentence about one cell that is not what its column needs."""
+        text, column = self.text(name)[row], self.columns[name]
+        found = describe(text) if text else "an empty cell"
+        self.refuse(row, found, f"{needed}; {column.remedy}", name, what=column.what)
+
+    def refuse_file(self, sentence: str) -> None:
+        """Add a sentence about more than one row."""
+        self._problems.append((0, sentence))
+
+    def need(self, names: Iterable[str], rows: BoolArray) -> None:
+        """Refuse cells that are empty, in some of the rows, though their column allows it."""
+        chosen = np.flatnonzero(rows).tolist()
+        for name in names:
+            texts = self.text(name)
+            for row in chosen:
+                if not texts[row]:
+                    self.refuse_cell(row, name, "a finite number")
+
+    def once(self, keys: Sequence[Hashable], same: str) -> None:
+        """Refuse rows with the key of an earlier row; a key of None is not looked at."""
+        first: dict[Hashable, int] = {}
+        for row, key in enumerate(keys):
+            if key is not None and first.setdefault(key, row) != row:
+                earlier = place_in(self.where[first[key]])
+                self.refuse(row, f"{same} in {earlier}", "it once; remove one of them")
+
+    def keep(self, rows: BoolArray) -> None:
+        """Leave out all but some rows, and what is wrong with the others."""
+        gone = {line for line, kept in zip(self._lines, rows, strict=True) if not kept}
+        kept_rows = np.flatnonzero(rows).tolist()
+        self.where = [self.where[row] for row in kept_rows]
+        self._lines = [self._lines[row] for row in kept_rows]
+        self._cells = [self._cells[row] for row in kept_rows]
+        self._problems = [problem for problem in self._problems if problem[0] not in gone]
+
+    def check(self) -> None:
+        """Raise DatasetError with everything that is wrong, by line."""
+        if self._problems:
+            self._problems.sort(key=lambda problem: problem[0])
+            raise DatasetError([sentence for _, sentence in self._problems])
+
+    def _add(self, lines: Iterable[tuple[int, list[str]]], header: Sequence[str]) -> None:
+        """Take the lines below the header; those that are not complete are refused."""
+        columns, n = list(self.columns.values()), len(header)
+        order = [header.index(column.name) for column in columns]
+        for row, (line, cells) in enumerate(lines, start=1):
+            self.where.append(f"{self.path}, row {row} (line {line})")
+            self._lines.append(line)
+            self._cells.append([cells[i] for i in order] if len(cells) == n else [])
+            if len(cells) != n:
+                remedy = "complete or remove the row"
+                if len(cells) > n:
+                    remedy = "remove what is too much, and write decimals with points"
+                found = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
+                self.refuse(len(self) - 1, found, f"{n} as in the header; {remedy}", what="row")
+        problems = self._problems
+        self.keep(np.array([bool(cells) for cells in self._cells], dtype=np.bool_))
+        self._problems = problems
+        for place, column in enumerate(columns):
+            for row, cells in enumerate(self._cells):
+                needed = column.problem(cells[place])
+                if needed:
+                    self.refuse_cell(row, column.name, needed)
+        for group in dict.fromkeys(column.group for column in columns if column.group):
+            names = [column.name for column in columns if column.group == group]
+            filled = np.array(
+                [[bool(text) for text in self.text(name)] for name in names], dtype=bool
+            )
+            for i, row in np.argwhere(~filled & filled.any(axis=0)).tolist():
+                needed = f"a finite number beside {' and '.join(names[:i] + names[i + 1 :])}"
+                self.refuse_cell(row, names[i], needed)
+
+
+def read_table(
+    path: Path,
+    what: str,
+    thing: str,
+    columns: Sequence[Column],
+    *,
+    needed: str = "",
+    remedy: str = "",
+    unknown: Callable[[str], str] = lambda name: "",
+    fold: bool = False,
+) -> Table:
+    """Return a CSV file as a table, with the problems of its cells still to be raised.
 
     Parameters
     ----------
     path : Path
         The file.
-    what : str
-        What the file is, for the message.
+    what, thing : str
+        What the file and what a row of it is, for messages.
+    columns : sequence of Column
+        The columns that there may be, in any order.
+    needed : str
+        What its rows should be and what to do about a file without any. Such a file is an empty
+        table if this is not told.
+    remedy : str
+        What else to do about a column that lacks.
+    unknown : callable
+        What is to be said about certain unknown columns, ``found ..., needed ...``; else "".
+    fold : bool
+        Take capitals in the header for small letters.
 
     Raises
     ------
     DatasetError
-        If the file cannot be read or is not comma-separated text in UTF-8.
+        If the file cannot be read, has no row, or other columns.
+    """
+    lines = _read_lines(path, what)
+    if needed and len(lines) < 2:
+        raise DatasetError(
+            f"{path}: the {what} could not be used: found {'a' if lines else 'no'} header and no "
+            f"row, needed {needed}."
+        )
+    header = lines[0][1] if lines else []
+    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+        raise DatasetError(
+            f"{path}, header: the columns could not be used: found '{header[0]}' in one column, "
+            "needed commas between columns; save as CSV."
+        )
+    header = [name.lower() for name in header] if fold else header
+    start = f"{path}, header: the columns could not be used: found"
+    known = {column.name: column for column in columns}
+    problems = []
+    for name in dict.fromkeys(header):
+        if name not in known:
+            said = unknown(name) or (
+                f"the unknown column {describe(name)}, needed those of a {what}; "
+                f"{closest(name, known)}"
+            )
+            problems.append(f"{start} {said}")
+        elif header.count(name) > 1:
+            problems.append(
+                f"{start} the column '{name}' {header.count(name)} times, needed it once; remove "
+                "one."
+            )
+    groups = {column.group for column in columns if column.group and column.name in header}
+    for name, column in known.items():
+        if name not in header and (column.required or column.group in groups):
+            says = ", ".join(filter(None, (column.what, column.unit and f"in {column.unit}")))
+            problems.append(
+                f"{start} no column '{name}', needed it{f' ({says})' if says else ''}; add the "
+                f"column{f', or {remedy}' if remedy else ''}."
+            )
+    if problems:
+        raise DatasetError(problems)
+    table = Table(path, thing, [known[name] for name in header])
+    table._add(lines[1:], header)
+    return table
+
+
+def format_table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return the text of a CSV file; numbers are read back as they are, NaN is an empty cell."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow(
+            "" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row
+        )
+    return text.getvalue()
+
+
+def number_in(text: str) -> float:
+    """Return the number in a cell, NaN if it holds no finite one."""
+    value = float(text) if _NUMBER.fullmatch(text) else math.nan
+    return value if math.isfinite(value) else math.nan
+
+
+def place_in(where: str) -> str:
+    """Return the place of a row without its file."""
+    return where.rsplit(", ", 1)[-1]
+
+
+def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
+    """Return the lines that are not blank, numbered from 1, their cells stripped.
+
+    A byte-order mark and either kind of line end are accepted.
     """
     try:
         text = read_text(path, what).decode("utf-8-sig")
@@ -49,161 +309,3 @@ def read_lines(path: Path, what: str) -> list[Line]:
             "in UTF-8; save it again as CSV."
         ) from error
     return [(number, cells) for number, cells in lines if any(cells)]
-
-
-def finite_number(text: str) -> float:
-    """Return the number in a cell, NaN if it holds no finite one."""
-    value = float(text) if _NUMBER.fullmatch(text) else math.nan
-    return value if math.isfinite(value) else math.nan
-
-
-class Row(NamedTuple):
-    """A row of a table: where it is, for messages, and its cells by column."""
-
-    where: str
-    cells: Mapping[str, str]
-
-    def number(self, column: str, what: str, unit: str, problems: list[str]) -> float:
-        """Return the finite number in a cell.
-
-        Parameters
-        ----------
-        column : str
-            Which cell.
-        what, unit : str
-            What the number is, and its unit in words or "", for the message.
-        problems : list of str
-            Takes one sentence if the cell holds no such number.
-
-        Returns
-        -------
-        float
-            NaN if there is none.
-        """
-        text = self.cells[column]
-        value = finite_number(text)
-        if math.isfinite(value):
-            return value
-        problems.append(
-            f"{self.where}, column {column}: the {what} could not be used: found "
-            f"{describe(text) if text else 'an empty cell'}, needed a finite number"
-            f"{f' in {unit}' if unit else ''}; correct it or remove the row."
-        )
-        return math.nan
-
-
-@dataclass(frozen=True)
-class Table:
-    """The text of a CSV file with a header.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    header : tuple of str
-        Names of the columns, as they stand: some may be unknown, missing or there twice.
-    lines : tuple of Line
-        What is below.
-    """
-
-    path: Path
-    header: tuple[str, ...]
-    lines: tuple[Line, ...]
-
-    def rows(self, problems: list[str]) -> list[Row]:
-        """Return the rows that have as many cells as the header.
-
-        Parameters
-        ----------
-        problems : list of str
-            Takes one sentence for each of the others.
-        """
-        rows, n = [], len(self.header)
-        for number, (line, cells) in enumerate(self.lines, start=1):
-            where = f"{self.path}, row {number} (line {line})"
-            if len(cells) == n:
-                rows.append(Row(where, dict(zip(self.header, cells, strict=True))))
-                continue
-            remedy = "complete or remove the row"
-            if len(cells) > n:
-                remedy = "remove what is too much, and write decimals with points"
-            problems.append(
-                f"{where}: the row could not be used: found {len(cells)} "
-                f"cell{'s' * (len(cells) != 1)}, needed {n} as in the header; {remedy}."
-            )
-        return rows
-
-
-def read_table(path: Path, what: str, needed: str = "") -> Table:
-    """Return the header of a CSV file and the lines below.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        What the file is, for messages.
-    needed : str
-        What its rows should be and what to do about a file without any, for the message. Such a
-        file is an empty table if this is not told.
-
-    Raises
-    ------
-    DatasetError
-        If the file cannot be read, has other marks than commas between columns, or has no row.
-    """
-    lines = read_lines(path, what)
-    if needed and len(lines) < 2:
-        raise DatasetError(
-            f"{path}: the {what} could not be used: found {'a' if lines else 'no'} header and no "
-            f"row, needed {needed}."
-        )
-    header = lines[0][1] if lines else []
-    if len(header) == 1 and re.search(r"[;\t]", header[0]):
-        raise DatasetError(
-            f"{path}, header: the columns could not be used: found '{header[0]}' in one column, "
-            "needed commas between columns; save as CSV."
-        )
-    return Table(path, tuple(header), tuple(lines[1:]))
-
-
-def read_named_rows(
-    path: Path,
-    what: str,
-    columns: Sequence[str],
-    remedy: str,
-    problems: list[str],
-    *,
-    needed: str = "",
-    optional: Sequence[str] = (),
-) -> list[Row]:
-    """Return the rows of a CSV file whose columns are fixed.
-
-    Parameters
-    ----------
-    path, what
-        As in :func:`read_table`.
-    columns : sequence of str
-        The names in its header, in any order.
-    remedy : str
-        What to do about another header.
-    problems : list of str
-        Takes one sentence for each row that is not complete; such rows are left out.
-    needed : str
-        As in :func:`read_table`.
-    optional : sequence of str
-        Names that the header may have besides.
-
-    Raises
-    ------
-    DatasetError
-        If :func:`read_table` refuses the file, or it has other columns.
-    """
-    table = read_table(path, what, needed)
-    here = [name for name in optional if name in table.header]
-    if sorted(table.header) != sorted([*columns, *here]):
-        raise DatasetError(
-            f"{path}, header: the columns could not be used: found "
-            f"{','.join(table.header) or 'none'}, needed {','.join(columns)}; {remedy}."
-        )
-    return table.rows(problems)

@@ -2,14 +2,8 @@ from .lines import distance_to_line as distance_to_line
 from .lines import moment as moment
 from .lines import nearest_point_to_origin as nearest_point_to_origin
 from .lines import normal_basis as normal_basis
-from .motions import QUATERNION_TOLERANCE as QUATERNION_TOLERANCE
-from .motions import MotionEntry as MotionEntry
-from .motions import Quaternion as Quaternion
-from .motions import Vector as Vector
 from .motions import frame_on_points as frame_on_points
-from .motions import motion_from_xyz_quat as motion_from_xyz_quat
 from .motions import motion_of as motion_of
-from .motions import motion_to_xyz_quat as motion_to_xyz_quat
 from .motions import product as product
 from .motions import roll_pitch_yaw as roll_pitch_yaw
 from .types import Array as Array

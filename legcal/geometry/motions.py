@@ -1,14 +1,8 @@
-"""How files write a rigid motion."""
-
-import math
-from collections.abc import Sequence
-from typing import Annotated
+"""Rigid motions."""
 
 import numpy as np
-from pydantic import AfterValidator, field_validator
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from legcal.files import FileSchema, Metres, Number
 from legcal.geometry.types import Array
 
 _ONE = np.eye(3)
@@ -81,19 +75,6 @@ def product(*motions: RigidTransform) -> RigidTransform:
     return motion_of(matrix[..., :3, :3], matrix[..., :3, 3])
 
 
-def motion_from_xyz_quat(xyz: Sequence[float], quat_xyzw: Sequence[float]) -> RigidTransform:
-    """Return the rigid motion written as ``{xyz: [m], quat_xyzw: [-]}`` in the files."""
-    return motion_of(Rotation.from_quat(quat_xyzw).as_matrix(), np.asarray(xyz))
-
-
-def motion_to_xyz_quat(T: RigidTransform) -> dict[str, list[float]]:
-    """Return a rigid motion as the files write it, with the scalar part not negative."""
-    return {
-        "xyz": [float(x) for x in T.translation],
-        "quat_xyzw": [float(x) for x in T.rotation.as_quat(canonical=True)],
-    }
-
-
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return the angles of a rotation about fixed x, y, z, (3,) [rad], to rounding everywhere.
 
@@ -111,40 +92,3 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
     return np.array([roll, pitch, yaw])
-
-
-QUATERNION_TOLERANCE = 1e-3  # files round to a few digits; more is a mistake
-
-Vector = tuple[Metres, Metres, Metres]
-
-
-def _of_unit_norm(quat: tuple[float, ...]) -> tuple[float, ...]:
-    """Refuse a quaternion that is not one of a turn, up to its last digits."""
-    norm = math.hypot(*quat)
-    if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-        raise ValueError(
-            f"found a quaternion of norm {norm:.6g}, needed 1 within {QUATERNION_TOLERANCE:g}; "
-            "check its four numbers, x y z w."
-        )
-    return quat
-
-
-Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_of_unit_norm)]
-
-
-class MotionEntry(FileSchema):
-    """A rigid motion: ``{xyz: [m], quat_xyzw: [-]}``."""
-
-    xyz: Vector
-    quat_xyzw: Quaternion
-
-    @field_validator("quat_xyzw")
-    @classmethod
-    def _made_exact(cls, quat: Quaternion) -> Quaternion:
-        norm = math.hypot(*quat)
-        x, y, z, w = (c / norm for c in quat)
-        return x, y, z, w
-
-    def motion(self) -> RigidTransform:
-        """Return the motion, its quaternion made exactly unit."""
-        return motion_from_xyz_quat(self.xyz, self.quat_xyzw)

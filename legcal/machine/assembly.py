@@ -13,8 +13,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import LegcalError, ModelError, OutOfResources, UsageError
-from legcal.files import plain_name, temporary_folder
-from legcal.geometry import Array, frame_on_points, motion_of, motion_to_xyz_quat
+from legcal.files import motion_to_xyz_quat, plain_name, temporary_folder
+from legcal.geometry import Array, frame_on_points, motion_of
 from legcal.machine.description import (
     NEEDED_TYPE,
     Description,
@@ -26,7 +26,7 @@ from legcal.machine.description import (
     wrong_lengths,
     wrong_sizes,
 )
-from legcal.machine.description_table import in_metres, read_table
+from legcal.machine.description_table import in_metres, read_description
 from legcal.machine.leg import MOST_LEGS, LegKind
 from legcal.machine.load import load_mechanism
 from legcal.machine.model import Mechanism
@@ -1006,4 +1006,4 @@ def described(
             f"The model could not be written: found {options} beside a table, needed them with "
             "--family only; write them in the table."
         )
-    return read_table(table, unit, name)
+    return read_description(table, unit, name)

@@ -7,7 +7,8 @@ from typing import cast
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, motion_from_xyz_quat
+from legcal.files import motion_from_xyz_quat
+from legcal.geometry import Array
 from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.leg import (
     LONGEST,

@@ -11,18 +11,22 @@ from scipy.spatial.transform import Rotation
 
 from legcal.errors import DatasetError, ModelError
 from legcal.files import (
+    Column,
     FileSchema,
     PlainName,
+    Quaternion,
+    Table,
+    Vector,
     Version,
     closest,
     describe,
     is_plain_name,
     parse_yaml,
-    read_lines,
+    read_table,
     read_text,
     validate,
 )
-from legcal.geometry import Array, Quaternion, Vector
+from legcal.geometry import Array
 from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
 from legcal.machine.leg import MOST_LEGS, LegKind
 
@@ -176,166 +180,104 @@ class TableFile(FileSchema):
 
 WHAT = "table"
 _XYZ = ("x", "y", "z")
+_RADII = ("radius", "tube", "rod")
+_POINTS = tuple(f"{side}_{i}" for side in ("base", "platform") for i in _XYZ)
 _NUMBERS = (
-    *(f"base_{i}" for i in _XYZ), *(f"platform_{i}" for i in _XYZ),
-    "offset", "length", "travel_low", "travel_high", "radius", "tube", "rod",
-    *(f"base_axis_{i}" for i in _XYZ), *(f"platform_axis_{i}" for i in _XYZ),
-)  # fmt: skip
-_TEXTS = ("leg", "type", "kind", "unit")
-_NEEDED = ("type", "base_x", "base_y", "platform_x", "platform_y")
+    *("offset", "length", "travel_low", "travel_high", "radius", "tube", "rod"),
+    *(f"{side}_axis_{i}" for side in ("base", "platform") for i in _XYZ),
+)
+COLUMNS = (
+    *(Column(name, "text", required=name == "type") for name in ("leg", "type", "kind", "unit")),
+    *(
+        Column(
+            name,
+            least=-LARGEST,
+            most=LARGEST,
+            needed=f"a number below {LARGEST:g}",
+            remedy="correct the cell",
+            required=name in _POINTS and not name.endswith("z"),
+            blank=name not in _POINTS or name.endswith("z"),
+        )
+        for name in (*_POINTS, *_NUMBERS)
+    ),
+)
 
 
 def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     """Return a CSV as the mapping that the same table would be in YAML.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    unit : {"m", "mm"} or None
-        The unit of its lengths, unless a column states it.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each wrong column or cell.
+    ``unit`` is that of its lengths, unless a column states it. Raises DatasetError with one
+    sentence for each wrong column or cell.
     """
-    lines = read_lines(path, WHAT)
-    if len(lines) < 2:
-        raise DatasetError(
-            f"{path}: the table could not be read: found {len(lines)} lines, needed a header and "
-            "one line for each leg; add them."
-        )
-    header = [name.lower() for name in lines[0][1]]
-    _check_header(header, path)
-    problems, rows = list[str](), list[dict[str, Any]]()
-    for number, cells in lines[1:]:
-        if len(cells) != len(header):
-            problems.append(
-                f"{path}, line {number}: the leg could not be read: found {len(cells)} cells, "
-                f"needed {len(header)}; correct the line."
-            )
-            continue
-        row = dict(zip(header, cells, strict=True))
-        if row.get("radius") and (row.get("tube") or row.get("rod")):
-            problems.append(
-                f"{path}, line {number}: the radius could not be decided: found radius beside tube "
-                "or rod, needed one of them; empty the others."
-            )
-        rows.append({key: _cell(key, text, path, number, problems) for key, text in row.items()})
-    if problems:
-        raise DatasetError(problems)
-    return _as_yaml(rows, path, _unit(rows, unit, path))
+    needed = "one row for each leg; add them"
+    table = read_table(path, WHAT, "leg", COLUMNS, needed=needed, fold=True)
+    filled = [np.array([text != "" for text in table.text(name)]) for name in _RADII]
+    for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
+        needed = "one of them; empty the others"
+        table.refuse(row, "radius beside tube or rod", needed, *_RADII, what="radius")
+    table.check()
+
+    def texts(name: str) -> list[Any]:
+        return [text or None for text in table.text(name)]
+
+    def numbers(name: str) -> list[Any]:
+        return [None if math.isnan(x) else x for x in table.number(name).tolist()]
+
+    def points(side: str) -> list[Any]:
+        x, y, z = (table.number(f"{side}_{i}") for i in _XYZ)
+        return np.column_stack([x, y, np.nan_to_num(z)]).tolist()  # type: ignore[no-any-return]
+
+    def directions(side: str) -> list[Any]:
+        found = zip(*(numbers(f"{side}_axis_{i}") for i in _XYZ), strict=True)
+        return [None if vector == (None,) * 3 else list(vector) for vector in found]
+
+    travel = zip(numbers("travel_low"), numbers("travel_high"), strict=True)
+    document: dict[str, Any] = {
+        "legcal_table": 1,
+        "name": path.stem,
+        "unit": _unit(table, unit),
+        "types": texts("type"),
+        "base_joints": points("base"),
+        "platform_joints": points("platform"),
+        "travel": [None if pair == (None, None) else list(pair) for pair in travel],
+        "radius": [
+            {k: x for k, x in (("tube", tube), ("rod", rod)) if x is not None} or radius
+            for radius, tube, rod in zip(*map(numbers, _RADII), strict=True)
+        ],
+    }
+    optional = {
+        "legs": texts("leg"),
+        "kinds": texts("kind"),
+        "offsets": numbers("offset"),
+        "lengths": numbers("length"),
+        "base_axes": directions("base"),
+        "platform_axes": directions("platform"),
+    }
+    return document | {
+        key: column for key, column in optional.items() if any(x is not None for x in column)
+    }
 
 
-def _check_header(header: list[str], path: Path) -> None:
-    """Refuse columns that are unknown, repeated or missing."""
-    other = next((mark for mark in ";\t" if len(header) == 1 and mark in header[0]), None)
-    if other is not None:
-        mark = "';'" if other == ";" else "tabs"
-        raise DatasetError(
-            f"{path}: the table could not be read: found {mark} between the columns, needed ',' "
-            "there and '.' in numbers; save it again as comma-separated text."
-        )
-    known = (*_TEXTS, *_NUMBERS)
-    problems = [
-        f"{path}: the column '{name}' could not be used: found an unknown name; "
-        f"{closest(name, known)}"
-        for name in header
-        if name not in known
-    ]
-    problems += [
-        f"{path}: the column '{name}' could not be used: found it twice, needed it once; drop one."
-        for name in sorted({name for name in header if header.count(name) > 1})
-    ]
-    problems += [
-        f"{path}: the table could not be read: found no column '{name}', needed it; add it."
-        for name in _NEEDED
-        if name not in header
-    ]
-    if problems:
-        raise DatasetError(problems)
-
-
-def _cell(key: str, text: str, path: Path, line: int, problems: list[str]) -> str | float | None:
-    """Return the value of a cell; an empty one has none, if it need not."""
-    if key in _TEXTS or (not text and key not in _NEEDED):
-        return text or None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) < LARGEST:
-        found = f"'{text}'" if text else "nothing"
-        problems.append(
-            f"{path}, line {line}: {key} could not be read: found {found}, needed a number below "
-            f"{LARGEST:g}; correct the cell."
-        )
-    return value
-
-
-def _unit(rows: list[dict[str, Any]], told: str | None, path: Path) -> str:
+def _unit(table: Table, told: str | None) -> str:
     """Return the unit that the column states, or the one that was told."""
-    stated = {str(row["unit"]) for row in rows if row.get("unit")}
+    stated = sorted(set(filter(None, table.text("unit"))))
     if len(stated) > 1:
         raise DatasetError(
-            f"{path}: the unit could not be decided: found {' and '.join(sorted(stated))}, needed "
+            f"{table.path}: the unit could not be decided: found {' and '.join(stated)}, needed "
             "the same in all lines; correct the column 'unit'."
         )
     if not stated and told is None:
         raise DatasetError(
-            f"{path}: the lengths could not be understood: found no unit, needed m or mm; add a "
-            "column 'unit', or give --unit mm."
+            f"{table.path}: the lengths could not be understood: found no unit, needed m or mm; "
+            "add a column 'unit', or give --unit mm."
         )
-    return stated.pop() if stated else str(told)
-
-
-def _as_yaml(rows: list[dict[str, Any]], path: Path, unit: str) -> dict[str, Any]:
-    """Return rows as the keys of the YAML table."""
-
-    def column(key: str) -> list[Any]:
-        return [row.get(key) for row in rows]
-
-    def vectors(key: str) -> list[Any]:
-        found = [[row.get(f"{key}_{i}") for i in _XYZ] for row in rows]
-        if "axis" not in key:
-            return [[x, y, 0.0 if z is None else z] for x, y, z in found]
-        return [None if vector == [None] * 3 else vector for vector in found]
-
-    table: dict[str, Any] = {
-        "legcal_table": 1,
-        "name": path.stem,
-        "unit": unit,
-        "types": column("type"),
-        "base_joints": vectors("base"),
-        "platform_joints": vectors("platform"),
-        "travel": [
-            None if low is None and high is None else [low, high]
-            for low, high in zip(column("travel_low"), column("travel_high"), strict=True)
-        ],
-        "radius": [_radius_columns(row) for row in rows],
-    }
-    for key, name in (("leg", "legs"), ("kind", "kinds"), ("offset", "offsets"),
-                      ("length", "lengths")):  # fmt: skip
-        if any(x is not None for x in column(key)):
-            table[name] = column(key)
-    for key in ("base_axis", "platform_axis"):
-        axes = vectors(key)
-        if any(axis is not None for axis in axes):
-            table[key.replace("axis", "axes")] = axes
-    return table
-
-
-def _radius_columns(row: dict[str, Any]) -> Any:
-    """Return what a row says of the radius."""
-    parts = {part: row[part] for part in ("tube", "rod") if row.get(part) is not None}
-    return parts or row.get("radius")
+    return stated[0] if stated else str(told)
 
 
 UNITS = {"m": 0, "mm": -3}
 
 
-def read_table(path: Path, unit: str | None = None, name: str | None = None) -> Description:
+def read_description(path: Path, unit: str | None = None, name: str | None = None) -> Description:
     """Return the machine that a table describes.
 
     Parameters

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, ModelError, OutOfClass
-from legcal.files import closest
-from legcal.geometry import Array, MotionEntry, motion_to_xyz_quat
+from legcal.files import MotionEntry, closest, motion_to_xyz_quat
+from legcal.geometry import Array
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, LegChain, leg_of

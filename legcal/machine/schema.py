@@ -8,8 +8,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from legcal.errors import DatasetError, ModelError
-from legcal.files import FileSchema, PlainName, Version, closest, parse_yaml, validate
-from legcal.geometry import MotionEntry
+from legcal.files import FileSchema, MotionEntry, PlainName, Version, closest, parse_yaml, validate
 from legcal.machine.files import DATASET_YAML, read_file, what_a_dataset_is_for
 
 WHAT = "mechanism file"

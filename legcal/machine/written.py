@@ -15,8 +15,8 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, OutOfClass, OutOfResources, UsageError
-from legcal.files import write_atomically
-from legcal.geometry import Array, motion_to_xyz_quat, roll_pitch_yaw
+from legcal.files import motion_to_xyz_quat, write_atomically
+from legcal.geometry import Array, roll_pitch_yaw
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
 from legcal.machine.classification import LegChain, Step
 from legcal.machine.files import FOLDER_YAML

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from legcal.data import LegAxes, Measurements, choose_axes
+from legcal.data import LegAxes, Measurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.paper.base_unknowns import camera_starts, nominal_axes, side_of_plane, signs_seen
@@ -530,7 +530,7 @@ def _sided(
         legs = np.flatnonzero(with_axis)
         if len(legs) < 2:
             continue
-        of_view = choose_axes(axes, np.flatnonzero(view == v))
+        of_view = axes.choose(np.flatnonzero(view == v))
         seen = joints.A_camera[v, legs], joints.v_camera[v, legs[0]], legs
         side = side_of_plane(mechanism, of_view, measurements, *seen)
         sided[v], signs[v] = side != 0.0, -1.0 if side < 0.0 else 1.0

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
-from legcal.data import Corners, Measurements, choose_corners, few, row_names
+from legcal.data import Corners, Measurements, few, row_names
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry import Array, IntArray
 from legcal.vision import Board, Camera, PlanePose, plane_poses, refined_pose
@@ -156,7 +156,7 @@ def camera_poses(
     for v, view in enumerate(measurements.views):
         here = np.flatnonzero((measurements.view[corners.row] == v) & corners.used)
         try:
-            found = _view_pose(view.name, choose_corners(corners, here), board, measurements, names)
+            found = _view_pose(view.name, corners.choose(here), board, measurements, names)
         except (DatasetError, NotVisible) as error:
             if isinstance(error, DatasetError) or view.name in needed:
                 problems.setdefault(type(error), []).extend(error.problems)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Dataset, Outlines, choose_outlines
+from legcal.data import Dataset, Outlines
 from legcal.geometry import Array, Image, IntArray
 from legcal.machine import Cylinder
 from legcal.perception.outline import OUTSIDE
@@ -231,7 +231,7 @@ def marks_of_image(
     several |= {leg for leg, _ in pairs if len([None for j, _ in pairs if j == leg]) > 1}
     found = []
     for (leg, part), rows in pairs.items():
-        pair = choose_outlines(outlines, np.array(rows, dtype=np.intp))
+        pair = outlines.choose(np.array(rows, dtype=np.intp))
         marks = _part_marks(camera, pair, part, of_leg.get(leg))
         if not marks:
             continue

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from legcal.data import Outlines, choose_outlines, is_edited, join_outlines, merge_edited
+from legcal.data import Outlines, is_edited, join_outlines, merge_edited
 from legcal.geometry import BoolArray, IntArray
 from legcal.perception.bars import Bars
 from legcal.perception.detection import NOT_PLACED
@@ -71,7 +71,7 @@ def closer_look(
     hints = [view.T_base_camera for view in search.measurements.views]
     groups = group_views(search.measurements, photographs.detect, hints, joined)
     is_own = np.isin(outlines.row, photographs.detect)
-    own, others = choose_outlines(outlines, is_own), choose_outlines(outlines, ~is_own)
+    own, others = outlines.choose(is_own), outlines.choose(~is_own)
     closer = look_closer(
         search,
         groups,

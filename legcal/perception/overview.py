@@ -26,7 +26,6 @@ from legcal.data import (
     QUALITY,
     ImageReader,
     Outlines,
-    choose_outlines,
     is_edited,
     row_names,
     write_observations,
@@ -101,7 +100,7 @@ def view_figures(detection: Detection) -> dict[str, ViewFigures]:
     for v in np.unique(measurements.view).tolist():
         name = measurements.views[v].name
         images = int(np.count_nonzero(measurements.view[detection.rows] == v))
-        here = choose_outlines(outlines, measurements.view[outlines.row] == v)
+        here = outlines.choose(measurements.view[outlines.row] == v)
         found[name] = _figures(here, images, detection.unplaced.get(name, ""))
     return found
 
@@ -429,7 +428,7 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
     camera = measurements.views[int(measurements.view[row])].camera
     return marks_of_image(
         camera,
-        choose_outlines(outlines, outlines.row == row),
+        outlines.choose(outlines.row == row),
         detection.predicted(row),
         detection.dataset.mechanism.leg_names,
     )

@@ -18,7 +18,6 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data import (
     Measurements,
     Outlines,
-    choose_outlines,
     is_edited,
     join_outlines,
     merge_edited,
@@ -141,7 +140,7 @@ class Photographs:
     def narrowed(self, rows: IntArray, outlines: Outlines) -> Photographs:
         """Return the search of some rows again; edited and other rows' outlines are kept."""
         kept = ~np.isin(outlines.row, rows) | is_edited(outlines)
-        return replace(self, detect=rows, keep=choose_outlines(outlines, kept))
+        return replace(self, detect=rows, keep=outlines.choose(kept))
 
     def with_gammas(self, gammas: Mapping[str, float]) -> Photographs:
         """Return the same images, read with other gammas of some views, by their names."""
@@ -316,7 +315,7 @@ def given_outlines(photographs: Photographs, found: Outlines | None = None) -> O
     """Return found outlines and kept ones in one table; edited ones win."""
     kept = photographs.keep
     detected = no_outlines() if found is None else found
-    return join_outlines([merge_edited(detected, kept), choose_outlines(kept, ~is_edited(kept))])
+    return join_outlines([merge_edited(detected, kept), kept.choose(~is_edited(kept))])
 
 
 def counted(report: Report, stage: str, total: int) -> Callable[[int], None]:

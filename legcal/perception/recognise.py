@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import Outlines, choose_outlines, is_edited, join_outlines
+from legcal.data import Outlines, is_edited, join_outlines
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.agreement import NEAREST, Picture, Poses, exchanged
 from legcal.perception.camera_search import (
@@ -362,8 +362,8 @@ def _windows(
 def _merged(outlines: Outlines, again: Outlines) -> Outlines:
     """Return outlines with those of legs that were found again in their place."""
     found = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
-    kept, new = choose_outlines(outlines, ~_among(outlines, found)), _among(again, found)
-    return join_outlines([kept, choose_outlines(again, new)])
+    kept, new = outlines.choose(~_among(outlines, found)), _among(again, found)
+    return join_outlines([kept, again.choose(new)])
 
 
 def _among(outlines: Outlines, legs: Legs) -> BoolArray:

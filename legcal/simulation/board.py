@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DatasetError
-from legcal.files import parse_yaml, read_text
-from legcal.geometry import Array, BoolArray, motion_to_xyz_quat
+from legcal.files import motion_to_xyz_quat, parse_yaml, read_text
+from legcal.geometry import Array, BoolArray
 from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid
 from legcal.simulation.visibility import pixels_in_image
 from legcal.vision import (

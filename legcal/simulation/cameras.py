@@ -18,8 +18,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, NotVisible
-from legcal.files import FileSchema, PlainName, parse_yaml, read_text, validate
-from legcal.geometry import Array, MotionEntry, motion_of, normal_basis
+from legcal.files import FileSchema, MotionEntry, PlainName, parse_yaml, read_text, validate
+from legcal.geometry import Array, motion_of, normal_basis
 from legcal.machine import Mechanism
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard

@@ -6,8 +6,6 @@ cameras and the platform really were. Nothing of the method reads it.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import os
@@ -21,18 +19,29 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import AXES_NAME, CACHE_NAME, CORNERS_NAME, OBSERVATIONS_NAME, Measurements, View
-from legcal.errors import UsageError
+from legcal.data import (
+    AXES_NAME,
+    CACHE_NAME,
+    CORNERS_NAME,
+    OBSERVATIONS_NAME,
+    OUTLINE_COLUMNS,
+    Measurements,
+    View,
+)
+from legcal.errors import DatasetError, UsageError
 from legcal.files import (
     OutputKind,
     check_destination,
     check_path,
+    format_table,
     holds_files,
     in_the_way,
+    motion_to_xyz_quat,
     path_problem,
+    read_table,
     result_folder,
 )
-from legcal.geometry import Array, motion_to_xyz_quat
+from legcal.geometry import Array
 from legcal.machine import Configurations, LegKind, Mechanism, main_cylinders
 from legcal.simulation.settings import SimulationSettings
 from legcal.simulation.visibility import Images, Viewpoint
@@ -173,16 +182,15 @@ def _write_cameras(folder: Path, views: Sequence[View]) -> list[str]:
 
 def _measurements_text(mechanism: Mechanism, m: Measurements, groups: Sequence[str]) -> str:
     """Return the text of ``measurements.csv``."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
     motors = list(mechanism.motors)
     joints = [str(mechanism.legs[j].prismatic) for j in motors]
-    writer.writerow(["view", "image", "pose", *joints])
-    for row in range(m.n_rows):
-        v, label = m.view[row], m.pose_labels[m.pose[row]]
-        view = groups[v] if groups else m.views[v].name
-        writer.writerow([view, m.image[row], label, *map(repr, m.q[row, motors].tolist())])
-    return text.getvalue()
+    views = list(groups) or [view.name for view in m.views]
+    readings = m.q[:, motors].tolist()
+    rows = (
+        [views[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row]]
+        for row, v in enumerate(m.view.tolist())
+    )
+    return format_table(["view", "image", "pose", *joints], rows)
 
 
 def _rounded(T: RigidTransform) -> dict[str, list[float]]:
@@ -265,11 +273,11 @@ def _is_detected(folder: Path) -> bool:
     try:
         if json.loads((folder / CACHE_NAME).read_bytes()).get("given"):
             return False
-        with (folder / OBSERVATIONS_NAME).open(encoding="utf-8-sig", newline="") as file:
-            return all(row.get("source") != "edited" for row in csv.DictReader(file))
-    except FileNotFoundError as error:
-        return Path(error.filename).name == OBSERVATIONS_NAME
-    except (OSError, ValueError, AttributeError, RecursionError, csv.Error):
+        if not os.path.exists(folder / OBSERVATIONS_NAME):
+            return True
+        table = read_table(folder / OBSERVATIONS_NAME, "table", "outline", OUTLINE_COLUMNS)
+        return "edited" not in table.text("source")
+    except (OSError, ValueError, AttributeError, RecursionError, DatasetError):
         return False
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -12,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.data import check_travel
+from legcal.data import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
-from legcal.files import closest, describe, read_table
+from legcal.files import read_table
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     INSIDE,
@@ -44,43 +43,16 @@ class GivenReadings:
 
 def read_readings(path: Path, mechanism: Mechanism) -> GivenReadings:
     """Read a CSV of poses."""
-    motors = [mechanism.legs[j] for j in mechanism.motors]
-    joints = [str(leg.prismatic) for leg in motors]
     table = read_table(
-        path, "file of poses", "one row for each pose; write the readings of the motors"
+        path,
+        "file of poses",
+        "row",
+        reading_columns(mechanism.legs),
+        needed="one row for each pose; write the readings of the motors",
     )
-    problems = _header_problems(path, table.header, joints)
-    if problems:
-        raise DatasetError(problems)
-    rows = table.rows(problems)
-    where = [row.where for row in rows]
-    readings = np.array(
-        [[row.number(joint, "reading", "metres", problems) for joint in joints] for row in rows],
-        dtype=np.float64,
-    ).reshape(len(rows), len(joints))
-    problems += check_travel(path, where, motors, readings)[0]
-    if problems:
-        raise DatasetError(problems)
-    return GivenReadings(tuple(where), readings)
-
-
-def _header_problems(path: Path, header: Sequence[str], joints: Sequence[str]) -> list[str]:
-    """Return what is wrong with the columns."""
-    start = f"{path}, header: the columns could not be used: found"
-    problems = []
-    for name in dict.fromkeys([*header, *joints]):
-        count = header.count(name)
-        if name not in joints:
-            problems.append(
-                f"{start} the unknown column {describe(name)}, needed actuated joints of the "
-                f"mechanism; {closest(name, joints)}"
-            )
-        elif count != 1:
-            problems.append(
-                f"{start} the column '{name}' {count} times, needed the readings of that joint [m] "
-                "once; correct the header."
-            )
-    return problems
+    readings, _ = readings_in(table, mechanism.legs)
+    table.check()
+    return GivenReadings(tuple(table.where), readings)
 
 
 JITTER = 0.12  # of the travel, by which extreme lengths stay away from its ends at most

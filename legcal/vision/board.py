@@ -19,6 +19,7 @@ from legcal.errors import DatasetError, UsageError
 from legcal.files import (
     LENGTH,
     FileSchema,
+    MotionEntry,
     Number,
     closest,
     describe,
@@ -27,7 +28,7 @@ from legcal.files import (
     read_text,
     validate,
 )
-from legcal.geometry import Array, MotionEntry
+from legcal.geometry import Array
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 

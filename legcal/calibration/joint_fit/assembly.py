@@ -31,7 +31,7 @@ from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_rea
 from legcal.calibration.joint_fit.solution import Solution, Status
 from legcal.calibration.joint_fit.solver import robust_cost
 from legcal.calibration.joint_fit.state import RefinementSettings, State
-from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements, restore_outlines
+from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
 from legcal.estimation import NoiseModel, width_to_k
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import footed, parametrize, radius_name
@@ -273,7 +273,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
         value_covariance=solution.value_covariance[np.ix_(steps, steps)],
         held_basis=solution.held_basis[:, steps],
         sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
-        outlines=restore_outlines(solution.outlines, order),
+        outlines=order.restore(solution.outlines),
     )
 
 

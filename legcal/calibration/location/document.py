@@ -28,17 +28,19 @@ from legcal.calibration.location.model import (
 from legcal.errors import DatasetError, ModelError, UsageError
 from legcal.files import (
     FileSchema,
+    MotionEntry,
     Number,
     OwnYaml,
     Version,
     existing_parent,
     is_plain_name,
+    motion_to_xyz_quat,
     parse_yaml,
     read_text,
     temporary_folder,
     validate,
 )
-from legcal.geometry import MotionEntry, motion_to_xyz_quat, roll_pitch_yaw
+from legcal.geometry import roll_pitch_yaw
 from legcal.machine import Mechanism, Origin, Urdf, load_mechanism, patch_origins, write_model
 
 WHAT = "location file"

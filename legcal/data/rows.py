@@ -1,0 +1,150 @@
+"""Tables of what images show: rows chosen, joined, put in order, and brought to other images.
+
+A table (outlines, axes, corners) has one entry a row in each of its fields, and names in ``row``
+the image that shows it, a row of the measurements. Sessions are put into canonical order where
+they are loaded, so that results do not depend on the order of files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self, TypeVar
+
+import numpy as np
+
+from legcal.data.measurements import Measurements
+from legcal.geometry import BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A table whose fields are arrays or tuples with one entry a row."""
+
+    row: IntArray  # (n,) of the measurements
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def row_keys(self) -> list[tuple[Any, ...]]:
+        """Return what makes each row one and the same, by which tables are sorted."""
+        raise NotImplementedError
+
+    def choose(self, chosen: BoolArray | IntArray) -> Self:
+        """Return some rows: those of a mask, or those of indices in a new order."""
+        index = np.arange(len(self))[chosen]
+        some: dict[str, Any] = {
+            name: tuple(map(values.__getitem__, index.tolist()))
+            if isinstance(values, tuple)
+            else values[index]
+            for name, values in self._fields().items()
+        }
+        return replace(self, **some)
+
+    def join(self, others: Iterable[Self]) -> Self:
+        """Return the rows of this table and of others, one after the other."""
+        parts = [self._fields(), *(other._fields() for other in others)]
+        all_of_them: dict[str, Any] = {
+            name: tuple(entry for part in parts for entry in part[name])
+            if isinstance(values, tuple)
+            else np.concatenate([part[name] for part in parts])
+            for name, values in parts[0].items()
+        }
+        return replace(self, **all_of_them)
+
+    def sort(self) -> Self:
+        """Return the rows sorted by their keys."""
+        keys = self.row_keys()
+        return self.choose(np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp))
+
+    def at(self, rows: IntArray) -> Self:
+        """Return what some images show, as a table of :func:`measurements_at` them."""
+        place = np.full(max(rows.max(initial=-1), self.row.max(initial=-1)) + 1, -1, dtype=np.intp)
+        place[rows] = np.arange(len(rows))
+        place = place[self.row]
+        return replace(self.choose(place >= 0), row=place[place >= 0])
+
+    def _fields(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+_Table = TypeVar("_Table", bound=Rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """Permutations: element k of a reordered thing is element ``index[k]`` of the original."""
+
+    rows: IntArray
+    views: IntArray
+    legs: IntArray
+
+    def reorder(self, table: _Table) -> _Table:
+        """Return a table of the original measurements as one of the reordered ones, sorted."""
+        return self._renamed(table, inverse(self.rows), inverse(self.legs))
+
+    def restore(self, table: _Table) -> _Table:
+        """Return a table of reordered measurements as one of the original ones, sorted."""
+        return self._renamed(table, self.rows, self.legs)
+
+    def _renamed(self, table: _Table, rows: IntArray, legs: IntArray) -> _Table:
+        changed = {"row": rows[table.row]}
+        if hasattr(table, "leg"):
+            changed["leg"] = legs[table.leg]
+        return replace(table, **changed).sort()
+
+
+def canonical_order(measurements: Measurements, leg_names: Sequence[str]) -> Order:
+    """Return legs and views by name, and rows by view, image, pose label and readings."""
+    legs = np.argsort(np.array(leg_names, dtype=object), kind="stable")
+    view_names = np.array([view.name for view in measurements.views], dtype=object)
+    views = np.argsort(view_names, kind="stable")
+    return Order(sort_rows(measurements, legs), views, legs)
+
+
+def sort_rows(measurements: Measurements, legs: IntArray | None = None) -> IntArray:
+    """Return the rows by view name, image, pose label and readings, the legs' in a given order."""
+    q = np.nan_to_num(measurements.q if legs is None else measurements.q[:, legs])
+    labels = measurements.pose_labels or ("",) * measurements.n_poses
+    keys = [
+        (measurements.views[v].name, image, labels[p], readings)
+        for v, image, p, readings in zip(
+            measurements.view.tolist(),
+            measurements.image,
+            measurements.pose.tolist(),
+            q.tolist(),
+            strict=True,
+        )
+    ]
+    return np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+
+
+def reorder_measurements(measurements: Measurements, order: Order) -> Measurements:
+    """Return measurements in another order; poses are numbered as they first appear."""
+    moved = measurements_at(measurements, order.rows)
+    return replace(
+        moved,
+        views=tuple(measurements.views[v] for v in order.views.tolist()),
+        view=inverse(order.views)[moved.view],
+        q=moved.q[:, order.legs],
+    )
+
+
+def measurements_at(measurements: Measurements, rows: IntArray) -> Measurements:
+    """Return some rows in a new order; poses are numbered as they first appear, all views stay."""
+    poses, first, pose = np.unique(measurements.pose[rows], return_index=True, return_inverse=True)
+    appearance = np.argsort(first)
+    labels = measurements.pose_labels
+    return replace(
+        measurements,
+        image=tuple(measurements.image[row] for row in rows.tolist()),
+        view=measurements.view[rows],
+        pose=np.argsort(appearance)[pose],
+        q=measurements.q[rows],
+        pose_labels=tuple(labels[p] for p in poses[appearance].tolist()) if labels else (),
+    )
+
+
+def inverse(permutation: IntArray) -> IntArray:
+    """Return where each original element went: ``inverse(p)[p[k]] == k``."""
+    return np.argsort(permutation)
