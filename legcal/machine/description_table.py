@@ -211,7 +211,7 @@ def read_columns(path: Path, unit: str | None) -> dict[str, Any]:
     """
     needed = "one row for each leg; add them"
     table = read_table(path, WHAT, "leg", COLUMNS, needed=needed, fold=True)
-    filled = [np.array([text != "" for text in table.text(name)]) for name in _RADII]
+    filled = [np.array([text != "" for text in table.text(name)], dtype=bool) for name in _RADII]
     for row in np.flatnonzero(filled[0] & (filled[1] | filled[2])).tolist():
         needed = "one of them; empty the others"
         table.refuse(row, "radius beside tube or rod", needed, *_RADII, what="radius")
