@@ -99,32 +99,14 @@ class LegAxes(Rows):
 
 
 def axes_from_outlines(
-    outlines: Outlines, measurements: Measurements, radius_of_part: Mapping[str, float]
+    outlines: Outlines,
+    measurements: Measurements,
+    radius_of_part: Mapping[str, float],  # radius of each cylinder by its URDF link [m]
 ) -> LegAxes:
     """Return the axis of every leg of which both outlines are used, eqs (4) and (5).
 
     The cylinders of one leg in one image (a tube and a rod) share an axis: they are joined,
     weighted by their covariances.
-
-    Parameters
-    ----------
-    outlines : Outlines
-        Outlines in images; those that are rejected or lack their partner are passed over.
-    measurements : Measurements
-        The images and their cameras.
-    radius_of_part : mapping from str to float
-        Radius of each cylinder by its URDF link [m].
-
-    Returns
-    -------
-    LegAxes
-        One row for each leg in each image, by image and then by leg. The reference point M is
-        the point of the axis in the middle of the used piece, where it is known best.
-
-    Raises
-    ------
-    NotVisible
-        If no image shows both outlines of a leg, or two outlines coincide.
     """
     pairs = _pairs(outlines)
     if len(pairs) == 0:
@@ -151,27 +133,17 @@ def axes_from_outlines(
     return join_axes(separate, separate.row)
 
 
-def axis_derivative(h: Array, h_of_offset: Array, u: Array, M: Array, basis: Array) -> Array:
+def axis_derivative(
+    h: Array,  # (n, 2, 3) unit normals of both outlines
+    h_of_offset: Array,  # (n, 2, 2
+    u: Array,  # (n, 3)
+    M: Array,  # (n, 3)
+    basis: Array,  # (n, 2, 3) e1 and e2 of each axis
+) -> Array:
     """Return the derivative of axes with respect to the offsets of both outlines.
 
     A change of h_i must keep h_i . u = 0 (4) and h_i . M = epsilon_i R (5), so the
     changes of u and of M solve the same 2 x 2 system.
-
-    Parameters
-    ----------
-    h : (n, 2, 3) array
-        Unit normals of both outlines.
-    h_of_offset : (n, 2, 2, 3) array
-        Derivative of each normal with respect to the offsets of its two ends [1/px].
-    u, M : (n, 3) array
-        The axes [m].
-    basis : (n, 2, 3) array
-        e1 and e2 of each axis.
-
-    Returns
-    -------
-    (n, 4, 4) array
-        d(alpha1, alpha2, beta1, beta2) / d(offsets of edge 1, of edge 2) [rad/px, m/px].
     """
     system = np.einsum("nia,nja->nij", h, basis)
     change = np.zeros((len(u), 2, 2, 4))  # (n, equation i, of u or of M, offset)
@@ -184,21 +156,11 @@ def axis_derivative(h: Array, h_of_offset: Array, u: Array, M: Array, basis: Arr
     return np.concatenate([solved[:, :, 0], solved[:, :, 1]], axis=1)
 
 
-def join_axes(axes: LegAxes, group: IntArray) -> LegAxes:
-    """Return one axis for each leg in each group of rows, weighted by the covariances.
-
-    Parameters
-    ----------
-    axes : LegAxes
-        Observed axes, in one camera frame within a group.
-    group : (n,) array of int
-        Axes with the same group and leg are observations of one line.
-
-    Returns
-    -------
-    LegAxes
-        Joined axes, ordered by group and then by leg; ``row`` is the first of each.
-    """
+def join_axes(
+    axes: LegAxes,
+    group: IntArray,  # (n,) axes with the same group and leg are observations of one line
+) -> LegAxes:
+    """Return one axis for each leg in each group of rows, weighted by the covariances."""
     keys = np.stack([group, axes.leg], axis=1)
     _, first, which, count = np.unique(
         keys, axis=0, return_index=True, return_inverse=True, return_counts=True
@@ -217,18 +179,12 @@ def join_axes(axes: LegAxes, group: IntArray) -> LegAxes:
 
 
 def _joined(
-    axes: LegAxes, first: IntArray, members: IntArray, line: IntArray
+    axes: LegAxes,
+    first: IntArray,  # (m,) the first observation of each line, in whose basis the mean is taken
+    members: IntArray,  # (n,)
+    line: IntArray,  # (n,)
 ) -> tuple[Array, Array, Array, Array]:
-    """Return u, M, basis and covariance of the weighted mean of the observations of each line.
-
-    Parameters
-    ----------
-    axes : LegAxes
-    first : (m,) array of int
-        The first observation of each line, in whose basis the mean is taken.
-    members, line : (n,) array of int
-        Observations, and the line that each of them shows.
-    """
+    """Return u, M, basis and covariance of the weighted mean of the observations of each line."""
     u, M, basis = axes.u[first], axes.M[first], axes.basis[first]
     E = basis[line]
     # Each observation at the height of the first one's M, written in its basis.
@@ -280,25 +236,14 @@ def _end_rays_and_derivatives(
     return rays, derivative
 
 
-def outline_derivative(camera: Camera, h: Array, ends: Array) -> tuple[Array, Array]:
+def outline_derivative(
+    camera: Camera,
+    h: Array,  # (..., 3) unit normals of outlines, in its frame
+    ends: Array,  # (..., 2, 2) their ends [px]
+) -> tuple[Array, Array]:
     """Return the rays of an outline's ends and how its normal follows offsets of these ends.
 
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    h : (..., 3) array
-        Unit normals of outlines, in its frame.
-    ends : (..., 2, 2) array
-        Their ends [px].
-
-    Returns
-    -------
-    rays : (..., 2, 3) array
-        The ends (x, y, 1) on the sensor plane.
-    derivative : (..., 2, 3) array
-        d h / d offset of each end [1/px], an offset being that of
-        :meth:`legcal.vision.camera.Camera.line_offset`.
+    Returns rays (..., 2, 3); derivative (..., 2, 3) [1/px].
     """
     xy = camera.undistort(ends)
     ones = np.ones((*xy.shape[:-1], 1))
@@ -323,23 +268,13 @@ def _nearest_point_to_ray(u: Array, M: Array, ray: Array) -> Array:
     return np.asarray(M + t[:, None] * u)
 
 
-def axes_of_table(row: IntArray, leg: IntArray, values: Array, sigmas: Array) -> LegAxes:
-    """Return axes from their angles and their points M_LS.
-
-    Parameters
-    ----------
-    row, leg : (n,) array of int
-        Indices of the image and of the leg.
-    values : (n, 4) array
-        psi, theta [rad] and x, z [m] in the camera frame. Away from |theta| = pi/2 and
-        |psi| = pi/2, where M_LS does not exist.
-    sigmas : (n, 4) array
-        Their standard deviations; their errors are independent.
-
-    Returns
-    -------
-    LegAxes
-    """
+def axes_of_table(
+    row: IntArray,  # (n,)
+    leg: IntArray,  # (n,)
+    values: Array,  # (n, 4) psi, theta [rad] and x, z [m] in the camera frame
+    sigmas: Array,  # (n, 4) their standard deviations; their errors are independent
+) -> LegAxes:
+    """Return axes from their angles and their points M_LS."""
     psi, theta, x, z = values.T
     u = direction_of_angles(psi, theta)
     M = np.stack([x, np.zeros_like(x), z], axis=-1)
@@ -353,20 +288,6 @@ def table_of_axes(axes: LegAxes) -> tuple[Array, Array]:
 
     Correlations between the four, which the table has no place for, are left out; axes that
     came from :func:`axes_of_table` have none.
-
-    Parameters
-    ----------
-    axes : LegAxes
-
-    Returns
-    -------
-    values, sigmas : (n, 4) array
-        psi, theta [rad] and x, z [m].
-
-    Raises
-    ------
-    NotVisible
-        If an axis is parallel to the plane y = 0, where M_LS does not exist.
     """
     M = point_with_zero_y(axes.u, axes.M)
     # The same line and its covariance, written at M_LS.

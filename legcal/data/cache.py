@@ -33,71 +33,33 @@ FORMAT = 1
 
 
 class CacheEntry(FileSchema):
-    """The content of ``.legcal-cache.json``.
-
-    Attributes
-    ----------
-    fingerprint : str
-        Of all that the detected outlines in the table came from.
-    given : list of (view, image)
-        The images whose outlines the user gave; they are never detected.
-    notes : tuple of str
-        What was to be said of the images.
-    """
+    """The content of ``.legcal-cache.json``."""
 
     format: int
-    fingerprint: str
-    given: list[tuple[str, str]]
-    notes: tuple[str, ...] = ()
+    fingerprint: str  # of all that the detected outlines in the table came from
+    given: list[tuple[str, str]]  # the images whose outlines the user gave; they are never detected
+    notes: tuple[str, ...] = ()  # what was to be said of the images
 
 
 @dataclass(frozen=True, eq=False)
 class DetectionPlan:
-    """What is left to detect.
+    """What is left to detect."""
 
-    Attributes
-    ----------
-    detect : (n,) array of int
-        Rows of the measurements whose images are to be detected.
-    keep : Outlines
-        Outlines to use as they are; its edited rows win over those that detection finds.
-    given : (n_rows,) array of bool
-        Rows whose outlines the user gave.
-    notes : tuple of str
-        What was to be said of the images when they were searched, if none is searched again.
-    is_cached : bool
-        Whether all outlines are those that an earlier run left.
-    """
-
-    detect: IntArray
-    keep: Outlines
-    given: BoolArray
-    notes: tuple[str, ...] = ()
-    is_cached: bool = False
+    detect: IntArray  # (n,) rows of the measurements whose images are to be detected
+    keep: Outlines  # outlines to use as they are
+    given: BoolArray  # (n_rows,) rows whose outlines the user gave
+    notes: tuple[str, ...] = ()  # what was to be said of the images when they were searched
+    is_cached: bool = False  # whether all outlines are those that an earlier run left
 
 
 def plan_detection(
     table: Outlines | None,
-    has_image: BoolArray,
+    has_image: BoolArray,  # (n_rows,) whether a row has an image file
     recorded: str | None,
     current: str,
-    given: BoolArray,
+    given: BoolArray,  # (n_rows,)
 ) -> DetectionPlan:
-    """Return which images to detect and which outlines of the table to keep.
-
-    Parameters
-    ----------
-    table : Outlines or None
-        The table beside the dataset, if there is one.
-    has_image : (n_rows,) array of bool
-        Whether a row has an image file; one without cannot be detected.
-    recorded : str or None
-        The fingerprint beside the table; None for a table that the user gave.
-    current : str
-        The fingerprint of the dataset as it is.
-    given : (n_rows,) array of bool
-        Rows that the user gave to a table which legcal has completed since.
-    """
+    """Return which images to detect and which outlines of the table to keep."""
     if table is None:
         return DetectionPlan(np.flatnonzero(has_image), no_outlines(), np.zeros_like(has_image))
     edited = is_edited(table)
@@ -113,15 +75,7 @@ def plan_detection(
 
 
 def plan_dataset(dataset: Dataset, current: str) -> DetectionPlan:
-    """Return :func:`plan_detection` for a dataset as it lies in its folder.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        The dataset.
-    current : str
-        Its :func:`fingerprint`.
-    """
+    """Return :func:`plan_detection` for a dataset as it lies in its folder."""
     if dataset.axes is not None:  # they take the place of images
         none = np.zeros(0, dtype=np.intp)
         given = np.zeros(dataset.measurements.n_rows, dtype=np.bool_)
@@ -146,13 +100,6 @@ def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:
     It covers the images, readings, views and cameras, the board and its pose, the mechanism's
     files, the encoder sigma, the settings of detection and the version of legcal; not the order
     of the rows.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        The dataset.
-    settings : mapping
-        The settings of detection, as JSON has them.
     """
     digest = hashlib.sha256()
     for part in (*_described(dataset, settings), *_files(dataset)):
@@ -209,30 +156,10 @@ def store_outlines(
     dataset: Dataset,
     outlines: Outlines,
     current: str,
-    given: BoolArray,
+    given: BoolArray,  # (n_rows,) ``DetectionPlan.given``
     notes: Sequence[str] = (),
 ) -> str | None:
-    """Write outlines and the fingerprint of what they came from beside the dataset.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        The dataset.
-    outlines : Outlines
-        All of its outlines, detected, edited and given.
-    current : str
-        Its :func:`fingerprint`.
-    given : (n_rows,) array of bool
-        ``DetectionPlan.given``.
-    notes : sequence of str
-        What is to be said of the images.
-
-    Returns
-    -------
-    str or None
-        A note if the folder cannot be written to: detection is repeated next time. None if
-        the outlines were written.
-    """
+    """Write outlines and the fingerprint of what they came from beside the dataset."""
     names = zip(places(dataset.measurements), given, strict=True)
     entry = {
         "format": FORMAT,

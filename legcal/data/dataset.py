@@ -44,22 +44,7 @@ AXES_NAME = "axes.csv"
 def read_given_axes(
     path: Path, leg_names: Sequence[str], measurements: Measurements
 ) -> tuple[LegAxes | None, list[str]]:
-    """Return the axes of the legs that the views use, and a note about others.
-
-    Parameters
-    ----------
-    path : Path
-        The table; None is returned if there is none.
-    leg_names : sequence of str
-        The legs of the mechanism.
-    measurements : Measurements
-        The rows that axes belong to.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each thing that is wrong.
-    """
+    """Return the axes of the legs that the views use, and a note about others."""
     if not os.path.exists(path):
         return None, []
     axes = read_axes(path, leg_names, measurements)
@@ -96,22 +81,7 @@ LEAST_CORNERS = 4  # in an image that must place its camera
 def read_given_corners(
     path: Path, board: Board | None, measurements: Measurements
 ) -> Corners | None:
-    """Return the corners beside a dataset, if there are any.
-
-    Parameters
-    ----------
-    path : Path
-        The table; None is returned if there is none.
-    board : Board or None
-        The board that the dataset describes.
-    measurements : Measurements
-        The rows that corners belong to.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each thing that is wrong.
-    """
+    """Return the corners beside a dataset, if there are any."""
     if not os.path.exists(path):
         return None
     if board is None:
@@ -125,19 +95,7 @@ def read_given_corners(
 def rows_without_board(
     table_path: Path, measurements: Measurements, corners: Corners, hand_held: Sequence[int]
 ) -> list[str]:
-    """Return one sentence for each row of a hand-held view in which the board has no pose.
-
-    Parameters
-    ----------
-    table_path : Path
-        ``measurements.csv``, for messages.
-    measurements : Measurements
-        The rows.
-    corners : Corners
-        The given corners.
-    hand_held : sequence of int
-        The rows of hand-held views.
-    """
+    """Return one sentence for each row of a hand-held view in which the board has no pose."""
     counts = np.bincount(corners.row[corners.used], minlength=measurements.n_rows)
     return [
         f"{table_path}, row {row + 1}: its camera could not be placed: found "
@@ -158,27 +116,13 @@ _WORDS: Mapping[Action, str] = {
 
 @dataclass(frozen=True)
 class Wish:
-    """What somebody asks of one parameter, or of all that a pattern matches.
+    """What somebody asks of one parameter, or of all that a pattern matches."""
 
-    Attributes
-    ----------
-    name : str
-        A name or a pattern.
-    action : {"prior", "fixed", "free"}
-        What to do with it.
-    where : str
-        Where this was said: the start of a sentence about it.
-    stated : Stated or None
-        The prior, or the value that it is fixed at; None for the nominal one.
-    in_file : bool
-        Said in ``dataset.yaml``, which gives way to what is asked for in a run.
-    """
-
-    name: str
-    action: Action
-    where: str
-    stated: Stated | None = None
-    in_file: bool = False
+    name: str  # or a pattern
+    action: Action  # what to do with it
+    where: str  # where this was said: the start of a sentence about it
+    stated: Stated | None = None  # the prior, or the value that it is fixed at
+    in_file: bool = False  # said in ``dataset.yaml``, which gives way to what is asked for in a run
 
 
 def wishes_of_call(
@@ -186,21 +130,7 @@ def wishes_of_call(
     fixed: Sequence[str] = (),
     free: Sequence[str] = (),
 ) -> tuple[Wish, ...]:
-    """Return what the arguments of a call or the options of a command ask for.
-
-    Parameters
-    ----------
-    priors : mapping or sequence of str
-        Pairs (value, sigma) in SI units or pixels, or texts with units, by name; or texts that
-        begin with ``NAME=``.
-    fixed, free : sequence of str
-        Names; ``NAME=VALUE`` fixes at a value that is not the nominal one.
-
-    Raises
-    ------
-    UsageError
-        With one sentence for each that cannot be read.
-    """
+    """Return what the arguments of a call or the options of a command ask for."""
     entries: list[tuple[Action, str, object]] = []
     if isinstance(priors, Mapping):
         entries += [("prior", str(name), value) for name, value in priors.items()]
@@ -224,26 +154,7 @@ def wishes_of_call(
 def read_wish(
     action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
 ) -> Wish:
-    """Return a wish as it was written.
-
-    Parameters
-    ----------
-    action : {"prior", "fixed", "free"}
-        What to do.
-    text : str
-        The name, with ``=VALUE`` behind it where the value does not stand apart.
-    where : str
-        Where this was said.
-    value : Stated, str, pair of numbers, mapping or None
-        The prior, where it stands apart from its name.
-    in_file : bool
-        Said in ``dataset.yaml``.
-
-    Raises
-    ------
-    ValueError
-        If the value cannot be read: found, needed, and what to do.
-    """
+    """Return a wish as it was written."""
     name, stated = text, None
     if value is not None:
         stated = read_prior(value)
@@ -267,50 +178,21 @@ OBSERVATIONS_NAME = "observations.csv"
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Everything that a calibration starts from.
+    """Everything that a calibration starts from."""
 
-    Attributes
-    ----------
-    folder : Path
-        The dataset folder.
-    yaml_path, table_path : Path
-        ``dataset.yaml`` and the table of measurements.
-    camera_paths : tuple of Path
-        The camera file of each view.
-    mechanism : Mechanism
-        The nominal model.
-    measurements : Measurements
-        The rows of the table, in its order.
-    observations : Outlines or None
-        The rows of ``observations.csv`` if there is one: given, cached or edited.
-    notes : tuple of str
-        What is odd but allowed.
-    axes : LegAxes or None
-        The rows of ``axes.csv`` if there is one, of the legs that the views use. Images are
-        then not searched, and there are no observations.
-    wishes : tuple of Wish
-        What the block ``parameters`` asks of parameters by name.
-    board : Board or None
-        The calibration board that is fixed to the base.
-    T_base_board : RigidTransform or None
-        Its pose in the base link, where it is known.
-    corners : Corners or None
-        The rows of ``corners.csv`` if there is one. Images are then not searched for the board.
-    """
-
-    folder: Path
-    yaml_path: Path
-    table_path: Path
-    camera_paths: tuple[Path, ...]
-    mechanism: Mechanism
-    measurements: Measurements
-    observations: Outlines | None
-    notes: tuple[str, ...] = ()
-    axes: LegAxes | None = None
-    wishes: tuple[Wish, ...] = ()
-    board: Board | None = None
-    T_base_board: RigidTransform | None = None
-    corners: Corners | None = None
+    folder: Path  # the dataset folder
+    yaml_path: Path  # ``dataset.yaml`` and the table of measurements
+    table_path: Path  # ``dataset.yaml`` and the table of measurements
+    camera_paths: tuple[Path, ...]  # the camera file of each view
+    mechanism: Mechanism  # the nominal model
+    measurements: Measurements  # the rows of the table, in its order
+    observations: Outlines | None  # the rows of ``observations.csv`` if there is one
+    notes: tuple[str, ...] = ()  # what is odd but allowed
+    axes: LegAxes | None = None  # the rows of ``axes.csv`` if there is one
+    wishes: tuple[Wish, ...] = ()  # what the block ``parameters`` asks of parameters by name
+    board: Board | None = None  # the calibration board that is fixed to the base
+    T_base_board: RigidTransform | None = None  # its pose in the base link, where it is known
+    corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
 
     def image_path(self, row: int) -> Path | None:
         """Return the image file of a row; None where only outlines are given."""
@@ -318,13 +200,7 @@ class Dataset:
         return self.folder / image if image else None
 
     def read_image(self, row: int) -> Image:
-        """Return the image of a row as (height, width) grey levels 0 to 255, float32.
-
-        Raises
-        ------
-        DatasetError
-            If the row has no image, or its file cannot be used.
-        """
+        """Return the image of a row as (height, width) grey levels 0 to 255, float32."""
         return self.image_reader([row])(0)
 
     def image_reader(self, rows: Sequence[int]) -> ImageReader:
@@ -351,21 +227,11 @@ class Dataset:
 
 @dataclass(frozen=True, eq=False)
 class ImageReader:
-    """Reads images by their number.
+    """Reads images by their number."""
 
-    Attributes
-    ----------
-    paths : tuple of Path or None
-        The files; None where a row has no image.
-    cameras : tuple of Camera
-        The camera of each image.
-    places : tuple of str
-        Where each image is named, for messages.
-    """
-
-    paths: tuple[Path | None, ...]
-    cameras: tuple[Camera, ...]
-    places: tuple[str, ...]
+    paths: tuple[Path | None, ...]  # the files; None where a row has no image
+    cameras: tuple[Camera, ...]  # the camera of each image
+    places: tuple[str, ...]  # where each image is named, for messages
 
     def __call__(self, k: int) -> Image:
         """Return image k as (height, width) grey levels 0 to 255, float32."""
@@ -379,15 +245,7 @@ class ImageReader:
 
 
 def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
-    """Return one sentence for each row that neither an image nor tables make usable.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        The dataset.
-    hand_held : sequence of int
-        The rows of hand-held views, which need the board.
-    """
+    """Return one sentence for each row that neither an image nor tables make usable."""
     table_path, measurements = dataset.table_path, dataset.measurements
     if dataset.corners is None:
         problems = [
@@ -495,17 +353,7 @@ class DatasetEntry(FileSchema):
 
 
 def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board: bool) -> list[str]:
-    """Return what keeps views from being hand-held.
-
-    Parameters
-    ----------
-    path : Path
-        ``dataset.yaml``.
-    views : mapping of str to ViewEntry
-        Its views.
-    has_board : bool
-        Whether it describes a calibration board.
-    """
+    """Return what keeps views from being hand-held."""
     held = {name: view for name, view in views.items() if view.hand_held}
     problems = [
         f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
@@ -526,26 +374,7 @@ def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board:
 def expand_hand_held(
     path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
 ) -> tuple[Measurements, tuple[int, ...], list[str]]:
-    """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows.
-
-    Parameters
-    ----------
-    path : Path
-        ``dataset.yaml``, for messages.
-    measurements : Measurements
-        The rows, with the views of the file.
-    views : mapping of str to ViewEntry
-        Those views.
-
-    Returns
-    -------
-    measurements : Measurements
-        With the new views in the places of the old ones.
-    origin : tuple of int
-        The view of the file that each new view comes from.
-    problems : list of str
-        Names that the file has given to other views.
-    """
+    """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows."""
     new: list[View] = []
     origin: list[int] = []
     problems: list[str] = []

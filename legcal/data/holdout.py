@@ -21,26 +21,14 @@ _SEED = 20020721
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """The images of a dataset that are fitted, and those that are kept aside.
+    """The images of a dataset that are fitted, and those that are kept aside."""
 
-    Attributes
-    ----------
-    fitted, kept_aside : (n,) array of int
-        Rows of the measurements, rising.
-    """
-
-    fitted: IntArray
-    kept_aside: IntArray
+    fitted: IntArray  # (n,) rows of the measurements, rising
+    kept_aside: IntArray  # (n,) rows of the measurements, rising
 
 
 def check_fraction(fraction: float) -> None:
-    """Refuse a part of the images that is none.
-
-    Raises
-    ------
-    UsageError
-        If it is not between 0 and 1.
-    """
+    """Refuse a part of the images that is none."""
     if not 0.0 < fraction < 1.0:
         raise UsageError(
             f"The images to keep aside could not be chosen: found the fraction {fraction:g}, "
@@ -49,26 +37,7 @@ def check_fraction(fraction: float) -> None:
 
 
 def split_images(dataset: Dataset, fraction: float) -> Split:
-    """Return which images to fit and which to keep aside.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        All images.
-    fraction : float
-        Part of the images to keep aside, between 0 and 1.
-
-    Returns
-    -------
-    Split
-
-    Raises
-    ------
-    UsageError
-        If the fraction is not between 0 and 1.
-    NotIdentifiable
-        If there are too few images to keep any aside.
-    """
+    """Return which images to fit and which to keep aside."""
     check_fraction(fraction)
     measurements = dataset.measurements
     shown = _shown(dataset)

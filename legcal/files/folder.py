@@ -25,20 +25,7 @@ _MOST_OF_NAME = 40  # letters: a name of the greatest length leaves none for wha
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that any other program sees its old or its new content, never a part.
-
-    Parameters
-    ----------
-    path : Path
-        The file; one that is there is replaced.
-    content : bytes
-        Its new content.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; the old file is then untouched.
-    """
+    """Write a file so that any other program sees its old or its new content, never a part."""
     with temporary_folder(path.parent, path.name) as folder:
         (folder / path.name).write_bytes(content)
         os.replace(folder / path.name, path)
@@ -60,13 +47,6 @@ def path_problem(folder: Path, named: str) -> str | None:
     """Return what keeps a path from being a relative path inside a folder, or None.
 
     Symbolic links are followed: a link that leads out of the folder is a way out of it.
-
-    Parameters
-    ----------
-    folder : Path
-        The dataset folder.
-    named : str
-        The path as the file names it.
     """
     if PurePosixPath(named).is_absolute() or PureWindowsPath(named).is_absolute():
         return "an absolute path"
@@ -81,33 +61,15 @@ def path_problem(folder: Path, named: str) -> str | None:
 
 @dataclass(frozen=True)
 class OwnYaml:
-    """A kind of file.
+    """A kind of file."""
 
-    Attributes
-    ----------
-    noun : str
-        What is written, with its article, for sentences: "the camera".
-    what : str
-        What the file is called where it cannot be read: "camera file".
-    key : str
-        The entry by which a file of this kind is known.
-    needed : str
-        What may stand in its place, for sentences: "a new file or an earlier location".
-    """
-
-    noun: str
-    what: str
-    key: str
-    needed: str
+    noun: str  # what is written, with its article, for sentences: "the camera"
+    what: str  # what the file is called where it cannot be read: "camera file"
+    key: str  # the entry by which a file of this kind is known
+    needed: str  # what may stand in its place, for sentences: "a new file or an earlier location"
 
     def check_place(self, path: Path) -> None:
-        """Refuse a place where no file can be written, or where another one stands.
-
-        Raises
-        ------
-        UsageError
-            With what is there instead.
-        """
+        """Refuse a place where no file can be written, or where another one stands."""
         start = f"{path}: {self.noun} could not be written: found"
         if not path.name or os.path.isdir(path):
             raise UsageError(f"{start} a folder, needed the name of a file; give one in it.")
@@ -134,15 +96,7 @@ class OwnYaml:
             return False
 
     def write(self, path: Path, text: str) -> None:
-        """Write a file; an earlier one of its kind is replaced, any other is not.
-
-        Raises
-        ------
-        UsageError
-            As :meth:`check_place`.
-        OutOfResources
-            If the file cannot be written.
-        """
+        """Write a file; an earlier one of its kind is replaced, any other is not."""
         self.check_place(path)
         try:
             write_atomically(path, text.encode())
@@ -155,19 +109,11 @@ class OwnYaml:
 
 @dataclass(frozen=True)
 class OutputKind:
-    """A kind of output folder.
+    """A kind of output folder."""
 
-    Attributes
-    ----------
-    noun : str
-        What the folder holds.
-    marker, key : str
-        The JSON document that legcal leaves in such a folder, and a key in it.
-    """
-
-    noun: str
-    marker: str
-    key: str
+    noun: str  # what the folder holds
+    marker: str  # the JSON document that legcal leaves in such a folder, and a key in it
+    key: str  # the JSON document that legcal leaves in such a folder, and a key in it
 
     def is_in(self, folder: Path) -> bool:
         """Say whether a folder holds an output of this kind that legcal wrote."""
@@ -182,13 +128,7 @@ RESULT = OutputKind("result", "result.json", "legcal_result")
 
 
 def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
-    """Return the path of an output folder; an empty text is none, where a path would be ".".
-
-    Raises
-    ------
-    UsageError
-        If it is empty.
-    """
+    """Return the path of an output folder; an empty text is none, where a path would be "."."""
     if output == "":
         raise UsageError(
             f"The {kind.noun} could not be written: found an empty text, needed the path of a "
@@ -198,20 +138,7 @@ def output_path(output: str | Path, kind: OutputKind = RESULT) -> Path:
 
 
 def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
-    """Refuse an output folder that holds something else than an earlier output of its kind.
-
-    Parameters
-    ----------
-    destination : Path
-        The output folder; it need not exist.
-    kind : OutputKind
-        What it is to hold.
-
-    Raises
-    ------
-    UsageError
-        If it is a file, holds files but nothing of this kind, or cannot be written to.
-    """
+    """Refuse an output folder that holds something else than an earlier output of its kind."""
     check_path(destination, kind)
     start = f"{destination}: the {kind.noun} could not be written: found"
     if destination.is_dir() and holds_files(destination) and not kind.is_in(destination):
@@ -228,18 +155,7 @@ def check_destination(destination: Path, kind: OutputKind = RESULT) -> None:
 
 
 def check_path(destination: Path, kind: OutputKind = RESULT) -> None:
-    """Refuse a path at which no folder is and none can be made.
-
-    Parameters
-    ----------
-    destination, kind
-        As in :func:`check_destination`.
-
-    Raises
-    ------
-    UsageError
-        If it is too long, a file or below one, or a folder that cannot be listed.
-    """
+    """Refuse a path at which no folder is and none can be made."""
     start = f"{destination}: the {kind.noun} could not be written: found"
     remedy = "needed a path that can be created; give another output folder."
     try:
@@ -299,30 +215,6 @@ def result_folder(
 
     An earlier result is replaced file by file; other files beside it are kept. If the block or
     the moving is interrupted, the destination is as it was before.
-
-    Parameters
-    ----------
-    destination : Path
-        The output folder; it and its parents are created at the end.
-    kind : OutputKind
-        What it is to hold.
-    stale : iterable of Path
-        Files of an earlier output, relative to the folder, that go where they are not replaced.
-    replaceable : container of Path, optional
-        The only files, relative to the folder, that may be replaced; all without it.
-
-    Yields
-    ------
-    Path
-        An empty folder to write into.
-
-    Raises
-    ------
-    UsageError
-        As :func:`check_destination`, before the block runs; or if something else stands in the
-        place of a file, after it.
-    OutOfResources
-        If the files cannot be written, as on a full disk.
     """
     check_destination(destination, kind)
     try:

@@ -19,22 +19,7 @@ _WRITTEN = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-
 
 
 def parse_quantity(text: str, units: Mapping[str, float], what: str) -> float:
-    """Return a quantity in metres, radians or pixels.
-
-    Parameters
-    ----------
-    text : str
-        A number and its unit: ``2mm``, ``0.05 deg``. Zero may do without one.
-    units : mapping
-        The units that it may be written in, with their size in SI.
-    what : str
-        What it is for, for the message: ``--pixel-noise``.
-
-    Raises
-    ------
-    UsageError
-        If it is no number, has no unit or one of something else, or is negative.
-    """
+    """Return a quantity in metres, radians or pixels."""
     match = _WRITTEN.fullmatch(text)
     value, unit = (float(match[1]), match[2]) if match else (math.nan, "")
     if not math.isfinite(value) or (unit not in units and (unit or value != 0.0)):
@@ -65,32 +50,15 @@ EXAMPLE = "0.4200±0.0001 or 420±0.1 mm"
 
 @dataclass(frozen=True)
 class Stated:
-    """A number as somebody stated it.
+    """A number as somebody stated it."""
 
-    Attributes
-    ----------
-    value : float
-        In SI units or pixels.
-    sigma : float or None
-        Its standard deviation; None where there is none.
-    dimension : {"m", "rad", "px", ""}
-        What its unit is one of; "" where none was written.
-    """
-
-    value: float
-    sigma: float | None = None
-    dimension: str = ""
+    value: float  # in SI units or pixels
+    sigma: float | None = None  # its standard deviation; None where there is none
+    dimension: str = ""  # what its unit is one of; "" where none was written
 
 
 def read_prior(value: object) -> Stated:
-    """Return a prior given as text, as (value, sigma) or as {value, sigma}.
-
-    Raises
-    ------
-    ValueError
-        If it is none of these, its units contradict each other, or sigma is zero, negative, far
-        too small or not finite.
-    """
+    """Return a prior given as text, as (value, sigma) or as {value, sigma}."""
     if isinstance(value, Stated):
         return value
     if isinstance(value, str):

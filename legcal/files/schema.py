@@ -132,20 +132,7 @@ def _at(node: yaml.Node, found: str) -> yaml.MarkedYAMLError:
 
 
 def read_text(path: Path, what: str) -> bytes:
-    """Return the bytes of a small text file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        What the file is, for the message: ``dataset file``, ``camera file``.
-
-    Raises
-    ------
-    DatasetError
-        If there is no such regular file, it cannot be read, or it is far too large.
-    """
+    """Return the bytes of a small text file."""
     remedy = f"check the path of the {what}"
     if not os.path.exists(path):  # unlike that of a Path, False where a name is too long
         raise DatasetError(
@@ -171,14 +158,7 @@ def read_text(path: Path, what: str) -> bytes:
 
 
 def parse_yaml(content: bytes, path: Path, what: str) -> dict[str, Any]:
-    """Return the mapping that a YAML file holds, with its keys as text.
-
-    Raises
-    ------
-    DatasetError
-        If the text is not YAML, repeats a key, is not a mapping, or grows without bound
-        through its aliases.
-    """
+    """Return the mapping that a YAML file holds, with its keys as text."""
     try:
         found = yaml.load(content, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -232,13 +212,7 @@ def _exceeds(value: object, limit: int) -> bool:
 def validate(
     schema: type[_Schema], found: Mapping[str, Any], path: Path, prefix: str = ""
 ) -> _Schema:
-    """Return a mapping as its schema has it; ``prefix`` is its own key in the file.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each value that does not fit, naming its place in the file.
-    """
+    """Return a mapping as its schema has it; ``prefix`` is its own key in the file."""
     try:
         return schema.model_validate(dict(found))
     except ValidationError as error:

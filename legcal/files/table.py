@@ -198,31 +198,7 @@ def read_table(
     unknown: Callable[[str], str] = lambda name: "",
     fold: bool = False,
 ) -> Table:
-    """Return a CSV file as a table, with the problems of its cells still to be raised.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what, thing : str
-        What the file and what a row of it is, for messages.
-    columns : sequence of Column
-        The columns that there may be, in any order.
-    needed : str
-        What its rows should be and what to do about a file without any. Such a file is an empty
-        table if this is not told.
-    remedy : str
-        What else to do about a column that lacks.
-    unknown : callable
-        What is to be said about certain unknown columns, ``found ..., needed ...``; else "".
-    fold : bool
-        Take capitals in the header for small letters.
-
-    Raises
-    ------
-    DatasetError
-        If the file cannot be read, has no row, or other columns.
-    """
+    """Return a CSV file as a table, with the problems of its cells still to be raised."""
     lines = _read_lines(path, what)
     if needed and len(lines) < 2:
         raise DatasetError(

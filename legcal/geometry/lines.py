@@ -12,75 +12,38 @@ from legcal.geometry.types import Array
 _COORDINATE_AXES = np.eye(3)
 
 
-def moment(u: Array, M: Array) -> Array:
-    """Return the moment h = u x M of oriented lines, eq (1).
-
-    Parameters
-    ----------
-    u : (..., 3) array
-        Unit directions.
-    M : (..., 3) array
-        Any point of each line [m].
-
-    Returns
-    -------
-    (..., 3) array
-        Moments about the origin [m]; their norm is the distance of the line to the origin.
-    """
+def moment(
+    u: Array,  # (..., 3) unit directions
+    M: Array,  # (..., 3) any point of each line [m]
+) -> Array:
+    """Return the moment h = u x M of oriented lines, eq (1), (..., 3) [m]."""
     return np.asarray(np.cross(u, M))
 
 
-def nearest_point_to_origin(u: Array, M: Array) -> Array:
-    """Return the point of each line that lies nearest to the origin of the frame.
-
-    Parameters
-    ----------
-    u : (..., 3) array
-        Unit directions.
-    M : (..., 3) array
-        Any point of each line [m].
-
-    Returns
-    -------
-    (..., 3) array
-        Feet of the perpendiculars from the origin [m].
-    """
+def nearest_point_to_origin(
+    u: Array,  # (..., 3) unit directions
+    M: Array,  # (..., 3) any point of each line [m]
+) -> Array:
+    """Return the point of each line that lies nearest to the origin of the frame, (..., 3) [m]."""
     return np.asarray(M - u * np.sum(u * M, axis=-1, keepdims=True))
 
 
-def distance_to_line(P: Array, u: Array, M: Array) -> Array:
-    """Return the distance of points to lines, the norm of (M - P) x u of eq (6).
-
-    Parameters
-    ----------
-    P : (..., 3) array
-        Points [m].
-    u, M : (..., 3) array
-        Unit directions, and a point of each line [m].
-
-    Returns
-    -------
-    (...) array
-        Distances [m].
-    """
+def distance_to_line(
+    P: Array,  # (..., 3) points [m]
+    u: Array,  # (..., 3)
+    M: Array,  # (..., 3)
+) -> Array:
+    """Return the distance of points to lines, the norm of (M - P) x u of eq (6), (...) [m]."""
     return np.asarray(np.linalg.norm(np.cross(M - P, u), axis=-1))
 
 
-def normal_basis(u: Array) -> Array:
-    """Return two unit vectors that complete each direction to a right-handed basis.
+def normal_basis(
+    u: Array,  # (..., 3) unit directions
+) -> Array:
+    """Return two unit vectors that complete each direction to a right-handed basis, (..., 2, 3).
 
     The choice is a fixed function of u: the coordinate axis least aligned with u, made
     orthogonal to it, comes first; u x e1 comes second.
-
-    Parameters
-    ----------
-    u : (..., 3) array
-        Unit directions.
-
-    Returns
-    -------
-    (..., 2, 3) array
-        e1 and e2, with e1 x e2 = u.
     """
     axis = _COORDINATE_AXES[np.abs(u).round(9).argmin(axis=-1)]  # ties are not left to rounding
     basis = np.empty((*u.shape[:-1], 2, 3))

@@ -8,29 +8,14 @@ from legcal.geometry.types import Array
 _ONE = np.eye(3)
 
 
-def frame_on_points(points: Array, normal: Array | None = None) -> RigidTransform:
+def frame_on_points(
+    points: Array,  # (3, 3) joint centres in some frame L [m]
+    normal: Array | None = None,  # (3,) unit normal of the plane of motion in L, for two points
+) -> RigidTransform:
     """Return the frame that three points define: origin, x axis, xy plane (z completes).
 
     Two points define the frame of a planar mechanism: its z axis is the normal of the plane, its
     x axis the direction of the second point in that plane.
-
-    Parameters
-    ----------
-    points : (3, 3) or (2, 3) array
-        Joint centres in some frame L [m].
-    normal : (3,) array, optional
-        Unit normal of the plane of motion in L, for two points; z without it.
-
-    Returns
-    -------
-    RigidTransform
-        T_L_frame. The points have coordinates (0, 0, 0), (x > 0, 0, 0), (., y > 0, 0) in it;
-        of two points the second one has (x > 0, 0, .).
-
-    Raises
-    ------
-    ValueError
-        If two points coincide or the three are collinear.
     """
     x = points[1] - points[0]
     spread = float(np.linalg.norm(points - points[0], axis=1).max())
@@ -47,18 +32,14 @@ def frame_on_points(points: Array, normal: Array | None = None) -> RigidTransfor
     return motion_of(np.column_stack([x, np.cross(z, x), z]), points[0])
 
 
-def motion_of(R: Array, t: Array) -> RigidTransform:
+def motion_of(
+    R: Array,  # (..., 3, 3) rotation matrix, orthogonal but for rounding, which is corrected
+    t: Array,  # (..., 3) translation [m]
+) -> RigidTransform:
     """Return the rigid motion of a rotation matrix and a translation.
 
     Quick: ``RigidTransform.from_components`` decomposes every matrix anew, which is most of the
     time of reading a model.
-
-    Parameters
-    ----------
-    R : (..., 3, 3) array
-        Rotation matrix, orthogonal but for rounding, which is corrected.
-    t : (..., 3) array
-        Translation [m].
     """
     matrix = np.zeros((*R.shape[:-2], 4, 4))
     matrix[..., :3, :3] = R @ (1.5 * _ONE - 0.5 * (np.swapaxes(R, -1, -2) @ R))
@@ -75,16 +56,13 @@ def product(*motions: RigidTransform) -> RigidTransform:
     return motion_of(matrix[..., :3, :3], matrix[..., :3, 3])
 
 
-def roll_pitch_yaw(rotation: Array) -> Array:
+def roll_pitch_yaw(
+    rotation: Array,  # (3, 3) rotation matrix
+) -> Array:
     """Return the angles of a rotation about fixed x, y, z, (3,) [rad], to rounding everywhere.
 
     Near a pitch of 90 degrees the yaw is badly determined: whatever it comes out as, the roll
     makes up for it.
-
-    Parameters
-    ----------
-    rotation : (3, 3) array
-        Rotation matrix.
     """
     r = rotation
     yaw = np.arctan2(r[1, 0], r[0, 0])

@@ -46,11 +46,6 @@ def find_home(described: Description) -> Home:
     Without a given one it is the pose where all motors are at the middle of their travel that
     turns the platform least; of mirror images in the plane of the base joints the one on the
     positive side of z is taken.
-
-    Raises
-    ------
-    ModelError
-        If the given pose does not close, or none is found.
     """
     if described.home is not None:
         return _settle(described, described.home)
@@ -227,37 +222,20 @@ FREE_TRAVEL = (0.5, 1.5)  # of the length at home, for passive sliders without l
 
 @dataclass(frozen=True, eq=False)
 class AssembledLeg:
-    """A leg of which everything is known.
+    """A leg of which everything is known."""
 
-    Attributes
-    ----------
-    name, type, kind, tube, rod
-        As described, see :class:`legcal.machine.description.LegEntry`.
-    A_base, B_platform : (3,) array
-        Joint centres in the base and the platform link [m].
-    u : (3,) array
-        Direction from A to B at home, in the base link.
-    q0 : float
-        Length at reading zero, or of a constant leg [m].
-    travel : tuple of float
-        Lowest and highest reading [m]; (0, 0) for a constant leg.
-    base_axis, platform_axis : (3,) array
-        Axes of R and outer axes of U, both in the base link at home; of an S any direction across
-        the leg.
-    """
-
-    name: str
-    type: LegType
-    kind: LegKind
-    A_base: Array
-    B_platform: Array
-    u: Array
-    q0: float
-    travel: tuple[float, float]
-    tube: float | None
-    rod: float | None
-    base_axis: Array
-    platform_axis: Array
+    name: str  # as described, see :class:`legcal.machine.description.LegEntry`
+    type: LegType  # as described, see :class:`legcal.machine.description.LegEntry`
+    kind: LegKind  # as described, see :class:`legcal.machine.description.LegEntry`
+    A_base: Array  # (3,) joint centres in the base and the platform link [m]
+    B_platform: Array  # (3,) joint centres in the base and the platform link [m]
+    u: Array  # (3,) direction from A to B at home, in the base link
+    q0: float  # length at reading zero, or of a constant leg [m]
+    travel: tuple[float, float]  # lowest and highest reading [m]; (0, 0) for a constant leg
+    tube: float | None  # as described, see :class:`legcal.machine.description.LegEntry`
+    rod: float | None  # as described, see :class:`legcal.machine.description.LegEntry`
+    base_axis: Array  # (3,) axes of R and outer axes of U, both in the base link at home
+    platform_axis: Array  # (3,) axes of R and outer axes of U, both in the base link at home
 
     @property
     def shortest_shown(self) -> float:
@@ -267,27 +245,13 @@ class AssembledLeg:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """A machine of which everything is known.
+    """A machine of which everything is known."""
 
-    Attributes
-    ----------
-    name : str
-        Its name.
-    legs : tuple of AssembledLeg
-        In order.
-    home : Home
-        A pose in which it closes, as the file gets it.
-    base_frame : tuple of str
-        The legs whose joints define R_b and R_e.
-    planar : bool
-        Whether it moves in the xy plane of base and platform.
-    """
-
-    name: str
-    legs: tuple[AssembledLeg, ...]
-    home: Home
-    base_frame: tuple[str, ...]
-    planar: bool
+    name: str  # its name
+    legs: tuple[AssembledLeg, ...]  # in order
+    home: Home  # a pose in which it closes, as the file gets it
+    base_frame: tuple[str, ...]  # the legs whose joints define R_b and R_e
+    planar: bool  # whether it moves in the xy plane of base and platform
 
     @property
     def T_base_platform(self) -> RigidTransform:
@@ -296,19 +260,7 @@ class Assembled:
 
 
 def assemble(described: Description) -> Assembled:
-    """Return a described machine with its home, lengths and axes.
-
-    Parameters
-    ----------
-    described : Description
-        What a table or a family says.
-
-    Raises
-    ------
-    ModelError
-        If it cannot be: joints that coincide, lengths out of all proportion, a travel that does
-        not reach home, an axis that does not fit the leg; one sentence for each.
-    """
+    """Return a described machine with its home, lengths and axes."""
     _refuse(wrong_sizes(described))
     home = find_home(described)
     T = home.motion()
@@ -612,42 +564,15 @@ def _unit(vector: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Created:
-    """A model that was written.
+    """A model that was written."""
 
-    Attributes
-    ----------
-    mechanism : Mechanism
-        The model as legcal understands it.
-    yaml_path, urdf_path : Path
-        Its files.
-    """
-
-    mechanism: Mechanism
-    yaml_path: Path
-    urdf_path: Path
+    mechanism: Mechanism  # the model as legcal understands it
+    yaml_path: Path  # its files
+    urdf_path: Path  # its files
 
 
 def create_model(described: Description, output: Path, *, force: bool = False) -> Created:
-    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine, and load them.
-
-    Parameters
-    ----------
-    described : Description
-        The machine, of a table or a family.
-    output : Path
-        The folder that gets ``models`` and ``urdf``; it is made if there is none.
-    force : bool
-        Replace files that are there.
-
-    Raises
-    ------
-    ModelError, OutOfClass, DidNotConverge
-        If the machine cannot be put together or is outside the method; nothing is left behind.
-    UsageError
-        If a file is there already and ``force`` is not given, or a folder is.
-    OutOfResources
-        If the files cannot be written.
-    """
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine, and load them."""
     machine = assemble(described)
     paths = model_paths(machine.name, output)
     folders = [str(path) for path in paths if path.is_dir()]
@@ -720,59 +645,25 @@ SHORTEST, STROKE, RADIUS = 0.8, 0.4, 0.02  # parts of the length at home
 
 @dataclass(frozen=True)
 class Family:
-    """The dimensions of a machine, lengths in ``unit`` and angles in degrees.
+    """The dimensions of a machine, lengths in ``unit`` and angles in degrees."""
 
-    Attributes
-    ----------
-    family : str
-        Number and type of the legs, ``6-UPS``.
-    unit : {"m", "mm"} or None
-        Unit of the lengths; it must be stated.
-    base_radius, platform_radius : float or None
-        Radii of the circles on which the joint centres lie; they must be stated.
-    height : float or None
-        Height of the platform over the base at home; to be stated unless all joints are R.
-    base_spread, platform_spread : float or None
-        Angle between the two joints of a pair, for 6 legs, by default 30 deg; the pairs of the
-        platform stand between those of the base. Other numbers of legs have no pairs.
-    turn : float or None
-        Turn of the platform about z at home; 30 deg by default where all joints are R, else 0.
-    offset : float or None
-        Leg length at reading zero; by default 0.8 of the length at home.
-    travel : tuple of float or None
-        Lowest and highest reading; by default 0 to 0.4 of the length at home.
-    leg_radius : float or None
-        Radius of tube and rod; by default 0.02 of the length at home.
-    tilt : float
-        How far the outer axes of U joints rise from the horizontal on the base and sink on the
-        platform, and R axes turn about their leg, both ways.
-    name : str or None
-        Name of the model; the family in small letters by default.
-    """
-
-    family: str
-    unit: str | None = None
-    base_radius: float | None = None
-    platform_radius: float | None = None
-    height: float | None = None
-    base_spread: float | None = None
-    platform_spread: float | None = None
-    turn: float | None = None
-    offset: float | None = None
-    travel: tuple[float, float] | None = None
-    leg_radius: float | None = None
+    family: str  # number and type of the legs, ``6-UPS``
+    unit: str | None = None  # unit of the lengths; it must be stated
+    base_radius: float | None = None  # radii of the circles on which the joint centres lie
+    platform_radius: float | None = None  # radii of the circles on which the joint centres lie
+    height: float | None = None  # height of the platform over the base at home
+    base_spread: float | None = None  # angle between the two joints of a pair, for 6 legs
+    platform_spread: float | None = None  # angle between the two joints of a pair, for 6 legs
+    turn: float | None = None  # turn of the platform about z at home
+    offset: float | None = None  # leg length at reading zero; by default 0.8 of the length at home
+    travel: tuple[float, float] | None = None  # lowest and highest reading
+    leg_radius: float | None = None  # radius of tube and rod; by default 0.02 of the length at home
     tilt: float = 0.0
-    name: str | None = None
+    name: str | None = None  # name of the model; the family in small letters by default
 
 
 def describe_family(asked: Family) -> Description:
-    """Return the machine of a family.
-
-    Raises
-    ------
-    UsageError
-        If the family is none, or a dimension is missing or impossible.
-    """
+    """Return the machine of a family."""
     match = _FAMILY.fullmatch(asked.family)
     letters = None if match is None else leg_type(match[2])
     if match is None or letters is None or not 2 <= int(match[1]) <= MOST_LEGS:
@@ -965,28 +856,7 @@ def described(
     name: str | None,
     dimensions: Mapping[str, Any],
 ) -> Description:
-    """Return the machine that a table or a family describes.
-
-    Parameters
-    ----------
-    table : Path or None
-        A YAML or CSV file.
-    family : str or None
-        Number and type of the legs, instead of a table.
-    unit : {"m", "mm"} or None
-        The unit of all lengths; a table may state it itself.
-    name : str or None
-        The name of the model, instead of the default one.
-    dimensions : mapping
-        Attributes of :class:`legcal.machine.assembly.Family`; None where nothing was said.
-
-    Raises
-    ------
-    UsageError
-        If not exactly one of table and family is given, or dimensions come with a table.
-    ModelError
-        With all problems of the table.
-    """
+    """Return the machine that a table or a family describes."""
     told = {key: value for key, value in dimensions.items() if value is not None}
     if (table is None) == (family is None):
         found = "neither" if table is None else "both"

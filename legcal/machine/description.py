@@ -30,21 +30,11 @@ NEEDED_TYPE = (
 
 @dataclass(frozen=True)
 class LegType:
-    """The joints of a leg from base to platform, as they are written: ``UPS``, ``SS``, ``UP``.
+    """The joints of a leg from base to platform, as they are written: ``UPS``, ``SS``, ``UP``."""
 
-    Attributes
-    ----------
-    base : {"R", "U", "S"}
-        The joint at the base.
-    has_slider : bool
-        Whether there is a P.
-    platform : {"R", "U", "S", ""}
-        The joint at the platform; empty for a leg that is fixed there.
-    """
-
-    base: JointLetter
-    has_slider: bool
-    platform: PlatformLetter
+    base: JointLetter  # the joint at the base
+    has_slider: bool  # whether there is a P
+    platform: PlatformLetter  # the joint at the platform; empty for a leg that is fixed there
 
     @property
     def has_sphere(self) -> bool:
@@ -62,88 +52,39 @@ def leg_type(text: str) -> LegType | None:
 
 @dataclass(frozen=True, eq=False)
 class LegEntry:
-    """One leg as described.
+    """One leg as described."""
 
-    Attributes
-    ----------
-    name : str
-        Its name.
-    type : LegType
-        Its joints.
-    kind : LegKind
-        Whether its slider has a motor, moves freely, or is not there.
-    A_base, B_platform : (3,) array
-        Joint centres in the base and the platform link [m]; B of a leg that is fixed to the
-        platform is any point of its axis.
-    offset : float or None
-        Length at reading zero [m] of an actuated leg, length of a constant one. A passive slider
-        without one reads the length itself. None also for a constant leg that has the length
-        which home gives it.
-    travel : tuple of float or None
-        Lowest and highest reading [m]; None for constant legs and for passive sliders that move
-        freely.
-    tube, rod : float or None
-        Radii of the base and of the platform half [m]; None where they cannot be seen.
-    base_axis, platform_axis : (3,) array or None
-        Axes of R and outer axes of U as unit vectors in the base and the platform link; None for
-        the default.
-    """
-
-    name: str
-    type: LegType
-    kind: LegKind
-    A_base: Array
-    B_platform: Array
-    offset: float | None
-    travel: tuple[float, float] | None
-    tube: float | None
-    rod: float | None
-    base_axis: Array | None
-    platform_axis: Array | None
+    name: str  # its name
+    type: LegType  # its joints
+    kind: LegKind  # whether its slider has a motor, moves freely, or is not there
+    A_base: Array  # (3,) joint centres in the base and the platform link [m]
+    B_platform: Array  # (3,) joint centres in the base and the platform link [m]
+    offset: float | None  # length at reading zero [m] of an actuated leg, length of a constant one
+    travel: tuple[float, float] | None  # lowest and highest reading [m]
+    tube: float | None  # radii of the base and of the platform half [m]
+    rod: float | None  # radii of the base and of the platform half [m]
+    base_axis: Array | None  # (3,)
+    platform_axis: Array | None  # (3,)
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A machine as described by a table or a family.
+    """A machine as described by a table or a family."""
 
-    Attributes
-    ----------
-    name : str
-        The name of the model and of its files.
-    source : str
-        Where it was described, for messages: a path, or the family.
-    unit : str
-        The unit in which it was described, for messages.
-    legs : tuple of LegEntry
-        The legs in order.
-    home : Home or None
-        T_base_platform of a pose in which it closes.
-    base_frame : tuple of str or None
-        The legs whose joints define R_b and R_e.
-    """
-
-    name: str
-    source: str
-    unit: str
-    legs: tuple[LegEntry, ...]
-    home: "Home | None"
-    base_frame: tuple[str, ...] | None
+    name: str  # the name of the model and of its files
+    source: str  # where it was described, for messages: a path, or the family
+    unit: str  # the unit in which it was described, for messages
+    legs: tuple[LegEntry, ...]  # the legs in order
+    home: "Home | None"  # T_base_platform of a pose in which it closes
+    base_frame: tuple[str, ...] | None  # the legs whose joints define R_b and R_e
 
 
 @dataclass(frozen=True, eq=False)
 class Home:
-    """A pose with the numbers as they were written.
+    """A pose with the numbers as they were written."""
 
-    Attributes
-    ----------
-    xyz : tuple of float
-        Position [m].
-    quat_xyzw : tuple of float
-        Unit quaternion, as far as its digits go.
-    """
-
-    xyz: tuple[float, ...]
-    quat_xyzw: tuple[float, ...]
+    xyz: tuple[float, ...]  # position [m]
+    quat_xyzw: tuple[float, ...]  # unit quaternion, as far as its digits go
 
     def motion(self) -> RigidTransform:
         """Return T_base_platform."""

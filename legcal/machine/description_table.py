@@ -278,22 +278,7 @@ UNITS = {"m": 0, "mm": -3}
 
 
 def read_description(path: Path, unit: str | None = None, name: str | None = None) -> Description:
-    """Return the machine that a table describes.
-
-    Parameters
-    ----------
-    path : Path
-        A YAML file, or a CSV file with one row for each leg.
-    unit : {"m", "mm"}, optional
-        The unit of all lengths, where the table does not state it.
-    name : str, optional
-        The name of the model, instead of the one in the YAML or the stem of the CSV.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each problem of the file.
-    """
+    """Return the machine that a table describes."""
     try:
         if path.suffix.lower() == ".csv":
             found = read_columns(path, unit)

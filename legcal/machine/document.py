@@ -7,21 +7,7 @@ from legcal.machine.model import Mechanism
 
 
 def describe(mechanism: Mechanism) -> dict[str, Any]:
-    """Return what was found in a mechanism: legs with types, frames, mobility, diagnostics.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-
-    Returns
-    -------
-    dict
-        The document of ``legcal inspect --json``: A in the base link and B in the platform link
-        [m], ``n_d`` the number of legs that define the frames, ``r`` that of R joints on the base,
-        ``n_ac`` that of legs that are actuated or of constant length, ``idle_spins`` the
-        freedoms that turn nothing but a leg about itself; twist in [rad].
-    """
+    """Return what was found in a mechanism: legs with types, frames, mobility, diagnostics."""
     kinds = [leg.kind for leg in mechanism.legs]
     return {
         "name": mechanism.name,

@@ -26,23 +26,7 @@ def shipped_names() -> list[str]:
 
 
 def find_model(model: str | Path) -> Path:
-    """Return the file that describes a mechanism, of a path or of the name of a shipped model.
-
-    Parameters
-    ----------
-    model : str or Path
-        A mechanism YAML, a URDF, an MJCF file, a folder with ``robot.yaml``, or a shipped name.
-
-    Returns
-    -------
-    Path
-        A YAML, or another file whose format its content tells.
-
-    Raises
-    ------
-    ModelError
-        If there is no such file and no such shipped model.
-    """
+    """Return the file that describes a mechanism, of a path or of the name of a shipped model."""
     path = Path(model)
     names = shipped_names()
     is_shipped = str(model) in names
@@ -81,13 +65,7 @@ def what_a_dataset_is_for(path: Path) -> str:
 
 
 def find_urdf(yaml_path: Path, written: str | None) -> Path:
-    """Return the URDF of a mechanism YAML: as written in it, or the same stem near it.
-
-    Raises
-    ------
-    ModelError
-        If there is none.
-    """
+    """Return the URDF of a mechanism YAML: as written in it, or the same stem near it."""
     if written is not None:
         path = yaml_path.parent / written
         return path.resolve() if ".." in path.parts else path
@@ -102,13 +80,7 @@ def find_urdf(yaml_path: Path, written: str | None) -> Path:
 
 
 def read_file(path: Path, what: str) -> bytes:
-    """Return the bytes of a mechanism file.
-
-    Raises
-    ------
-    ModelError
-        If it is missing, a folder, unreadable or far too large.
-    """
+    """Return the bytes of a mechanism file."""
     try:
         return read_text(path, what)
     except DatasetError as error:

@@ -47,13 +47,7 @@ _AXES = dict(zip("XYZ", np.eye(3), strict=True))
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    """Check that each joint that stands for another is there once and means something known.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each that is not.
-    """
+    """Check that each joint that stands for another is there once and means something known."""
     problems = []
     for i, (name, kind) in enumerate(zip(file.joint_name, file.joint_type, strict=True)):
         if name not in urdf.joints:
@@ -89,22 +83,7 @@ def axes_of(kind: str) -> str | None:
 
 
 def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) -> dict[str, str]:
-    """Replace the joints of a URDF that stand for others, and return what frames they carried.
-
-    Parameters
-    ----------
-    robot : Element
-        The URDF, changed in place.
-    file : MechanismFile
-        Names and types, checked.
-    urdf : Urdf
-        The same URDF as read.
-
-    Returns
-    -------
-    dict of str to str
-        The child link of every joint that was replaced: the frame that its name meant.
-    """
+    """Replace the joints of a URDF that stand for others, and return what frames they carried."""
     text = TreeText(dict.fromkeys(urdf.links, ""), dict.fromkeys(urdf.joints, ""))
     elements = {e.get("name"): e for e in robot if e.tag == "joint"}
     replaced = {}
@@ -149,24 +128,7 @@ _LONGEST = 0.3  # step [rad, m]
 
 
 def completed(source: Source) -> Source:
-    """Return a mechanism without a block with the poses where it is closed, and all travels.
-
-    Parameters
-    ----------
-    source : Source
-        A mechanism as its file has it.
-
-    Returns
-    -------
-    Source
-        The same with ``poses`` where a closed configuration was found, and a travel about it
-        for sliders that have none.
-
-    Raises
-    ------
-    ModelError
-        If Pinocchio cannot build the tree.
-    """
+    """Return a mechanism without a block with the poses where it is closed, and all travels."""
     known = {*source.urdf.links, *source.urdf.joints}
     if not all(name in known for pair in source.file.closed_loop for name in pair):
         return source  # refused later, with the place of the name
@@ -285,11 +247,6 @@ def read_yaml_source(path: Path) -> Source:
     """Return a mechanism from its YAML and the URDF that it names.
 
     A file without the block ``legcal`` may leave the travel of sliders open, as Gepetto's do.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each problem of a file.
     """
     file = read_mechanism_file(path)
     block = file.legcal
@@ -345,11 +302,6 @@ def read_loop_source(path: Path, content: bytes) -> Source:
 
     Motors are the prismatic joints that a ``<transmission>`` or ``<ros2_control>`` names, or all
     prismatic joints where none is named.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each problem of the file.
     """
     robot = parse_robot(path, content)
     problems = Problems(path)
@@ -515,21 +467,7 @@ XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
 
 
 def read_source(model: str | Path) -> Source:
-    """Return the tree and the closures of a mechanism, checked in themselves.
-
-    Parameters
-    ----------
-    model : str or Path
-        A mechanism YAML or a folder with ``robot.yaml``; a URDF with its YAML beside it (or in
-        ``../models``) or with loops of its own; an MJCF file; or the name of a shipped model.
-
-    Raises
-    ------
-    ModelError
-        If a file is missing or malformed; all problems of a file at once.
-    OutOfClass
-        If nothing closes the loops, or there are two mechanisms.
-    """
+    """Return the tree and the closures of a mechanism, checked in themselves."""
     path = find_model(model)
     is_xml = path.suffix.lower() in XML_SUFFIXES
     source = _read_xml(path) if is_xml else read_yaml_source(path)

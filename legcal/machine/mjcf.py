@@ -38,21 +38,11 @@ Attributes = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Compiler:
-    """The options of ``<compiler>`` that matter for kinematics.
+    """The options of ``<compiler>`` that matter for kinematics."""
 
-    Attributes
-    ----------
-    degrees : bool
-        Whether angles are in degrees, as they are by default.
-    eulerseq : str
-        Three letters: small ones turn with the frame, capital ones about fixed axes.
-    autolimits : bool
-        Whether a range alone limits a joint.
-    """
-
-    degrees: bool = True
-    eulerseq: str = "xyz"
-    autolimits: bool = True
+    degrees: bool = True  # whether angles are in degrees, as they are by default
+    eulerseq: str = "xyz"  # three letters
+    autolimits: bool = True  # whether a range alone limits a joint
 
     def radians(self, angle: float) -> float:
         """Return an angle of the file in radians."""
@@ -65,15 +55,7 @@ def own_attributes(element: etree._Element) -> dict[str, str]:
 
 
 class Values:
-    """What the elements of one MJCF file say, after defaults, with problems noted.
-
-    Parameters
-    ----------
-    root : Element
-        The ``<mujoco>``.
-    problems : Problems
-        Where to note what is wrong.
-    """
+    """What the elements of one MJCF file say, after defaults, with problems noted."""
 
     def __init__(self, root: etree._Element, problems: Problems) -> None:
         self.problems = problems
@@ -251,34 +233,16 @@ WORLD = "world"
 
 @dataclass
 class MjcfTree:
-    """What is found while the bodies are walked.
-
-    Attributes
-    ----------
-    text : TreeText
-        The URDF.
-    poses : dict of str to RigidTransform
-        The bodies in the world in the configuration of the file, where its loops are closed.
-    sites : dict of str to (str, RigidTransform)
-        Body and pose there of every named site.
-    joints : dict of str to str
-        The type of every hinge, slide, ball or free joint.
-    references : dict of str to float
-        The values [rad, m] of hinges and slides in the configuration of the file.
-    taken : set of str
-        Names that no new link or joint may have.
-    driven : frozenset of str
-        The joints that actuators drive or sensors measure.
-    """
+    """What is found while the bodies are walked."""
 
     values: Values
-    text: TreeText = field(default_factory=TreeText)
+    text: TreeText = field(default_factory=TreeText)  # the URDF
     poses: dict[str, RigidTransform] = field(default_factory=dict)
     sites: dict[str, tuple[str, RigidTransform]] = field(default_factory=dict)
-    joints: dict[str, str] = field(default_factory=dict)
-    references: dict[str, float] = field(default_factory=dict)
-    taken: set[str] = field(default_factory=set)
-    driven: frozenset[str] = frozenset()
+    joints: dict[str, str] = field(default_factory=dict)  # the type of every hinge, slide
+    references: dict[str, float] = field(default_factory=dict)  # the values [rad
+    taken: set[str] = field(default_factory=set)  # names that no new link or joint may have
+    driven: frozenset[str] = frozenset()  # the joints that actuators drive or sensors measure
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,13 +416,6 @@ def read_bodies(root: etree._Element, values: Values) -> MjcfTree:
     """Return the bodies of a ``<mujoco>`` as links and joints, problems noted in ``values``.
 
     The configuration of the file, where all joints are at their ``ref``, closes its loops.
-
-    Parameters
-    ----------
-    root : Element
-        The ``<mujoco>``.
-    values : Values
-        Its defaults and options.
     """
     named = (*root.iterfind("actuator/*"), *root.iterfind("sensor/jointpos"))
     tree = MjcfTree(values, driven=frozenset(str(element.get("joint")) for element in named))
@@ -617,15 +574,7 @@ _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
 
 
 def read_mjcf_source(path: Path, content: bytes) -> Source:
-    """Return the mechanism of an MJCF file.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each problem of the file.
-    OutOfClass
-        If nothing closes a loop, or there is another machine beside the mechanism.
-    """
+    """Return the mechanism of an MJCF file."""
     root = parse_xml(path, content, "MJCF file")
     n_parts = sum(1 for _ in root.iter("body", "joint", "default", "frame"))
     if n_parts > MOST_PARTS:
@@ -800,13 +749,7 @@ def _drives_no_leg(element: etree._Element) -> bool:
 def _without_loose_bodies(
     urdf: Urdf, frames: list[list[str]], tree: MjcfTree, name: str
 ) -> tuple[Urdf, list[str]]:
-    """Return the tree without free bodies that no closure touches, and their names.
-
-    Raises
-    ------
-    OutOfClass
-        If joints move something beside the mechanism.
-    """
+    """Return the tree without free bodies that no closure touches, and their names."""
     loose = {link for links, closed in moving_groups(urdf, frames) if not closed for link in links}
     if not loose:
         return urdf, []

@@ -62,13 +62,7 @@ class MechanismFile(BaseModel):
 
 
 def read_mechanism_file(path: Path) -> MechanismFile:
-    """Return a mechanism YAML, checked in itself (its names are checked against the URDF later).
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each problem, naming its place in the file.
-    """
+    """Return a mechanism YAML, checked in itself (its names are checked against the URDF later)."""
     content = read_file(path, WHAT)
     try:
         found = parse_yaml(content, path, WHAT)
@@ -147,17 +141,7 @@ def _contradictions(file: MechanismFile, path: Path) -> list[str]:
 def mechanism_yaml(
     loops: Sequence[tuple[str, str, str]], motors: Sequence[str], legcal: dict[str, Any]
 ) -> str:
-    """Return the YAML of a mechanism.
-
-    Parameters
-    ----------
-    loops : sequence of tuples of str
-        The two frames of every closure, and its type.
-    motors : sequence of str
-        The joints with motors.
-    legcal : dict
-        The block ``legcal`` without its version.
-    """
+    """Return the YAML of a mechanism."""
     document = {
         "closed_loop": [[one, two] for one, two, _ in loops],
         "type": [kind for *_, kind in loops],

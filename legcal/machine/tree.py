@@ -33,34 +33,14 @@ DRAWING = (
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A mechanism as one of its formats has it.
+    """A mechanism as one of its formats has it."""
 
-    Attributes
-    ----------
-    path : Path
-        The file that closes the loops; messages name it.
-    file : MechanismFile
-        Closures, motors and the ``legcal`` block, as a mechanism YAML would have them.
-    urdf : Urdf
-        The tree. ``urdf.content`` is the URDF on disk, or one that was made of another format.
-    converted : bool
-        Whether ``urdf.content`` was made of another format, so that ``urdf.path`` names the file
-        of that format.
-    notes : tuple of str
-        What the reader should know of the conversion, one sentence each.
-    values : mapping of str to float
-        Joint values [rad, m] of the configuration that the file is drawn in; others are zero.
-    poses : mapping of str to RigidTransform or None
-        Where the links are in a closed configuration near that one, in the root link; None
-        where none was looked for or found.
-    """
-
-    path: Path
-    file: MechanismFile
-    urdf: Urdf
-    converted: bool = False
-    notes: tuple[str, ...] = ()
-    values: Mapping[str, float] = field(default_factory=dict)
+    path: Path  # closes the loops; messages name it
+    file: MechanismFile  # closures, motors and the ``legcal`` block
+    urdf: Urdf  # the tree
+    converted: bool = False  # whether ``urdf.content`` was made of another format
+    notes: tuple[str, ...] = ()  # what the reader should know of the conversion, one sentence each
+    values: Mapping[str, float] = field(default_factory=dict)  # joint values [rad
     poses: Mapping[str, RigidTransform] | None = None
     words: Sequence[tuple[str, str]] = ()
 
@@ -86,16 +66,10 @@ class TextCylinder:
 
 @dataclass
 class TreeText:
-    """The lines of a URDF while it is put together.
+    """The lines of a URDF while it is put together."""
 
-    Attributes
-    ----------
-    links, joints : dict of str to str
-        The line of every link and joint, by name.
-    """
-
-    links: dict[str, str] = field(default_factory=dict)
-    joints: dict[str, str] = field(default_factory=dict)
+    links: dict[str, str] = field(default_factory=dict)  # the line of every link and joint, by name
+    joints: dict[str, str] = field(default_factory=dict)  # the line of every link and joint
 
     def unused(self, name: str, others: Set[str] = frozenset()) -> str:
         """Return a name that no link and no joint has yet: the given one, or it with a number."""
@@ -192,13 +166,7 @@ def _quoted(text: str) -> str:
 
 
 def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Path) -> None:
-    """Check that a file holds one mechanism: loops that share a body other than the ground.
-
-    Raises
-    ------
-    OutOfClass
-        If it holds two, or more.
-    """
+    """Check that a file holds one mechanism: loops that share a body other than the ground."""
     groups = moving_groups(urdf, closures)
     closed = [links for links, is_closed in groups if is_closed]
     if len(closed) > 1:
@@ -210,20 +178,7 @@ def check_one_mechanism(urdf: Urdf, closures: Iterable[Sequence[str]], path: Pat
 
 
 def moving_groups(urdf: Urdf, closures: Iterable[Sequence[str]]) -> list[tuple[list[str], bool]]:
-    """Return the links that joints and closures join, without those of the ground.
-
-    Parameters
-    ----------
-    urdf : Urdf
-        The tree. The ground is its root and what fixed joints hold on it.
-    closures : iterable of pairs of str
-        Frames that coincide.
-
-    Returns
-    -------
-    list of (links, closed)
-        The links of each group in the order of the file, and whether a closure is among them.
-    """
+    """Return the links that joints and closures join, without those of the ground."""
     group = {link: link for link in urdf.links}
 
     def find(link: str) -> str:
@@ -275,18 +230,7 @@ def sliders_without_travel(urdf: Urdf) -> list[str]:
 
 
 def assumed_travel(poses: Mapping[str, RigidTransform]) -> tuple[float, float]:
-    """Return a travel for sliders that have none written: 5 % of the mechanism to either side.
-
-    Parameters
-    ----------
-    poses : mapping of str to RigidTransform
-        The links where the mechanism is closed.
-
-    Returns
-    -------
-    tuple of float
-        Lower and upper limit [m], to one significant digit.
-    """
+    """Return a travel for sliders that have none written: 5 % of the mechanism to either side."""
     points = np.array([pose.translation for pose in poses.values()])
     size = float(np.ptp(points, axis=0).max())
     reach = float(f"{TRAVEL_OF_SIZE * size:.0e}") if size > 0.0 else TRAVEL_OF_SIZE
@@ -324,51 +268,19 @@ _X, _Y, _Z = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A joint between two links that closes a loop of the tree.
+    """A joint between two links that closes a loop of the tree."""
 
-    Attributes
-    ----------
-    name : str
-        Its name; new links and joints are named after it.
-    kind : {"point", "weld", "revolute", "universal"}
-        What of both frames coincides.
-    links : tuple of str
-        The two links.
-    T_link_frame : tuple of RigidTransform
-        The frame of the joint in either link.
-    axes : tuple of (3,) array
-        Unit axis in either frame: the common one of a revolute joint; of a universal one the
-        axis that is fixed in the first link and the axis that is fixed in the second.
-    """
-
-    name: str
-    kind: LoopKind
-    links: tuple[str, str]
-    T_link_frame: tuple[RigidTransform, RigidTransform]
-    axes: tuple[Array, Array] = (_X, _X)
+    name: str  # new links and joints are named after it
+    kind: LoopKind  # what of both frames coincides
+    links: tuple[str, str]  # the two links
+    T_link_frame: tuple[RigidTransform, RigidTransform]  # the frame of the joint in either link
+    axes: tuple[Array, Array] = (_X, _X)  # unit axis in either frame
 
 
 def close_loop(
     loop: Loop, text: TreeText, poses: Mapping[str, RigidTransform]
 ) -> tuple[list[str], str]:
-    """Add the frames of a loop to a tree and return the closure.
-
-    Parameters
-    ----------
-    loop : Loop
-        The joint that closes it.
-    text : TreeText
-        The tree; frames are added on links of their own, so that calibration can move them.
-    poses : mapping of str to RigidTransform
-        A configuration that is closed, or near one: the zeros of new joints are taken from it.
-
-    Returns
-    -------
-    frames : list of str
-        The two links that coincide.
-    type : str
-        ``3d`` or ``6d``.
-    """
+    """Add the frames of a loop to a tree and return the closure."""
     one, two = loop.T_link_frame
     if loop.kind in ("revolute", "universal"):
         one, two = _with_axes(loop, poses)

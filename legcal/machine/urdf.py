@@ -19,13 +19,7 @@ from legcal.machine.files import read_file
 
 
 def parse_robot(path: Path, content: bytes) -> etree._Element:
-    """Return the ``<robot>`` of a URDF, without comments, entities or the network.
-
-    Raises
-    ------
-    ModelError
-        If it is not well-formed XML in UTF-8, has a document type, or is no named robot.
-    """
+    """Return the ``<robot>`` of a URDF, without comments, entities or the network."""
     robot = parse_xml(path, content, "URDF")
     if robot.tag != "robot":
         raise ModelError(
@@ -41,22 +35,7 @@ def parse_robot(path: Path, content: bytes) -> etree._Element:
 
 
 def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
-    """Return the outermost element of an XML file, without comments, entities or the network.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for messages.
-    content : bytes
-        What it holds.
-    what : str
-        What it is, for messages: ``URDF``.
-
-    Raises
-    ------
-    ModelError
-        If it is not well-formed XML in UTF-8 or has a document type.
-    """
+    """Return the outermost element of an XML file, without comments, entities or the network."""
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False,
         remove_comments=True, remove_pis=True,
@@ -267,30 +246,16 @@ LOOP_TAGS = ("loop_joint", "constraint")
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """One joint of a URDF.
+    """One joint of a URDF."""
 
-    Attributes
-    ----------
-    name, type, parent, child : str
-        As in the file; ``parent`` and ``child`` are links.
-    T_parent_origin : RigidTransform
-        The joint frame in the parent link, at joint value zero [m].
-    axis : (3,) array
-        Unit axis in the joint frame.
-    limits : tuple of float or None
-        Lower and upper limit [rad] or [m].
-    line : int
-        The line of the file.
-    """
-
-    name: str
-    type: JointType
-    parent: str
-    child: str
-    T_parent_origin: RigidTransform
-    axis: Array
-    limits: tuple[float, float] | None
-    line: int
+    name: str  # as in the file; ``parent`` and ``child`` are links
+    type: JointType  # as in the file; ``parent`` and ``child`` are links
+    parent: str  # as in the file; ``parent`` and ``child`` are links
+    child: str  # as in the file; ``parent`` and ``child`` are links
+    T_parent_origin: RigidTransform  # the joint frame in the parent link, at joint value zero [m]
+    axis: Array  # (3,) unit axis in the joint frame
+    limits: tuple[float, float] | None  # lower and upper limit [rad] or [m]
+    line: int  # the line of the file
 
     @property
     def moves(self) -> bool:
@@ -300,33 +265,15 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """A URDF whose tree, names and numbers have been checked.
+    """A URDF whose tree, names and numbers have been checked."""
 
-    Attributes
-    ----------
-    path : Path
-        The file.
-    content : bytes
-        The file as it stands on disk, or the URDF that was made of another format.
-    name : str
-        The robot's name.
-    links : tuple of str
-        Link names in the order of the file.
-    joints : dict of str to UrdfJoint
-        Joints by name in the order of the file.
-    root : str
-        The link without a parent.
-    has_cylinders : bool
-        Whether any visual is a cylinder.
-    """
-
-    path: Path
-    content: bytes
-    name: str
-    links: tuple[str, ...]
-    joints: dict[str, UrdfJoint]
-    root: str
-    has_cylinders: bool
+    path: Path  # the file
+    content: bytes  # the file as it stands on disk, or the URDF that was made of another format
+    name: str  # the robot's name
+    links: tuple[str, ...]  # link names in the order of the file
+    joints: dict[str, UrdfJoint]  # joints by name in the order of the file
+    root: str  # the link without a parent
+    has_cylinders: bool  # whether any visual is a cylinder
 
     @property
     def text(self) -> str:
@@ -335,41 +282,12 @@ class Urdf:
 
 
 def read_urdf(path: Path, *, travel_needed: bool = True) -> Urdf:
-    """Return the tree of a URDF file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    travel_needed : bool
-        Whether a prismatic joint without limits is refused; else its limits are None.
-
-    Raises
-    ------
-    ModelError
-        If the file is missing or not XML, has a document type or entities, or if its links,
-        joints or numbers do not describe one tree; one sentence a problem, with line numbers.
-    """
+    """Return the tree of a URDF file."""
     return parse_urdf(path, read_file(path, "URDF"), travel_needed=travel_needed)
 
 
 def parse_urdf(path: Path, content: bytes, *, travel_needed: bool = True) -> Urdf:
-    """Return the tree of a URDF that was read before.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for messages.
-    content : bytes
-        What it holds.
-    travel_needed : bool
-        Whether a prismatic joint without limits is refused; else its limits are None.
-
-    Raises
-    ------
-    ModelError
-        As :func:`read_urdf`, of whose tests this has all but those of the file itself.
-    """
+    """Return the tree of a URDF that was read before."""
     robot = parse_robot(path, content)
     problems = Problems(path)
     for element in robot:
@@ -510,18 +428,10 @@ _ATTRIBUTES = {
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """What is written into the origin of a joint.
+    """What is written into the origin of a joint."""
 
-    Attributes
-    ----------
-    xyz : (3,) array or None
-        Position in the parent link [m]; None where it stays as it is.
-    rpy : (3,) array or None
-        Angles about fixed x, y, z [rad]; None where they stay as they are.
-    """
-
-    xyz: Array | None = None
-    rpy: Array | None = None
+    xyz: Array | None = None  # (3,) position in the parent link [m]; None where it stays as it is
+    rpy: Array | None = None  # (3,) angles about fixed x, y, z [rad]
 
 
 @dataclass(frozen=True)
@@ -539,18 +449,6 @@ def patch_origins(content: bytes, origins: Mapping[str, Origin]) -> bytes:
 
     Values are written with 17 significant digits where they need them. The tags, quotes, comments,
     white space and line ends of the file are not touched.
-
-    Parameters
-    ----------
-    content : bytes
-        A checked URDF.
-    origins : mapping of str to Origin
-        New origins by joint name.
-
-    Raises
-    ------
-    ModelError
-        If the file has no such joint.
     """
     tags = _origin_tags(content)
     missing = sorted(set(origins) - set(tags))
@@ -567,16 +465,11 @@ def patch_origins(content: bytes, origins: Mapping[str, Origin]) -> bytes:
     return _changed(content, changes)
 
 
-def patch_radii(content: bytes, radii: Mapping[tuple[str, int], float]) -> bytes:
-    """Return a URDF with other radii of some visual cylinders, otherwise as it was.
-
-    Parameters
-    ----------
-    content : bytes
-        A checked URDF.
-    radii : mapping of (str, int) to float
-        New radii [m] by link and number of the cylinder among the visual cylinders of that link.
-    """
+def patch_radii(
+    content: bytes,
+    radii: Mapping[tuple[str, int], float],  # [m]
+) -> bytes:
+    """Return a URDF with other radii of some visual cylinders, otherwise as it was."""
     tags = _cylinder_tags(content)
     return _changed(
         content,

@@ -38,33 +38,14 @@ from legcal.machine.urdf import Origin, UrdfJoint, patch_origins, same_point
 
 
 class Handle(NamedTuple):
-    """The joint of the URDF whose origin is moved.
-
-    Attributes
-    ----------
-    joint : UrdfJoint
-        The joint.
-    is_inverse : bool
-        Whether its origin moves the body against the leg's joint, and not this in the body.
-    """
+    """The joint of the URDF whose origin is moved."""
 
     joint: UrdfJoint
-    is_inverse: bool
+    is_inverse: bool  # whether its origin moves the body against the leg's joint
 
 
 class Handles:
-    """What moves the joints of legs in the bodies of a mechanism.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The mechanism, as loaded.
-
-    Attributes
-    ----------
-    bodies : Bodies
-        Links that fixed joints and welds hold together.
-    """
+    """What moves the joints of legs in the bodies of a mechanism."""
 
     def __init__(self, mechanism: Mechanism) -> None:
         self._mechanism = mechanism
@@ -75,24 +56,7 @@ class Handles:
         self._above = {joint.child: joint for joint in self._urdf.joints.values()}
 
     def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
-        """Return what moves a joint in a body.
-
-        Parameters
-        ----------
-        step : Step
-            The joint of the leg.
-        side : int
-            Its side in the body.
-        body : str
-            The link that stands for the body.
-        leg : str
-            The leg, for messages.
-
-        Raises
-        ------
-        OutOfClass
-            If no origin moves this joint alone.
-        """
+        """Return what moves a joint in a body."""
         connection = step.connection
         if connection.closure is not None:
             closure = self._closures[connection.closure]
@@ -175,19 +139,11 @@ ROUNDING = 1e-14  # [rad]: what turns less does not turn
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A rigid motion in a frame: p -> about + R (p - about) + shift.
+    """A rigid motion in a frame: p -> about + R (p - about) + shift."""
 
-    Attributes
-    ----------
-    shift, about : (3,) array
-        Displacement, and the point that it is the displacement of [m].
-    turn : Rotation or None
-        R; None where nothing turns, so that nothing is rounded.
-    """
-
-    shift: Array
-    about: Array
-    turn: Rotation | None = None
+    shift: Array  # (3,) displacement, and the point that it is the displacement of [m]
+    about: Array  # (3,) displacement, and the point that it is the displacement of [m]
+    turn: Rotation | None = None  # R; None where nothing turns, so that nothing is rounded
 
     def inv(self) -> Motion:
         """Return the motion back."""
@@ -212,41 +168,14 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class MovedOrigin:
-    """The new origin of a joint.
+    """The new origin of a joint."""
 
-    Attributes
-    ----------
-    T_parent_origin : RigidTransform
-        In its parent link [m].
-    is_turned : bool
-        Whether its orientation changes too.
-    """
-
-    T_parent_origin: RigidTransform
-    is_turned: bool
+    T_parent_origin: RigidTransform  # in its parent link [m]
+    is_turned: bool  # whether its orientation changes too
 
 
 def moved_origins(mechanism: Mechanism, legs: Sequence[LegGeometry]) -> dict[str, MovedOrigin]:
-    """Return the origin of every joint that carries a number of a leg.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The nominal mechanism, as loaded.
-    legs : sequence of LegGeometry
-        The legs as they are to be, in R_b and R_e, in the order of ``mechanism.legs``. Axes may
-        be given either way round.
-
-    Returns
-    -------
-    dict of str to MovedOrigin
-        By joint; those that stay where they are, are among them.
-
-    Raises
-    ------
-    OutOfClass
-        If the tree ties a leg to base or platform where no origin moves that leg alone.
-    """
+    """Return the origin of every joint that carries a number of a leg."""
     handles = Handles(mechanism)
     found: dict[str, MovedOrigin] = {}
 
@@ -352,15 +281,7 @@ def _in_rod(
 
 
 def mechanism_text(mechanism: Mechanism, urdf: str) -> str:
-    """Return the YAML of a mechanism, complete.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The mechanism, of any format.
-    urdf : str
-        The path of its URDF, relative to the YAML.
-    """
+    """Return the YAML of a mechanism, complete."""
     return mechanism_yaml(
         [(c.frame_1, c.frame_2, c.kind) for c in mechanism.chain.closures],
         [str(leg.prismatic) for leg in mechanism.legs if leg.kind is LegKind.ACTUATED],
@@ -386,25 +307,6 @@ def write_model(mechanism: Mechanism, folder: Path) -> tuple[Path, Path]:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism.
 
     A URDF that was read as it stands is copied byte for byte.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The mechanism, of any format.
-    folder : Path
-        The folder that gets ``models`` and ``urdf``; it is made if there is none.
-
-    Returns
-    -------
-    tuple of Path
-        The YAML and the URDF.
-
-    Raises
-    ------
-    UsageError
-        If a file of either name is there already.
-    OutOfResources
-        If the files cannot be written.
     """
     name = model_name(mechanism)
     places = folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
@@ -448,21 +350,6 @@ def write_urdf(mechanism: Mechanism, legs: Sequence[LegGeometry], destination: P
     Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
     Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
     or axes the mechanism may close elsewhere.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The nominal mechanism, as loaded.
-    legs : sequence of LegGeometry
-        The legs in R_b and R_e, in the order of ``mechanism.legs``. B of a leg that is fixed
-        to the platform is where the platform link's origin has its foot on the leg.
-    destination : Path
-        The file to write.
-
-    Raises
-    ------
-    OutOfClass
-        If the tree ties a leg to base or platform where no origin moves that leg alone.
     """
     changed: dict[str, Origin] = {}
     for name, moved in moved_origins(mechanism, legs).items():
@@ -484,17 +371,6 @@ def write_calibrated_yaml(
     Every other character stays as it was, but for the numbers of ``legcal.home`` where home moves;
     the key is added where the file does not have it. A mechanism of another format, or without a
     block ``legcal``, gets a YAML with all it needs.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The nominal mechanism, as loaded.
-    destination : Path
-        The file to write, beside the calibrated URDF.
-    urdf_name : str
-        The calibrated URDF, relative to ``destination``.
-    home : RigidTransform, optional
-        T_base_platform where the calibrated legs close, if not where the nominal ones do.
     """
     if not _is_written_down(mechanism):
         there = mechanism if home is None else replace(mechanism, home=home)
@@ -547,18 +423,7 @@ def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
 
 
 def check_closes(mechanism: Mechanism) -> None:
-    """Check that a mechanism closes at home: its own readings lead back to it.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The mechanism, loaded from the files in question.
-
-    Raises
-    ------
-    DidNotConverge
-        If no closed pose is found there, or another one.
-    """
+    """Check that a mechanism closes at home: its own readings lead back to it."""
     found = forward_kinematics(mechanism, inverse_kinematics(mechanism, mechanism.home))
     away = mechanism.home.inv() * found
     shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
@@ -590,15 +455,7 @@ Axes = Mapping[str, Sequence[float]]  # by leg name, in R_b or R_e
 def nominal_axes(
     leg_names: Sequence[str], nominal: Sequence[LegGeometry]
 ) -> dict[str, dict[str, list[float]]]:
-    """Return the axes that turns count from, at the base in R_b and at the platform in R_e.
-
-    Parameters
-    ----------
-    leg_names : sequence of str
-        Names of the legs.
-    nominal : sequence of LegGeometry
-        The nominal legs in R_b and R_e.
-    """
+    """Return the axes that turns count from, at the base in R_b and at the platform in R_e."""
     named = list(zip(leg_names, nominal, strict=True))
     return {
         "base": {name: leg.base_axis.tolist() for name, leg in named if leg.base_axis is not None},
@@ -616,13 +473,6 @@ def turns_between(
     """Return the derivative (p, p) of parameters with calibrated axes by those with nominal ones.
 
     Twists, which are tied to axes, depend on these and on the turns of the axes.
-
-    Parameters
-    ----------
-    parametrization : Parametrization
-        The parameters of rows and columns.
-    calibrated, nominal : sequence of LegGeometry
-        The legs at which the derivative is taken, and those whose axes counted as zero before.
     """
     by_step = []
     for start in (calibrated, nominal):

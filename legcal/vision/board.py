@@ -35,34 +35,15 @@ BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """A flat calibration board.
+    """A flat calibration board."""
 
-    Attributes
-    ----------
-    kind : {"chessboard", "charuco", "aprilgrid"}
-        What is printed on it.
-    columns, rows : int
-        Squares along x and along y, black and white ones (chessboard, ChArUco); tags along x
-        and along y (AprilGrid).
-    side : float
-        Side of a square, or of the black frame of a tag (AprilGrid) [m].
-    marker : float
-        Side of a marker of a ChArUco board [m]; zero for other kinds.
-    spacing : float
-        Gap between the tags of an AprilGrid as a part of their side; zero for other kinds.
-    dictionary : str
-        What markers and tags are taken from, as OpenCV names it; "" for a chessboard.
-    legacy : bool
-        Whether a ChArUco board is of the pattern that OpenCV made before version 4.6.
-    """
-
-    kind: BoardKind
-    columns: int
-    rows: int
-    side: float
-    marker: float = 0.0
-    spacing: float = 0.0
-    dictionary: str = ""
+    kind: BoardKind  # what is printed on it
+    columns: int  # squares along x and along y, black and white ones (chessboard, ChArUco)
+    rows: int  # squares along x and along y, black and white ones (chessboard, ChArUco)
+    side: float  # side of a square, or of the black frame of a tag (AprilGrid) [m]
+    marker: float = 0.0  # side of a marker of a ChArUco board [m]; zero for other kinds
+    spacing: float = 0.0  # gap between the tags of an AprilGrid as a part of their side
+    dictionary: str = ""  # what markers and tags are taken from, as OpenCV names it
     legacy: bool = False
 
     @property
@@ -309,20 +290,7 @@ def read_board(
 
 
 def described_board(found: Mapping[str, Any], path: Path) -> tuple[Board, RigidTransform | None]:
-    """Return the board that a block describes, and its pose in the base link where it is given.
-
-    Parameters
-    ----------
-    found : mapping
-        The block as the file has it.
-    path : Path
-        The file, for messages.
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each value that does not fit.
-    """
+    """Return the board that a block describes, and its pose in the base link where it is given."""
     kind = found.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
         what = "no such key" if "kind" not in found else describe(kind)
@@ -359,20 +327,7 @@ _OPTION = "--board"
 
 
 def board_of(spec: str | Path | Board) -> Board:
-    """Return the board that a word or a file describes.
-
-    Parameters
-    ----------
-    spec : str, Path or Board
-        ``KIND:NxM:SIZE...`` as in ``FORMS``, or a YAML file with the block ``board`` of a dataset.
-        The sides count as drawn: for a camera only their ratios matter. A chessboard may look the
-        same after half a turn here.
-
-    Raises
-    ------
-    UsageError, DatasetError
-        If it is none of these, or no such board can be printed.
-    """
+    """Return the board that a word or a file describes."""
     if isinstance(spec, Board):
         return spec
     kind, *words = str(spec).split(":")

@@ -23,58 +23,27 @@ _STEP = 1e-6  # of the central differences of undistortion, in units of the sens
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Intrinsics of a camera.
+    """Intrinsics of a camera."""
 
-    Attributes
-    ----------
-    K : (3, 3) array
-        Camera matrix [px].
-    distortion : (n,) array
-        Coefficients in OpenCV's order; empty for a camera without distortion.
-    width, height : int
-        Image size [px].
-    model : {"plumb_bob", "rational_polynomial", "equidistant"}
-        Meaning of the coefficients: OpenCV's usual model with 5 or 8 of them, or its
-        fisheye model with 4.
-    gamma : float
-        Grey levels are light to the power 1 / gamma; 1 for a camera whose levels are proportional
-        to light.
-    gamma_is_told : bool
-        False if nobody said so: outlines are then measured with ``gamma`` for a start, and a fit
-        looks for the true one.
-    sigma : mapping
-        Standard deviations of its numbers, by the names of
-        :func:`legcal.vision.camera.intrinsic_names` [px; distortion without unit]; those that
-        nobody stated are missing.
-    """
-
-    K: Array
-    width: int
-    height: int
-    distortion: Array = field(default_factory=lambda: np.zeros(0))
-    model: DistortionModel = "plumb_bob"
-    gamma: float = 1.0
-    gamma_is_told: bool = True
-    sigma: Mapping[str, float] = field(default_factory=dict)
+    K: Array  # (3, 3) camera matrix [px]
+    width: int  # image size [px]
+    height: int  # image size [px]
+    distortion: Array = field(default_factory=lambda: np.zeros(0))  # (n,)
+    model: DistortionModel = "plumb_bob"  # meaning of the coefficients
+    gamma: float = 1.0  # grey levels are light to the power 1 / gamma
+    gamma_is_told: bool = True  # false if nobody said so
+    sigma: Mapping[str, float] = field(default_factory=dict)  # standard deviations of its numbers
 
     @property
     def has_distortion(self) -> bool:
         """Whether any distortion coefficient differs from zero."""
         return bool(np.any(self.distortion != 0.0)) or self.model == "equidistant"
 
-    def project(self, P_camera: Array) -> Array:
-        """Return the pixels at which points are seen.
-
-        Parameters
-        ----------
-        P_camera : (..., 3) array
-            Points in front of the camera, in its frame [m].
-
-        Returns
-        -------
-        (..., 2) array
-            Pixels.
-        """
+    def project(
+        self,
+        P_camera: Array,  # (..., 3) points in front of the camera, in its frame [m]
+    ) -> Array:
+        """Return the pixels at which points are seen, (..., 2)."""
         xy = P_camera[..., :2] / P_camera[..., 2:]
         return self.distort(xy)
 
@@ -107,42 +76,26 @@ class Camera:
             )
         return np.asarray(xy, dtype=np.float64).reshape(pixels.shape)
 
-    def pixels_per_unit(self, xy: Array) -> Array:
-        """Return the derivative of pixels with respect to the sensor plane, at (x, y).
-
-        Parameters
-        ----------
-        xy : (..., 2) array
-            Points of the sensor plane.
-
-        Returns
-        -------
-        (..., 2, 2) array
-            d(u, v) / d(x, y) [px].
-        """
+    def pixels_per_unit(
+        self,
+        xy: Array,  # (..., 2) points of the sensor plane
+    ) -> Array:
+        """Return the derivative of pixels with respect to the sensor plane, at (x, y)."""
         if not self.has_distortion:
             return np.broadcast_to(self.K[:2, :2], (*xy.shape[:-1], 2, 2)).copy()
         steps = _STEP * np.eye(2)
         columns = [(self.distort(xy + s) - self.distort(xy - s)) / (2.0 * _STEP) for s in steps]
         return np.stack(columns, axis=-1)
 
-    def line_offset(self, h: Array, xy: Array) -> Array:
-        """Return the signed distance in the image of points from lines.
+    def line_offset(
+        self,
+        h: Array,  # (..., 3) lines (a, b, c) of the sensor plane, eq (2)
+        xy: Array,  # (..., 2) points of the sensor plane
+    ) -> Array:
+        """Return the signed distance in the image of points from lines, (...) [px].
 
         To first order in the distance, with the scale and the distortion of the lens at the
         point. Positive on the side where h . (x, y, 1) > 0.
-
-        Parameters
-        ----------
-        h : (..., 3) array
-            Lines (a, b, c) of the sensor plane, eq (2).
-        xy : (..., 2) array
-            Points of the sensor plane.
-
-        Returns
-        -------
-        (...) array
-            Distances [px].
         """
         # An offset d(u, v) in the image is J d(x, y), so the line's normal there is J^-T (a, b).
         J = self.pixels_per_unit(xy)
@@ -183,15 +136,7 @@ def intrinsic_values(camera: Camera) -> Array:
 
 
 def with_intrinsics(camera: Camera, values: Mapping[str, float]) -> Camera:
-    """Return a camera with some of its numbers replaced.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera as it was.
-    values : mapping
-        New values by their names [px; distortion without unit].
-    """
+    """Return a camera with some of its numbers replaced."""
     K, distortion = camera.K.copy(), _padded(camera)
     for name, value in values.items():
         if name in _PINHOLE:
@@ -203,25 +148,14 @@ def with_intrinsics(camera: Camera, values: Mapping[str, float]) -> Camera:
     return replace(camera, K=K, distortion=distortion)
 
 
-def undistort_derivatives(camera: Camera, pixels: Array, names: Sequence[str]) -> Array:
+def undistort_derivatives(
+    camera: Camera,
+    pixels: Array,  # (..., 2) pixels
+    names: Sequence[str],
+) -> Array:
     """Return how the points of the sensor plane seen at pixels move with a camera's numbers.
 
     A pixel stays where it is, so that d(u, v)/d(x, y) d(x, y) + d(u, v)/d(number) = 0.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    pixels : (..., 2) array
-        Pixels.
-    names : sequence of str
-        The numbers that change, n of :func:`intrinsic_names`.
-
-    Returns
-    -------
-    (..., 2, n) array
-        d(x, y) / d(number) of :meth:`legcal.vision.camera.Camera.undistort` [per unit of the
-        number].
     """
     flat = pixels.reshape(-1, 2)
     if len(flat) == 0:  # OpenCV refuses to project nothing
@@ -233,20 +167,7 @@ def undistort_derivatives(camera: Camera, pixels: Array, names: Sequence[str]) -
 
 
 def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return for each view the name of the view whose intrinsics it has.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the views.
-    cameras : sequence of Camera
-        The camera of each.
-
-    Returns
-    -------
-    tuple of str
-        The least of the names of views with an equal camera.
-    """
+    """Return for each view the name of the view whose intrinsics it has."""
     keys = [_identity(camera) for camera in cameras]
     owner: dict[object, str] = {}
     for name, key in sorted(zip(names, keys, strict=True), key=lambda pair: pair[0]):

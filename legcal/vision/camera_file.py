@@ -113,26 +113,7 @@ _SINGULAR = 1e-9  # smallest focal length, as a part of the image size
 
 
 def read_camera(path: Path) -> Camera:
-    """Read a camera file of any of the three kinds.
-
-    Parameters
-    ----------
-    path : Path
-        A ROS camera_info YAML (plumb_bob, rational_polynomial or equidistant), an OpenCV
-        FileStorage (YAML, XML or JSON), or a Kalibr camchain of one pinhole camera.
-
-    Returns
-    -------
-    Camera
-        K [px], its distortion and its image size [px].
-
-    Raises
-    ------
-    DatasetError
-        With one sentence for each thing that is wrong: no such file, a kind that is not
-        known, values of the wrong type or number, a camera matrix that is singular or not
-        finite, a principal point outside the image.
-    """
+    """Read a camera file of any of the three kinds."""
     content = read_text(path, "camera file")
     if _OPENCV_MARKS.search(content):
         return _from_opencv(_read_storage(content, path), path)
@@ -324,17 +305,7 @@ def _matrix_problems(path: Path, K: Array, size: tuple[int, int]) -> list[str]:
 
 
 def camera_info(camera: Camera, name: str, more: Mapping[str, Any] | None = None) -> str:
-    """Return the text of a ROS camera_info file that reads back as the same camera.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    name : str
-        What the file calls it.
-    more : mapping, optional
-        Keys that stand at the end; ROS does not read them.
-    """
+    """Return the text of a ROS camera_info file that reads back as the same camera."""
     distortion = camera.distortion if len(camera.distortion) else np.zeros(5)
     projection = np.column_stack([camera.K, np.zeros(3)])
     document = {

@@ -30,45 +30,22 @@ FLOOR_PX = 0.01  # no corner is known better: print, flatness, pixels that diffe
 
 @dataclass(frozen=True)
 class Saddle:
-    """A crossing of two edges in an image.
+    """A crossing of two edges in an image."""
 
-    Attributes
-    ----------
-    px : (2,) array
-        Where it is [px].
-    sigma_px : float
-        Standard deviation of either coordinate [px].
-    blur_px : float
-        Standard deviation of the blur of both edges [px].
-    misfit : float
-        What the model leaves over (root mean square), as a part of the contrast.
-    """
-
-    px: Array
-    sigma_px: float
-    blur_px: float
-    misfit: float
+    px: Array  # (2,) where it is [px]
+    sigma_px: float  # standard deviation of either coordinate [px]
+    blur_px: float  # standard deviation of the blur of both edges [px]
+    misfit: float  # what the model leaves over (root mean square), as a part of the contrast
 
 
 def fit_saddle(
-    grey: NDArray[np.float32], start: Array, axes: Array, length: float, band: float
+    grey: NDArray[np.float32],  # (height, width) grey levels, 0 to 255
+    start: Array,  # (2,) where the corner should be [px]
+    axes: Array,  # (2, 2) the steps in the image along the edges of the board through the corner
+    length: float,  # how far both edges are straight on either side of the corner [m]
+    band: float,  # how far from the edges nothing else is printed [m]
 ) -> Saddle | None:
-    """Return where two edges cross near a pixel; None where the picture is another.
-
-    Parameters
-    ----------
-    grey : (height, width) array
-        Grey levels, 0 to 255.
-    start : (2,) array
-        Where the corner should be [px].
-    axes : (2, 2) array
-        The steps in the image along the edges of the board through the corner, in columns,
-        for one metre on the board [px / m].
-    length : float
-        How far both edges are straight on either side of the corner [m].
-    band : float
-        How far from the edges nothing else is printed [m].
-    """
+    """Return where two edges cross near a pixel; None where the picture is another."""
     u, v, levels = _window(grey, start)
     away = np.stack([u - start[0], v - start[1]])
     on_board = np.abs(np.linalg.solve(axes, away))
@@ -174,17 +151,13 @@ _MOSTLY = 0.9  # of the neighbours that must be black and white
 _CROSSING = 0.08  # misfit of a corner; where squares meet a rim it is twice as large
 
 
-def search_chessboard(board: Board, grey: NDArray[np.uint8]) -> tuple[IntArray, Array]:
+def search_chessboard(
+    board: Board,
+    grey: NDArray[np.uint8],  # (height, width) the image
+) -> tuple[IntArray, Array]:
     """Return numbers (k,) and rough places (k, 2) [px] of the corners: all of them, or none.
 
     A part of a larger chessboard is none: nobody can tell which part.
-
-    Parameters
-    ----------
-    board : Board
-        The chessboard.
-    grey : (height, width) array of uint8
-        The image.
     """
     grid = inner_corners(grey, board.grid)
     if grid is None or goes_on(grid, grey):
@@ -271,16 +244,11 @@ _SCALES = (1, 2)  # by which images are enlarged: modules may be only a few pixe
 _FIRST_TAG = 0xD5D628584  # of the family 36h11, its modules row by row from the top left
 
 
-def search_charuco(board: Board, grey: NDArray[np.uint8]) -> tuple[IntArray, Array]:
-    """Return numbers (k,) and rough places (k, 2) [px] of the corners that are seen.
-
-    Parameters
-    ----------
-    board : Board
-        A ChArUco board.
-    grey : (height, width) array of uint8
-        The image.
-    """
+def search_charuco(
+    board: Board,
+    grey: NDArray[np.uint8],  # (height, width) the image
+) -> tuple[IntArray, Array]:
+    """Return numbers (k,) and rough places (k, 2) [px] of the corners that are seen."""
     charuco = cv2.aruco.CharucoParameters()
     charuco.minMarkers = 1  # places are refined later
     detector = cv2.aruco.CharucoDetector(charuco_board(board), charuco, _parameters(1))
@@ -295,16 +263,11 @@ def search_charuco(board: Board, grey: NDArray[np.uint8]) -> tuple[IntArray, Arr
     return best
 
 
-def search_aprilgrid(board: Board, grey: NDArray[np.uint8]) -> tuple[IntArray, Array]:
-    """Return numbers (k,) and rough places (k, 2) [px] of the corners of the tags that are seen.
-
-    Parameters
-    ----------
-    board : Board
-        An AprilGrid.
-    grey : (height, width) array of uint8
-        The image.
-    """
+def search_aprilgrid(
+    board: Board,
+    grey: NDArray[np.uint8],  # (height, width) the image
+) -> tuple[IntArray, Array]:
+    """Return numbers (k,) and rough places (k, 2) [px] of the corners of the tags that are seen."""
     tags, places = search_tags(board, grey)
     own = tags < board.columns * board.rows
     tags, places = tags[own], places[own]
@@ -319,22 +282,13 @@ def search_aprilgrid(board: Board, grey: NDArray[np.uint8]) -> tuple[IntArray, A
     return numbers.ravel().astype(np.intp), places.reshape(-1, 2)
 
 
-def search_tags(board: Board, grey: NDArray[np.uint8]) -> tuple[IntArray, Array]:
+def search_tags(
+    board: Board,
+    grey: NDArray[np.uint8],  # (height, width) the image
+) -> tuple[IntArray, Array]:
     """Return the tags or markers in an image, of whatever board of the same dictionary.
 
-    Parameters
-    ----------
-    board : Board
-        A ChArUco board or an AprilGrid.
-    grey : (height, width) array of uint8
-        The image.
-
-    Returns
-    -------
-    numbers : (n,) array of int
-        Their numbers.
-    places : (n, 4, 2) array
-        Their corners [px]: bottom left, bottom right, top right, top left.
+    Returns numbers (n,); places (n, 4, 2) [px].
     """
     borders = _BORDERS if board.kind == "aprilgrid" else (1,)
     ids, found = np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2))
@@ -393,27 +347,16 @@ _SEARCH = {
 }
 
 
-def find_corners(board: Board, image: NDArray[np.generic]) -> tuple[IntArray, Array, Array]:
+def find_corners(
+    board: Board,
+    image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
+) -> tuple[IntArray, Array, Array]:
     """Return the corners of a board that an image shows.
 
     Corners whose surroundings are not those of a board, or partly hidden, are left out. A
     chessboard is found as a whole, or not at all.
 
-    Parameters
-    ----------
-    board : Board
-        The board.
-    image : (height, width) array
-        Grey levels, 0 to 255.
-
-    Returns
-    -------
-    numbers : (k,) array of int
-        The corners, rising.
-    px : (k, 2) array
-        Where they are; (0, 0) is the centre of the top-left pixel.
-    sigma_px : (k,) array
-        Standard deviation of either coordinate [px].
+    Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
     """
     grey = np.ascontiguousarray(image, dtype=np.float32)
     eight_bits = np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8)
@@ -474,21 +417,11 @@ _FEWEST_CORNERS = 3  # along a side of a chessboard, for OpenCV
 _FEWEST_MARKERS = 3  # of another dictionary that are no chance
 
 
-def described(board: Board, image: NDArray[np.generic]) -> str | None:
-    """Return what an image shows instead of a board, in words that go after "found".
-
-    Parameters
-    ----------
-    board : Board
-        The board that was not found.
-    image : (height, width) array
-        Grey levels, 0 to 255.
-
-    Returns
-    -------
-    str or None
-        None if there is nothing like a board.
-    """
+def described(
+    board: Board,
+    image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
+) -> str | None:
+    """Return what an image shows instead of a board, in words that go after "found"."""
     grey = np.clip(np.rint(image.astype(np.float32)), 0.0, 255.0).astype(np.uint8)
     if board.kind == "chessboard":
         return _other_squares(board, grey)

@@ -14,30 +14,15 @@ from legcal.geometry import Array, moment, nearest_point_to_origin
 EPSILON = np.array([1.0, -1.0])
 
 
-def outlines_of_axis(u: Array, M: Array, radius: Array | float) -> Array:
-    """Return the outlines of cylinders seen from the origin, eqs (1) and (3).
+def outlines_of_axis(
+    u: Array,  # (..., 3) unit directions in the camera frame, from base to platform
+    M: Array,  # (..., 3) a point of each axis in the camera frame [m]
+    radius: Array | float,  # (...) radii [m]
+) -> Array:
+    """Return the outlines of cylinders seen from the origin, eqs (1) and (3), (..., 2, 3).
 
     The tangent planes contain u, and stand at the angle asin(R / d) to the plane through the
     axis and the camera centre, d being the distance of the axis.
-
-    Parameters
-    ----------
-    u : (..., 3) array
-        Unit directions in the camera frame, from base to platform.
-    M : (..., 3) array
-        A point of each axis in the camera frame [m].
-    radius : (...) array or float
-        Radii [m].
-
-    Returns
-    -------
-    (..., 2, 3) array
-        Unit normals h1 (epsilon +1) and h2 (epsilon -1).
-
-    Raises
-    ------
-    NotVisible
-        If the camera centre lies inside a cylinder or on its surface.
     """
     foot = nearest_point_to_origin(u, M)
     distance = np.linalg.norm(foot, axis=-1)
@@ -56,28 +41,14 @@ def outlines_of_axis(u: Array, M: Array, radius: Array | float) -> Array:
     )
 
 
-def axis_of_outlines(h1: Array, h2: Array, radius: Array | float) -> tuple[Array, Array]:
+def axis_of_outlines(
+    h1: Array,  # (..., 3)
+    h2: Array,  # (..., 3)
+    radius: Array | float,  # (...) radii [m]
+) -> tuple[Array, Array]:
     """Return the axes of cylinders from their outlines, eqs (4) and (5).
 
-    Parameters
-    ----------
-    h1, h2 : (..., 3) array
-        Unit normals of the tangent planes with epsilon +1 and -1.
-    radius : (...) array or float
-        Radii [m].
-
-    Returns
-    -------
-    u : (..., 3) array
-        Unit directions h1 x h2 of eq (4); with these signs they point from base to platform.
-    M : (..., 3) array
-        The solution of eq (5) nearest to the camera centre [m]. It exists for every
-        cylinder, unlike the point with y = 0 of the paper.
-
-    Raises
-    ------
-    NotVisible
-        If two outlines coincide, so that no cylinder has them.
+    Returns u (..., 3); M (..., 3) [m].
     """
     n = np.cross(h1, h2)
     norm = np.linalg.norm(n, axis=-1, keepdims=True)
@@ -93,24 +64,11 @@ def axis_of_outlines(h1: Array, h2: Array, radius: Array | float) -> tuple[Array
     return u, M
 
 
-def point_with_zero_y(u: Array, M: Array) -> Array:
-    """Return the point M_LS = (x, 0, z) of axes, the paper's choice among the points of eq (5).
-
-    Parameters
-    ----------
-    u, M : (..., 3) array
-        Directions, and a point of each axis [m], in the camera frame.
-
-    Returns
-    -------
-    (..., 3) array
-        M_LS [m].
-
-    Raises
-    ------
-    NotVisible
-        If an axis is parallel to the plane y = 0, where the point does not exist.
-    """
+def point_with_zero_y(
+    u: Array,  # (..., 3)
+    M: Array,  # (..., 3)
+) -> Array:
+    """Return the point M_LS = (x, 0, z) of axes, the paper's choice among the points of eq (5)."""
     if np.any(np.abs(u[..., 1]) < 1e-9):
         raise NotVisible(
             "M_LS = (x, 0, z) does not exist for a leg parallel to the image x axis; "
@@ -119,38 +77,20 @@ def point_with_zero_y(u: Array, M: Array) -> Array:
     return np.asarray(M - u * (M[..., 1:2] / u[..., 1:2]))
 
 
-def direction_of_angles(psi: Array, theta: Array) -> Array:
-    """Return u = (-sin theta cos psi, cos theta cos psi, sin psi).
-
-    Parameters
-    ----------
-    psi, theta : (...) array
-        Tilt away from the image plane, and angle in the image [rad].
-
-    Returns
-    -------
-    (..., 3) array
-        Unit directions in the camera frame, from base to platform.
-    """
+def direction_of_angles(
+    psi: Array,  # (...)
+    theta: Array,  # (...)
+) -> Array:
+    """Return u = (-sin theta cos psi, cos theta cos psi, sin psi), (..., 3)."""
     return np.stack(
         [-np.sin(theta) * np.cos(psi), np.cos(theta) * np.cos(psi), np.sin(psi)], axis=-1
     )
 
 
-def angles_of_direction(u: Array) -> tuple[Array, Array]:
-    """Return psi = asin(u_z) and theta = atan2(-u_x, u_y).
-
-    Parameters
-    ----------
-    u : (..., 3) array
-        Unit directions in the camera frame, from base to platform. Along the optical axis theta
-        has no meaning; 0 is returned.
-
-    Returns
-    -------
-    psi, theta : (...) array
-        In [-pi/2, pi/2] and [-pi, pi] [rad].
-    """
+def angles_of_direction(
+    u: Array,  # (..., 3) unit directions in the camera frame, from base to platform
+) -> tuple[Array, Array]:
+    """Return psi = asin(u_z) and theta = atan2(-u_x, u_y)."""
     x, y, z = np.moveaxis(u, -1, 0)
     # The same as asin(u_z), without its loss of digits near the optical axis.
     return np.arctan2(z, np.hypot(x, y)), np.arctan2(-x, y)

@@ -61,30 +61,7 @@ class ImageSize:
 
 
 def read_image(path: Path, camera: Camera, where: str = "") -> Image:
-    """Read an image as grey levels.
-
-    Parameters
-    ----------
-    path : Path
-        A PNG, JPEG or TIFF file, grey or colour, 8 or 16 bit. An orientation in its EXIF
-        data is ignored: pixels stay where the camera has them.
-    camera : Camera
-        The camera that took it.
-    where : str
-        Where the file is named, such as ``measurements.csv, row 3``, for the message.
-
-    Returns
-    -------
-    (height, width) array of float32
-        Grey levels on the scale 0 to 255, with fractions where the file has 16 bits or
-        colours. Files of 16 bits often hold data of 12, and do where no level of the image needs
-        more: saturated ones are 255 then.
-
-    Raises
-    ------
-    DatasetError
-        If the file is missing, truncated, unreadable, or of another size than the camera.
-    """
+    """Read an image as grey levels, (height, width)."""
     content, problem = _complete_content(path, camera, where)
     if problem:
         raise DatasetError(problem)
@@ -114,24 +91,12 @@ def _depth(pixels: Image) -> int:
 
 
 def image_problem(path: Path, camera: Camera, where: str = "") -> str | None:
-    """Return what keeps an image file from being used, or None; the pixels are not decoded.
-
-    Parameters
-    ----------
-    path, camera, where
-        As in :func:`read_image`.
-    """
+    """Return what keeps an image file from being used, or None; the pixels are not decoded."""
     return _complete_content(path, camera, where)[1]
 
 
 def image_size(content: bytes) -> ImageSize:
-    """Return the size of an image from the bytes of its file.
-
-    Raises
-    ------
-    ValueError
-        If the bytes are not a complete PNG, JPEG or TIFF file; says what was found.
-    """
+    """Return the size of an image from the bytes of its file."""
     if not content:
         raise _BadImage("an empty file")
     try:

@@ -18,42 +18,19 @@ END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cyl
 
 @dataclass(frozen=True)
 class Piece:
-    """A visible stretch of one cylinder of a leg.
+    """A visible stretch of one cylinder of a leg."""
 
-    Attributes
-    ----------
-    link : str
-        The URDF link that names the part.
-    radius : float
-        Radius [m].
-    start, end : float
-        Distances from A along the leg between which its outline is looked for [m].
-    """
-
-    link: str
-    radius: float
-    start: float
-    end: float
+    link: str  # the URDF link that names the part
+    radius: float  # radius [m]
+    start: float  # distances from A along the leg between which its outline is looked for [m]
+    end: float  # distances from A along the leg between which its outline is looked for [m]
 
 
-def visible_pieces(cylinders: Sequence[Cylinder], length: float) -> tuple[Piece, ...]:
-    """Return the visible piece of every part of a leg, from base to platform.
-
-    Parameters
-    ----------
-    cylinders : sequence of Cylinder
-        What the model knows of the leg.
-    length : float
-        Leg length AB [m].
-
-    Returns
-    -------
-    tuple of Piece
-        One for each part with something left to see: its longest stretch that no thicker
-        cylinder covers, shortened at the joints and beside thicker cylinders. Cylinders of
-        equal radius that touch or overlap are one part, named by the longest of them. Of
-        several cylinders of one link the longest is the part; the others only hide.
-    """
+def visible_pieces(
+    cylinders: Sequence[Cylinder],
+    length: float,  # leg length AB [m]
+) -> tuple[Piece, ...]:
+    """Return the visible piece of every part of a leg, from base to platform."""
     main = main_cylinders(cylinders)
     parts = _merge_equal(cylinders, length)
     pieces = []
@@ -102,23 +79,13 @@ NEAREST = 0.05  # points nearer to the image plane than this fraction of the leg
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """A frame on the sensor plane.
+    """A frame on the sensor plane."""
 
-    Attributes
-    ----------
-    origin, along, normal : (2,) array
-        Point with t = v = 0, and unit directions of t and v, on the sensor plane.
-    scale : float
-        Pixels per unit of the sensor plane.
-    length : float
-        The predicted leg is visible for 0 <= t <= length [px].
-    """
-
-    origin: Array
-    along: Array
-    normal: Array
-    scale: float
-    length: float
+    origin: Array  # (2,) point with t = v = 0, and unit directions of t and v, on the sensor plane
+    along: Array  # (2,) point with t = v = 0, and unit directions of t and v, on the sensor plane
+    normal: Array  # (2,) point with t = v = 0, and unit directions of t and v, on the sensor plane
+    scale: float  # pixels per unit of the sensor plane
+    length: float  # the predicted leg is visible for 0 <= t <= length [px]
 
     def points(self, t: Array, v: Array) -> Array:
         """Return the points (x, y) of the sensor plane with coordinates t, v [px], (..., 2)."""
@@ -151,42 +118,25 @@ class Band:
 
 
 def band_of_leg(
-    camera: Camera, A_camera: Array, B_camera: Array, start: float, end: float
+    camera: Camera,
+    A_camera: Array,  # (3,)
+    B_camera: Array,  # (3,)
+    start: float,
+    end: float,
 ) -> Band | None:
-    """Return the band along the visible stretch of a leg, or None if the image misses it.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    A_camera, B_camera : (3,) array
-        Predicted joint centres in the camera frame [m].
-    start, end : float
-        The stretch of the axis that is of interest, as distances from A [m].
-
-    Returns
-    -------
-    Band or None
-        From the first to the last point of the longest stretch that the image shows.
-    """
+    """Return the band along the visible stretch of a leg, or None if the image misses it."""
     ends = np.array([[start], [end]])
     return bands_of_legs(camera, A_camera[None], B_camera[None], *ends)[0]
 
 
 def bands_of_legs(
-    camera: Camera, A_camera: Array, B_camera: Array, start: Array, end: Array
+    camera: Camera,
+    A_camera: Array,  # (n, 3)
+    B_camera: Array,  # (n, 3)
+    start: Array,  # (n,)
+    end: Array,  # (n,)
 ) -> list[Band | None]:
-    """Return the bands along the visible stretches of legs, as :func:`band_of_leg` does for one.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    A_camera, B_camera : (n, 3) array
-        Predicted joint centres in the camera frame [m].
-    start, end : (n,) array
-        The stretches of the axes that are of interest, as distances from A [m].
-    """
+    """Return the bands along the visible stretches of legs, as :func:`band_of_leg` does for one."""
     length = np.linalg.norm(B_camera - A_camera, axis=1)
     u = (B_camera - A_camera) / length[:, None]
     s = start[:, None] + (end - start)[:, None] * np.linspace(0.0, 1.0, N_SAMPLES)
@@ -247,29 +197,15 @@ def longest_run(flags: BoolArray) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class PredictedLeg:
-    """One leg as it should appear in one image.
+    """One leg as it should appear in one image."""
 
-    Attributes
-    ----------
-    row, leg : int
-        The image and the leg.
-    A_camera, B_camera : (3,) array
-        Joint centres in the camera frame [m].
-    pieces : tuple of Piece
-        The parts that can be seen, from base to platform.
-    outlines : (n_pieces, 2, 3) array
-        Their outlines h1, h2, eq (3).
-    band : Band
-        The frame along the visible stretch of the whole leg.
-    """
-
-    row: int
-    leg: int
-    A_camera: Array
-    B_camera: Array
-    pieces: tuple[Piece, ...]
-    outlines: Array
-    band: Band
+    row: int  # the image and the leg
+    leg: int  # the image and the leg
+    A_camera: Array  # (3,) joint centres in the camera frame [m]
+    B_camera: Array  # (3,) joint centres in the camera frame [m]
+    pieces: tuple[Piece, ...]  # the parts that can be seen, from base to platform
+    outlines: Array  # (n_pieces, 2, 3) their outlines h1, h2, eq (3)
+    band: Band  # the frame along the visible stretch of the whole leg
 
     @cached_property
     def u(self) -> Array:
@@ -287,31 +223,12 @@ class PredictedLeg:
 def predict_legs(
     camera: Camera,
     T_base_camera: RigidTransform,
-    A_base: Array,
-    B_base: Array,
+    A_base: Array,  # (n_legs, 3)
+    B_base: Array,  # (n_legs, 3)
     cylinders: Sequence[Sequence[Cylinder]],
     row: int,
 ) -> list[PredictedLeg]:
-    """Predict every leg that an image should show.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera of the image.
-    T_base_camera : RigidTransform
-        Its pose in the base link.
-    A_base, B_base : (n_legs, 3) array
-        Joint centres at the reading of the image, in the base link [m].
-    cylinders : sequence, for each leg a sequence of Cylinder
-        What can be seen of the legs.
-    row : int
-        Index of the image.
-
-    Returns
-    -------
-    list of PredictedLeg
-        In the order of the legs; legs outside the image are missing.
-    """
+    """Predict every leg that an image should show."""
     T_camera_base = T_base_camera.inv()
     A_camera, B_camera = T_camera_base.apply(A_base), T_camera_base.apply(B_base)
     length = np.linalg.norm(B_camera - A_camera, axis=1)
@@ -337,26 +254,12 @@ def predict_legs(
 
 
 def hidden_by(
-    legs: Sequence[PredictedLeg], own: IntArray, P_camera: Array, margin: Array
+    legs: Sequence[PredictedLeg],
+    own: IntArray,  # (n,) the leg to whose outline each point belongs
+    P_camera: Array,  # (n, 3) the points [m]
+    margin: Array,  # (n,) points this near to another leg's outline count as hidden
 ) -> IntArray:
-    """Return which other leg stands in front of points of legs.
-
-    Parameters
-    ----------
-    legs : sequence of PredictedLeg
-        The legs of one image.
-    own : (n,) array of int
-        The leg to whose outline each point belongs.
-    P_camera : (n, 3) array
-        The points [m].
-    margin : (n,) array
-        Points this near to another leg's outline count as hidden, as an angle [rad].
-
-    Returns
-    -------
-    (n,) array of int
-        Index of the leg in front, -1 where the view is free.
-    """
+    """Return which other leg stands in front of points of legs, (n,)."""
     distance = np.linalg.norm(P_camera, axis=1)
     ray = P_camera / distance[:, None]
     u, A, B = (

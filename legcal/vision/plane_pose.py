@@ -21,45 +21,21 @@ _SAME = 1e-3  # [rad] between solutions that are one
 
 @dataclass(frozen=True, eq=False)
 class PlanePose:
-    """A pose that explains the points of a plane.
+    """A pose that explains the points of a plane."""
 
-    Attributes
-    ----------
-    T_camera_plane : RigidTransform
-        The pose of the plane in the camera.
-    cost : float
-        Half the sum of squares of weighted residuals, large ones by Huber's loss.
-    residual_px : (n, 2) array
-        Pixels less where the points should be seen [px].
-    information : (6, 6) array
-        Of a shift [m] and a turn [rad] of the plane, both in the camera frame.
-    """
-
-    T_camera_plane: RigidTransform
-    cost: float
-    residual_px: Array
-    information: Array
+    T_camera_plane: RigidTransform  # the pose of the plane in the camera
+    cost: float  # half the sum of squares of weighted residuals, large ones by Huber's loss
+    residual_px: Array  # (n, 2) pixels less where the points should be seen [px]
+    information: Array  # (6, 6) of a shift [m] and a turn [rad] of the plane
 
 
-def plane_poses(camera: Camera, points: Array, px: Array, sigma_px: Array) -> list[PlanePose]:
-    """Return the poses of a plane that explain where its points are seen, the better one first.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    points : (n, 3) array
-        Four points or more of the plane z = 0, not all on a line [m].
-    px : (n, 2) array
-        Where they are seen [px].
-    sigma_px : (n,) array
-        Standard deviations of either coordinate [px].
-
-    Returns
-    -------
-    list of PlanePose
-        One or two; none where no pose has all points before the camera.
-    """
+def plane_poses(
+    camera: Camera,
+    points: Array,  # (n, 3) four points or more of the plane z = 0, not all on a line [m]
+    px: Array,  # (n, 2) where they are seen [px]
+    sigma_px: Array,  # (n,) standard deviations of either coordinate [px]
+) -> list[PlanePose]:
+    """Return the poses of a plane that explain where its points are seen, the better one first."""
     middle = points.mean(axis=0)
     xy = camera.undistort(px)
     found, turns, shifts, _ = cv2.solvePnPGeneric(
@@ -86,15 +62,7 @@ def plane_poses(camera: Camera, points: Array, px: Array, sigma_px: Array) -> li
 def refined_pose(
     camera: Camera, points: Array, px: Array, sigma_px: Array, start: RigidTransform
 ) -> PlanePose | None:
-    """Return the pose of least cost near a start; None if it puts points behind the camera.
-
-    Parameters
-    ----------
-    camera, points, px, sigma_px
-        As for :func:`plane_poses`.
-    start : RigidTransform
-        T_camera_plane.
-    """
+    """Return the pose of least cost near a start; None if it puts points behind the camera."""
     here = _evaluated(camera, points, px, sigma_px, start)
     damping = 1e-6
     for _ in range(_ITERATIONS):
