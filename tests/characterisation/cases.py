@@ -1,0 +1,386 @@
+"""The commands whose results are recorded, by name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from characterisation.facts import facts, folder_facts, table_facts
+from characterisation.inputs import MACHINES, copy_of, simulated
+from characterisation.running import run, words_of
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command line. ``{in}`` is a copy of the input, ``{out}`` a new place.
+
+    Parameters
+    ----------
+    command : str
+        The words after ``legcal``.
+    folder : str
+        A place whose files are recorded afterwards; none without it.
+    many : bool
+        Use all processors.
+    """
+
+    command: str
+    folder: str = ""
+    many: bool = False
+
+
+@dataclass(frozen=True)
+class Case:
+    """Command lines that follow each other in one folder, and what is recorded of them."""
+
+    name: str
+    steps: tuple[Step, ...]
+    input: str = ""
+    files: tuple[tuple[str, str], ...] = ()  # written first: name, text
+    slow: bool = False
+
+    def observe(self, folder: Path) -> dict[str, Any]:
+        """Run it in an empty folder, and return all facts."""
+        places: dict[str, Path | str] = {"out": folder / "out", "here": folder}
+        if self.input:
+            places["in"] = copy_of(self.input, folder / "in")
+        for name, text in self.files:
+            (folder / name).write_text(text)
+        return {"steps": [self._observe(step, places) for step in self.steps]}
+
+    def _observe(self, step: Step, places: dict[str, Path | str]) -> dict[str, Any]:
+        words = words_of(step.command, places)
+        outcome = run(words, inside=Path(places["here"]), many=step.many)
+        found: dict[str, Any] = {"exit": outcome.code}
+        printed = None
+        if "--json" in words:
+            printed = outcome.document
+            found["document"] = facts(printed)
+        else:
+            found["printed"] = bool(outcome.out.strip())
+        if step.folder:
+            place = Path(step.folder.format(**places))
+            found["files"] = folder_facts(place, printed)
+        return found
+
+
+@dataclass(frozen=True)
+class Chain(Case):
+    """The whole path of one machine: simulated, calibrated, compared with its truth."""
+
+    def observe(self, folder: Path) -> dict[str, Any]:
+        """Run it, and tell of the simulated dataset too: what is wrong there shows there."""
+        machine, _, level = self.name.rpartition("-")
+        made, outcome = simulated(machine, level)
+        tables = [path for path in sorted(made.glob("*.csv"))]
+        before = {
+            "document": facts(outcome.document),
+            "tables": {path.name: table_facts(path) for path in tables},
+            "files": sorted(p.relative_to(made).as_posix() for p in made.rglob("*.*")),
+        }
+        return {"simulated": before} | super().observe(folder)
+
+
+@dataclass(frozen=True)
+class Places(Case):
+    """Where cameras are put around a machine."""
+
+    def observe(self, folder: Path) -> dict[str, Any]:
+        """Simulate hardly anything, and return the true places."""
+        machine = self.name.removeprefix("places-")
+        words = f"simulate {machine} -o {folder / 'out'} --level outlines --seed 3 --poses 8"
+        assert run(words.split()).code == 0
+        views = json.loads((folder / "out/truth/truth.json").read_text())["views"]
+        return {"views": facts(views)}
+
+
+QUICK_MACHINES = {
+    "outlines": set(MACHINES) - {"nategh-agheli"},
+    "axes": {"3-rpr", "3-rps", "3-upu", "hexapod", "tricept"},
+    "photographs": {"3-rpr"},
+}
+QUICK = "--level outlines --poses 1 --views 1 --seed 3 --json"
+SMALL = (
+    "image_width: 200\nimage_height: 150\ncamera_name: tiny\n"
+    "camera_matrix: {rows: 3, cols: 3, data: [300, 0, 100, 0, 300, 75, 0, 0, 1]}\n"
+    "distortion_model: plumb_bob\n"
+    "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
+)
+PLACE = "{T_base_camera: {xyz: [1.2, 0.0, 0.3], quat_xyzw: [-0.5, -0.5, 0.5, 0.5]}}"
+
+
+def _chains() -> Iterable[Case]:
+    for level in ("outlines", "axes", "photographs"):
+        for machine in MACHINES:
+            truth = f"{{in}}/truth/models/{machine}.yaml"
+            steps = (
+                Step("calibrate {in} -o {out} --json", folder="{out}"),
+                Step(f"evaluate {{out}}/calibrated.yaml {truth} --dataset {{in}} --json"),
+                Step("inspect {out}/calibrated.yaml --json"),
+            )
+            name = f"{machine}-{level}"
+            yield Chain(name, steps, input=name, slow=machine not in QUICK_MACHINES[level])
+
+
+def _models() -> Iterable[Case]:
+    for machine in MACHINES:
+        yield Case(
+            f"model-{machine}",
+            (
+                Step(f"inspect {machine} --json"),
+                Step(f"new {{in}}/{machine}.yaml --output {{out}} --json", folder="{out}"),
+            ),
+            input="tables",
+        )
+        yield Case(
+            f"rebuilt-{machine}",
+            (
+                Step(f"new {{in}}/{machine}.yaml -o {{out}} --json"),
+                Step(f"evaluate {{out}}/models/{machine}.yaml {machine} --json"),
+            ),
+            input="tables",
+            slow=machine != "3-rps",
+        )
+        yield Case(f"identify-{machine}", (Step(f"identify {machine} --json"),))
+    yield Case(
+        "inspect-text-and-write",
+        (
+            Step("inspect hexapod"),
+            Step("inspect {in}/models/hexapod.yaml --write {out} --json", folder="{out}"),
+            Step("inspect {out}/models/hexapod.yaml --json"),
+        ),
+        input="model",
+    )
+    family = "new --family {} --unit mm --base-radius 300 --platform-radius 150 -o {{out}} --json"
+    options = {
+        "6-UPS": "--height 400 --base-spread 20 --platform-spread 25 --name mine",
+        "3-UPU": "--height 0.4 --tilt 10 --travel 0 0.2 --offset 0.3 --leg-radius 0.01",
+        "3-RPR": "--turn 20",
+        "6-SS": "--height 400",
+        "3-RPS": "--height 400 --turn 5",
+    }
+    for kind, words in options.items():
+        command = family.format(kind)
+        if kind == "3-UPU":  # in metres
+            command = command.replace("mm --base-radius 300 --platform-radius 150", "m"
+                                      " --base-radius 0.3 --platform-radius 0.15")  # fmt: skip
+        yield Case(f"new-{kind}", (Step(f"{command} {words}", folder="{out}"),))
+    yield Case(
+        "new-csv-and-force",
+        (
+            Step("new {in}/tripod.csv --unit mm -o {out} --json", folder="{out}"),
+            Step("new {in}/tripod.csv --unit mm -o {out} --force"),
+            Step("new {in}/tripod.csv --unit mm -o {out} --name other", folder="{out}"),
+        ),
+        input="tables",
+    )
+
+
+def _identify() -> Iterable[Case]:
+    views = {
+        "paper": ("leg1,leg2,leg3,leg4", "leg3,leg4,leg5,leg6", "leg1,leg2,leg5,leg6"),
+        "weak": ("leg1,leg2,leg3,leg4,leg5", "leg1,leg2,leg3,leg4,leg5", "leg5,leg6"),
+        "narrow": ("leg1,leg2,leg3", "leg4,leg5,leg6", "leg1,leg2,leg3"),
+    }
+    for name, chosen in views.items():
+        words = " ".join(f"--view {view}" for view in chosen)
+        yield Case(f"identify-views-{name}", (Step(f"identify hexapod {words} --json"),))
+    words = "--view leg1,leg2 --view leg3,leg4,leg5,leg6 --images 6"
+    yield Case(
+        "identify-options",
+        (
+            Step(f"identify hexapod {words} --json"),
+            Step(f"identify hexapod {words} --board --json"),
+            Step(f"identify hexapod {words} --board --hand-held --json"),
+            Step(f"identify hexapod {words}"),
+        ),
+    )
+    yield Case("identify-dataset", (Step("identify {in} --json"),), input="hexapod-outlines")
+    yield Case("identify-photographs", (Step("identify {in} --json"),), input="3-rpr-photographs")
+
+
+def _calibrate() -> Iterable[Case]:
+    def case(name: str, words: str, given: str = "3-rpr-outlines", slow: bool = False) -> Case:
+        command = f"calibrate {{in}} -o {{out}} {words} --json"
+        return Case(f"calibrate-{name}", (Step(command, folder="{out}"),), given, slow=slow)
+
+    yield case("literal", "--criteria literal")
+    yield case("literal-hexapod", "--criteria literal", "hexapod-axes")
+    yield case("points", "--criteria literal --transformation points")
+    yield case("cross-product", "--criteria default --transformation cross_product")
+    prior = "--prior leg1.offset=231+-0.5mm --prior '*.radius.leg2_rod=8±0.1mm'"
+    yield case("by-name", f"{prior} --fix leg2.offset --fix leg3.offset=0.2302 --free 'c1.f?'")
+    yield case("contradicted", "--fix 'leg2.base.*'", "hexapod-outlines")
+    yield case("patterns", "--prior '*.base.?=0.3+-1' --free '*.radius.*'")
+    yield case("twists", "--free '*.twist'", "3-upu-axes", slow=True)
+    yield case("holdout", "--holdout 0.25")
+    yield Case(
+        "calibrate-text",
+        (
+            Step("calibrate {in} --output {out}", folder="{out}"),
+            Step("evaluate {out}/calibrated.yaml {in}/truth/models/3-rpr.yaml"),
+            Step("evaluate 3-rpr {in}/truth/models/3-rpr.yaml --json"),
+            Step("calibrate {in} --check {out}"),
+        ),
+        input="3-rpr-axes",
+    )
+    yield Case(
+        "check",
+        (
+            Step("calibrate {in}/set --check {in}/result --json"),
+            Step("calibrate {in}/set --check {in}/result/result.json --significance 0.001 --json"),
+            Step("simulate 3-rpr -o {out} --level outlines --poses 4 --views 1 --seed 8"),
+            Step("calibrate {out} --check {in}/result --json"),
+        ),
+        input="result",
+    )
+    yield Case(
+        "photographs-again",
+        (
+            Step("calibrate {in} -o {out} --json"),
+            Step("calibrate {in} -o {here}/cached --json", folder="{here}/cached"),
+            Step("calibrate {in} -o {here}/fresh --fresh --json", folder="{in}"),
+        ),
+        input="3-rpr-photographs",
+        slow=True,
+    )
+
+
+def _images() -> Iterable[Case]:
+    yield Case(
+        "detect",
+        (
+            Step("detect {in} -o {out} --json --workers 1", folder="{out}"),
+            Step("detect {in} --output {here}/two --workers 2", folder="{here}/two", many=True),
+        ),
+        input="3-rpr-photographs",
+        slow=True,
+    )
+    yield Case(
+        "detect-repeats",
+        (Step("detect {in}/set -o {out} --json", folder="{out}"),),
+        input="repeats",
+    )
+    yield Case("noise", (Step("noise {in}/set --json"), Step("noise {in}/set")), input="repeats")
+    camera = "camera {in}/set/images --board {in}/set/dataset.yaml"
+    yield Case(
+        "camera",
+        (
+            Step(f"{camera} -o {{here}}/a.yaml --json --workers 1 --model plumb_bob"),
+            Step(f"{camera} --output {{out}} --model equidistant"),
+        ),
+        input="boards",
+    )
+    yield Case(
+        "board",
+        (Step("calibrate {in}/set -o {out} --json", folder="{out}"),),
+        input="boards",
+        slow=True,
+    )
+
+
+def _locate() -> Iterable[Case]:
+    model = "locate {in}/hexapod/models/hexapod.yaml {in}/hexapod.csv"
+    sigmas = "--position-sigma 0.02mm --angle-sigma 0.01deg --encoder-sigma 2um"
+    yield Case(
+        "locate",
+        (
+            Step(f"{model} -o {{here}}/a.yaml --json --urdf {{out}}", folder="{out}"),
+            Step(f"{model} -o {{here}}/b.yaml --json {sigmas}"),
+            Step(
+                f"{model} --output {{here}}/c.yaml --position-sigma 0.0001mm "
+                "--urdf {here}/cell --world-link room --tool-link tcp",
+                folder="{here}/cell",
+            ),
+            Step("inspect {here}/cell/models/hexapod.yaml --json"),
+        ),
+        input="tool-poses",
+    )
+    yield Case(
+        "locate-in-part",
+        (
+            Step(
+                "locate {in}/3-rpr/models/3-rpr.yaml {in}/3-rpr.csv -o {out} --json "
+                "--tool-position 0,0,5mm"
+            ),
+        ),
+        input="tool-poses",
+    )
+
+
+def _simulate() -> Iterable[Case]:
+    for machine in MACHINES:
+        yield Places(f"places-{machine}", (), slow=machine != "3-rpr")
+
+    def case(name: str, words: str, machine: str = "3-rpr", **more: Any) -> Case:
+        step = Step(f"simulate {machine} -o {{out}} {words}", folder="{out}")
+        return Case(f"simulate-{name}", (step,), **more)
+
+    poses = "leg1_prismatic,leg2_prismatic,leg3_prismatic\n0.06,0.07,0.08\n0.08,0.07,0.06\n"
+    errors = "--error joints=1mm:normal --error radii=0.1mm --error offsets=0.5mm:uniform"
+    noise = "--pixel-noise 0.2px --encoder-noise 3um:uniform"
+    yield case("errors", f"{QUICK} {errors} {noise}")
+    yield case("no-errors", f"{QUICK} --error none --no-hints")
+    yield case("coplanar", f"{QUICK} --coplanar --hints", "hexapod")
+    yield case("poses", "--level outlines --json --poses {here}/p.csv --views 2",
+               files=(("p.csv", poses),))  # fmt: skip
+    words = "--level axes --poses 2 --seed 1 --json"
+    yield case("shared", f"{words} --views 2 --shared-poses --sampling workspace --images 2")
+    cameras = f"views: {{one: {PLACE}}}\n"
+    yield case("cameras", f"{words} --cameras {{here}}/c.yaml --table-noise radians --own-poses",
+               files=(("c.yaml", cameras),))  # fmt: skip
+    yield case("table-noise", f"{words} --views 1 --table-noise degrees --sampling extreme")
+    yield case("board", f"{QUICK} --board chessboard --board-pose")
+    yield case("hand-held", f"{QUICK} --board aprilgrid --hand-held")
+    tiny = "--level photographs --poses 1 --views 1 --camera {here}/tiny.yaml"
+    look = "blur: 0.8\nclutter: 3\nelectrons: .inf\nlights: [{direction: [0, 0, 1]}]\n"
+    yield case("look", f"{tiny} --appearance {{here}}/look.yaml --clutter 7 --bits 16 --json",
+               files=(("tiny.yaml", SMALL), ("look.yaml", look)))  # fmt: skip
+    yield case("colour", f"{tiny} --colour --blur 1.5 --no-gamma", files=(("tiny.yaml", SMALL),))
+    yield case("grey", f"{tiny} --grey --gamma", files=(("tiny.yaml", SMALL),), slow=True)
+    yield Case(
+        "simulate-force",
+        (
+            Step(f"simulate 3-rpr -o {{out}} {QUICK}"),
+            Step(f"simulate 3-rps -o {{out}} {QUICK} --force", folder="{out}"),
+        ),
+    )
+
+
+def _studies() -> Iterable[Case]:
+    machine = "--machine 3-rpr"
+    for name, words, folder in (
+        ("paper", "--radians", "{out}"),
+        ("bound", machine, "{out}"),
+        ("convergence", machine, "{out}"),
+        ("classes", machine, "{out}"),
+    ):
+        runs = "1" if name == "paper" else "2"
+        command = f"study {name} --runs {runs} --seed 5 --workers 1 {words} --output {{out}} --json"
+        yield Case(f"study-{name}", (Step(command, folder=folder),), slow=name == "bound")
+    resumed = f"study convergence --runs {{}} --seed 5 --workers 2 {machine} -o {{{{out}}}} --json"
+    yield Case(
+        "study-resumed",
+        (Step(resumed.format(1)), Step(resumed.format(3)), Step(resumed.format(2))),
+        slow=True,
+    )
+
+
+def _others() -> Iterable[Case]:
+    yield Case("version", (Step("--version"),))
+
+
+CASES: tuple[Case, ...] = (
+    *_chains(),
+    *_models(),
+    *_identify(),
+    *_calibrate(),
+    *_images(),
+    *_locate(),
+    *_simulate(),
+    *_studies(),
+    *_others(),
+)

@@ -1,0 +1,85 @@
+"""One command line of legcal, run in this process."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import one_thread  # noqa: F401
+import typer.main
+
+from legcal import cli
+
+# Typer reads the signatures of all commands anew for every run: as long as a refusal takes.
+_get_command = cache(typer.main.get_command)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @cached_property
+    def document(self) -> Any:
+        """The JSON document on stdout: all that there is, in one line."""
+        return json.loads(self.out)
+
+
+def words_of(command: str, places: dict[str, Path | str]) -> list[str]:
+    """Split a command line and put paths in the place of their names in braces."""
+    return [word.format(**places) for word in shlex.split(command)]
+
+
+def run(words: Sequence[str], *, inside: Path | None = None, many: bool = False) -> Outcome:
+    """Run ``legcal WORDS``, in a folder if one is given.
+
+    Images are searched in this process unless ``many`` is true: for the few of a test, starting
+    others takes longer than the work.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    folder = contextlib.chdir(inside) if inside is not None else contextlib.nullcontext()
+    processors = contextlib.nullcontext() if many else _one_processor()
+    code: object = None
+    with (
+        patch.object(sys, "argv", ["legcal", *words]),
+        patch.object(typer.main, "get_command", _get_command),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        folder,
+        processors,
+    ):
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code
+    assert isinstance(code, int), f"legcal {' '.join(words)} did not exit"
+    return Outcome(code, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def _one_processor() -> Iterator[None]:
+    """Let this process have one processor, another one in every process that runs tests."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
+    chosen = sorted(before)[int(worker) % len(before)]
+    os.sched_setaffinity(0, {chosen})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
