@@ -75,7 +75,7 @@ class Chain(Case):
         """Run it, and tell of the simulated dataset too: what is wrong there shows there."""
         machine, _, level = self.name.rpartition("-")
         made, outcome = simulated(machine, level)
-        tables = [path for path in sorted(made.glob("*.csv"))]
+        tables = sorted(made.glob("*.csv"))
         before = {
             "document": facts(outcome.document),
             "tables": {path.name: table_facts(path) for path in tables},
@@ -178,6 +178,13 @@ def _models() -> Iterable[Case]:
         input="tables",
     )
 
+    steps = tuple(
+        Step(f"inspect {{in}}/{name} --json")
+        for name in ("gepetto", "bare.yaml", "loops.urdf", "planar.xml")
+    )
+    written = Step("inspect {in}/planar.xml --write {out} --json", folder="{out}")
+    yield Case("inspect-formats", (*steps, written), input="formats")
+
 
 def _identify() -> Iterable[Case]:
     views = {
@@ -212,7 +219,7 @@ def _calibrate() -> Iterable[Case]:
     yield case("points", "--criteria literal --transformation points")
     yield case("cross-product", "--criteria default --transformation cross_product")
     prior = "--prior leg1.offset=231+-0.5mm --prior '*.radius.leg2_rod=8±0.1mm'"
-    yield case("by-name", f"{prior} --fix leg2.offset --fix leg3.offset=0.2302 --free 'c1.f?'")
+    yield case("by-name", f"{prior} --fix leg2.offset --fix leg3.offset=0.23075 --free 'c1.f?'")
     yield case("contradicted", "--fix 'leg2.base.*'", "hexapod-outlines")
     yield case("patterns", "--prior '*.base.?=0.3+-1' --free '*.radius.*'")
     yield case("twists", "--free '*.twist'", "3-upu-axes", slow=True)
@@ -247,6 +254,22 @@ def _calibrate() -> Iterable[Case]:
         input="3-rpr-photographs",
         slow=True,
     )
+
+
+def _boards() -> Iterable[Case]:
+    for name, words in {
+        "unknown": "--board charuco --views 2",
+        "known": "--board chessboard --board-pose --views 2",
+        "hand-held": "--board aprilgrid --hand-held --views 1",
+    }.items():
+        yield Case(
+            f"board-{name}",
+            (
+                Step(f"simulate 3-rpr -o {{here}}/set --level outlines --poses 7 --seed 4 {words}"),
+                Step("calibrate {here}/set -o {out} --json", folder="{out}"),
+                Step("identify {here}/set --json"),
+            ),
+        )
 
 
 def _images() -> Iterable[Case]:
@@ -340,6 +363,20 @@ def _simulate() -> Iterable[Case]:
     yield case("look", f"{tiny} --appearance {{here}}/look.yaml --clutter 7 --bits 16 --json",
                files=(("tiny.yaml", SMALL), ("look.yaml", look)))  # fmt: skip
     yield case("colour", f"{tiny} --colour --blur 1.5 --no-gamma", files=(("tiny.yaml", SMALL),))
+    kalibr = (
+        "cam0: {camera_model: pinhole, intrinsics: [300, 300, 100, 75], resolution: [200, 150],\n"
+        "  distortion_model: equidistant, distortion_coeffs: [0.01, 0, 0, 0]}\n"
+    )
+    opencv = (
+        "%YAML:1.0\n---\nimage_width: 200\nimage_height: 150\n"
+        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [300., 0., 100., 0., 300., 75., 0., 0., 1.]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "   data: [-0.1, 0.01, 0., 0., 0.]\n"
+    )
+    for name, content in {"kalibr": kalibr, "opencv": opencv}.items():
+        yield case(f"camera-{name}", f"{QUICK} --camera {{here}}/c.yaml",
+                   files=(("c.yaml", content),))  # fmt: skip
     yield case("grey", f"{tiny} --grey --gamma", files=(("tiny.yaml", SMALL),), slow=True)
     yield Case(
         "simulate-force",
@@ -378,6 +415,7 @@ CASES: tuple[Case, ...] = (
     *_models(),
     *_identify(),
     *_calibrate(),
+    *_boards(),
     *_images(),
     *_locate(),
     *_simulate(),

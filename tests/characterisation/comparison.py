@@ -15,7 +15,7 @@ ROUNDING = 1e-11  # of numbers that are zero but for rounding [m, rad]
 OF_SIGMA = max(1e-6, SIGMAS) if STRICT else 0.01  # of standard deviations, relative
 OTHERWISE = 1e-6 if STRICT else 1e-4  # of other numbers, relative
 
-# Where numbers may differ more: (path, relative difference, how many times the sigma of parameters).
+# Where numbers may differ more: path, relative difference, times the sigma of parameters.
 # Costs follow the noise of a fit, places of cameras have larger sigmas than joints, and the
 # four steps end where IPOPT's tolerance lets them.
 LOOSER: tuple[tuple[str, float, float], ...] = (

@@ -124,12 +124,14 @@ def test_python_gives_what_commands_give(tmp_path: Path) -> None:
 
 
 def test_python_simulates_locates_and_judges(tmp_path: Path) -> None:
+    level: Any = "axes"  # names instead of members, as in docs/formats.md
+    normal: Any = "normal"
     settings = legcal.SimulationSettings(
-        level="axes", poses=2, seed=1, views=1,
+        level=level, poses=2, seed=1, views=1,
         errors=legcal.ParameterErrors(
-            base_joints=legcal.Spread(1e-3), offsets=legcal.Spread(5e-4, "normal")
+            base_joints=legcal.Spread(1e-3), offsets=legcal.Spread(5e-4, normal)
         ),
-        readings=legcal.Spread(2e-6, "normal"), table=legcal.TableNoise(x=1e-4),
+        readings=legcal.Spread(2e-6, normal), table=legcal.TableNoise(x=1e-4),
     )  # fmt: skip
     made = legcal.simulate("3-rpr", tmp_path / "sim", settings)
     apart = legcal.evaluate(made.nominal, made.truth)
