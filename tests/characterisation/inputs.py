@@ -234,14 +234,13 @@ def _planar_mjcf() -> str:
             f'<body name="tube{j}" pos="{A[0]:.12f} {A[1]:.12f} 0" euler="0 0 {turn:.12f}">'
             f'<joint name="a{j}" axis="0 0 1"/>'
             f'<body name="rod{j}"><joint name="q{j}" type="slide" axis="1 0 0" range="-0.1 0.1"/>'
-            f'<geom type="cylinder" size="0.01" fromto="0.1 0 0 0.2 0 0"/></body></body>'
+            f'<geom type="cylinder" size="0.01" fromto="0.1 0 0 0.2 0 0"/>'
+            f'<body name="end{j}" pos="{length:.12f} 0 0"><joint name="b{j}" axis="0 0 1"/></body>'
+            "</body></body>"
         )
-        ties += f'<connect body1="rod{j}" body2="platform" anchor="{length:.12f} 0 0"/>'
+        ties += f'<weld body1="end{j}" body2="platform"/>'
         motors += f'<position joint="q{j}"/>'
-    platform = (
-        '<body name="platform"><joint name="px" type="slide" axis="1 0 0"/>'
-        '<joint name="py" type="slide" axis="0 1 0"/><joint name="pz" axis="0 0 1"/></body>'
-    )
+    platform = '<body name="platform"><freejoint name="free"/></body>'
     return (
         '<mujoco model="planar"><compiler angle="radian"/>'
         f"<worldbody>{bodies}{platform}</worldbody><equality>{ties}</equality>"

@@ -743,10 +743,10 @@ def _tables() -> Iterable[Refusal]:
         ("view", "c8,images/c1_2.png,3,1,2,0.1,used,,detected", ("view", "'c8'")),
         ("twice", good.strip(), ("row 2", "row 1")),
     ]
-    for name, row, named in corners:
+    for name, row, said in corners:
         edits = (board, text(c, f"{line}{good}{row}\n"))
         yield Refusal(
-            f"corners-{name}", "calibrate {in} -o {out}", (*named, "row 2"), "plain", edits
+            f"corners-{name}", "calibrate {in} -o {out}", (*said, "row 2"), "plain", edits
         )
     yield Refusal(
         "corners-none", "calibrate {in} -o {out}", ("no row",), "plain", (board, text(c, line))
