@@ -269,6 +269,7 @@ def _boards() -> Iterable[Case]:
                 Step("calibrate {here}/set -o {out} --json", folder="{out}"),
                 Step("identify {here}/set --json"),
             ),
+            slow=name != "unknown",
         )
 
 
