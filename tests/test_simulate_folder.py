@@ -233,6 +233,6 @@ def test_the_python_of_the_description_of_simulated_datasets_runs(
     assert 1e-4 < names["apart"].displacement.mean() < 2e-3
 
 
-@pytest.mark.parametrize("name", dir(legcal))
+@pytest.mark.parametrize("name", legcal.__all__)
 def test_every_public_name_is_found(name: str) -> None:
     assert getattr(legcal, name) is not None
