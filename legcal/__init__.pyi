@@ -25,4 +25,5 @@ from .simulation import Spread as Spread
 from .simulation import TableNoise as TableNoise
 from .simulation import simulate as simulate
 from .version import __version__ as __version__
+
 __all__: list[str]
