@@ -32,7 +32,7 @@ from rendered_cylinders import (
 )
 
 from legcal.geometry.types import Array
-from legcal.perception.picture import to_grey
+from legcal.perception.light import to_grey
 from legcal.vision.cylinder import EPSILON
 
 START = 0.4  # how far the start is off at each end [px]

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array, Image
-from legcal.perception.picture import Grey, to_grey
+from legcal.perception.light import Grey, to_grey
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.rays import in_view
 from legcal.simulation.rendering.scene import Canvas, develop, prepare_scene

@@ -22,9 +22,9 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.machine.kinematics import forward_kinematics
 from legcal.machine.model import Mechanism
-from legcal.perception.detection import detect_outlines
-from legcal.perception.recognise import recognise, shifted
-from legcal.perception.search import Search
+from legcal.perception.detection import measure_outlines
+from legcal.perception.placement import Placement, Search
+from legcal.perception.recognise import recognise
 from legcal.vision.cylinder import EPSILON
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -130,24 +130,19 @@ def main() -> None:
 
     A, B = joint_centres(mechanism, measurements)
     rough = [view.T_base_camera for view in measurements.views]
-    search, rows = Search(load, measurements, A, B, cylinders, wanted), np.arange(len(A))
+    search, rows = Search(load, measurements, A, B, cylinders, wanted, names), np.arange(len(A))
     for words, hints in (("with", rough), ("without", [None] * len(rough))):
         start = time.perf_counter()
         placed = recognise(search, rows, hints)
         print(f"recognition {words} rough camera poses: {time.perf_counter() - start:.2f} s")
-    A, B = shifted(placed, measurements.view, A, B)
-    T, error = placed.T_base_camera, placed.joint_error
     start = time.perf_counter()
-    first = detect_outlines(
-        load, measurements, A, B, cylinders, T, wanted, names, joint_error=error
-    )
+    first, _ = measure_outlines(search, placed, rows.tolist())
     seconds = time.perf_counter() - start
     show("near the nominal model", first, *errors(truth, measurements, first), seconds)
     A, B, poses = true_scene(truth, measurements)
     start = time.perf_counter()
-    again = detect_outlines(
-        load, measurements, A, B, cylinders, poses, wanted, names, joint_error=0.0
-    )
+    true = Placement(A, B, tuple(poses), joint_error=0.0)
+    again, _ = measure_outlines(search, true, rows.tolist())
     seconds = time.perf_counter() - start
     show("near the true scene", again, *errors(truth, measurements, again), seconds)
 

@@ -35,12 +35,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.perception.agreement import Picture, Poses, targets_of
-from legcal.perception.bars import Bars, find_bars, find_segments
 from legcal.perception.camera_search import JOINT_ERROR, joined, place_camera, refined, supports
-from legcal.perception.detection import detect_outlines
-from legcal.perception.picture import to_grey
-from legcal.perception.recognise import Recognised, look_closer, recognise, shifted
-from legcal.perception.search import Search, group_views
+from legcal.perception.detection import measure_outlines
+from legcal.perception.light import to_grey
+from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
+from legcal.perception.look_again import look_again
+from legcal.perception.placement import Placement, Search, group_views
+from legcal.perception.recognise import recognise
 from legcal.simulation.visibility import field_of_view, silhouette
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
@@ -55,7 +56,7 @@ COLOURS = ((60, 60, 255), (60, 220, 60), (255, 120, 40), (0, 200, 255), (255, 60
 class Found:
     """What the method made of a scene."""
 
-    recognised: Recognised
+    placement: Placement
     outlines: Outlines
     seconds: tuple[float, float]  # of the processor: recognition, outlines
 
@@ -65,35 +66,31 @@ def find(given: Given) -> Found:
     n_legs, m = len(given.leg_names), given.measurements
     wanted = np.ones((1, n_legs), dtype=np.bool_)
     search = Search(
-        lambda row: given.images[row], m, given.A_base, given.B_base, given.cylinders, wanted
-    )
+        lambda row: given.images[row], m, given.A_base, given.B_base, given.cylinders, wanted,
+        given.leg_names,
+    )  # fmt: skip
     begin = time.process_time()
     rows = np.arange(len(given.images))
     found = recognise(search, rows, [None])
     middle = time.process_time()
-    A, B = shifted(found, m.view, given.A_base, given.B_base)
-    outlines = detect_outlines(
-        search.load, m, A, B, given.cylinders, found.T_base_camera,
-        wanted, given.leg_names, joint_error=found.joint_error,
-    )  # fmt: skip
-    closer = look_closer(
-        search, group_views(m, rows, [None], None), found, outlines, given.leg_names
-    )
+    outlines, _ = measure_outlines(search, found, rows.tolist())
+    groups = group_views(m, rows, [None], None)
+    placement, outlines, _ = look_again(search, groups, found, outlines)
     seconds = middle - begin, time.process_time() - middle
-    return Found(closer.recognised, closer.outlines, seconds)
+    return Found(placement, outlines, seconds)
 
 
 def judge(scene: Scene, found: Found) -> dict[str, Any]:
     """Return what is right and wrong, as a line of the results."""
     given, truth, outlines = scene.given, scene.truth, found.outlines
-    T = found.recognised.T_base_camera[0]
+    T = found.placement.T_base_camera[0]
     error = offsets(given, truth, outlines)
     used = np.flatnonzero(outlines.used)
     wrong = [i for i in used.tolist() if not error[i] <= WRONG_PX]
     seen = truth.visible
     hit = np.zeros_like(seen)
     hit[outlines.row[used], outlines.leg[used]] = True
-    problem = found.recognised.unplaced.get(0, "")
+    problem = next(iter(found.placement.unplaced.values()), "")
     if T is not None:
         verdict = "right" if _same(T, truth.T_base_camera) else "wrong"
     else:
@@ -182,7 +179,7 @@ def ideal_pictures(scene: Scene) -> list[Picture]:
         xy = np.array(ends).reshape(-1, 2, 2)
         step = xy[:, 1] - xy[:, 0]
         length = np.linalg.norm(step, axis=1)
-        bars = Bars(
+        bars = EdgePairs(
             xy.mean(axis=1),
             step / length[:, None],
             0.5 * length,
@@ -261,7 +258,7 @@ def look(seed: int, folder: Path) -> dict[str, Any]:
     given, truth = scene.given, scene.truth
     for row, image in enumerate(given.images):
         picture = _eight_bits(image)
-        bars = find_bars(find_segments(to_grey(image), given.camera))
+        bars = find_edge_pairs(find_segments(to_grey(image), given.camera))
         for middle, along, half in zip(bars.middle, bars.along, bars.half_length, strict=True):
             ends = np.stack([middle - half * along, middle + half * along])
             _line(picture, given.camera.distort(ends), (150, 150, 150), 1)

@@ -17,7 +17,6 @@ import resource
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,11 +27,12 @@ from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
 from legcal.geometry.types import Image
 from legcal.machine.kinematics import forward_kinematics
-from legcal.perception.examine import closer_look
-from legcal.perception.exposure import expose
-from legcal.perception.outline import outline_parts
-from legcal.perception.photographs import Photographs, Placement, Scene, detect, place, usual_blur
-from legcal.perception.picture import to_grey
+from legcal.perception import Photographs, Placement, measure_photographs, place
+from legcal.perception.detection import measure_outlines
+from legcal.perception.diagnostics import expose
+from legcal.perception.light import to_grey
+from legcal.perception.look_again import look_again
+from legcal.perception.placement import group_views
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -42,7 +42,7 @@ N_MEMORY = 15
 T = TypeVar("T")
 
 
-def sample() -> tuple[Photographs, Scene]:
+def sample() -> tuple[Photographs, Placement]:
     """Return the images of the sample and the nominal scene, with rough camera poses."""
     dataset = load_dataset(DATASET)
     mechanism, measurements = dataset.mechanism, dataset.measurements
@@ -52,10 +52,10 @@ def sample() -> tuple[Photographs, Scene]:
     rows = np.arange(measurements.n_rows)
     load = dataset.image_reader(rows.tolist())
     photographs = Photographs(mechanism, measurements, load, in_turn, rows, no_outlines())
-    return photographs, Scene(A, B, tuple(view.T_base_camera for view in measurements.views))
+    return photographs, Placement(A, B, tuple(view.T_base_camera for view in measurements.views))
 
 
-def without_poses(scene: Scene) -> Scene:
+def without_poses(scene: Placement) -> Placement:
     """Return a scene of whose cameras nothing is known."""
     nothing: tuple[RigidTransform | None, ...] = (None,) * len(scene.T_base_camera)
     return replace(scene, T_base_camera=nothing)
@@ -89,26 +89,29 @@ def measure_speed() -> None:
     photographs = replace(photographs, load=decoded.__getitem__)
     watch = Stopwatch(len(rows))
     begin = np.array(rows[:3])
-    detect(replace(photographs, detect=begin), scene, no_progress)  # what is computed only once
+    measure_photographs(
+        replace(photographs, detect=begin), scene, no_progress
+    )  # what is computed only once
     watch("exposure and blur", lambda: [expose(to_grey(image)) for image in decoded])
     near = watch("recognition near poses", lambda: place(photographs, scene, no_progress))
     watch("recognition without", lambda: place(photographs, without_poses(scene), no_progress))
-    blurs: dict[int, float] = {}
-    brief = partial(outline_parts, together=False)
-    once = watch(
-        "outlines in brief",
-        lambda: detect(photographs, near.scene, no_progress, method=brief, blur_of_row=blurs),
+    search = photographs.search(scene)
+    once, blur = watch(
+        "outlines in brief", lambda: measure_outlines(search, near, rows, together=False)
     )
+    groups = group_views(photographs.measurements, photographs.detect, scene.T_base_camera, None)
     watch(
         "views fitted, and missing legs",
-        lambda: closer_look(photographs, near, once, no_progress, together=False),
+        lambda: look_again(search, groups, near, once, together=False),
     )
-    watch("outlines with all care", lambda: detect(photographs, near.scene, no_progress))
-    methods = [partial(outline_parts, blur=blur) for blur in usual_blur(photographs, blurs)]
-    fitted = settled(photographs, near)
+    watch("outlines with all care", lambda: measure_photographs(photographs, near, no_progress))
+    view = photographs.measurements.view
+    usual = [float(np.nanmedian(blur[view == v])) for v in range(len(near.T_base_camera))]
+    # What the images show is what a joint fit would hardly change.
+    fitted = Placement.of_fit(near.A_base, near.B_base, near.T_base_camera, usual)
     watch(
         "outlines with all care near a fit",
-        lambda: detect(photographs, fitted, no_progress, near_fit=True, method=methods),
+        lambda: measure_photographs(photographs, fitted, no_progress),
     )
     for words in ("near poses", "without"):
         begins = (
@@ -119,11 +122,6 @@ def measure_speed() -> None:
         )
         watch.rate(f"measured once, {words}", *begins)
         watch.rate(f"calibrate, {words}", *begins, "outlines with all care near a fit")
-
-
-def settled(photographs: Photographs, placement: Placement) -> Scene:
-    """Return the scene that the images show, which a fit would hardly change."""
-    return replace(placement.scene, joint_error=0.0)
 
 
 def peak_memory(n: int) -> float:
@@ -148,7 +146,7 @@ def peak_memory(n: int) -> float:
     scene = replace(scene, A_base=scene.A_base[rows], B_base=scene.B_base[rows])
     for row in range(n):
         expose(to_grey(photographs.load(row)))
-    detect(photographs, place(photographs, scene, no_progress).scene, no_progress)
+    measure_photographs(photographs, place(photographs, scene, no_progress), no_progress)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 

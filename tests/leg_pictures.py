@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
 from legcal.perception.agreement import Picture, Targets, targets_of
-from legcal.perception.bars import Segments, find_bars
+from legcal.perception.lines import Segments, find_edge_pairs
 from legcal.vision.cylinder import outlines_of_axis
 
 PIXEL = 1.0 / 600.0  # of the pictures, on the sensor plane
@@ -132,7 +132,7 @@ def picture(
         step = lines[..., 1, :] - lines[..., 0, :]
         part = rng.uniform(0.0, 0.15, (*step.shape[:2], 2, 1)) * [[1.0], [-1.0]]
         lines = lines + part * step[..., None, :] + noise * PIXEL * rng.normal(size=lines.shape)
-    return Picture(find_bars(segments(lines)), pieces(*nominal), CORNERS)
+    return Picture(find_edge_pairs(segments(lines)), pieces(*nominal), CORNERS)
 
 
 def pictures(

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.measurements import Measurements, View
 from legcal.errors import NotVisible
-from legcal.perception.detection import detect_corners, require_board
+from legcal.perception.boards import detect_corners, require_board
 from legcal.progress import no_progress
 from legcal.vision.board import Board
 from legcal.vision.corners import described, find_corners, quarter_turns

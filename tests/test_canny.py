@@ -11,8 +11,8 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
 from legcal.machine.leg import Cylinder
-from legcal.perception.detection import detect_outlines
-from legcal.perception.outline import outline_parts
+from legcal.perception.detection import measure_outlines
+from legcal.perception.placement import Placement, Search
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -37,17 +37,19 @@ def detect(cam: Camera, bars: list[Bar], image: Array, *, canny: bool = True) ->
     one = np.zeros(1, dtype=np.intp)
     lengths = [float(np.linalg.norm(b.B - b.A)) for b in bars]
     pixels = np.rint(image).astype(np.uint8)
-    return detect_outlines(
-        lambda row: pixels,
-        Measurements((View("c1", cam),), ("a.png",), one, one, np.zeros((1, len(bars))), 1e-6),
-        A + 2e-3 * rng.choice([-1.0, 1.0], A.shape),
-        B + 2e-3 * rng.choice([-1.0, 1.0], B.shape),
-        [(Cylinder("rod", 0.011, "base", 0.0, length),) for length in lengths],
-        [RigidTransform.identity()],
+    A = A + 2e-3 * rng.choice([-1.0, 1.0], A.shape)
+    B = B + 2e-3 * rng.choice([-1.0, 1.0], B.shape)
+    one_view = Measurements(
+        (View("c1", cam),), ("a.png",), one, one, np.zeros((1, len(bars))), 1e-6
+    )
+    cylinders = [(Cylinder("rod", 0.011, "base", 0.0, length),) for length in lengths]
+    wanted, names = (
         np.ones((1, len(bars)), dtype=np.bool_),
         [f"leg{i + 1}" for i in range(len(bars))],
-        method=canny_parts if canny else outline_parts,
     )
+    search = Search(lambda row: pixels, one_view, A, B, cylinders, wanted, names)
+    placement = Placement(A, B, (RigidTransform.identity(),))
+    return measure_outlines(search, placement, [0], method=canny_parts if canny else None)[0]
 
 
 def errors(cam: Camera, bars: list[Bar], found: Outlines) -> Array:

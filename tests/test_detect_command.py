@@ -19,10 +19,8 @@ from legcal import cli, detect, load_dataset
 from legcal.data.outlines import QUALITY, read_observations
 from legcal.data.rows import canonical_order
 from legcal.errors import DatasetError, UsageError
-from legcal.perception.drawing import Detection
-from legcal.perception.examine import Observed, observe
-from legcal.perception.overview import _caption, picture_names
-from legcal.perception.photographs import Photographs
+from legcal.perception.overview import Detection, _caption, picture_names
+from legcal.perception.photographs import Observed, Photographs, observe
 
 BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
 

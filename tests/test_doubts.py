@@ -19,13 +19,22 @@ from legcal.calibration.joint_fit.choices import Choices
 from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.run import CalibrationRun, start_run
 from legcal.errors import NotIdentifiable
-from legcal.perception.doubts import Explanation, _best
-from legcal.perception.drawing import Detection
-from legcal.perception.examine import NOTHING_LIKE, OutlineCount, _usual, judged, observe, rejected
-from legcal.perception.exposure import Exposure, expose, image_defects
-from legcal.perception.hints import hint_notes
-from legcal.perception.photographs import Placement
-from legcal.perception.picture import to_grey
+from legcal.perception.diagnostics import (
+    NOTHING_LIKE,
+    Explanation,
+    Exposure,
+    OutlineCount,
+    _best,
+    _usual,
+    expose,
+    hint_notes,
+    image_defects,
+    judged,
+    reject_images,
+)
+from legcal.perception.light import to_grey
+from legcal.perception.overview import Detection
+from legcal.perception.photographs import Observed, observe
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -124,7 +133,7 @@ def test_left_out_images_keep_what_they_should_not_show(example_run: Run) -> Non
     for i, why in zip(one.tolist(), reasons, strict=True):
         reason[i], used[i] = why, not why
     before = replace(o, reason=tuple(reason), used=used)
-    out = rejected(before, {int(o.row[0]): "the image is black"})
+    out = reject_images(before, {int(o.row[0]): "the image is black"})
     assert not out.used[o.row == o.row[0]].any()
     assert [out.reason[i] for i in one] == [*reasons[:2], *2 * ["the image is black"]]
     others = o.row != o.row[0]
@@ -169,10 +178,10 @@ def _work(made: Spoiled) -> CalibrationRun:
     return start_run(dataset, in_turn, no_progress, Choices(), use_cache=False)
 
 
-def _observed(made: Spoiled) -> Placement:
+def _observed(made: Spoiled) -> Observed:
     work = _work(made)
     scene, _ = rough_scene(work)
-    return observe(work.photographs, scene, no_progress).placement
+    return observe(work.photographs, scene, no_progress)
 
 
 def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: Path) -> None:
@@ -202,7 +211,7 @@ def test_images_that_show_nothing_are_named_although_their_view_is_not_placed(
     made.change("c1", 3, _elsewhere)
     for k in range(4):
         made.change("c2", k, lambda picture: 0 * picture)
-    found = _observed(made)
+    found = _observed(made).placement
     assert list(found.unplaced) == ["c1", "c2"]
     assert list(found.notes) == [
         f"view c1, image {image}: was left out: the image is black, at most 0 of 255 grey levels; "
@@ -216,16 +225,17 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
     made = spoiled(tmp_path / "alone", 3, ("c1", "c2"))
     work = _work(made)
     photographs, view = work.photographs, work.measurements.view
-    placement = _observed(made)
+    observed = _observed(made)
     (alone,) = np.flatnonzero(view == 1)[:1].tolist()
     found = {row: OutlineCount(11, 12) for row in np.flatnonzero(view == 0).tolist()}
     found[alone] = OutlineCount(1, 12)
-    usual = _usual(photographs, placement, found, [alone])
+    search = photographs.search(rough_scene(work)[0])
+    usual = _usual(search, observed.placement, found, [alone], in_turn)
     assert usual[1] > 0.3
-    reason, note = judged(photographs, alone, Explanation(0.0), usual, found)
+    reason, note = judged(work.measurements, alone, Explanation(0.0), usual, found)
     assert reason == NOTHING_LIKE
     assert "was left out: found 1 of 12 outlines where its reading has the legs" in note
-    reason, note = judged(photographs, alone, Explanation(usual[1]), usual, found)
+    reason, note = judged(work.measurements, alone, Explanation(usual[1]), usual, found)
     assert reason == ""
     assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
 
@@ -271,11 +281,12 @@ def test_radii_that_are_wrong_by_a_fifth_are_found(
 ) -> None:
     made = spoiled(tmp_path / "radii", 5)
     made.scale_radii(factor, leg)
-    found = _observed(made)
+    observed = _observed(made)
+    found = observed.placement
     assert found.unplaced == {}
     assert len(found.notes) == 1
     assert re.match(words, found.notes[0]), found.notes
-    wrong = [c.radius for of_leg in found.search.cylinders for c in of_leg]
+    wrong = [c.radius for of_leg in observed.photographs.cylinders for c in of_leg]
     assert np.allclose(wrong, 0.01, rtol=0.06)
 
 
@@ -311,7 +322,7 @@ def test_a_blurred_image_that_is_alone_in_its_view_is_named(tmp_path: Path) -> N
     made = spoiled(tmp_path / "hand", 3, ("c1", "c2"))
     image = made.change("c2", 1, _blurred)
     made.rows = [*made.rows[:3], made.row("c2", 1)]
-    found = _observed(made)
+    found = _observed(made).placement
     assert list(found.unplaced) == ["c2"]
     words = (
         rf"in its 1 image \({image}: the image is blurred by \d\.\d px, the others of its camera"

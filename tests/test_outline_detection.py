@@ -1,8 +1,6 @@
 """Detection on rendered scenes whose outlines are known exactly, and on sample photographs."""
 
 import json
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,10 +13,9 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
 from legcal.machine.leg import Cylinder
-from legcal.perception.detection import Method, detect_outlines
-from legcal.perception.outline import outline_parts
-from legcal.perception.recognise import recognise, shifted
-from legcal.perception.search import Search
+from legcal.perception.detection import measure_outlines
+from legcal.perception.placement import Placement, Search
+from legcal.perception.recognise import recognise
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -48,30 +45,30 @@ def cylinder(b: Bar, radius: float | None = None) -> tuple[Cylinder, ...]:
 
 
 def detect(
+    cam: Camera, bars: list[Bar], image: Image, off: float = 2e-3, radius: float | None = None
+) -> Outlines:
+    """Detect bars whose predicted joints are ``off`` metres wrong in every coordinate."""
+    return detect_with_blur(cam, bars, image, off, radius)[0]
+
+
+def detect_with_blur(
     cam: Camera,
     bars: list[Bar],
     image: Image,
     off: float = 2e-3,
     radius: float | None = None,
-    method: Method | Sequence[Method] = outline_parts,
-    blur_of_row: dict[int, float] | None = None,
-) -> Outlines:
-    """Detect bars whose predicted joints are ``off`` metres wrong in every coordinate."""
+    known: tuple[float, ...] = (),
+) -> tuple[Outlines, float]:
+    """Return the blur of the image as well; that of the view may be known [px]."""
     rng = np.random.default_rng(0)
-    A = np.array([b.A for b in bars])[None]
-    B = np.array([b.B for b in bars])[None]
-    return detect_outlines(
-        lambda row: image,
-        measurements(cam, len(bars)),
-        A + off * rng.choice([-1.0, 1.0], A.shape),
-        B + off * rng.choice([-1.0, 1.0], B.shape),
-        [cylinder(b, radius) for b in bars],
-        [IDENTITY],
-        np.ones((1, len(bars)), dtype=np.bool_),
-        [f"leg{i + 1}" for i in range(len(bars))],
-        method=method,
-        blur_of_row=blur_of_row,
-    )
+    A = np.array([b.A for b in bars])[None] + off * rng.choice([-1.0, 1.0], (1, len(bars), 3))
+    B = np.array([b.B for b in bars])[None] + off * rng.choice([-1.0, 1.0], (1, len(bars), 3))
+    names = [f"leg{i + 1}" for i in range(len(bars))]
+    wanted, one_view = np.ones((1, len(bars)), dtype=np.bool_), measurements(cam, len(bars))
+    cylinders = [cylinder(b, radius) for b in bars]
+    search = Search(lambda row: image, one_view, A, B, cylinders, wanted, names)
+    found, blur = measure_outlines(search, Placement(A, B, (IDENTITY,), blur=known), [0])
+    return found, float(blur[0])
 
 
 def errors(cam: Camera, bars: list[Bar], found: Outlines) -> Array:
@@ -135,15 +132,14 @@ def test_a_saturated_background_moves_no_outline(level: float, blur: float) -> N
     behind = np.full((270, 360), 120.0)
     behind[:, 181:] = level  # behind the second leg
     image = render(cam, bars, behind, blur=blur, noise=1.0, supersample=4)
-    blurs: dict[int, float] = {}
     clipped = np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8)
-    found = detect(cam, bars, clipped, off=1e-3, blur_of_row=blurs)
+    found, seen = detect_with_blur(cam, bars, clipped, off=1e-3)
     assert np.all(found.used), found.reason
     error = errors(cam, bars, found)
     sigma = np.sqrt([np.diag(c) for c in found.covariance])
     assert np.abs(error).max() < 0.15
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.5
-    assert blurs[0] == pytest.approx(np.hypot(blur, 0.29), rel=0.15)  # with that of the pixels
+    assert seen == pytest.approx(np.hypot(blur, 0.29), rel=0.15)  # with that of the pixels
 
 
 def test_outlines_are_rejected_where_saturation_leaves_nothing_of_the_step() -> None:
@@ -162,20 +158,18 @@ def test_outlines_near_a_fit_are_found_with_the_blur_of_other_images(known: floa
     cam = camera()
     bars = [bar(-0.09, 0.03, albedo), bar(0.08, -0.05, albedo)]
     image = render(cam, bars, background, light, blur=blur, noise=2.0, supersample=4)
-    blurs: dict[int, float] = {}
-    found = detect(
+    found, seen = detect_with_blur(
         cam,
         bars,
         np.rint(image).astype(np.uint8),
         off=2e-4,  # as after a fit: some tenths of a pixel
-        method=[partial(outline_parts, blur=known)],
-        blur_of_row=blurs,
+        known=(known,),
     )
     assert np.all(found.used), found.reason
     error = errors(cam, bars, found)
     assert np.abs(error).max() < 0.2
     assert np.median(np.abs(error)) < 0.08
-    assert blurs[0] == pytest.approx(np.hypot(blur, 0.29), rel=0.25)  # with that of the pixels
+    assert seen == pytest.approx(np.hypot(blur, 0.29), rel=0.25)  # with that of the pixels
 
 
 def test_an_edge_stands_alone_where_the_other_side_is_as_dark_as_the_background() -> None:
@@ -308,19 +302,12 @@ def test_tube_and_rod_are_two_parts() -> None:
         Cylinder("tube", 0.014, "base", 0.0, 0.5 * length),
         Cylinder("rod", 0.009, "platform", -0.8 * length, 0.0),
     )
-    found = detect_outlines(
-        lambda row: image,
-        measurements(cam, 1),
-        whole.A[None, None],
-        whole.B[None, None],
-        [parts],
-        [IDENTITY],
-        np.ones((1, 1), dtype=np.bool_),
-        ["leg1"],
-    )
-    assert found.part == ("tube", "tube", "rod", "rod")
+    A, B, wanted = whole.A[None, None], whole.B[None, None], np.ones((1, 1), dtype=np.bool_)
+    search = Search(lambda row: image, measurements(cam, 1), A, B, [parts], wanted, ["leg1"])
+    found, _ = measure_outlines(search, Placement(A, B, (IDENTITY,)), [0])
+    assert found.part == ("rod", "rod", "tube", "tube")
     assert np.all(found.used), found.reason
-    for i, one in ((slice(0, 2), tube), (slice(2, 4), rod)):
+    for i, one in ((slice(0, 2), rod), (slice(2, 4), tube)):
         u = (one.B - one.A) / np.linalg.norm(one.B - one.A)
         h = outlines_of_axis(u, one.A, one.radius)
         offset = cam.line_offset(h[:, None], cam.undistort(found.ends[i]))
@@ -355,21 +342,9 @@ def test_the_sample_is_detected_from_its_nominal_model() -> None:
     B = np.array([forward_kinematics(mechanism, q).apply(mechanism.B_platform) for q in chosen.q])
     cylinders = [leg.cylinders for leg in mechanism.legs]
     wanted = np.ones((3, 6), dtype=np.bool_)
-    placed = recognise(
-        Search(load, chosen, A, B, cylinders, wanted), np.arange(len(rows)), [None] * 3
-    )
-    A, B = shifted(placed, chosen.view, A, B)
-    found = detect_outlines(
-        load,
-        chosen,
-        A,
-        B,
-        cylinders,
-        placed.T_base_camera,
-        wanted,
-        mechanism.leg_names,
-        joint_error=placed.joint_error,
-    )
+    search = Search(load, chosen, A, B, cylinders, wanted, mechanism.leg_names)
+    placed = recognise(search, np.arange(len(rows)), [None] * 3)
+    found, _ = measure_outlines(search, placed, range(len(rows)))
     truth = json.loads((ROOT / "tests/data/hexapod-truth/truth.json").read_text())
     legs = {image["file"]: image["legs"] for image in truth["images"]}
     middle, visible = np.full(len(found), np.nan), np.zeros(len(found))

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from legcal.perception.limb import N_BASIS, Samples, basis
-from legcal.perception.straight import estimate_blur, fit_blocks
+from legcal.perception.blocks import estimate_blur, fit_blocks
+from legcal.perception.light import Samples
+from legcal.perception.limb import N_BASIS, basis
 
 HALF_WIDTH = 14.0
 

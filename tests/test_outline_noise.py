@@ -5,8 +5,7 @@ import pytest
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array, BoolArray
-from legcal.perception.limb import Samples
-from legcal.perception.picture import LARGEST_RATIO, evened_weights
+from legcal.perception.light import LARGEST_RATIO, Samples, evened_weights
 
 N_BLOCKS, ROWS, REACH, BLUR = 40, 8, 6, 0.6
 BOUNDS = np.array([0, N_BLOCKS // 2, N_BLOCKS])

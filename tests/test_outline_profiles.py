@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from legcal.perception.limb import Samples
+from legcal.perception.light import Samples
 from legcal.perception.profiles import Edge, Profiles, read_profiles
 from legcal.vision.camera import Camera
 from legcal.vision.in_view import Band

@@ -1,16 +1,20 @@
 import numpy as np
 import pytest
 
-from legcal.perception.straight import (
+from legcal.geometry.types import Array
+from legcal.perception.blocks import (
     COMMON_BIAS,
     TILT_BIAS,
-    StraightFit,
-    fit_straight,
-    fit_straights,
+    Line,
+    fit_lines,
 )
 
 
-def fitted(line: StraightFit | None) -> StraightFit:
+def fit_straight(position: Array, shift: Array, variance: Array) -> Line | None:
+    return fit_lines(np.array([0, len(position)]), position, shift, variance)[0]
+
+
+def fitted(line: Line | None) -> Line:
     assert line is not None
     return line
 
@@ -91,7 +95,7 @@ def test_lines_of_several_outlines_are_those_of_each() -> None:
     variance[rng.random(len(position)) < 0.1] = np.inf
     variance[-8:-3] = np.inf
     bounds = np.cumsum([0, *counts])
-    lines = fit_straights(bounds, position, shift, variance)
+    lines = fit_lines(bounds, position, shift, variance)
     assert [line is None for line in lines] == [False, True, True, False, False, True]
     for line, first, last in zip(lines, bounds[:-1], bounds[1:], strict=True):
         own = slice(first, last)

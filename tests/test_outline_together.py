@@ -7,7 +7,10 @@ import pytest
 from scipy.integrate import quad
 
 from legcal.geometry.types import Array
-from legcal.perception import limb_fit as pool
+from legcal.perception import joint_lines as pool
+from legcal.perception.blocks import Blocks
+from legcal.perception.joint_lines import fit_together
+from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import (
     HALF,
     LESS_HALF,
@@ -17,12 +20,9 @@ from legcal.perception.limb import (
     SQUARE,
     STEP,
     THREE_HALVES,
-    Samples,
     powers,
     profile_functions,
 )
-from legcal.perception.limb_fit import Blocks, fit_together
-from legcal.perception.picture import to_light
 
 HALF_WIDTH, DEPTH = 15.0, 3.5
 BRIGHT = np.array([20.0, 0.0, 120.0, 90.0, -60.0, 0.0, 0.0])

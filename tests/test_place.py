@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.perception.agreement import Picture, Poses
 from legcal.perception.camera_search import (
-    Placed,
+    Candidates,
     _reversed,
     is_mirrored,
     may_be_mirrored,
@@ -30,7 +30,7 @@ def _pictures(
     return lp.pictures(made, T, platforms, rng, joint_error=joint_error, **difficulty), T  # type: ignore[arg-type]
 
 
-def _is_right(placed: Placed, T: RigidTransform) -> bool:
+def _is_right(placed: Candidates, T: RigidTransform) -> bool:
     away, angle = lp.apart(T, placed.pose())
     return angle < np.deg2rad(5.0) and away < 0.1
 
@@ -204,7 +204,7 @@ def test_a_flat_machine_is_seen_alike_with_near_and_far_exchanged() -> None:
 def test_few_legs_are_believed_only_without_a_rival(rival: float, is_believed: bool) -> None:
     poses = Poses.rigid(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 6)
     support, expected = np.array([[0.9] * 4, [rival / 4] * 4]), np.full((2, 4), 6.0)
-    placed = Placed(poses, support, expected, support.sum(axis=1), np.zeros(6))
+    placed = Candidates(poses, support, expected, support.sum(axis=1), np.zeros(6))
     assert 0.12 < placed.share < 0.2
     assert placed.is_convincing == is_believed
     assert not placed.is_clear

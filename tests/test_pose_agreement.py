@@ -77,7 +77,7 @@ def test_pictures_of_cameras_that_are_fixed_to_each_other_are_judged_in_one_fram
 
 def test_a_picture_without_bars_or_legs_agrees_with_nothing() -> None:
     (picture, *_), T = _scene(0)
-    empty = replace(picture, bars=picture.bars.take(np.zeros(0, dtype=np.intp)))
+    empty = replace(picture, pairs=picture.pairs.take(np.zeros(0, dtype=np.intp)))
     found = agreement(empty, _pose(T, 6), 0.01)
     assert not found.value.any()
     assert found.visible.any()

@@ -15,10 +15,10 @@ from legcal.machine.kinematics import forward_kinematics
 from legcal.machine.model import Mechanism
 from legcal.perception import recognise as recognising
 from legcal.perception.agreement import Picture, Poses, Targets, agreement, improved, targets_of
-from legcal.perception.bars import Bars, Segments, find_bars, find_segments
-from legcal.perception.camera_search import Placed, place_camera, place_near, pose_starts
-from legcal.perception.recognise import Recognised, recognise
-from legcal.perception.search import Search
+from legcal.perception.camera_search import Candidates, place_camera, place_near, pose_starts
+from legcal.perception.lines import EdgePairs, Segments, find_edge_pairs, find_segments
+from legcal.perception.placement import Placement, Search
+from legcal.perception.recognise import recognise
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
@@ -41,7 +41,9 @@ def looking_at(place: Array, target: Array, roll: float) -> RigidTransform:
     return RigidTransform.from_components(place, R * Rotation.from_rotvec([0.0, 0.0, roll]))
 
 
-def bars_of(targets: Targets, T_base_camera: RigidTransform, rng: Generator, clutter: int) -> Bars:
+def bars_of(
+    targets: Targets, T_base_camera: RigidTransform, rng: Generator, clutter: int
+) -> EdgePairs:
     """Return the bars that an ideal picture shows, with half a pixel of noise, and others."""
     X = T_base_camera.inv().apply(targets.ends.reshape(-1, 3)).reshape(-1, 2, 3)
     xy = X[..., :2] / X[..., 2:]
@@ -60,7 +62,7 @@ def bars_of(targets: Targets, T_base_camera: RigidTransform, rng: Generator, clu
     noise = 0.25 * PIXEL
     n = clutter
     angle = rng.uniform(0.0, np.pi, n)
-    bars = Bars(
+    bars = EdgePairs(
         np.concatenate([xy.mean(axis=1), rng.uniform(CORNERS[0], CORNERS[1], (n, 2))]),
         np.concatenate([along, np.stack([np.cos(angle), np.sin(angle)], axis=1)]),
         np.concatenate([0.45 * length, rng.uniform(0.03, 0.2, n)]),
@@ -69,7 +71,7 @@ def bars_of(targets: Targets, T_base_camera: RigidTransform, rng: Generator, clu
         PIXEL,
     )
     moved = bars.middle + noise * rng.standard_normal(bars.middle.shape)
-    bars = Bars(moved, bars.along, bars.half_length, bars.width, bars.merit, PIXEL)
+    bars = EdgePairs(moved, bars.along, bars.half_length, bars.width, bars.merit, PIXEL)
     return bars.take(np.argsort(-bars.merit, kind="stable"))
 
 
@@ -102,7 +104,7 @@ def readings_of(mechanism: Mechanism, n: int, rng: Generator) -> Array:
     )
 
 
-def apart(placed: Placed, T_base_camera: RigidTransform) -> tuple[float, float]:
+def apart(placed: Candidates, T_base_camera: RigidTransform) -> tuple[float, float]:
     """Return how far the first pose is from the true one: part of the distance, angle [deg]."""
     off = T_base_camera.inv() * placed.pose()
     distance = float(np.linalg.norm(T_base_camera.translation))
@@ -136,7 +138,7 @@ def test_a_model_a_centimetre_off_is_recognised_all_the_same(hexapod: Mechanism)
     leg = pictures[0].targets.leg
     error = rng.uniform(-0.01, 0.01, (6, 2, 3))
     moved = [
-        Picture(p.bars, Targets(leg, p.targets.ends + error[leg], *_rest(p.targets)), p.corners)
+        Picture(p.pairs, Targets(leg, p.targets.ends + error[leg], *_rest(p.targets)), p.corners)
         for p in pictures
     ]
     placed = place_camera(moved, 6)
@@ -221,7 +223,7 @@ def test_a_bright_bar_gives_two_edges_and_one_bar() -> None:
     long = np.linalg.norm(direction, axis=1) > 150.0 / 500.0
     assert np.count_nonzero(long) == 2
     assert np.all(np.sum(bright * middle, axis=1)[long] < 0.0)  # towards the middle of the bar
-    bars = find_bars(segments)
+    bars = find_edge_pairs(segments)
     assert bars.width[0] * 500.0 == pytest.approx(20.0, abs=1.0)
     assert np.abs(bars.along[0] @ [-np.sin(0.3), np.cos(0.3)]) > 0.9999
 
@@ -230,7 +232,7 @@ def test_an_empty_picture_has_neither_edges_nor_bars() -> None:
     camera = Camera(np.array([[500.0, 0.0, 160.0], [0.0, 500.0, 120.0], [0.0, 0.0, 1.0]]), 320, 240)
     segments = find_segments(np.zeros((240, 320), dtype=np.float32), camera)
     assert len(segments) == 0
-    assert len(find_bars(Segments(segments.ends, segments.covered, segments.pixel))) == 0
+    assert len(find_edge_pairs(Segments(segments.ends, segments.covered, segments.pixel))) == 0
 
 
 class _Known(Search):
@@ -244,7 +246,7 @@ class _Known(Search):
 
 def _recognised(
     mechanism: Mechanism, pictures: list[Picture], hint: RigidTransform | None
-) -> Recognised:
+) -> Placement:
     """Return what is recognised in the pictures of one view by bars alone: there are no images."""
     n, n_legs = len(pictures), mechanism.n_legs
     rows, names = np.arange(n), tuple(f"{k}.png" for k in range(n))
@@ -253,10 +255,14 @@ def _recognised(
     )
     nowhere, cylinders = np.zeros((n, n_legs, 3)), [leg.cylinders for leg in mechanism.legs]
     wanted = np.ones((1, n_legs), dtype=np.bool_)
-    search = _Known(_no_image, measurements, nowhere, nowhere, cylinders, wanted)
+    search = _Known(
+        _no_image, measurements, nowhere, nowhere, cylinders, wanted, mechanism.leg_names
+    )
     _Known.made[:] = pictures
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recognising, "look_again", lambda search, group, placed, pictures: placed)
+        patch.setattr(
+            recognising, "_decided_by_outlines", lambda s, groups, placed, p, g: placed[g]
+        )
         return recognise(search, rows, [hint])
 
 

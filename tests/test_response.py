@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError
-from legcal.perception.limb import Samples, basis
-from legcal.perception.picture import to_light
-from legcal.perception.straight import fit_blocks
+from legcal.perception.blocks import fit_blocks
+from legcal.perception.light import Samples, to_light
+from legcal.perception.limb import basis
 
 __all__ = ["folder"]
 BLUR, HALF_WIDTH, WHITE = 0.6, 14.0, 255.0

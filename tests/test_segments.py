@@ -5,8 +5,8 @@ import pytest
 from rendering import Bar, Light, render
 
 from legcal.geometry.types import Array
-from legcal.perception.bars import Segments, find_segments
-from legcal.perception.picture import Grey, to_grey
+from legcal.perception.light import Grey, to_grey
+from legcal.perception.lines import Segments, find_segments
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 

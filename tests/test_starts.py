@@ -73,7 +73,7 @@ def test_one_bar_or_one_leg_suggest_nothing() -> None:
     made, T, where = lp.machine(6, rng), lp.camera(rng), lp.platform(rng)
     joints = made.A, made.posed(where)
     picture = lp.picture(joints, joints, T, rng)
-    one_bar = replace(picture, bars=picture.bars.take(np.array([0])))
+    one_bar = replace(picture, pairs=picture.pairs.take(np.array([0])))
     assert len(pose_starts(one_bar, 6)) == 0
     one_leg = replace(picture, targets=lp.pieces(joints[0][:1], joints[1][:1]))
     assert len(pose_starts(one_leg, 6)) == 0

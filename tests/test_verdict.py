@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from legcal.geometry.types import Array
-from legcal.perception.limb_fit import MeasuredEdge
+from legcal.perception.blocks import Line
+from legcal.perception.edge_pairs import EdgePair
+from legcal.perception.measure import MeasuredEdge
 from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, Verdict, verdict
-from legcal.perception.pairs import Pair
-from legcal.perception.straight import StraightFit
 
 WIDTH = np.array([20.0, 18.0])  # by the radius [px]
 LENGTH = 200.0
@@ -20,7 +20,7 @@ def _edge(v: Array, *, sigma: float = 0.1, kept: float = 1.0, is_step: bool = Tr
     on_line = np.arange(N) < kept * N
     position = (np.flatnonzero(on_line) + 0.5) / N
     n = len(position)
-    line = StraightFit(np.zeros(2), on_line, 1.0, position, np.zeros(n), np.full(n, 0.01))
+    line = Line(np.zeros(2), on_line, 1.0, position, np.zeros(n), np.full(n, 0.01))
     return MeasuredEdge(v, line, 50.0, is_step, 1.0, sigma**2 * np.eye(2))
 
 
@@ -34,7 +34,7 @@ def _judged(
 ) -> Verdict:
     """Judge edges whose pair was found at a distance that is off [px]."""
     v = np.stack([np.zeros(2), WIDTH + off])
-    pair = Pair(v, np.ones(2, dtype=np.bool_), np.full(2, alone))
+    pair = EdgePair(v, np.ones(2, dtype=np.bool_), np.full(2, alone))
     return verdict(pair, np.stack([np.zeros(2), WIDTH]), LENGTH, (one, two), window)
 
 
@@ -58,7 +58,7 @@ def test_after_a_fit_the_edge_away_from_its_prediction_is_not_the_outline(wrong:
     v = predicted.copy()
     v[wrong] += 1.0 if wrong == 0 else -1.0
     edges = _edge(v[0]), _edge(v[1])
-    pair = Pair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
+    pair = EdgePair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
     assert verdict(pair, predicted, LENGTH, edges).reasons == ("", "")
     found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
     assert found.reasons[1 - wrong] == ""
@@ -68,7 +68,7 @@ def test_after_a_fit_the_edge_away_from_its_prediction_is_not_the_outline(wrong:
 def test_after_a_fit_two_edges_that_both_err_are_not_used() -> None:
     predicted = np.stack([np.zeros(2), WIDTH])
     edges = _edge(np.full(2, 0.6)), _edge(WIDTH - 0.6)
-    pair = Pair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
+    pair = EdgePair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
     found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
     assert all(reason.startswith(WRONG_WIDTH) for reason in found.reasons)
 

@@ -10,9 +10,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.perception.recognise import reversed_pose, sideways_sigmas
-from legcal.perception.search import Group, Search, group_views
-from legcal.perception.view_fit import ViewFit, fit_view, least_evidence
+from legcal.perception.placement import Group, Search, group_views
+from legcal.perception.view_fit import (
+    ViewFit,
+    fit_view,
+    least_evidence,
+    reversed_pose,
+    sideways_sigmas,
+)
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
@@ -36,7 +41,9 @@ def _session(seed: int) -> tuple[Search, Group, RigidTransform]:
     )  # fmt: skip
     wanted = np.ones((1, N_LEGS), dtype=np.bool_)
     A = np.broadcast_to(made.A, B.shape)
-    search = Search(_no_image, measurements, A, B, [lp.CYLINDERS] * N_LEGS, wanted)
+    search = Search(
+        _no_image, measurements, A, B, [lp.CYLINDERS] * N_LEGS, wanted, ["leg"] * N_LEGS
+    )
     return search, group_views(measurements, rows, [None], None)[0], T
 
 

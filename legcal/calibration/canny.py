@@ -1,21 +1,29 @@
 """Outlines as the paper found them: Canny's edge points, and a line by least squares (4.2).
 
-The search for the edges is that of :mod:`legcal.detection`, so that both methods look at the same
-edges; the points are whole pixels, and the line through them is the one with the least sum of
-squared distances (total least squares). The thresholds follow the picture in the usual way: a share
-of all pixels is no edge. Nothing more is asked of the lines: that shading displaces them, and
+The search for the edges is that of :func:`legcal.perception.measure`, so that both methods look at
+the same edges; the points are whole pixels, and the line through them is the one with the least sum
+of squared distances (total least squares). The thresholds follow the picture in the usual way: a
+share of all pixels is no edge. Nothing more is asked of the lines: that shading displaces them, and
 the width of the leg with them, belongs to the method.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from legcal.geometry import Array, BoolArray
-from legcal.perception import LEAST_LENGTH, LONE_KEPT, FoundPart, Grey, PartOutlines, find_parts
-from legcal.vision import Camera, PredictedLeg
+from legcal.data import Outlines, join_outlines
+from legcal.geometry import Array
+from legcal.perception import (
+    LEAST_LENGTH,
+    LONE_KEPT,
+    Grey,
+    ImageSearch,
+    Part,
+    find_parts,
+    part_outlines,
+)
 
 SMOOTHING = 1.0  # of the picture before its gradient is taken [px]
 NO_EDGE = 0.9  # share of the pixels whose gradient is below the upper threshold
@@ -36,32 +44,17 @@ class _Line:
     kept: float  # points for each pixel of the unhidden length
 
 
-def canny_parts(
-    grey: Grey,
-    camera: Camera,
-    legs: Sequence[PredictedLeg],
-    names: Sequence[str],
-    wanted: BoolArray,
-    window: Array,
-) -> list[PartOutlines]:
+def canny_parts(search: ImageSearch) -> tuple[Outlines, float]:
     """Find the outlines of all parts in one image by Canny's edge points and least squares.
 
-    Parameters
-    ----------
-    grey, camera, legs, names, wanted, window
-        As for :func:`legcal.perception.outline.outline_parts`.
-
-    Returns
-    -------
-    list of PartOutlines
-        One for every part of every wanted leg. The covariances take the points' scatter about
-        their line for independent errors.
+    Two for every part of every leg that is looked for, and no blur. The covariances take the
+    points' scatter about their line for independent errors.
     """
-    parts, results = find_parts(grey, camera, legs, names, wanted, window)
+    parts, results = find_parts(search)
     if parts:
-        xy = camera.undistort(edge_points(grey))
-        results.extend(_measured(camera, part, xy) for part in parts)
-    return sorted(results, key=lambda result: result.leg)
+        xy = search.camera.undistort(edge_points(search.grey))
+        results.extend(_measured(search, part, xy) for part in parts)
+    return join_outlines(results), np.nan
 
 
 def edge_points(grey: Grey) -> Array:
@@ -86,7 +79,7 @@ def edge_points(grey: Grey) -> Array:
     return np.column_stack([column, row]).astype(np.float64)
 
 
-def _measured(camera: Camera, part: FoundPart, xy: Array) -> PartOutlines:
+def _measured(search: ImageSearch, part: Part, xy: Array) -> Outlines:
     """Measure both outlines of a part from all edge points of the image, and judge them."""
     t, v = part.band.coordinates(xy)
     n = len(part.hidden)
@@ -96,12 +89,11 @@ def _measured(camera: Camera, part: FoundPart, xy: Array) -> PartOutlines:
     free = part.band.length * float(np.mean(~part.hidden))
     lines = [
         _line(t[near], v[near], start, part.band.length, free) if found else None
-        for start, found in zip(part.pair.v, part.pair.found, strict=True)
+        for start, found in zip(part.edges.v, part.edges.found, strict=True)
     ]
-    outlines = part.outlines(
-        camera, [None if line is None else (line.v, line.place, line.covariance) for line in lines]
-    )
-    return replace(outlines, reasons=_reasons(part, lines))
+    found = [None if line is None else (line.v, line.place, line.covariance) for line in lines]
+    leg, link, reasons = part.leg.leg, part.piece.link, _reasons(part, lines)
+    return part_outlines(search, leg, link, reasons, found, found=part)
 
 
 def _line(t: Array, v: Array, start: Array, length: float, free: float) -> _Line | None:
@@ -135,7 +127,7 @@ def _least_squares(t: Array, v: Array, length: float) -> Array:
     return np.asarray(centre[1] + slope * (np.array([0.0, length]) - centre[0]))
 
 
-def _reasons(part: FoundPart, lines: Sequence[_Line | None]) -> tuple[str, str]:
+def _reasons(part: Part, lines: Sequence[_Line | None]) -> tuple[str, str]:
     """Return why each outline is not to be used, "" if it is."""
     least = max(LEAST_LENGTH[0], LEAST_LENGTH[1] * 2.0 * part.half_width)
     reasons = []

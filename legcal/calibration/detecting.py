@@ -31,7 +31,7 @@ from legcal.perception import (
     BEFORE_FIT,
     DETECTION,
     Detection,
-    Scene,
+    Placement,
     check_detection_destination,
     given_outlines,
     hint_notes,
@@ -121,7 +121,7 @@ def _detected(run: CalibrationRun, images: IntArray) -> Detection:
         )
     T_board_camera = None if board is None else board.T_board_camera
     seen = observe(photographs, scene, run.progress, T_board_camera)
-    placement, cameras = seen.placement, seen.placement.scene.T_base_camera
+    placement, cameras = seen.placement, seen.placement.T_base_camera
     # Legs of a view that could not be placed are drawn where its rough pose has them.
     drawn = tuple(
         T if T is not None else rough for T, rough in zip(cameras, scene.T_base_camera, strict=True)
@@ -143,7 +143,7 @@ def _detected(run: CalibrationRun, images: IntArray) -> Detection:
         run,
         images,
         seen.outlines.choose(kept),
-        replace(placement.scene, T_base_camera=drawn),
+        replace(placement, T_base_camera=drawn),
         seen.photographs.cylinders,
         placement.unplaced,
         (*hints, *placement.notes, *(gamma if untold else ())),
@@ -154,7 +154,7 @@ def _in_file_order(
     run: CalibrationRun,
     images: IntArray,
     outlines: Outlines,
-    scene: Scene,
+    scene: Placement,
     cylinders: tuple[tuple[Cylinder, ...], ...],
     unplaced: dict[str, str],
     notes: tuple[str, ...],

@@ -16,7 +16,6 @@ kept aside are searched like the others, and not fitted.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -50,13 +49,12 @@ from legcal.machine import Cylinder, Mechanism, geometries
 from legcal.paper import nominal_mechanism, run_base_steps, run_platform_steps
 from legcal.perception import (
     Observed,
-    Scene,
-    detect,
+    Placement,
     given_outlines,
     hint_notes,
+    measure_photographs,
+    nominal_placement,
     observe,
-    outline_parts,
-    scene_at_poses,
 )
 
 # That of all outlines that are measured in photographs: light at the limb that no model of shading
@@ -109,20 +107,20 @@ def _observe_and_fit(run: CalibrationRun, rows: IntArray) -> Found:
     T_board_camera = None if board is None else board.T_board_camera
     seen = observe(photographs, scene, run.progress, T_board_camera, together=False)
     seen.placement.require_one()
-    other_radii = bool(seen.placement.recognised.radii.factor)
+    other_radii = bool(seen.placement.radii.factor)
     if other_radii:
         run = replace(run, mechanism=seen.photographs.mechanism)
     if run.every_leg and (seen.left_out or seen.placement.unplaced):
         _refuse_too_few(run, rows, seen)
-    found = _fit(run.part(rows), seen.outlines, seen.placement.scene, board)
+    found = _fit(run.part(rows), seen.outlines, seen.placement, board)
     found, lost = _measure_again(run, found, seen, board)
     notes = (*seen.placement.all_notes, *lost)
     return replace(found, notes=notes, doubts=_doubts(found), other_radii=other_radii)
 
 
-def rough_scene(run: CalibrationRun) -> tuple[Scene, BoardViews | None]:
+def rough_scene(run: CalibrationRun) -> tuple[Placement, BoardViews | None]:
     """Return where the nominal model has the legs, with rough cameras, and what shows the board."""
-    scene = scene_at_poses(run.mechanism, run.measurements, run.T_base_platform)
+    scene = nominal_placement(run.mechanism, run.measurements, run.T_base_platform)
     board = observe_board(run)
     if board is not None:
         T_base_board = base_of_board(run.dataset, board, scene.T_base_camera)
@@ -132,7 +130,9 @@ def rough_scene(run: CalibrationRun) -> tuple[Scene, BoardViews | None]:
     return scene, board
 
 
-def _fit(part: CalibrationRun, outlines: Outlines, scene: Scene, board: BoardViews | None) -> Found:
+def _fit(
+    part: CalibrationRun, outlines: Outlines, scene: Placement, board: BoardViews | None
+) -> Found:
     """Run the four steps, then the joint fit, with the outlines of all images."""
     seen = outlines.at(part.rows)
     seen = reject_unused_legs(seen, part.measurements, part.mechanism.leg_names)
@@ -164,7 +164,7 @@ def _measure_again(
 
     Returns the fit, and what the first one said of images in which hardly anything is found near.
     """
-    scene, view = seen.placement.scene, run.measurements.view
+    scene, view = seen.placement, run.measurements.view
     rows = seen.photographs.detect
     shown = [
         row
@@ -176,14 +176,11 @@ def _measure_again(
     before = _disagreeing(found)
     again = seen.photographs.narrowed(np.array(shown, dtype=np.intp), found.outlines)
     again = replace(again, mechanism=_with_fitted_radii(again.mechanism, found.solution))
-    methods = [
-        outline_parts if np.isnan(blur) else partial(outline_parts, blur=blur) for blur in seen.blur
-    ]
     told = known_gammas(again.keep, again.measurements)
     gammas: list[tuple[EstimatedGamma, ...]] = []
     for _ in range(1 + ROUNDS):
-        scene = _fitted_scene(run, found.solution, scene)
-        outlines = detect(again, scene, run.progress, near_fit=True, method=methods)
+        scene = _fitted_placement(run, found.solution, seen)
+        outlines = measure_photographs(again, scene, run.progress)
         found = _fit(found.part, outlines, scene, board)
         gammas.append(found.solution.gammas)
         others = {name: gamma for name, gamma in next_gammas(gammas).items() if name not in told}
@@ -215,7 +212,7 @@ def _with_fitted_radii(mechanism: Mechanism, solution: Solution) -> Mechanism:
     return mechanism.with_cylinders(cylinders)
 
 
-def _fitted_scene(run: CalibrationRun, solution: Solution, before: Scene) -> Scene:
+def _fitted_placement(run: CalibrationRun, solution: Solution, seen: Observed) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb = run.mechanism.T_base_Rb
     A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
@@ -224,9 +221,10 @@ def _fitted_scene(run: CalibrationRun, solution: Solution, before: Scene) -> Sce
     pose = run.measurements.pose
     cameras = tuple(
         None if known is None else T_base_Rb * T.inv()
-        for known, T in zip(before.T_base_camera, solution.T_camera_Rb, strict=True)
+        for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
     )
-    return Scene(np.broadcast_to(A, placed.shape)[pose], placed[pose], cameras)
+    A_base = np.broadcast_to(A, placed.shape)[pose]
+    return Placement.of_fit(A_base, placed[pose], cameras, seen.blur)
 
 
 def _four_steps(part: CalibrationRun, outlines: Outlines, board: BoardViews | None) -> Steps:
@@ -272,7 +270,11 @@ def _four_steps(part: CalibrationRun, outlines: Outlines, board: BoardViews | No
 
 
 def _starts(
-    part: CalibrationRun, outlines: Outlines, scene: Scene, steps: Steps, board: BoardViews | None
+    part: CalibrationRun,
+    outlines: Outlines,
+    scene: Placement,
+    steps: Steps,
+    board: BoardViews | None,
 ) -> list[Start]:
     """Return the starts of the fit: the nominal model, and the steps where they gave a result."""
     mechanism = part.mechanism
@@ -334,7 +336,7 @@ def _doubts(found: Found) -> tuple[str, ...]:
 
 def _refuse_too_few(run: CalibrationRun, rows: IntArray, seen: Observed) -> None:
     """Raise NotIdentifiable if the images that are left do not determine the parameters."""
-    cameras, notes = seen.placement.scene.T_base_camera, seen.placement.all_notes
+    cameras, notes = seen.placement.T_base_camera, seen.placement.all_notes
     left = [
         row
         for row in rows.tolist()

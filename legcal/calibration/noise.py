@@ -40,11 +40,11 @@ from legcal.perception import (
     Method,
     Photographs,
     Placement,
-    detect,
     hint_notes,
-    outline_parts,
+    measure,
+    measure_photographs,
+    nominal_placement,
     place,
-    scene_at_poses,
 )
 from legcal.progress import Report, no_progress
 from legcal.vision import EPSILON, Camera, angles_of_direction
@@ -829,7 +829,7 @@ def _spread(spread: Spread | None) -> dict[str, Any] | None:
 
 
 METHODS: dict[str, tuple[Method, str]] = {
-    "detector": (outline_parts, "Measuring outlines"),
+    "detector": (measure, "Measuring outlines"),
     "canny": (canny_parts, "Canny and least squares"),
 }
 
@@ -910,14 +910,13 @@ def _search(
     measurements = every.measurements
     q = measurements.q[measurements.first_rows]
     poses = forward_kinematics_many(every.mechanism, q)
-    scene = scene_at_poses(every.mechanism, measurements, poses)
+    nominal = nominal_placement(every.mechanism, measurements, poses)
     to_align = replace(every, detect=_rows_to_align(every, repeats))
-    placement = place(to_align, scene, progress)
+    placement = place(to_align, nominal, progress)
     placement.require_one()
-    scene = placement.scene
     repeated = replace(every, detect=np.sort(np.concatenate([group.rows for group in repeats])))
     found = {
-        name: detect(repeated, scene, progress, method=method, stage=stage)
+        name: measure_photographs(repeated, placement, progress, method=method, stage=stage)
         for name, (method, stage) in METHODS.items()
     }
     return placement, found
@@ -927,7 +926,7 @@ def _hint_notes(measurements: Measurements, placement: Placement) -> list[str]:
     """Return what is to be said of rough camera poses that are wrong."""
     views = measurements.views
     hints = [view.T_base_camera for view in views]
-    cameras = placement.scene.T_base_camera
+    cameras = placement.T_base_camera
     return hint_notes([view.name for view in views], hints, cameras, BEFORE_FIT)
 
 

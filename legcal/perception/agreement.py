@@ -1,39 +1,45 @@
-"""Poses at which a flat machine looks alike from far: near and far exchanged."""
+"""How camera poses agree with the edge pairs of a picture, and steps towards them.
+
+A leg that is where a pose has it shows an edge pair along its axis, as wide as its radius says. A
+few hundred poses are judged at once by all pictures of a view, and improved by Gauss-Newton steps
+in which joints may be off what the model says.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from legcal.geometry import Array, IntArray
 from legcal.machine import Cylinder
-from legcal.perception.bars import Bars
+from legcal.perception.lines import EdgePairs
 from legcal.vision import visible_pieces
+
+NEAREST = 0.02  # depth of the nearest point of a leg [m]
+WIDTH_ERROR = 0.08  # of a pair and of what is predicted: relative, one standard deviation
+WIDTH_PIXELS = 1.0  # and of a pair in its pixels
+WIDTH_REACH = 2.5  # standard deviations
+TOO_NARROW = 0.4  # by which pairs are found, since shading ends inside an outline [px of a pair]
+SLACK_PIXELS = 1.5  # added to every tolerance [px of a pair]
+LINE_ERROR, LINE_PIXELS = 2e-3, 0.7  # of an axis beside its pair, one standard deviation: [m], [px]
+PLACE_ERROR = 0.1  # of the middle of a pair that is as long as its piece, in its length
+LINE_PART = 1.0 / 6.0  # at least this part of the tolerance
+INSIDE = 0.8  # share of a pair that should lie along the leg
+CHUNK = 128  # poses judged together
+TURN_PRIOR, PLACE_PRIOR = 0.3, 0.1  # of one step: angle [rad], of the machine, in its distance
+MOST_TURN, MOST_PLACE = 0.4, 0.2  # the same, at most
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """The visible pieces of all legs at the reading of a picture.
+    """The visible pieces of all legs at the reading of a picture."""
 
-    Attributes
-    ----------
-    leg : (n,) array of int
-        The leg of each piece.
-    ends : (n, 2, 3) array
-        Both ends of its axis in the base link, the first nearer to the base joint [m].
-    place : (n, 2) array
-        Where these ends are along the leg, 0 at A and 1 at B.
-    radius : (n,) array
-        Its radius [m].
-    share : (n,) array
-        Its part of the visible length of its leg.
-    """
-
-    leg: IntArray
-    ends: Array
-    place: Array
-    radius: Array
-    share: Array
+    leg: IntArray  # (n,) the leg of each piece
+    ends: Array  # (n, 2, 3) of its axis in the base link, the first nearer to the base joint [m]
+    place: Array  # (n, 2) where these ends are along the leg, 0 at A and 1 at B
+    radius: Array  # (n,) [m]
+    share: Array  # (n,) its part of the visible length of its leg
 
     def __len__(self) -> int:
         """Return the number of pieces."""
@@ -43,17 +49,7 @@ class Targets:
 def targets_of(
     A_base: Array, B_base: Array, cylinders: Sequence[Sequence[Cylinder]], legs: IntArray
 ) -> Targets:
-    """Return the pieces of some legs.
-
-    Parameters
-    ----------
-    A_base, B_base : (n_legs, 3) array
-        Joint centres at the reading of the picture, in the base link [m].
-    cylinders : sequence, for each leg a sequence of Cylinder
-        What can be seen of the legs.
-    legs : (m,) array of int
-        The legs to look for.
-    """
+    """Return the pieces of some legs (m,), joint centres (n_legs, 3) in the base link [m]."""
     leg, place, ends, radius, share = [], [], [], [], []
     for j in legs.tolist():
         AB = B_base[j] - A_base[j]
@@ -75,38 +71,13 @@ def targets_of(
     )
 
 
-NEAREST = 0.02  # depth of the nearest point of a leg [m]
-WIDTH_ERROR = 0.08  # of a bar and of what is predicted: relative, one standard deviation
-WIDTH_PIXELS = 1.0  # and of a bar in its pixels
-WIDTH_REACH = 2.5  # standard deviations
-TOO_NARROW = 0.4  # by which bars are found, since shading ends inside an outline [px of a bar]
-SLACK_PIXELS = 1.5  # added to every tolerance [px of a bar]
-LINE_ERROR, LINE_PIXELS = 2e-3, 0.7  # of an axis beside its bar, one standard deviation: [m], [px]
-PLACE_ERROR = 0.1  # of the middle of a bar that is as long as its piece, in its length
-LINE_PART = 1.0 / 6.0  # at least this part of the tolerance
-INSIDE = 0.8  # share of a bar that should lie along the leg
-CHUNK = 128  # poses judged together
-TURN_PRIOR, PLACE_PRIOR = 0.3, 0.1  # of one step: angle [rad], of the machine, in its distance
-MOST_TURN, MOST_PLACE = 0.4, 0.2  # the same, at most
-
-
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Camera poses T_camera_base.
+    """Candidate camera poses T_camera_base."""
 
-    Attributes
-    ----------
-    R : (n, 3, 3) array
-        Rotations.
-    t : (n, 3) array
-        Translations [m].
-    shift : (n, n_legs, 2, 3) array
-        Where A and B of each leg are, against where the model has them, in the base link [m].
-    """
-
-    R: Array
-    t: Array
-    shift: Array
+    R: Array  # (n, 3, 3)
+    t: Array  # (n, 3) [m]
+    shift: Array  # (n, n_legs, 2, 3) of A and B against the model, in the base link [m]
 
     @classmethod
     def rigid(cls, R: Array, t: Array, n_legs: int) -> "Poses":
@@ -124,76 +95,43 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What is known of a picture: its bars, and the legs that it may show.
+    """What is known of a picture: its edge pairs, and the legs that it may show."""
 
-    Attributes
-    ----------
-    bars : Bars
-        Candidate cylinders.
-    targets : Targets
-        Pieces of legs at its reading.
-    corners : (2, 2) array
-        Least and greatest x and y of the sensor plane that it shows.
-    R, t : (3, 3) and (3,) array
-        Its camera frame, where poses are those of another frame that is fixed to it:
-        X_camera = R X + t.
-    """
-
-    bars: Bars
-    targets: Targets
-    corners: Array
+    pairs: EdgePairs
+    targets: Targets  # pieces of legs at its reading
+    corners: Array  # (2, 2) least and greatest x and y of the sensor plane that it shows
+    # Its camera frame, where poses are those of another one that is fixed to it: X_camera = R X + t
     R: Array = field(default_factory=lambda: np.eye(3))
     t: Array = field(default_factory=lambda: np.zeros(3))
 
 
-@dataclass(frozen=True, eq=False)
-class Agreement:
-    """How poses agree with a picture.
+class Agreement(NamedTuple):
+    """How poses agree with a picture, (n_poses, n_targets) each."""
 
-    Attributes
-    ----------
-    value : (n_poses, n_targets) array
-        Agreement of each piece, 0 to 1: how well, times how much of its visible length.
-    bar : (n_poses, n_targets) array of int
-        The bar that agrees best.
-    visible : (n_poses, n_targets) array
-        Share of each piece that is inside the picture.
-    """
-
-    value: Array
-    bar: IntArray
-    visible: Array
+    value: Array  # of each piece, 0 to 1: how well, times how much of its visible length
+    pair: IntArray  # the edge pair that agrees best
+    visible: Array  # share of each piece that is inside the picture
 
     @property
-    def one_bar_each(self) -> Array:
-        """The values, where a bar counts for the piece that it suits best."""
-        same = self.bar[:, :, None] == self.bar[:, None, :]
+    def one_pair_each(self) -> Array:
+        """The values, where a pair counts for the piece that it suits best."""
+        same = self.pair[:, :, None] == self.pair[:, None, :]
         better = self.value[:, None, :] > self.value[:, :, None]
         return np.where(np.any(same & better, axis=2), 0.0, self.value)
 
 
 def agreement(picture: Picture, poses: Poses, tolerance: float) -> Agreement:
-    """Judge poses by a picture.
-
-    Parameters
-    ----------
-    picture : Picture
-        Its bars and targets.
-    poses : Poses
-        Camera poses.
-    tolerance : float
-        Distance of an axis from a bar at which they agree no longer [m].
-    """
+    """Judge poses by a picture; ``tolerance`` is how far axes may be from pairs [m]."""
     n, n_targets = len(poses), len(picture.targets)
-    if n == 0 or n_targets == 0 or len(picture.bars) == 0:
+    if n == 0 or n_targets == 0 or len(picture.pairs) == 0:
         visible = _in_picture(picture, poses)[3] if n and n_targets else np.zeros((n, n_targets))
         return Agreement(np.zeros((n, n_targets)), np.zeros((n, n_targets), np.intp), visible)
     parts = [
         _judge(picture, poses.take(np.arange(k, min(k + CHUNK, len(poses)))), tolerance)
         for k in range(0, len(poses), CHUNK)
     ]
-    value, bar, visible = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return Agreement(value, bar, visible)
+    value, pair, visible = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return Agreement(value, pair, visible)
 
 
 def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Array]:
@@ -234,20 +172,20 @@ def _shown(xy: Array, corners: Array) -> Array:
 
 
 def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, IntArray, Array]:
-    """Return value, bar and visible of :class:`Agreement`."""
-    bars = picture.bars
+    """Return value, pair and visible of :class:`Agreement`."""
+    pairs = picture.pairs
     X, xy, width, visible = _in_picture(picture, poses)
-    reach = _reach(bars, X, tolerance)[..., None].astype(np.float32)
+    reach = _reach(pairs, X, tolerance)[..., None].astype(np.float32)
     xy, width = xy.astype(np.float32), width.astype(np.float32)
-    frame = np.concatenate([bars.along, bars.normal]).T.astype(np.float32)  # (2, 2 n_bars)
+    frame = np.concatenate([pairs.along, pairs.normal]).T.astype(np.float32)  # (2, 2 n_pairs)
     own = np.concatenate(
-        [np.sum(bars.middle * bars.along, axis=1), np.sum(bars.middle * bars.normal, axis=1)]
+        [np.sum(pairs.middle * pairs.along, axis=1), np.sum(pairs.middle * pairs.normal, axis=1)]
     ).astype(np.float32)
     place = xy @ frame - own
-    n = len(bars)
+    n = len(pairs)
     a0, a1 = place[:, :, 0, :n], place[:, :, 1, :n]
     o0, o1 = place[:, :, 0, n:], place[:, :, 1, n:]
-    half = bars.half_length.astype(np.float32)
+    half = pairs.half_length.astype(np.float32)
     run = a1 - a0
     run = np.where(np.abs(run) < 1e-6, np.float32(1e-6), run)
     slope = (o1 - o0) / run
@@ -255,8 +193,8 @@ def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, Int
     value = np.maximum(1.0 - (gap / reach) ** 2, 0.0)
     w0, w1 = width[:, :, 0, None], width[:, :, 1, None]
     expected = np.maximum(w0 - (w1 - w0) * a0 / run, np.float32(1e-6))
-    seen = seen_width(bars).astype(np.float32)
-    sigma = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen).astype(np.float32)
+    seen = seen_width(pairs).astype(np.float32)
+    sigma = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * pairs.pixel / seen).astype(np.float32)
     pull = np.log(expected / seen) / (np.float32(WIDTH_REACH) * sigma)
     value *= np.maximum(1.0 - pull**2, 0.0)
     overlap = np.minimum(half, np.maximum(a0, a1)) - np.maximum(-half, np.minimum(a0, a1))
@@ -269,15 +207,15 @@ def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, Int
     return np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible
 
 
-def _reach(bars: Bars, X: Array, tolerance: float) -> Array:
+def _reach(pairs: EdgePairs, X: Array, tolerance: float) -> Array:
     """Return a tolerance [m] on the sensor plane at pieces X (n, T, 2, 3), (n, T)."""
     depth = np.maximum(X[..., 2].mean(axis=-1), NEAREST)
-    return np.asarray(tolerance / depth + SLACK_PIXELS * bars.pixel)
+    return np.asarray(tolerance / depth + SLACK_PIXELS * pairs.pixel)
 
 
-def seen_width(bars: Bars) -> Array:
-    """Return the widths of bars (n,) in their middle, as wide as legs are that look like this."""
-    return np.asarray(bars.width.mean(axis=1) + TOO_NARROW * bars.pixel)
+def seen_width(pairs: EdgePairs) -> Array:
+    """Return the widths of pairs (n,) in their middle, as wide as legs are that look like this."""
+    return np.asarray(pairs.width.mean(axis=1) + TOO_NARROW * pairs.pixel)
 
 
 def improved(
@@ -287,20 +225,10 @@ def improved(
     tolerance: float,
     joint_error: float = 0.0,
 ) -> Poses:
-    """Return poses after one Gauss-Newton step towards the bars that agree with them.
+    """Return poses after one Gauss-Newton step towards the pairs that agree with them.
 
-    Parameters
-    ----------
-    pictures : sequence of Picture
-        Some pictures of one camera.
-    poses : Poses
-        Camera poses.
-    agreements : sequence of Agreement
-        Of these poses with each picture.
-    tolerance : float
-        As for :func:`agreement`.
-    joint_error : float
-        Standard deviation of the joint centres of the model [m]; 0 to leave them in place.
+    By pictures of one camera and agreements with each, for a tolerance as in :func:`agreement`;
+    ``joint_error`` is the standard deviation of the model's joints [m], 0 to leave them in place.
     """
     n, n_legs = poses.shift.shape[:2]
     centre = _centre(pictures, poses)
@@ -308,7 +236,7 @@ def improved(
     H_leg, H_cross = np.zeros((n, n_legs, 6, 6)), np.zeros((n, n_legs, 6, 6))
     b_leg = np.zeros((n, n_legs, 6))
     for picture, found in zip(pictures, agreements, strict=True):
-        if len(picture.bars) == 0 or len(picture.targets) == 0:
+        if len(picture.pairs) == 0 or len(picture.targets) == 0:
             continue
         J, J_leg, residual, weight = _equations(picture, poses, found, tolerance)
         weighted = (J * weight[..., None]).swapaxes(2, 3)  # (n, T, 6, 4)
@@ -359,25 +287,25 @@ def _equations(
     Derivatives (n, T, 4, 6) by the motion of the camera, and by shifts of A and B of the leg;
     residuals and weights (n, T, 4).
     """
-    bars, place = picture.bars, picture.targets.place
+    pairs, place = picture.pairs, picture.targets.place
     X, xy, width, _ = _in_picture(picture, poses)
-    along, across = bars.along[found.bar], bars.normal[found.bar]
-    to_ends = xy - bars.middle[found.bar][:, :, None, :]
+    along, across = pairs.along[found.pair], pairs.normal[found.pair]
+    to_ends = xy - pairs.middle[found.pair][:, :, None, :]
     a = np.einsum("ntkx,ntx->ntk", to_ends, along)
     o = np.einsum("ntkx,ntx->ntk", to_ends, across)
     run = a[..., 1] - a[..., 0]
     run = np.where(np.abs(run) < 1e-6, 1e-6, run)
-    half = bars.half_length[found.bar]
+    half = pairs.half_length[found.pair]
     z = np.maximum(X[..., 2], NEAREST)
     depth = z.mean(axis=-1)
-    # Derivatives of the offset of each end across the bar and along it, (n, T, 2, 3).
+    # Derivatives of the offset of each end across the pair and along it, (n, T, 2, 3).
     g, g_along = _of_offset(xy, across, z), _of_offset(xy, along, z)
     shares = np.stack([(-half - a[..., 0]) / run, (half - a[..., 0]) / run], axis=-1)
     parts = np.stack([1.0 - shares, shares], axis=-1)  # (n, T, 2 places, 2 ends)
     residual = np.einsum("ntpe,nte->ntp", parts, o)
     share = -a[..., 0] / run
     expected = np.maximum(width[..., 0] + (width[..., 1] - width[..., 0]) * share, 1e-6)
-    seen = seen_width(bars)[found.bar]
+    seen = seen_width(pairs)[found.pair]
     P = (1.0 - share)[..., None] * X[:, :, 0] + share[..., None] * X[:, :, 1]
     of_depth = np.zeros_like(P)
     of_depth[..., 2] = -1.0 / np.maximum(P[..., 2], NEAREST)
@@ -397,10 +325,10 @@ def _equations(
         [((1.0 - at) * in_base).sum(axis=3), (at * in_base).sum(axis=3)], axis=-1
     )
     J_leg[:, :, 2:] = 0.0  # too vague to tell where joints are
-    sigma_width = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * bars.pixel / seen)
+    sigma_width = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * pairs.pixel / seen)
     sigma = max(LINE_ERROR, LINE_PART * tolerance) / depth
-    line = found.value / (sigma**2 + (LINE_PIXELS * bars.pixel) ** 2)
-    # A bar as long as the piece has its middle where the piece has it.
+    line = found.value / (sigma**2 + (LINE_PIXELS * pairs.pixel) ** 2)
+    # A pair as long as the piece has its middle where the piece has it.
     length = np.abs(run)
     sigma_place = PLACE_ERROR * length + 0.5 * np.abs(length - 2.0 * half)
     return (
@@ -424,9 +352,9 @@ def _of_offset(xy: Array, normal: Array, z: Array) -> Array:
 
 
 def distances(picture: Picture, poses: Poses, found: Agreement) -> Array:
-    """Return how far pieces are from the bars that agree with them, (n_poses, n_targets) [m].
+    """Return how far pieces are from the pairs that agree with them, (n_poses, n_targets) [m].
 
-    Sideways, at the ends of the bars and at the depth of the pieces.
+    Sideways, at the ends of the pairs and at the depth of the pieces.
     """
     _, _, residual, _ = _equations(picture, poses, found, 1.0)
     X, _, _, _ = _in_picture(picture, poses)
@@ -468,21 +396,10 @@ def _cross(vectors: Array) -> Array:
 
 
 def exchanged(R: Array, t: Array, X: Array) -> tuple[Array, Array]:
-    """Return the poses that show points of a flat machine alike from far.
+    """Return the poses R (n, 3, 3), t (n, 3) that show points X (m, 3) of a flat machine alike.
 
-    The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
-    through its middle that faces the camera.
-
-    Parameters
-    ----------
-    R, t : (n, 3, 3) and (n, 3) array
-        T_camera_base of some poses: rotations and translations [m].
-    X : (m, 3) array
-        Points of the machine, one at least, in the base link [m].
-
-    Returns
-    -------
-    R, t : (n, 3, 3) and (n, 3) array
+    As seen from far: the machine is reflected in its own plane, which leaves a flat one as it is,
+    and in the plane through its middle that faces the camera.
     """
     middle = X.mean(axis=0)
     normal = np.linalg.svd(X - middle, full_matrices=False)[2][2]

@@ -1,119 +1,124 @@
-"""Where the cameras stand before the board: one pose for each view, from the corners it shows."""
+"""The calibration board: searched in images, and where the cameras stand before it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
-from legcal.data import Corners, Measurements, few, row_names
+from legcal.data import (
+    Corners,
+    Measurements,
+    few,
+    found_corners,
+    join_corners,
+    row_names,
+)
 from legcal.errors import DatasetError, NotVisible
 from legcal.geometry import Array, IntArray
-from legcal.vision import Board, Camera, PlanePose, plane_poses, refined_pose
+from legcal.perception.light import to_grey
+from legcal.perception.placement import Load
+from legcal.progress import Report
+from legcal.vision import (
+    Board,
+    Camera,
+    PlanePose,
+    described,
+    find_corners,
+    plane_poses,
+    refined_pose,
+)
+from legcal.workers import Run
 
-LEAST_PX = 0.15  # by which corners must shift together
-SIGNIFICANCE = 1e-6  # of a motion, for each pair of images
-
-
-def moved_board(
-    name: str,
-    single: Mapping[int, PlanePose],
-    scale: float,
-    board: Board,
-    camera: Camera,
-    names: tuple[str, ...],
-) -> str | None:
-    """Return in which images of a view the board stands elsewhere than in most, and how far.
-
-    Parameters
-    ----------
-    name : str
-        The view.
-    single : mapping of int to PlanePose
-        The pose by each image alone, by its row.
-    scale : float
-        By how much residuals exceed what corners claim.
-    board, camera
-        The board and the camera.
-    names : tuple of str
-        What each row is called.
-
-    Returns
-    -------
-    str or None
-        A sentence; None if nothing moved.
-    """
-    rows = list(single)
-    if len(rows) < 2:
-        return None
-    limit = float(chi2.isf(SIGNIFICANCE / len(rows), 6)) * scale**2
-    px = {
-        row: camera.project(pose.T_camera_plane.apply(board.points)) for row, pose in single.items()
-    }
-    together = np.array(
-        [[_agree(single[a], single[b], px[a] - px[b], limit) for b in rows] for a in rows]
-    )
-    most = int(np.argmax(together.sum(axis=1)))
-    others = [row for row, same in zip(rows, together[most], strict=True) if not same]
-    if not others:
-        return None
-    reference = single[rows[most]].T_camera_plane
-    moves = [reference.inv() * single[row].T_camera_plane for row in others]
-    middle = board.points.mean(axis=0)
-    far = max(float(np.linalg.norm(T.apply(middle) - middle)) for T in moves)
-    turn = max(float(T.rotation.magnitude()) for T in moves)
-    told = few([names[row] for row in others])
-    return (
-        f"view {name}: its camera could not be placed: found the board elsewhere in {told} than in "
-        f"{names[rows[most]]}, by up to {1e3 * far:.2g} mm and {np.rad2deg(turn):.2g} degrees, "
-        "needed a camera and a board that stand still in all images of a view; leave those images "
-        "out, or give them a view of their own."
-    )
-
-
-def _agree(one: PlanePose, other: PlanePose, shift_px: Array, limit: float) -> bool:
-    """Say whether two poses of the board are one, within what is known of them."""
-    if float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1)))) < LEAST_PX:
-        return True
-    a, b = one.T_camera_plane, other.T_camera_plane
-    turn = (b.rotation * a.rotation.inv()).as_rotvec()
-    d = np.concatenate([b.translation - a.translation, turn])
-    covariance = np.linalg.inv(one.information) + np.linalg.inv(other.information)
-    return bool(d @ np.linalg.solve(covariance, d) < limit)
-
-
+STAGE = "Searching the board"
+_ASKED = 2  # images of a view that are asked what they show instead
 FEWEST = 4  # corners, not on a line, that place a camera
 WORST_PX, WORST_SIGMA = 1.0, 5.0  # residual (root mean square) of corners that are of this board
 REJECTED_PX, REJECTED_SIGMA = 0.3, 6.0  # a corner further off than both is rejected
 SURELY = 25.0  # by which twice the cost of the second pose must exceed that of the first
+LEAST_PX = 0.15  # by which corners must shift together
+SIGNIFICANCE = 1e-6  # of a motion, for each pair of images
+
+
+def detect_corners(
+    board: Board,
+    load: Load,
+    rows: Sequence[int],
+    run: Run,
+    report: Report,
+) -> Corners:
+    """Return the corners of the board in the images of rows; one without the board has none.
+
+    ``load`` returns the image of a row and can travel to another process.
+    """
+    report(STAGE, 0, len(rows))
+    found = []
+    search = partial(_search, board, load)
+    for k, (row, (corner, px, sigma)) in enumerate(zip(rows, run(search, rows), strict=True)):
+        found.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
+        report(STAGE, k + 1, len(rows))
+    return join_corners(found)
+
+
+def require_board(
+    board: Board,
+    corners: Corners,
+    load: Load,
+    measurements: Measurements,
+    views: Collection[str],
+) -> None:
+    """Refuse needed views whose images do not show the board, and say what they show instead.
+
+    Raises NotVisible with one sentence for each of them.
+    """
+    shown = set(measurements.view[corners.row].tolist())
+    problems = []
+    for v, view in enumerate(measurements.views):
+        rows = [row for row in np.flatnonzero(measurements.view == v).tolist()
+                if measurements.image[row]]  # fmt: skip
+        if view.name not in views or v in shown or not rows:
+            continue
+        found = next(
+            (what for row in rows[:_ASKED] if (what := described(board, to_grey(load(row))))), None
+        )
+        problems.append(
+            f"view {view.name}: the board could not be found in any of its {len(rows)} "
+            f"image{'s' * (len(rows) != 1)}: found {found or 'nothing like it'}, needed "
+            f"{_words(board)}; correct the block board of the dataset file, or turn the camera."
+        )
+    if problems:
+        raise NotVisible(problems)
+
+
+def _words(board: Board) -> str:
+    """Return a board in words."""
+    what = "tags" if board.kind == "aprilgrid" else "squares"
+    whole = ", the whole of it" if board.kind == "chessboard" else ""
+    name = {"chessboard": "a chessboard", "charuco": "a ChArUco board", "aprilgrid": "an AprilGrid"}
+    return f"{name[board.kind]} of {board.columns} x {board.rows} {what}{whole}"
+
+
+def _search(board: Board, load: Load, row: int) -> tuple[IntArray, Array, Array]:
+    """Return the corners, their pixels and sigmas in the image of a row."""
+    return find_corners(board, to_grey(load(row)))
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPoses:
-    """Cameras in front of the board.
+    """Cameras in front of the board."""
 
-    Attributes
-    ----------
-    rows : tuple of RigidTransform or None, length n_rows
-        T_board_camera of every image by the corners that it shows itself, of two poses that these
-        leave that nearer to the view's; None where they are too few.
-    views : tuple of RigidTransform or None, length n_views
-        T_board_camera of every view by all of its images; None where no image shows the board.
-    covariance : (n_views, 6, 6) array
-        Of a shift [m] and a turn [rad] of the board, both in the camera frame; NaN without a pose.
-        As large as the residuals say where they exceed what the corners claim. What all images of a
-        view have in common, such as an edge of a shadow, counts as often as there are images.
-    corners : Corners
-        The corners, those that contradict the others rejected.
-    """
-
-    rows: tuple[RigidTransform | None, ...]
-    views: tuple[RigidTransform | None, ...]
-    covariance: Array
-    corners: Corners
+    rows: tuple[RigidTransform | None, ...]  # (n_rows,) T_board_camera by the corners of the image
+    # itself, of two poses that these leave that nearer to the view's; None where they are too few
+    views: tuple[RigidTransform | None, ...]  # (n_views,) by all images; None: none shows the board
+    covariance: Array  # (n_views, 6, 6) of a shift [m] and a turn [rad] of the board, both in the
+    # camera frame; NaN without a pose. As large as the residuals say where they exceed what corners
+    # claim. What all images have in common, such as a shadow, counts as often as there are images
+    corners: Corners  # those that contradict the others rejected
 
 
 def camera_poses(
@@ -122,31 +127,11 @@ def camera_poses(
     measurements: Measurements,
     needed: Collection[str] = (),
 ) -> BoardPoses:
-    """Return where the cameras of all views stand before the board.
+    """Return where the cameras of all views stand before the board, by corners that are used.
 
-    Parameters
-    ----------
-    corners : Corners
-        The corners; rejected ones are left out.
-    board : Board
-        The board.
-    measurements : Measurements
-        The rows that corners belong to.
-    needed : collection of str
-        Views that must have a pose.
-
-    Returns
-    -------
-    BoardPoses
-
-    Raises
-    ------
-    NotVisible
-        If a view that needs it has no pose: the board is in none of its images, or is seen so that
-        two poses explain it.
-    DatasetError
-        If corners are not those of this board by the camera file, or the board moved between
-        images of a view.
+    Raises NotVisible if a needed view has no pose: the board is in none of its images, or is seen
+    so that two poses explain it; DatasetError if corners are not those of this board by the camera
+    file, or the board moved between images of a view.
     """
     names = row_names(measurements)
     rows: list[RigidTransform | None] = [None] * measurements.n_rows
@@ -181,8 +166,7 @@ def camera_poses(
     return BoardPoses(tuple(rows), tuple(views), covariance, corners)
 
 
-@dataclass(frozen=True, eq=False)
-class _ViewPose:
+class _ViewPose(NamedTuple):
     """The pose of a view, those of its images, and the corners that contradict it."""
 
     T_board_camera: RigidTransform
@@ -234,7 +218,7 @@ def _view_pose(
         for row, poses in of_row.items()
         if (pose := _sure(poses, scale, best)) is not None
     }
-    moved = moved_board(name, single, scale, board, camera, names)
+    moved = _moved_board(name, single, scale, board, camera, names)
     if moved is not None:
         raise DatasetError(moved)
     _check_fit(name, best, corners, board)
@@ -254,6 +238,58 @@ def _view_pose(
         wrong=np.flatnonzero(off > limit),
         off_px=off,
     )
+
+
+def _moved_board(
+    name: str,
+    single: Mapping[int, PlanePose],
+    scale: float,
+    board: Board,
+    camera: Camera,
+    names: tuple[str, ...],
+) -> str | None:
+    """Return in which images of a view the board stands elsewhere than in most, and how far.
+
+    By the pose of each image alone, by its row; ``scale`` is by how much residuals exceed what
+    corners claim, ``names`` what each row is called. None if nothing moved.
+    """
+    rows = list(single)
+    if len(rows) < 2:
+        return None
+    limit = float(chi2.isf(SIGNIFICANCE / len(rows), 6)) * scale**2
+    px = {
+        row: camera.project(pose.T_camera_plane.apply(board.points)) for row, pose in single.items()
+    }
+    together = np.array(
+        [[_agree(single[a], single[b], px[a] - px[b], limit) for b in rows] for a in rows]
+    )
+    most = int(np.argmax(together.sum(axis=1)))
+    others = [row for row, same in zip(rows, together[most], strict=True) if not same]
+    if not others:
+        return None
+    reference = single[rows[most]].T_camera_plane
+    moves = [reference.inv() * single[row].T_camera_plane for row in others]
+    middle = board.points.mean(axis=0)
+    far = max(float(np.linalg.norm(T.apply(middle) - middle)) for T in moves)
+    turn = max(float(T.rotation.magnitude()) for T in moves)
+    told = few([names[row] for row in others])
+    return (
+        f"view {name}: its camera could not be placed: found the board elsewhere in {told} than in "
+        f"{names[rows[most]]}, by up to {1e3 * far:.2g} mm and {np.rad2deg(turn):.2g} degrees, "
+        "needed a camera and a board that stand still in all images of a view; leave those images "
+        "out, or give them a view of their own."
+    )
+
+
+def _agree(one: PlanePose, other: PlanePose, shift_px: Array, limit: float) -> bool:
+    """Say whether two poses of the board are one, within what is known of them."""
+    if float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1)))) < LEAST_PX:
+        return True
+    a, b = one.T_camera_plane, other.T_camera_plane
+    turn = (b.rotation * a.rotation.inv()).as_rotvec()
+    d = np.concatenate([b.translation - a.translation, turn])
+    covariance = np.linalg.inv(one.information) + np.linalg.inv(other.information)
+    return bool(d @ np.linalg.solve(covariance, d) < limit)
 
 
 def _check_fit(name: str, pose: PlanePose, corners: Corners, board: Board) -> None:

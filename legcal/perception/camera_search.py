@@ -1,12 +1,15 @@
-"""Bars of mirrored images, and whether they explain a view better than its images as they are.
+"""The camera pose of a view, searched for anywhere or near a rough one, by its edge pairs.
 
-A camera pose is found for mirrored images of many machines as well, with fewer legs on their bars:
-a leg or two on the wrong ones. So a pose at which many legs are missing is held against the best
-one of the images with left and right exchanged.
+Two pairs taken for two legs suggest a pose; thousands are judged by one picture, the better ones
+refined and judged by more, the best by all. A pose is believed where enough legs agree and no other
+pose rivals it. A pose is found for mirrored images of many machines as well, with fewer legs on
+their pairs: so one at which many legs are missing is held against the best one of the images with
+left and right exchanged.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -24,190 +27,17 @@ from legcal.perception.agreement import (
     improved,
     seen_width,
 )
-from legcal.perception.bars import Bars
+from legcal.perception.lines import EdgePairs
 
-N_FIRST, N_SECOND = 20, 40  # best bars that are tried as the first one, and as the second
+N_FIRST, N_SECOND = 20, 40  # best pairs that are tried as the first one, and as the second
 LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
-LONGER = 1.25, 3.0  # a bar is at most so much longer than the piece that it shows: factor, radii
+LONGER = 1.25, 3.0  # a pair is at most so much longer than the piece that it shows: factor, radii
 CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
-WIDTH_REACH = 2.5  # standard deviations of the width of the second bar
+WIDTH_REACH = 2.5  # standard deviations of the width of the second pair
 SLACK = 0.2  # of the place along a piece, in its lengths
-TURNED = 1.05  # how far from a solution bars and legs may be that allow none, as a cosine
-CROSSING = 0.03  # sine between axes seen, below which the second bar does not tell the place
+TURNED = 1.05  # how far from a solution pairs and legs may be that allow none, as a cosine
+CROSSING = 0.03  # sine between axes seen, below which the second pair does not tell the place
 MOST = 3000  # poses of a picture
-
-
-@dataclass(frozen=True, eq=False)
-class _Firsts:
-    """Bars taken for legs, each with a lean: all about a start but the turn and the place."""
-
-    u: Array  # (n, 3) direction in the camera frame, from base to platform
-    P: Array  # (n, 3) where the middle of the piece is put [m]
-    slack: Array  # (n,) how far along the leg it may be instead [m]
-    bar: IntArray  # (n,)
-    target: IntArray  # (n,)
-
-
-def pose_starts(picture: Picture, n_legs: int) -> Poses:
-    """Return camera poses that put two legs where two bars are.
-
-    Parameters
-    ----------
-    picture : Picture
-        Its best bars and all its targets are combined.
-    n_legs : int
-        Number of legs of the machine.
-    """
-    bars, targets = picture.bars.take(np.arange(min(N_SECOND, len(picture.bars)))), picture.targets
-    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
-    if len(bars) < 2 or len(set(targets.leg.tolist())) < 2:
-        return nothing
-    firsts = _firsts(bars, targets)
-    if len(firsts.u) == 0:
-        return nothing
-    middle = targets.ends.mean(axis=1)
-    piece = targets.ends[:, 1] - targets.ends[:, 0]
-    length = np.linalg.norm(piece, axis=1)
-    direction = piece / length[:, None]
-    # All in frames whose x axis is the first leg: of the camera, and of the base link.
-    U_c, U_b = _triads(firsts.u), _triads(direction)[firsts.target]
-    rays, planes = _rays(bars), _planes(bars)
-    n_all, ray_all = planes @ U_c, rays @ U_c  # (n_firsts, n_bars, 3)
-    P_all = np.einsum("fxi,fx->fi", U_c, firsts.P)
-    w_all = direction @ U_b  # (n_firsts, n_targets, 3)
-    d_all = (middle[None] - middle[firsts.target][:, None]) @ U_b
-    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
-    n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
-    across = n[:, 0]
-    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < CROSSING, np.inf, across)
-    good = np.flatnonzero(np.abs(place) <= firsts.slack[f])
-    f, k, m = f[good], k[good], m[good]
-    cosine, sine, place = cosine[good], sine[good], place[good]
-    # Where the second bar's middle is on the second leg, and how wide it should be there.
-    X = d[good] + P[good]
-    X[:, 0] += place
-    v, ray = _turned(w_all[f, m], cosine, sine), ray_all[f, k]
-    vX, vr, Xr = _dot(v, X), _dot(v, ray), _dot(X, ray)
-    along = -(_dot(X, X) * vr - vX * Xr) / _safe(vX * vr - Xr)
-    depth = _dot(U_c[f, 2], X + along[:, None] * v)
-    flat = np.linalg.norm(planes[k][:, :2], axis=1)
-    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
-    seen = seen_width(bars)[k]
-    # The depth of the first leg is no better known.
-    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, bars.pixel / seen)
-    off = np.abs(np.log(expected / seen)) / (WIDTH_REACH * sigma)
-    good_along = np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]
-    good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
-    merit = bars.merit[k] + bars.merit[firsts.bar[f]]
-    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MOST]]
-    f, place = f[good], place[good]
-    R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
-    where = firsts.P[f] + place[:, None] * firsts.u[f]
-    t = where - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
-    return Poses.rigid(R, t, n_legs)
-
-
-def _turns(
-    firsts: _Firsts, targets: Targets, n: Array, w: Array
-) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
-    """Return the turns about a first leg that lay a second one into the plane of a second bar.
-
-    Indices of the first, the second bar and the second piece, and cosine and sine of the turn,
-    from the normals n (n_firsts, n_bars, 3) of the planes and the directions w (n_firsts,
-    n_targets, 3) of the pieces.
-    """
-    n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
-    c0 = n[..., 0] * w[..., 0]
-    c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
-    c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
-    good = c0**2 <= TURNED**2 * (c1**2 + c2**2)
-    good &= (np.arange(n.shape[1]) != firsts.bar[:, None])[:, :, None]
-    good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
-    f, k, m = np.nonzero(good)
-    c0, c1, c2 = (c[good].astype(np.float64) for c in (c0, c1, c2))
-    step = np.arccos(np.clip(-c0 / np.maximum(np.hypot(c1, c2), 1e-12), -1.0, 1.0))
-    base = np.arctan2(c2, c1)
-    turn = np.concatenate([base + step, base - step])
-    f, k, m = (np.concatenate([x, x]) for x in (f, k, m))
-    return f, k, m, np.cos(turn), np.sin(turn)
-
-
-def _firsts(bars: Bars, targets: Targets) -> _Firsts:
-    """Take the best bars for every piece, with all leans that their edges allow."""
-    n = min(N_FIRST, len(bars))
-    first = bars.take(np.arange(n))
-    rays, planes = _rays(first), _planes(first)
-    along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
-    ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    side = np.cross(ray, planes)  # in the plane of the axis, across the ray
-    side *= np.sign(_dot(side, along))[:, None]
-    width = seen_width(first)
-    cone = np.log(first.width[:, 1] / first.width[:, 0])[:, None, None]
-    sigma = (CONE + 1.5 * bars.pixel / width)[:, None, None]
-    length = np.linalg.norm(targets.ends[:, 1] - targets.ends[:, 0], axis=1)
-    flat = np.linalg.norm(planes[:, :2], axis=1)
-    z = 2.0 * targets.radius / (width * flat)[:, None]  # (n, n_targets)
-    v = np.cos(LEANS)[:, None] * side[:, None] + np.sin(LEANS)[:, None] * ray[:, None]
-    # The ends of the bar on an axis along v, and how their widths differ.
-    steep = np.maximum(np.abs(np.einsum("nlx,nx->nl", v, along)), 0.2)
-    reach = (first.half_length[:, None] / steep)[:, None, :] * z[..., None]  # (n, n_targets, leans)
-    z0, z1 = z[..., None] - reach * v[:, None, :, 2], z[..., None] + reach * v[:, None, :, 2]
-    longest = LONGER[0] * length + LONGER[1] * targets.radius
-    good = (np.minimum(z0, z1) > 0.0) & (2.0 * reach <= longest[:, None])
-    ratio = np.log(np.where(good, z0, 1.0) / np.where(good, z1, 1.0))
-    good &= np.abs(ratio - cone) <= 3.0 * sigma
-    i, j, lean = np.nonzero(good)
-    slack = np.maximum(0.5 * length[j] - reach[good], 0.0) + SLACK * length[j]
-    u, P = v[i, lean], z[i, j][:, None] * rays[i]
-    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, slack, i, j)))
-
-
-def _rays(bars: Bars) -> Array:
-    """Return the points (x, y, 1) of the middles, (n, 3)."""
-    return np.concatenate([bars.middle, np.ones((len(bars), 1))], axis=1)
-
-
-def _planes(bars: Bars) -> Array:
-    """Return the unit normals (n, 3) of the planes of the axes and the camera centre."""
-    along = np.concatenate([bars.along, np.zeros((len(bars), 1))], axis=1)
-    planes = np.cross(along, _rays(bars))
-    return np.asarray(planes / np.linalg.norm(planes, axis=1, keepdims=True))
-
-
-def _triads(u: Array) -> Array:
-    """Return right-handed orthonormal matrices (n, 3, 3) whose first columns are u."""
-    other = np.eye(3)[np.argmin(np.abs(u), axis=1)]
-    v = np.cross(u, other)
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    return np.stack([u, v, np.cross(u, v)], axis=2)
-
-
-def _about_x(cosine: Array, sine: Array) -> Array:
-    """Return rotations (n, 3, 3) about the x axis."""
-    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
-    rows = [one, zero, zero, zero, cosine, -sine, zero, sine, cosine]
-    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
-
-
-def _turned(x: Array, cosine: Array, sine: Array) -> Array:
-    """Return vectors (n, 3) turned about the x axis."""
-    y, z = x[:, 1], x[:, 2]
-    return np.stack([x[:, 0], cosine * y - sine * z, sine * y + cosine * z], axis=-1)
-
-
-def _dot(x: Array, y: Array) -> Array:
-    return np.asarray(np.einsum("ni,ni->n", x, y))
-
-
-def _safe(x: Array) -> Array:
-    return np.where(np.abs(x) < 1e-12, 1e-12, x)
-
-
-def joined(parts: Sequence[Poses]) -> Poses:
-    """Return all poses of some sets."""
-    R, t, shift = ([getattr(p, name) for p in parts] for name in ("R", "t", "shift"))
-    return Poses(np.concatenate(R), np.concatenate(t), np.concatenate(shift))
-
 
 # Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
 # lead over the next pose in legs of all images together, and as a part.
@@ -218,38 +48,45 @@ HINTED_SUPPORT = 0.6  # share near a rough pose that leaves no doubt
 LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
 HINTED_LEAST = 1.6  # the same near a rough pose
 
+TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
+LAST = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
+JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
+START_PICTURES = 1, 1, 2, 4  # whose pairs suggest poses, as long as there is a doubt
+SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
+KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
+N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
+N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
+POLISH = (0.018, 0.012, 0.008)  # tolerances
+POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
+SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
+SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
+OTHER_TURN, OTHER_PLACE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
+SAME_PAIR = np.deg2rad(4.0), 0.6  # of two pairs on one leg: angle, distance in widths
+MATCHED = 0.15  # agreement of a piece with its pair that counts as a match
+JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
+SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
+NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
+FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
+
+LEFT_RIGHT = np.array([-1.0, 1.0])
+UP_DOWN = np.array([1.0, -1.0])
+UPSIDE_DOWN = np.array([-1.0, -1.0])
+PLAIN = 0.45  # share of the expected legs that mirrored images do not reach
+LEAD, LEAD_PART = 0.3, 0.06  # of the mirrored pictures over the own ones: legs of all images, part
+
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """Poses of a camera, best first, each far from the better ones or with legs on other bars.
+class Candidates:
+    """Poses of a camera, best first, each far from the better ones or with legs on other pairs."""
 
-    Attributes
-    ----------
-    poses : Poses
-        T_camera_base.
-    support : (n, n_pictures) array
-        How many legs agree in each picture, weighted by how well and how much of them.
-    expected : (n, n_pictures) array
-        How many legs each picture would show.
-    score : (n,) array
-        The support in all pictures together, less what the shifts of the joints cost: legs.
-    leg_error : (n_legs,) array
-        Root mean square distance of the legs from their bars at the first pose [m]; infinite for
-        legs without any.
-    hinted : bool
-        Whether the pose was searched for near a rough one only.
-    by_outlines : bool or None
-        Whether outlines that were measured at the poses speak for the first one; None where bars
-        left no doubt.
-    """
-
-    poses: Poses
-    support: Array
-    expected: Array
-    score: Array
-    leg_error: Array
-    hinted: bool = False
-    by_outlines: bool | None = None
+    poses: Poses  # T_camera_base
+    support: Array  # (n, n_pictures) legs that agree, by how well and how much of them
+    expected: Array  # (n, n_pictures) legs that each picture would show
+    score: Array  # (n,) support of all pictures, less what the shifts of the joints cost: legs
+    leg_error: Array  # (n_legs,) of legs from their pairs at the first pose, infinite without [m]
+    hinted: bool = False  # whether it was searched for near a rough pose only
+    by_outlines: bool | None = None  # whether outlines measured at the poses speak for the first
+    # one; None where pairs left no doubt
 
     @property
     def needed(self) -> float:
@@ -274,12 +111,12 @@ class Placed:
 
     @property
     def leads_clearly(self) -> bool:
-        """Whether bars leave no doubt that the first pose is better than the second one."""
+        """Whether pairs leave no doubt that the first pose is better than the second one."""
         return self._leads(CLEAR_LEAD, CLEAR_PART)
 
     @property
     def leads(self) -> bool:
-        """Whether bars tell the first pose from the second one."""
+        """Whether pairs tell the first pose from the second one."""
         return self._leads(ENOUGH_LEAD, ENOUGH_PART)
 
     @property
@@ -313,40 +150,13 @@ class Placed:
         return RigidTransform.from_components(self.poses.t[i], R).inv()
 
 
-TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
-LAST = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
-JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
-START_PICTURES = 1, 1, 2, 4  # whose bars suggest poses, as long as there is a doubt
-SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
-KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
-N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
-N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
-POLISH = (0.018, 0.012, 0.008)  # tolerances
-POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distance
-SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
-SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
-OTHER_TURN, OTHER_PLACE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
-SAME_BAR = np.deg2rad(4.0), 0.6  # of two bars on one leg: angle, distance in widths
-MATCHED = 0.15  # agreement of a piece with its bar that counts as a match
-JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
-SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
-NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
-FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
-
-
 def place_camera(
     pictures: Sequence[Picture], n_legs: int, starts: Sequence[int] = START_PICTURES
-) -> Placed:
+) -> Candidates:
     """Return the camera poses on which most legs of all pictures of a view agree.
 
-    Parameters
-    ----------
-    pictures : sequence of Picture
-        Of one camera pose, at different readings.
-    n_legs : int
-        Number of legs of the machine.
-    starts : sequence of int
-        How many pictures more suggest poses, as long as there is a doubt.
+    Pictures are of one camera pose at different readings; ``starts`` says how many more of them
+    suggest poses, as long as there is a doubt.
     """
     by_merit = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
     best_first = [pictures[k] for k in by_merit]
@@ -379,7 +189,7 @@ def place_camera(
 def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
     """Return for each of the best poses the best one around it that steps lead to.
 
-    A leg on a wrong bar keeps a pose, and the joints moved for it, from where all legs agree.
+    A leg on a wrong pair keeps a pose, and the joints moved for it, from where all legs agree.
     """
     n_legs = poses.shift.shape[1]
     found = []
@@ -409,18 +219,10 @@ def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Pos
     return Poses.rigid(new, further[:, None] * (R @ middle + t) - new @ middle, n_legs)
 
 
-def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int) -> Placed:
-    """Return the camera pose near a rough one on which the pictures of a view agree.
-
-    Parameters
-    ----------
-    pictures : sequence of Picture
-        Of one camera pose, at different readings.
-    T_base_camera : RigidTransform
-        The rough pose.
-    n_legs : int
-        Number of legs of the machine.
-    """
+def place_near(
+    pictures: Sequence[Picture], T_base_camera: RigidTransform, n_legs: int
+) -> Candidates:
+    """Return the camera pose near a rough one on which the pictures of a view agree."""
     T = T_base_camera.inv()
     turns = NEAR_STARTS * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
@@ -431,7 +233,7 @@ def place_near(pictures: Sequence[Picture], T_base_camera: RigidTransform, n_leg
     return replace(found, hinted=True)
 
 
-def with_first(placed: Placed, i: int, pose: Poses, pictures: Sequence[Picture]) -> Placed:
+def with_first(placed: Candidates, i: int, pose: Poses, pictures: Sequence[Picture]) -> Candidates:
     """Return poses with the i-th one first, where outlines put it."""
     order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
     return replace(
@@ -444,14 +246,14 @@ def with_first(placed: Placed, i: int, pose: Poses, pictures: Sequence[Picture])
     )
 
 
-def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
+def _judged(pictures: Sequence[Picture], poses: Poses) -> Candidates:
     """Return poses with their support, best first, without those that say the same."""
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
-        return Placed(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
+        return Candidates(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
     found = [agreement(picture, poses, JUDGED) for picture in pictures]
-    values = [one.one_bar_each for one in found]
+    values = [one.one_pair_each for one in found]
     shares = [picture.targets.share for picture in pictures]
     support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
     expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
@@ -460,7 +262,7 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Placed:
     order = _different(pictures, poses, found, [v >= MATCHED for v in values], score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
-    return Placed(poses.take(order), support[order], expected[order], score[order], error)
+    return Candidates(poses.take(order), support[order], expected[order], score[order], error)
 
 
 def _different(
@@ -470,19 +272,19 @@ def _different(
     matched: Sequence[BoolArray],
     score: Array,
 ) -> IntArray:
-    """Return the poses, best first, that put other legs on other bars than better ones do.
+    """Return the poses, best first, that put other legs on other pairs than better ones do.
 
     So do poses that are far from them: legs in a plane that is seen from its edge are on the same
-    bars from below.
+    pairs from below.
     """
     common = np.zeros((len(score), len(score)))
     for picture, agreed, match in zip(pictures, found, matched, strict=True):
-        if len(picture.bars) == 0:
+        if len(picture.pairs) == 0:
             continue
-        same = _one_leg(picture.bars)
+        same = _one_leg(picture.pairs)
         for j in range(len(picture.targets)):
-            bar, has = agreed.bar[:, j], match[:, j]
-            common += same[np.ix_(bar, bar)] & has[:, None] & has[None, :]
+            pair, has = agreed.pair[:, j], match[:, j]
+            common += same[np.ix_(pair, pair)] & has[:, None] & has[None, :]
     least = np.maximum(np.diag(common), 1.0)
     kept: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
@@ -492,22 +294,24 @@ def _different(
     return np.array(kept, dtype=np.intp)
 
 
-def _one_leg(bars: Bars) -> BoolArray:
-    """Return which bars (n, n) may be of one leg: they continue each other or overlap."""
-    apart = np.abs(np.einsum("ijx,ix->ij", bars.middle[None] - bars.middle[:, None], bars.normal))
-    near = np.maximum(apart, apart.T) <= SAME_BAR[1] * bars.width.mean(axis=1)[:, None]
-    return np.asarray(near & (np.abs(bars.along @ bars.along.T) >= np.cos(SAME_BAR[0])))
+def _one_leg(pairs: EdgePairs) -> BoolArray:
+    """Return which pairs (n, n) may be of one leg: they continue each other or overlap."""
+    apart = np.abs(
+        np.einsum("ijx,ix->ij", pairs.middle[None] - pairs.middle[:, None], pairs.normal)
+    )
+    near = np.maximum(apart, apart.T) <= SAME_PAIR[1] * pairs.width.mean(axis=1)[:, None]
+    return np.asarray(near & (np.abs(pairs.along @ pairs.along.T) >= np.cos(SAME_PAIR[0])))
 
 
 def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
-    """Return the root mean square distance (n_legs,) of legs from their bars [m]."""
+    """Return the root mean square distance (n_legs,) of legs from their pairs [m]."""
     n_legs = pose.shift.shape[1]
     square, count = np.zeros(n_legs), np.zeros(n_legs)
     for picture in pictures:
-        if len(picture.bars) == 0 or len(picture.targets) == 0:
+        if len(picture.pairs) == 0 or len(picture.targets) == 0:
             continue
         found = agreement(picture, pose, JUDGED)
-        matched = found.one_bar_each[0] >= MATCHED
+        matched = found.one_pair_each[0] >= MATCHED
         distance = distances(picture, pose, found)[0]
         np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
         np.add.at(count, picture.targets.leg[matched], 1.0)
@@ -517,7 +321,7 @@ def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
 
 
 def _starts(picture: Picture, n_legs: int) -> Poses:
-    """Return the poses that suit a picture best, among those that two of its bars suggest."""
+    """Return the poses that suit a picture best, among those that two of its pairs suggest."""
     poses = pose_starts(picture, n_legs)
     if len(poses) == 0:
         return poses
@@ -531,7 +335,7 @@ def _starts(picture: Picture, n_legs: int) -> Poses:
 
 
 def _merit(picture: Picture) -> float:
-    return float(picture.bars.merit[:8].sum()) if len(picture.bars) else 0.0
+    return float(picture.pairs.merit[:8].sum()) if len(picture.pairs) else 0.0
 
 
 def refined(
@@ -540,7 +344,7 @@ def refined(
     tolerances: Sequence[float],
     joint_error: float = 0.0,
 ) -> Poses:
-    """Return poses after a step towards the bars for each of some tolerances."""
+    """Return poses after a step towards the pairs for each of some tolerances."""
     for tolerance in tolerances:
         found = [agreement(picture, poses, tolerance) for picture in pictures]
         poses = improved(pictures, poses, found, tolerance, joint_error)
@@ -552,7 +356,7 @@ def supports(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tup
     support, expected = [], []
     for picture in pictures:
         found = agreement(picture, poses, tolerance)
-        support.append(found.one_bar_each @ picture.targets.share)
+        support.append(found.one_pair_each @ picture.targets.share)
         expected.append(found.visible @ picture.targets.share)
     return np.stack(support, axis=1), np.stack(expected, axis=1)
 
@@ -582,52 +386,197 @@ def _near(poses: Poses, some: list[int], i: int, angle: float, part: float) -> B
     return np.asarray((turn < angle) & (apart < part * np.linalg.norm(poses.t[i])))
 
 
-LEFT_RIGHT = np.array([-1.0, 1.0])
-UP_DOWN = np.array([1.0, -1.0])
-UPSIDE_DOWN = np.array([-1.0, -1.0])
-PLAIN = 0.45  # share of the expected legs that mirrored images do not reach
-LEAD, LEAD_PART = 0.3, 0.06  # of the mirrored pictures over the own ones: legs of all images, part
+def flipped(pairs: EdgePairs, corners: Array, flip: Array) -> EdgePairs:
+    """Return the pairs of the image with its pixels in the opposite order along some axes.
 
-
-def flipped(bars: Bars, corners: Array, flip: Array) -> Bars:
-    """Return the bars of the image with its pixels in the opposite order along some axes.
-
-    Parameters
-    ----------
-    bars : Bars
-        Of the image as it is.
-    corners : (2, 2) array
-        Least and greatest x and y of the sensor plane that it shows.
-    flip : (2,) array
-        -1 along the axes that are turned around.
+    ``corners`` (2, 2) are of the sensor plane; ``flip`` (2,) is -1 along axes that are turned.
     """
     middle = corners.mean(axis=0)
-    return replace(bars, middle=middle + flip * (bars.middle - middle), along=flip * bars.along)
+    return replace(pairs, middle=middle + flip * (pairs.middle - middle), along=flip * pairs.along)
 
 
 def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
     """Return the pictures with left and right exchanged."""
-    return [replace(p, bars=flipped(p.bars, p.corners, LEFT_RIGHT)) for p in pictures]
+    return [replace(p, pairs=flipped(p.pairs, p.corners, LEFT_RIGHT)) for p in pictures]
 
 
-def may_be_mirrored(own: Placed) -> bool:
+def may_be_mirrored(own: Candidates) -> bool:
     """Say whether a placed view needs to be held against its mirror image."""
     return not own.is_convincing or own.share < PLAIN
 
 
-def is_mirrored(own: Placed, other: Placed) -> bool:
+def is_mirrored(own: Candidates, other: Candidates) -> bool:
     """Say whether mirrored pictures explain a view better than its own ones do.
 
     Those of a machine with a plane of symmetry, as all planar ones, explain it about as well.
-
-    Parameters
-    ----------
-    own : Placed
-        By the pictures as they are.
-    other : Placed
-        By :func:`mirrored` ones.
     """
     if not own.is_convincing:
         return other.is_clear
     lead = float(other.score[0] - own.score[0])
     return other.is_convincing and lead >= max(LEAD, LEAD_PART * float(other.score[0]))
+
+
+def joined(parts: Sequence[Poses]) -> Poses:
+    """Return all poses of some sets."""
+    R, t, shift = ([getattr(p, name) for p in parts] for name in ("R", "t", "shift"))
+    return Poses(np.concatenate(R), np.concatenate(t), np.concatenate(shift))
+
+
+class _Firsts(NamedTuple):
+    """Pairs taken for legs, each with a lean: all about a start but the turn and the place."""
+
+    u: Array  # (n, 3) direction in the camera frame, from base to platform
+    P: Array  # (n, 3) where the middle of the piece is put [m]
+    slack: Array  # (n,) how far along the leg it may be instead [m]
+    pair: IntArray  # (n,)
+    target: IntArray  # (n,)
+
+
+def pose_starts(picture: Picture, n_legs: int) -> Poses:
+    """Return camera poses that put two legs where two pairs of a picture are."""
+    pairs, targets = (
+        picture.pairs.take(np.arange(min(N_SECOND, len(picture.pairs)))),
+        picture.targets,
+    )
+    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
+    if len(pairs) < 2 or len(set(targets.leg.tolist())) < 2:
+        return nothing
+    firsts = _firsts(pairs, targets)
+    if len(firsts.u) == 0:
+        return nothing
+    middle = targets.ends.mean(axis=1)
+    piece = targets.ends[:, 1] - targets.ends[:, 0]
+    length = np.linalg.norm(piece, axis=1)
+    direction = piece / length[:, None]
+    # All in frames whose x axis is the first leg: of the camera, and of the base link.
+    U_c, U_b = _triads(firsts.u), _triads(direction)[firsts.target]
+    rays, planes = _rays(pairs), _planes(pairs)
+    n_all, ray_all = planes @ U_c, rays @ U_c  # (n_firsts, n_pairs, 3)
+    P_all = np.einsum("fxi,fx->fi", U_c, firsts.P)
+    w_all = direction @ U_b  # (n_firsts, n_targets, 3)
+    d_all = (middle[None] - middle[firsts.target][:, None]) @ U_b
+    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
+    n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
+    across = n[:, 0]
+    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < CROSSING, np.inf, across)
+    good = np.flatnonzero(np.abs(place) <= firsts.slack[f])
+    f, k, m = f[good], k[good], m[good]
+    cosine, sine, place = cosine[good], sine[good], place[good]
+    # Where the second pair's middle is on the second leg, and how wide it should be there.
+    X = d[good] + P[good]
+    X[:, 0] += place
+    v, ray = _turned(w_all[f, m], cosine, sine), ray_all[f, k]
+    vX, vr, Xr = _dot(v, X), _dot(v, ray), _dot(X, ray)
+    along = -(_dot(X, X) * vr - vX * Xr) / _safe(vX * vr - Xr)
+    depth = _dot(U_c[f, 2], X + along[:, None] * v)
+    flat = np.linalg.norm(planes[k][:, :2], axis=1)
+    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
+    seen = seen_width(pairs)[k]
+    # The depth of the first leg is no better known.
+    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, pairs.pixel / seen)
+    off = np.abs(np.log(expected / seen)) / (WIDTH_REACH * sigma)
+    good_along = np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]
+    good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
+    merit = pairs.merit[k] + pairs.merit[firsts.pair[f]]
+    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MOST]]
+    f, place = f[good], place[good]
+    R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
+    where = firsts.P[f] + place[:, None] * firsts.u[f]
+    t = where - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
+    return Poses.rigid(R, t, n_legs)
+
+
+def _turns(
+    firsts: _Firsts, targets: Targets, n: Array, w: Array
+) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
+    """Return the turns about a first leg that lay a second one into the plane of a second pair.
+
+    Indices of the first, the second pair and the second piece, and cosine and sine of the turn,
+    from the normals n (n_firsts, n_pairs, 3) of the planes and the directions w (n_firsts,
+    n_targets, 3) of the pieces.
+    """
+    n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
+    c0 = n[..., 0] * w[..., 0]
+    c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
+    c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
+    good = c0**2 <= TURNED**2 * (c1**2 + c2**2)
+    good &= (np.arange(n.shape[1]) != firsts.pair[:, None])[:, :, None]
+    good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
+    f, k, m = np.nonzero(good)
+    c0, c1, c2 = (c[good].astype(np.float64) for c in (c0, c1, c2))
+    step = np.arccos(np.clip(-c0 / np.maximum(np.hypot(c1, c2), 1e-12), -1.0, 1.0))
+    base = np.arctan2(c2, c1)
+    turn = np.concatenate([base + step, base - step])
+    f, k, m = (np.concatenate([x, x]) for x in (f, k, m))
+    return f, k, m, np.cos(turn), np.sin(turn)
+
+
+def _firsts(pairs: EdgePairs, targets: Targets) -> _Firsts:
+    """Take the best pairs for every piece, with all leans that their edges allow."""
+    n = min(N_FIRST, len(pairs))
+    first = pairs.take(np.arange(n))
+    rays, planes = _rays(first), _planes(first)
+    along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
+    ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    side = np.cross(ray, planes)  # in the plane of the axis, across the ray
+    side *= np.sign(_dot(side, along))[:, None]
+    width = seen_width(first)
+    cone = np.log(first.width[:, 1] / first.width[:, 0])[:, None, None]
+    sigma = (CONE + 1.5 * pairs.pixel / width)[:, None, None]
+    length = np.linalg.norm(targets.ends[:, 1] - targets.ends[:, 0], axis=1)
+    flat = np.linalg.norm(planes[:, :2], axis=1)
+    z = 2.0 * targets.radius / (width * flat)[:, None]  # (n, n_targets)
+    v = np.cos(LEANS)[:, None] * side[:, None] + np.sin(LEANS)[:, None] * ray[:, None]
+    # The ends of the pair on an axis along v, and how their widths differ.
+    steep = np.maximum(np.abs(np.einsum("nlx,nx->nl", v, along)), 0.2)
+    reach = (first.half_length[:, None] / steep)[:, None, :] * z[..., None]  # (n, n_targets, leans)
+    z0, z1 = z[..., None] - reach * v[:, None, :, 2], z[..., None] + reach * v[:, None, :, 2]
+    longest = LONGER[0] * length + LONGER[1] * targets.radius
+    good = (np.minimum(z0, z1) > 0.0) & (2.0 * reach <= longest[:, None])
+    ratio = np.log(np.where(good, z0, 1.0) / np.where(good, z1, 1.0))
+    good &= np.abs(ratio - cone) <= 3.0 * sigma
+    i, j, lean = np.nonzero(good)
+    slack = np.maximum(0.5 * length[j] - reach[good], 0.0) + SLACK * length[j]
+    u, P = v[i, lean], z[i, j][:, None] * rays[i]
+    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, slack, i, j)))
+
+
+def _rays(pairs: EdgePairs) -> Array:
+    """Return the points (x, y, 1) of the middles, (n, 3)."""
+    return np.concatenate([pairs.middle, np.ones((len(pairs), 1))], axis=1)
+
+
+def _planes(pairs: EdgePairs) -> Array:
+    """Return the unit normals (n, 3) of the planes of the axes and the camera centre."""
+    along = np.concatenate([pairs.along, np.zeros((len(pairs), 1))], axis=1)
+    planes = np.cross(along, _rays(pairs))
+    return np.asarray(planes / np.linalg.norm(planes, axis=1, keepdims=True))
+
+
+def _triads(u: Array) -> Array:
+    """Return right-handed orthonormal matrices (n, 3, 3) whose first columns are u."""
+    other = np.eye(3)[np.argmin(np.abs(u), axis=1)]
+    v = np.cross(u, other)
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    return np.stack([u, v, np.cross(u, v)], axis=2)
+
+
+def _about_x(cosine: Array, sine: Array) -> Array:
+    """Return rotations (n, 3, 3) about the x axis."""
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    rows = [one, zero, zero, zero, cosine, -sine, zero, sine, cosine]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def _turned(x: Array, cosine: Array, sine: Array) -> Array:
+    """Return vectors (n, 3) turned about the x axis."""
+    y, z = x[:, 1], x[:, 2]
+    return np.stack([x[:, 0], cosine * y - sine * z, sine * y + cosine * z], axis=-1)
+
+
+def _dot(x: Array, y: Array) -> Array:
+    return np.asarray(np.einsum("ni,ni->n", x, y))
+
+
+def _safe(x: Array) -> Array:
+    return np.where(np.abs(x) < 1e-12, 1e-12, x)

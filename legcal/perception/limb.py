@@ -1,42 +1,38 @@
-"""What a profile across an outline may look like, as sums of blurred powers of the depth.
+"""The limb model: what a profile across the outline of a cylinder may look like.
 
 A background, flat or sloped, ends where the surface begins. What a surface of a cylinder sends to
 the camera depends on the direction of its normal: by r, the cosine between normal and line of
 sight, which is sqrt(rho (2 - rho)) at the depth rho = D / R inside the outline of a cylinder of
 half-width R. Diffuse light gives sums of 1, r and r^2, darkening towards the limb higher powers,
-and a highlight near the limb is a bump in r. So there are amplitudes of
+and a highlight near the limb is a bump in r. All is blurred by a Gaussian.
+
+Single blocks are fitted with five functions in single precision (:func:`basis`). All blocks of an
+outline are fitted together with seven, expanded in powers of rho up to rho^2, which is good to a
+part in a hundred up to rho = 0.8 (:func:`profile_functions` of :func:`powers`):
 
     background      outside the outline
     its slope       outside, by the depth that is looked at
     surface         inside, as it is seen edge-on
     r, ..., r^4     inside
-
-expanded in powers of rho up to rho^2, which is good to a part in a hundred up to rho = 0.8.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
 from legcal.geometry import Array, IntArray
-
-Samples = NDArray[np.float32]
+from legcal.perception.light import Samples
 
 N_BASIS = 5
 _BEFORE, _AFTER, _PER_UNIT = 6.0, 40.0, 1024  # range of the table, and entries per unit
 
 
-def _gauss(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _gauss(x: Array) -> Array:
     return np.asarray(np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi))
 
 
 def _tabulate() -> Samples:
-    """Tabulate blurred functions of x, (4, n).
-
-    The step and its derivative, and sqrt(max(x, 0)) and its derivative, all blurred by a Gaussian
-    of unit width, for x in [-_BEFORE, _AFTER].
-    """
+    """Tabulate step, Gaussian, blurred sqrt(max(x, 0)) and its derivative at x, (4, n)."""
     coarse = np.arange(-_BEFORE, _AFTER + 1e-9, 1.0 / 32.0)
     root = np.linspace(0.0, 7.0, 2801)  # substitute x = root^2: the integrands are smooth
     kernel = 2.0 * (root[1] - root[0]) * root**2 * _gauss(coarse[:, None] - root**2)
@@ -49,33 +45,17 @@ def _tabulate() -> Samples:
 _TABLE = _tabulate()
 
 
-def _look_up(x: Samples) -> list[Samples]:
-    """Return the four functions at x (n, m), from the nearest entries of the table."""
-    place = np.clip((x + _BEFORE) * _PER_UNIT + 0.5, 0.0, _TABLE.shape[1] - 1.0)
-    index = place.astype(np.intp)  # the type that needs no conversion: take is slower with others
-    return [function.take(index, mode="clip") for function in _TABLE]
-
-
 def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Samples, Samples]:
-    """Return the basis functions and their derivatives with respect to d.
+    """Return five functions (n, 5, m) of the distances d (n, m) inside an outline, and slopes by d.
 
-    Parameters
-    ----------
-    d : (n, m) array of float32
-        Distances inside the outline [px], negative outside.
-    half_width : (n, 1) array of float32
-        Half-width of the cylinder in the image [px].
-    blur : float or (n, 1) array of float32
-        Standard deviation of the blur [px].
-
-    Returns
-    -------
-    values, slopes : (n, 5, m) array of float32
-        In the order of the list above; the limb is one at the depth ``half_width``.
+    Constant, slope of the background, step, limb (one at the depth ``half_width``), depth.
+    Half-widths and blurs (n, 1) in px.
     """
     blur = np.asarray(blur, dtype=np.float32)
     z = d / blur
-    step, peak, root, root_slope = _look_up(z)
+    place = np.clip((z + _BEFORE) * _PER_UNIT + 0.5, 0.0, _TABLE.shape[1] - 1.0)
+    index = place.astype(np.intp)  # the type that needs no conversion: take is slower with others
+    step, peak, root, root_slope = (function.take(index, mode="clip") for function in _TABLE)
     depth = blur * (z * step + peak)  # the blurred ramp max(d, 0)
     rho = depth / half_width
     bend = np.sqrt(2.0 - np.clip(rho, 0.0, 1.0))
@@ -97,21 +77,17 @@ def basis(d: Samples, half_width: Samples, blur: Samples | float) -> tuple[Sampl
 ONE, Z, GAUSS, Z_GAUSS, STEP, LESS_HALF, Z_LESS_HALF, HALF, RAMP, THREE_HALVES, SQUARE = range(11)
 N_POWERS = 11
 
-_BEFORE_powers, _AFTER_powers, _PER_UNIT_powers = (
-    24.0,
-    24.0,
-    256,
-)  # range of the table, and entries per unit
+_REACH, _PER_BLUR = 24.0, 256  # range of the table on both sides, and entries per unit
 
 
 def _tabulate_powers() -> Array:
-    """Tabulate the functions for z in [-_BEFORE, _AFTER], (n, N_POWERS + 1)."""
-    coarse = np.arange(-_BEFORE_powers, _AFTER_powers + 1e-9, 1.0 / 32.0)
+    """Tabulate the functions and a column of zeros over the range, (n, N_POWERS + 1)."""
+    coarse = np.arange(-_REACH, _REACH + 1e-9, 1.0 / 32.0)
     root = np.linspace(0.0, 7.0, 1401)  # substitute x = root^2: the integrands are smooth
     kernel = np.exp(-0.5 * (root**2 - coarse[:, None]) ** 2) / np.sqrt(2.0 * np.pi)
     kernel *= 2.0 * (root[1] - root[0])
     kernel[:, 0] *= 0.5
-    z = np.arange(-_BEFORE_powers, _AFTER_powers + 1e-9, 1.0 / _PER_UNIT_powers)
+    z = np.arange(-_REACH, _REACH + 1e-9, 1.0 / _PER_BLUR)
     less_half = CubicSpline(coarse, kernel.sum(axis=1))(z)
     half = CubicSpline(coarse, kernel @ root**2)(z)
     gauss, step = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi), ndtr(z)
@@ -124,23 +100,23 @@ def _tabulate_powers() -> Array:
     return np.stack([*columns, np.zeros_like(z)], axis=1)
 
 
-_TABLE_WITH_ROOM = _tabulate_powers()
-_TABLE_powers = np.ascontiguousarray(_TABLE_WITH_ROOM[:, :N_POWERS])
+_POWERS_WITH_ROOM = _tabulate_powers()
+_POWERS = np.ascontiguousarray(_POWERS_WITH_ROOM[:, :N_POWERS])
 
 
 def powers(z: Array) -> Array:
     """Return the functions at distances z (...) in units of the blur, (..., N_POWERS)."""
-    return np.asarray(_TABLE_powers.take(_places(z), axis=0))
+    return np.asarray(_POWERS.take(_entries(z), axis=0))
 
 
 def powers_with_room(z: Array) -> Array:
     """Return the functions, and a column of zeros beside them, (..., N_POWERS + 1)."""
-    return np.asarray(_TABLE_WITH_ROOM.take(_places(z), axis=0))
+    return np.asarray(_POWERS_WITH_ROOM.take(_entries(z), axis=0))
 
 
-def _places(z: Array) -> IntArray:
+def _entries(z: Array) -> IntArray:
     """Return the nearest entries of the tables."""
-    place = np.clip((z + _BEFORE_powers) * _PER_UNIT_powers + 0.5, 0.0, len(_TABLE_powers) - 1.0)
+    place = np.clip((z + _REACH) * _PER_BLUR + 0.5, 0.0, len(_POWERS) - 1.0)
     return place.astype(np.intp)
 
 
@@ -161,20 +137,11 @@ _OF_DEPTH = np.array(
 
 
 def profile_functions(half_width: Array, blur: Array, depth: float) -> tuple[Array, Array, Array]:
-    """Return what profiles are made of, as coefficients of :func:`legcal.perception.limb.powers`.
+    """Return what profiles are made of, as coefficients (n, N_AMPLITUDES, N_POWERS) of powers.
 
-    Parameters
-    ----------
-    half_width, blur : (n,) array
-        Half-widths of cylinders in the image, and the standard deviations of the blur [px].
-    depth : float
-        Distance from an outline that is looked at [px], the unit of the background's slope.
-
-    Returns
-    -------
-    values, slopes, widenings : (n, N_AMPLITUDES, N_POWERS) array
-        Of the functions above, of their derivatives with respect to the distance inside the
-        outline [1/px], and with respect to the logarithm of the blur.
+    The functions above, their derivatives by the distance inside the outline [1/px], and by the
+    logarithm of the blur. Half-widths and blurs (n,) in px; ``depth`` is the distance from an
+    outline that is looked at [px], the unit of the background's slope.
     """
     n = len(blur)
     values, slopes, widenings = (np.zeros((n, N_AMPLITUDES, N_POWERS)) for _ in range(3))

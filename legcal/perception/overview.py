@@ -1,4 +1,4 @@
-"""What ``legcal detect`` prints: the figures of every view, and what was rejected why."""
+"""The result of ``legcal detect``: figures of every view, and the folder that people look at."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import cv2
@@ -20,10 +20,12 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
+from scipy.spatial.transform import RigidTransform
 
 from legcal.data import (
     OBSERVATIONS_NAME,
     QUALITY,
+    Dataset,
     ImageReader,
     Outlines,
     is_edited,
@@ -32,116 +34,22 @@ from legcal.data import (
 )
 from legcal.errors import OutOfResources, UsageError
 from legcal.files import OutputKind, check_destination, path_problem, result_folder
-from legcal.geometry import BoolArray
-from legcal.perception.drawing import Detection, PartMarks, draw, marks_of_image, short_reason
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import Cylinder
 from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.perception.overlays import PartMarks, draw, marks_of_image, short_reason
 from legcal.progress import Report
+from legcal.vision import PredictedLeg, predict_legs
 from legcal.workers import Run
 
 HIDDEN_LEG = "hidden by another leg"
-
-
-@dataclass(frozen=True)
-class ViewFigures:
-    """What was found in the images of a view.
-
-    Attributes
-    ----------
-    images : int
-    visible : int
-        Legs, counted in each image, that should be seen: neither outside nor hidden.
-    found : int
-        Those of which an outline is used.
-    outlines, used, edited : int
-        Rows of the table; those with a line or a reason, whether used or not.
-    medians : mapping
-        Of contrast [grey levels], length and residual [px] of the used outlines; None where
-        nothing is known of any.
-    rejected : mapping of str to int
-        How many outlines are not used, by the reason without its figures, the most first.
-    problem : str
-        Why its camera could not be placed, "" if it was.
-    """
-
-    images: int
-    visible: int
-    found: int
-    outlines: int
-    used: int
-    edited: int
-    medians: Mapping[str, float | None]
-    rejected: Mapping[str, int]
-    problem: str
-
-    def document(self) -> dict[str, Any]:
-        """Return the figures as JSON has them."""
-        return {
-            "images": self.images,
-            "legs_visible": self.visible,
-            "legs_found": self.found,
-            "outlines": self.outlines,
-            "used": self.used,
-            "edited": self.edited,
-            **self.medians,
-            "rejected": dict(self.rejected),
-            "problem": self.problem or None,
-        }
-
-
-def reason_class(reason: str) -> str:
-    """Return what kind of reason it is, as it is counted."""
-    return HIDDEN_LEG if reason.startswith(HIDDEN) else short_reason(reason) or "no reason given"
-
-
-def view_figures(detection: Detection) -> dict[str, ViewFigures]:
-    """Return the figures of every view that has images or outlines."""
-    measurements, outlines = detection.dataset.measurements, detection.outlines
-    found = {}
-    for v in np.unique(measurements.view).tolist():
-        name = measurements.views[v].name
-        images = int(np.count_nonzero(measurements.view[detection.rows] == v))
-        here = outlines.choose(measurements.view[outlines.row] == v)
-        found[name] = _figures(here, images, detection.unplaced.get(name, ""))
-    return found
-
-
-def _figures(outlines: Outlines, images: int, problem: str) -> ViewFigures:
-    """Return the figures of the outlines of a view."""
-    expected = np.array([_is_expected(reason) for reason in outlines.reason], dtype=np.bool_)
-    reasons = Counter(
-        reason_class(reason)
-        for reason, used in zip(outlines.reason, outlines.used, strict=True)
-        if not used
-    )
-    return ViewFigures(
-        images=images,
-        visible=_count_legs(outlines, expected | outlines.used),
-        found=_count_legs(outlines, outlines.used),
-        outlines=len(outlines),
-        used=int(np.count_nonzero(outlines.used)),
-        edited=int(np.count_nonzero(is_edited(outlines))),
-        medians={name: _median(outlines, name) for name in QUALITY},
-        rejected=dict(reasons.most_common()),
-        problem=problem,
-    )
-
-
-def _is_expected(reason: str) -> bool:
-    return reason != OUTSIDE and not reason.startswith(HIDDEN)
-
-
-def _count_legs(outlines: Outlines, chosen: BoolArray) -> int:
-    """Return in how many images legs have one of the chosen outlines, summed over the legs."""
-    places = zip(outlines.row[chosen].tolist(), outlines.leg[chosen].tolist(), strict=True)
-    return len(set(places))
-
-
-def _median(outlines: Outlines, name: str) -> float | None:
-    values = getattr(outlines, name)[outlines.used]
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if len(values) else None
-
-
+DETECTION = OutputKind("detection", "detection.json", "legcal_detection")
+PAGE = "index.html"
+PICTURES = "overlays"
+QUALITY_JPEG = 88
+_SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
+_LONGEST = 80  # letters of a name
+_TABLE_COLUMNS = ("images", "legs found", "outlines used", "contrast", "length", "residual")
 _HEAD = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
 body {{ font: 15px/1.45 system-ui, sans-serif; margin: 1.5em; color: #222; }}
@@ -161,20 +69,117 @@ _HOW = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """The result of :func:`legcal.detect`, in the order of the files.
+
+    Attributes
+    ----------
+    dataset : Dataset
+        What was searched.
+    outlines : Outlines
+        All outlines: detected, given and edited.
+    A_base, B_base : (n_rows, n_legs, 3) array
+        Joint centres at every row, where each view sees them, in the base link [m].
+    cylinders : sequence, for each leg a sequence of Cylinder
+        What can be seen of the legs, with the radii that outlines were searched by.
+    T_base_camera : tuple of RigidTransform or None
+        The camera of every view; None where nothing is known of it.
+    rows : (n,) array of int
+        The rows that have an image.
+    unplaced : dict
+        Why the cameras of some views could not be placed, by name of the view; they are left where
+        they were expected, and no outline of theirs is here but those that were given.
+    notes : tuple of str
+        What else a reader should know.
+    """
+
+    dataset: Dataset
+    outlines: Outlines
+    A_base: Array
+    B_base: Array
+    cylinders: Sequence[Sequence[Cylinder]]
+    T_base_camera: tuple[RigidTransform | None, ...]
+    rows: IntArray
+    unplaced: dict[str, str]
+    notes: tuple[str, ...]
+
+    def view_of(self, row: int) -> str:
+        """Return the name of the view of a row."""
+        measurements = self.dataset.measurements
+        return measurements.views[int(measurements.view[row])].name
+
+    def predicted(self, row: int) -> list[PredictedLeg]:
+        """Return where the legs of a row should be seen; none where the camera is not known."""
+        measurements, legs = self.dataset.measurements, self.dataset.mechanism.legs
+        view = int(measurements.view[row])
+        T = self.T_base_camera[view]
+        if T is None:
+            return []
+        used = measurements.views[view].legs
+        found = predict_legs(
+            measurements.views[view].camera,
+            T,
+            self.A_base[row],
+            self.B_base[row],
+            self.cylinders,
+            row,
+        )
+        return [leg for leg in found if used is None or legs[leg.leg].name in used]
+
+
+def reason_class(reason: str) -> str:
+    """Return what kind of reason it is, as it is counted."""
+    return HIDDEN_LEG if reason.startswith(HIDDEN) else short_reason(reason) or "no reason given"
+
+
+def view_figures(detection: Detection) -> dict[str, dict[str, Any]]:
+    """Return the figures of every view that has images or outlines, as JSON has them.
+
+    Legs are counted in each image that should show them: neither outside nor hidden. They are found
+    where one of their outlines is used.
+    """
+    measurements = detection.dataset.measurements
+    found = {}
+    for v in np.unique(measurements.view).tolist():
+        name = measurements.views[v].name
+        here = measurements.view[detection.outlines.row] == v
+        outlines = detection.outlines.choose(here)
+        used, reasons = outlines.used, outlines.reason
+        hidden = [why == OUTSIDE or why.startswith(HIDDEN) for why in reasons]
+        rejected = Counter(
+            reason_class(why) for why, ok in zip(reasons, used, strict=True) if not ok
+        )
+        found[name] = {
+            "images": int(np.count_nonzero(measurements.view[detection.rows] == v)),
+            "legs_visible": _count_legs(outlines, ~np.array(hidden, dtype=np.bool_) | used),
+            "legs_found": _count_legs(outlines, used),
+            "outlines": len(outlines),
+            "used": int(np.count_nonzero(used)),
+            "edited": int(np.count_nonzero(is_edited(outlines))),
+            **{name: _median(outlines, name) for name in QUALITY},
+            "rejected": dict(rejected.most_common()),
+            "problem": detection.unplaced.get(name) or None,
+        }
+    return found
+
+
+def _count_legs(outlines: Outlines, chosen: BoolArray) -> int:
+    """Return in how many images legs have one of the chosen outlines, summed over the legs."""
+    places = zip(outlines.row[chosen].tolist(), outlines.leg[chosen].tolist(), strict=True)
+    return len(set(places))
+
+
+def _median(outlines: Outlines, name: str) -> float | None:
+    values = getattr(outlines, name)[outlines.used]
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else None
+
+
 def overlay_page(
     detection: Detection, document: Mapping[str, Any], pictures: Mapping[int, str]
 ) -> str:
-    """Return the text of ``index.html``.
-
-    Parameters
-    ----------
-    detection : Detection
-        What was found.
-    document : mapping
-        Its document.
-    pictures : mapping of int to str
-        The picture of each row, relative to the page.
-    """
+    """Return the text of ``index.html``; pictures of rows are relative to the page."""
     title = f"Outlines of {detection.dataset.mechanism.name}"
     parts = [_HEAD.format(title=escape(title)), f"<h1>{escape(title)}</h1>\n"]
     parts.append(
@@ -244,28 +249,11 @@ def _said(detection: Detection, row: int) -> str:
     return said + (f" <span class=bad>({escape(told)})</span>" if told else "")
 
 
-DETECTION = OutputKind("detection", "detection.json", "legcal_detection")
-PAGE = "index.html"
-PICTURES = "overlays"
-QUALITY_JPEG = 88
-_SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
-_LONGEST = 80  # letters of a name
-
-
 def check_detection_destination(destination: Path, dataset: Path | None) -> None:
     """Refuse an output folder that holds something else, or a table that was corrected.
 
-    Parameters
-    ----------
-    destination : Path
-        The output folder.
-    dataset : Path or None
-        The dataset folder, where it is known: a corrected table that was copied there is safe.
-
-    Raises
-    ------
-    UsageError
-        With what is there instead.
+    A corrected table is safe where it was copied into the dataset folder. Raises UsageError with
+    what is there instead.
     """
     check_destination(destination, DETECTION)
     table = destination / OBSERVATIONS_NAME
@@ -290,23 +278,8 @@ def write_detection(
 ) -> dict[str, Any]:
     """Write the folder, all of it or nothing, and return its document.
 
-    Parameters
-    ----------
-    detection : Detection
-        What was found.
-    destination : Path
-        The output folder.
-    run : callable
-        How pictures are drawn: in turn or by several processes.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Raises
-    ------
-    UsageError
-        As :func:`check_detection_destination`.
-    OutOfResources
-        If the files cannot be written.
+    Raises UsageError as :func:`check_detection_destination` does, and OutOfResources if the files
+    cannot be written.
     """
     dataset = detection.dataset
     check_detection_destination(destination, dataset.folder)
@@ -333,13 +306,12 @@ def write_detection(
 
 def detection_document(detection: Detection, pictures: Mapping[int, str]) -> dict[str, Any]:
     """Return what ``--json`` prints; *pictures* are the files of rows, relative to the folder."""
-    figures = view_figures(detection)
     outlines = detection.outlines
     names = row_names(detection.dataset.measurements)
     return {
         "legcal_detection": 1,
         "mechanism": detection.dataset.mechanism.name,
-        "views": {name: view.document() for name, view in figures.items()},
+        "views": view_figures(detection),
         "images": len(detection.rows),
         "outlines": len(outlines),
         "used": int(np.count_nonzero(outlines.used)),
@@ -382,8 +354,7 @@ def _unique(names: Sequence[str]) -> list[str]:
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Gallery:
+class _Drawn(NamedTuple):
     """What is drawn of every row, and where; it travels to worker processes."""
 
     load: ImageReader
@@ -399,27 +370,27 @@ def _draw_all(
     rows = list(pictures)
     for file in pictures.values():
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    gallery = _Gallery(
+    drawn = _Drawn(
         detection.dataset.image_reader(rows),
         tuple(tuple(_marks(detection, row)) for row in rows),
         tuple(_caption(detection, row) for row in rows),
         tuple(folder / file for file in pictures.values()),
     )
     progress("Drawing overlays", 0, len(rows))
-    for done, _ in enumerate(run(partial(_write_picture, gallery), range(len(rows))), start=1):
+    for done, _ in enumerate(run(partial(_write_picture, drawn), range(len(rows))), start=1):
         progress("Drawing overlays", done, len(rows))
 
 
-def _write_picture(gallery: _Gallery, k: int) -> None:
+def _write_picture(drawn: _Drawn, k: int) -> None:
     """Draw picture k and write it."""
-    picture = draw(gallery.load(k), gallery.marks[k], gallery.captions[k])
+    picture = draw(drawn.load(k), drawn.marks[k], drawn.captions[k])
     ok, content = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY_JPEG])
     if not ok:
         raise OutOfResources(
-            f"{gallery.files[k].name}: the picture could not be written: found that it cannot be "
+            f"{drawn.files[k].name}: the picture could not be written: found that it cannot be "
             "encoded, needed enough memory; try again with fewer workers."
         )
-    gallery.files[k].write_bytes(content.tobytes())
+    drawn.files[k].write_bytes(content.tobytes())
 
 
 def _marks(detection: Detection, row: int) -> list[PartMarks]:
@@ -475,23 +446,12 @@ def _is_place(name: Path) -> bool:
     return name in own or (name.parts[0] == PICTURES and name.suffix == ".jpg")
 
 
-_COLUMNS_table = ("images", "legs found", "outlines used", "contrast", "length", "residual")
-
-
 def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
-    """Return the figures of a detection as people read them.
-
-    Parameters
-    ----------
-    document : dict
-        Of :func:`legcal.perception.overview.detection_document`.
-    output : Path
-        Where it was written.
-    """
+    """Return the figures of a detection, by its document, as people read them."""
     views = document["views"]
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("view", overflow="fold")
-    for column in _COLUMNS_table:
+    for column in _TABLE_COLUMNS:
         table.add_column(column, justify="right")
     for name, view in views.items():
         table.add_row(

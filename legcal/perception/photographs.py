@@ -1,8 +1,9 @@
-"""The images of a dataset as one table of outlines: detected, cached, given or edited.
+"""The photographs of a dataset turned into outlines: detected, kept, given or edited.
 
-First the legs are recognised and the camera of every view is placed by its images, then outlines
-are measured near where that has them; once a fit has told where everything is, images that left
-doubts are searched again close to it.
+:func:`observe` reads as the method: images are looked at, legs are recognised and the cameras
+placed, outlines are measured near there, parts that were not found are tried with other radii,
+views are fitted to their outlines and missing legs looked for, and what is wrong with an image is
+said. Once a joint fit has told where everything is, :func:`measure_photographs` measures near it.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -23,21 +24,37 @@ from legcal.data import (
     merge_edited,
     no_outlines,
 )
-from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder, Mechanism
-from legcal.perception.bars import Bars
-from legcal.perception.detection import JOINT_ERROR, PIXEL_ERROR, Load, Method, detect_outlines
-from legcal.perception.outline import outline_parts
+from legcal.perception.detection import measure_outlines
+from legcal.perception.diagnostics import (
+    Exposure,
+    diagnose,
+    expose,
+    image_defects,
+    is_visible,
+    reject_images,
+)
+from legcal.perception.light import to_grey
+from legcal.perception.lines import EdgePairs
+from legcal.perception.look_again import look_again
+from legcal.perception.outline import WRONG_WIDTH, Method
+from legcal.perception.placement import (
+    NEAR_FIT_PX,
+    Joined,
+    Load,
+    Placement,
+    Search,
+    group_views,
+)
 from legcal.perception.radii import Part, radius_notes
-from legcal.perception.recognise import Recognised, recognise, shifted
-from legcal.perception.search import LookedAt, Search
+from legcal.perception.recognise import recognise
 from legcal.progress import Report
+from legcal.vision import camera_numbers
 from legcal.workers import Run
 
-Joined = Sequence[RigidTransform | None] | None
-NEAR_FIT_PX = 3.0  # how far outlines may be from a fit of everything
 DETECTOR_VERSION = 1  # raise it whenever outlines or notes that are kept come out differently
+HARDLY = 0.3  # of the outlines of a part that should be seen
 
 
 def detection_settings() -> dict[str, object]:
@@ -46,80 +63,15 @@ def detection_settings() -> dict[str, object]:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """Where everything is believed to be, in the base link.
-
-    Attributes
-    ----------
-    A_base, B_base : (n_rows, n_legs, 3) array
-        Joint centres at every row [m].
-    T_base_camera : tuple of RigidTransform or None
-        The camera of every view; None where nothing is known.
-    joint_error : float or (n_views, n_legs) array
-        How far joint centres may be off in the images of a view [m].
-    """
-
-    A_base: Array
-    B_base: Array
-    T_base_camera: tuple[RigidTransform | None, ...]
-    joint_error: float | Array = JOINT_ERROR
-
-
-def scene_at_poses(
-    mechanism: Mechanism, measurements: Measurements, T_base_platform: Sequence[RigidTransform]
-) -> Scene:
-    """Return where a model has the legs of every row, with the rough cameras of the views.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The model.
-    measurements : Measurements
-        All rows.
-    T_base_platform : sequence of RigidTransform, length n_poses
-        The platform at every pose.
-    """
-    B_base = np.array([T.apply(mechanism.B_platform) for T in T_base_platform])
-    A_base = np.broadcast_to(mechanism.A_base, B_base.shape)
-    hints = tuple(view.T_base_camera for view in measurements.views)
-    return Scene(A_base[measurements.pose], B_base[measurements.pose], hints)
-
-
-@dataclass(frozen=True, eq=False)
 class Photographs:
-    """What is needed to search images.
+    """The images of a dataset, and which of them are searched."""
 
-    Attributes
-    ----------
-    mechanism : Mechanism
-        Its legs, in the order of the measurements' columns.
-    measurements : Measurements
-        All rows.
-    load : callable
-        Returns the image of a row; it can travel to another process.
-    run : callable
-        How images are searched: in turn or by several processes.
-    detect : (n,) array of int
-        The rows to search.
-    keep : Outlines
-        Outlines to use as they are; edited ones win over detected ones.
-    """
-
-    mechanism: Mechanism
-    measurements: Measurements
-    load: Load
-    run: Run
-    detect: IntArray
-    keep: Outlines
-
-    @property
-    def searched(self) -> Measurements:
-        """The measurements, with an image only in the rows to search."""
-        wanted = set(self.detect.tolist())
-        images = tuple(
-            image if row in wanted else "" for row, image in enumerate(self.measurements.image)
-        )
-        return replace(self.measurements, image=images)
+    mechanism: Mechanism  # its legs in the order of the measurements' columns
+    measurements: Measurements  # all rows
+    load: Load  # returns the image of a row; it can travel to another process
+    run: Run  # how images are searched: in turn or by several processes
+    detect: IntArray  # (n,) the rows to search
+    keep: Outlines  # outlines to use as they are; edited ones win over detected ones
 
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
@@ -136,6 +88,24 @@ class Photographs:
             ],
             dtype=np.bool_,
         )
+
+    def search(self, nominal: Placement, pairs: Mapping[int, EdgePairs] | None = None) -> Search:
+        """Return what is searched for by a model, in images some of whose edge pairs are known."""
+        return Search(
+            self.load,
+            self.measurements,
+            nominal.A_base,
+            nominal.B_base,
+            self.cylinders,
+            self.wanted,
+            self.mechanism.leg_names,
+            {} if pairs is None else pairs,
+        )
+
+    def with_found(self, found: Outlines) -> Outlines:
+        """Return found outlines and kept ones in one table; edited ones win."""
+        others = self.keep.choose(~is_edited(self.keep))
+        return join_outlines([merge_edited(found, self.keep), others])
 
     def narrowed(self, rows: IntArray, outlines: Outlines) -> Photographs:
         """Return the search of some rows again; edited and other rows' outlines are kept."""
@@ -154,171 +124,222 @@ class Photographs:
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
-    """What the images say of where everything is.
+class Observed:
+    """What the images show."""
 
-    Attributes
-    ----------
-    scene : Scene
-        With the camera of every searched view where its images put it, and joint centres where
-        the view sees them.
-    unplaced : dict of str
-        Why views could not be placed, by name.
-    notes : tuple of str
-        What else a reader should know.
-    search : Search
-        The images and the model, with the radii that the images show.
-    recognised : Recognised
-        What was made of them.
+    photographs: Photographs  # the images, and the mechanism with the radii that they show
+    placement: Placement  # with views that could not be placed, and notes on views and images
+    outlines: Outlines  # of all images; those of images that are left out are rejected
+    left_out: dict[int, str]  # why images were left out, by row
+    blur: tuple[float, ...]  # usual one of each view [px]; NaN where none was measured
+
+
+def given_outlines(photographs: Photographs) -> Outlines:
+    """Return the outlines that are used as they are; edited ones win."""
+    return photographs.with_found(no_outlines())
+
+
+def nominal_placement(
+    mechanism: Mechanism, measurements: Measurements, T_base_platform: Sequence[RigidTransform]
+) -> Placement:
+    """Return where a model has the legs at poses (n_poses,), with the rough cameras of views."""
+    B_base = np.array([T.apply(mechanism.B_platform) for T in T_base_platform])
+    A_base = np.broadcast_to(mechanism.A_base, B_base.shape)
+    hints = tuple(view.T_base_camera for view in measurements.views)
+    return Placement(A_base[measurements.pose], B_base[measurements.pose], hints)
+
+
+def observe(
+    photographs: Photographs,
+    nominal: Placement,
+    report: Report,
+    joined: Joined = None,
+    *,
+    together: bool = True,
+) -> Observed:
+    """Place the cameras, measure the outlines, and leave out the images that are wrong.
+
+    ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
+    ``together`` is as for :func:`legcal.perception.outline.measure`.
     """
+    exposures, pairs = _looked_at(photographs, nominal, report, joined)
+    defects = _defects(photographs.measurements, exposures)
+    usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
+    search = photographs.search(nominal, pairs)
+    hints = nominal.T_base_camera
 
-    scene: Scene
-    unplaced: dict[str, str]
-    notes: tuple[str, ...]
-    search: Search
-    recognised: Recognised
+    def recognised(doubtful: Collection[Part] = ()) -> Placement:
+        return _recognised(photographs, search, usable, hints, report, joined, doubtful)
 
-    def require_one(self) -> None:
-        """Refuse images of which no view could be placed.
-
-        Raises
-        ------
-        NotVisible
-            One sentence for each view.
-        """
-        if self.unplaced and all(T is None for T in self.scene.T_base_camera):
-            raise NotVisible(list(dict.fromkeys(self.unplaced.values())))
-
-    @property
-    def all_notes(self) -> tuple[str, ...]:
-        """What a reader should know, with the views that could not be placed."""
-        return (*dict.fromkeys(self.unplaced.values()), *self.notes)
-
-
-def search_in(
-    photographs: Photographs, scene: Scene, known: Mapping[int, Bars] = MappingProxyType({})
-) -> Search:
-    """Return what is searched for in the images, some of whose bars are known."""
-    return LookedAt(
-        photographs.load,
-        photographs.measurements,
-        scene.A_base,
-        scene.B_base,
-        photographs.cylinders,
-        photographs.wanted,
-        dict(known),
+    placement = recognised()
+    outlines, blur = _measured(photographs, search, placement, report, together=together)
+    doubtful = _parts_not_found(photographs, outlines)
+    if doubtful:
+        other = recognised(doubtful)
+        if other.radii.factor:
+            mechanism = photographs.mechanism.with_cylinders(
+                other.radii.corrected(search.cylinders)
+            )
+            corrected = replace(photographs, mechanism=mechanism)
+            by_other = corrected.search(nominal, pairs)
+            again, also = _measured(corrected, by_other, other, report, together=together)
+            blur = np.where(np.isnan(also), blur, also)
+            if again.used.sum() > outlines.used.sum():
+                photographs, search, placement, outlines = corrected, by_other, other, again
+    groups = group_views(photographs.measurements, usable, hints, joined)
+    is_own = np.isin(outlines.row, usable)
+    own, others = outlines.choose(is_own), outlines.choose(~is_own)
+    placement, found, _ = look_again(
+        search,
+        groups,
+        placement,
+        own,
+        together=together,
+        run=photographs.run,
+        progress=_counted(report, "Looking for missing legs", len(usable)),
     )
+    outlines = join_outlines([merge_edited(found, own), others])
+    placement, reasons = diagnose(
+        search, placement, outlines, photographs.detect, defects, photographs.run
+    )
+    usual = _usual_blur(photographs.measurements, blur)
+    return Observed(photographs, placement, reject_images(outlines, reasons), reasons, usual)
 
 
 def place(
-    photographs: Photographs,
-    scene: Scene,
-    report: Report,
-    joined: Joined = None,
-    doubtful: Collection[Part] = (),
-    known: Mapping[int, Bars] = MappingProxyType({}),
+    photographs: Photographs, nominal: Placement, report: Report, joined: Joined = None
 ) -> Placement:
-    """Recognise the legs in the images, and place the cameras by them.
-
-    Parameters
-    ----------
-    photographs : Photographs
-        The images.
-    scene : Scene
-        The model, and rough camera poses where there are any.
-    report : callable
-        Called as ``report(stage, done, total)``.
-    joined : sequence of RigidTransform or None, for each view
-        T_board_camera of the views that show a calibration board: they are placed together.
-    doubtful : collection of (int, float)
-        Parts that may have other radii, as :func:`legcal.perception.recognise.recognise` has it.
-    known : mapping of Bars
-        The bars of images that were looked at before, by row.
-    """
-    search = search_in(photographs, scene, known)
-    found = recognise(
-        search,
-        photographs.detect,
-        scene.T_base_camera,
-        joined,
-        doubtful=doubtful,
-        run=photographs.run,
-        progress=counted(report, "Recognising legs", len(photographs.detect)),
-    )
-    A, B = shifted(found, photographs.measurements.view, scene.A_base, scene.B_base)
-    cameras, unplaced = placed_cameras(photographs, scene, found)
-    notes = tuple(radius_notes(found.radii, photographs.mechanism.leg_names))
-    search = replace(search, cylinders=found.radii.corrected(search.cylinders))
-    return Placement(Scene(A, B, cameras, found.joint_error), unplaced, notes, search, found)
+    """Recognise the legs in the images, and place the cameras by them."""
+    search, hints = photographs.search(nominal), nominal.T_base_camera
+    return _recognised(photographs, search, photographs.detect, hints, report, joined)
 
 
-def placed_cameras(
-    photographs: Photographs, scene: Scene, found: Recognised
-) -> tuple[tuple[RigidTransform | None, ...], dict[str, str]]:
-    """Return the cameras of all views, those of searched ones as found, and why some have none.
-
-    The reasons are by the names of the views.
-    """
-    measurements = photographs.measurements
-    searched = set(measurements.view[photographs.detect].tolist())
-    cameras = tuple(
-        T if v in searched else rough
-        for v, (T, rough) in enumerate(zip(found.T_base_camera, scene.T_base_camera, strict=True))
-    )
-    return cameras, {measurements.views[v].name: why for v, why in found.unplaced.items()}
-
-
-def detect(
+def measure_photographs(
     photographs: Photographs,
-    scene: Scene,
+    placement: Placement,
     report: Report,
     *,
-    near_fit: bool = False,
-    method: Method | Sequence[Method] = outline_parts,
+    together: bool = True,
+    method: Method | None = None,
     stage: str = "Measuring outlines",
-    blur_of_row: dict[int, float] | None = None,
 ) -> Outlines:
-    """Return all outlines: those searched for near the scene, and those kept.
+    """Return all outlines: those measured near a placement, and those kept.
 
-    ``method`` and ``blur_of_row`` are those of :func:`legcal.perception.detection.detect_outlines`.
+    ``together`` and ``method`` are as for :func:`legcal.perception.detection.measure_outlines`.
     """
-    stage = f"{stage} again" if near_fit else stage
-    found = detect_outlines(
-        photographs.load,
-        photographs.searched,
-        scene.A_base,
-        scene.B_base,
-        photographs.cylinders,
-        scene.T_base_camera,
-        photographs.wanted,
-        photographs.mechanism.leg_names,
-        run=photographs.run,
-        method=method,
-        progress=counted(report, stage, len(photographs.detect)),
-        joint_error=0.0 if near_fit else scene.joint_error,
-        pixel_error=NEAR_FIT_PX if near_fit else PIXEL_ERROR,
-        blur_of_row=blur_of_row,
+    search = photographs.search(placement)
+    return _measured(
+        photographs, search, placement, report, together=together, method=method, stage=stage
+    )[0]
+
+
+def _recognised(
+    photographs: Photographs,
+    search: Search,
+    rows: IntArray,
+    hints: Sequence[RigidTransform | None],
+    report: Report,
+    joined: Joined,
+    doubtful: Collection[Part] = (),
+) -> Placement:
+    """Return what is recognised in some images, with notes on radii."""
+    progress = _counted(report, "Recognising legs", len(rows))
+    found = recognise(
+        search, rows, hints, joined, doubtful=doubtful, run=photographs.run, progress=progress
     )
-    return given_outlines(photographs, found)
+    return replace(found, notes=tuple(radius_notes(found.radii, search.leg_names)))
 
 
-def usual_blur(photographs: Photographs, blur_of_row: Mapping[int, float]) -> tuple[float, ...]:
+def _measured(
+    photographs: Photographs,
+    search: Search,
+    placement: Placement,
+    report: Report,
+    *,
+    together: bool,
+    method: Method | None = None,
+    stage: str = "Measuring outlines",
+) -> tuple[Outlines, Array]:
+    """Return all outlines, measured and kept, and the blur of each row [px]."""
+    rows = [r for r in photographs.detect.tolist() if photographs.measurements.image[r]]
+    stage += " again" * bool(placement.blur)
+    found, blur = measure_outlines(
+        search,
+        placement,
+        rows,
+        together=together,
+        method=method,
+        run=photographs.run,
+        progress=_counted(report, stage, len(photographs.detect)),
+    )
+    return photographs.with_found(found), blur
+
+
+def _usual_blur(measurements: Measurements, blur: Array) -> tuple[float, ...]:
     """Return the blur of most images of each view [px]; NaN where none was measured."""
-    view = photographs.measurements.view
-    of_view: list[list[float]] = [[] for _ in photographs.measurements.views]
-    for row, blur in blur_of_row.items():
-        of_view[int(view[row])].append(blur)
-    return tuple(float(np.median(blurs)) if blurs else np.nan for blurs in of_view)
+    known = ~np.isnan(blur)
+    of_views = [blur[known & (measurements.view == v)] for v in range(len(measurements.views))]
+    return tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
 
 
-def given_outlines(photographs: Photographs, found: Outlines | None = None) -> Outlines:
-    """Return found outlines and kept ones in one table; edited ones win."""
-    kept = photographs.keep
-    detected = no_outlines() if found is None else found
-    return join_outlines([merge_edited(detected, kept), kept.choose(~is_edited(kept))])
+def _looked_at(
+    photographs: Photographs, nominal: Placement, report: Report, joined: Joined
+) -> tuple[dict[int, Exposure], dict[int, EdgePairs]]:
+    """Return how images were exposed, and edge pairs of those recognised first, by row."""
+    rows = photographs.detect.tolist()
+    hints = nominal.T_base_camera
+    groups = group_views(photographs.measurements, photographs.detect, hints, joined)
+    first = {r for g in groups for r in (g.rows if g.hint is None else g.some)}
+    exposures, pairs = dict[int, Exposure](), dict[int, EdgePairs]()
+    count = _counted(report, "Looking at images", len(rows))
+    look = partial(_look, photographs.search(nominal), first)
+    for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
+        exposures[row] = exposure
+        if own is not None:
+            pairs[row] = own
+        count(row)
+    return exposures, pairs
 
 
-def counted(report: Report, stage: str, total: int) -> Callable[[int], None]:
+def _look(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, EdgePairs | None]:
+    """Return how an image was exposed, and the edge pairs of those that are to be recognised."""
+    image = search.load(row)
+    view = int(search.measurements.view[row])
+    pairs = replace(search, load=lambda _: image).pairs(row, view) if row in rows else None
+    return expose(to_grey(image)), pairs
+
+
+def _defects(measurements: Measurements, exposures: Mapping[int, Exposure]) -> dict[int, str]:
+    """Return why images show nothing, by row."""
+    numbers = [camera_numbers(view.camera) for view in measurements.views]
+    camera = [numbers.index(own) for own in numbers]  # the first view of the same camera
+    view = {row: int(measurements.view[row]) for row in exposures}
+    return image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
+
+
+def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]:
+    """Return the parts of legs, by leg and radius, of which hardly an outline can be used.
+
+    One that is used although the width of its part is wrong speaks for no radius.
+    """
+    visible = is_visible(outlines)
+    which = list(zip(outlines.row.tolist(), outlines.leg.tolist(), outlines.part, strict=True))
+    of_wrong_width = {
+        one for one, why in zip(which, outlines.reason, strict=True) if why.startswith(WRONG_WIDTH)
+    }
+    used = outlines.used & np.array([one not in of_wrong_width for one in which], dtype=np.bool_)
+    part = np.array(outlines.part)
+    parts = []
+    for j, leg in enumerate(photographs.mechanism.legs):
+        for link, radius in leg.radius_of_part.items():
+            own = visible & (outlines.leg == j) & (part == link)
+            is_seen = own.any() or not visible.any()
+            if is_seen and used[own].sum() <= HARDLY * own.sum():
+                parts.append((j, radius))
+    return parts
+
+
+def _counted(report: Report, stage: str, total: int) -> Callable[[int], None]:
     """Return a callback that counts images, up to a total that may not be reached."""
     done = itertools.count(1)
     report(stage, 0, total)

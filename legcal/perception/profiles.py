@@ -6,12 +6,12 @@ read as they are, and the distance of every pixel centre from the outline is com
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.limb import Samples
-from legcal.perception.picture import Grey
+from legcal.perception.light import Grey, Samples
 from legcal.vision import Band, Camera
 
 SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
@@ -24,59 +24,26 @@ NODE_SPACING = 16.0  # between points at which the lens distortion is computed [
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """An outline that is known to about a pixel.
+    """An outline that is known to about a pixel."""
 
-    Attributes
-    ----------
-    band : Band
-        The frame of its part.
-    v : (2,) array
-        Offsets at both ends of the band [px].
-    epsilon : float
-        +1 for edge 1, whose inside has greater v, -1 for edge 2.
-    half_width : float
-        Half of the width of the part in the image [px].
-    hidden : (n,) array of bool
-        Which of n equal stretches of the band other legs hide.
-    """
-
-    band: Band
-    v: Array
-    epsilon: float
-    half_width: float
-    hidden: BoolArray
+    band: Band  # the frame of its part
+    v: Array  # (2,) offsets at both ends of the band [px]
+    epsilon: float  # +1 for edge 1, whose inside has greater v, -1 for edge 2
+    half_width: float  # of the part in the image [px]
+    hidden: BoolArray  # (n,) which of n equal stretches of the band other legs hide
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """Blocks of pixels along outlines.
+    """Blocks of pixels along outlines, one outline after the other."""
 
-    Attributes
-    ----------
-    bounds : (n_edges + 1,) array of int
-        The first block of each outline.
-    position : (n_blocks,) array
-        Positions of the blocks, as fractions of the bands.
-    gain : (n_blocks,) array
-        Pixels of distance in the image per unit of v of the band; near 1.
-    d : (n_blocks, n_samples) array of float32
-        Distances inside the outline [px].
-    grey : (n_blocks, n_samples) array of float32
-        Grey levels.
-    inside : (n_blocks, n_samples) array of bool
-        False for samples outside the image or out of range, and saturated ones.
-    clipped : (n_blocks,) array of float32
-        Up to which distance inside the background saturates the picture [px]; -inf where it does
-        not.
-    """
-
-    bounds: IntArray
-    position: Array
-    gain: Array
-    d: Samples
-    grey: Samples
-    inside: BoolArray
-    clipped: Samples
+    bounds: IntArray  # (n_edges + 1,) first block of each outline
+    position: Array  # (n_blocks,) as fractions of the bands
+    gain: Array  # (n_blocks,) pixels of distance in the image per unit of v of the band; near 1
+    d: Samples  # (n_blocks, n_samples) distances inside the outline [px]
+    grey: Samples  # (n_blocks, n_samples) grey levels
+    inside: BoolArray  # (n_blocks, n_samples) False outside the image, out of range, and saturated
+    clipped: Samples  # (n_blocks,) depth up to which the background saturates [px], or -inf
 
 
 def read_profiles(
@@ -88,24 +55,10 @@ def read_profiles(
     n_rows: int,
     most: int | None = None,
 ) -> Profiles:
-    """Read the pixels beside outlines, where nothing hides them.
+    """Read the pixels beside one outline or more with offsets v (2,), where nothing hides them.
 
-    Parameters
-    ----------
-    grey : Grey
-        The image.
-    camera : Camera
-        Its camera.
-    edges : sequence of Edge
-        The outlines, at least one.
-    v : sequence of (2,) array
-        Offsets of each at both ends of its band [px], in place of its own.
-    depths : float, (n_edges,) array
-        Distances from the outlines that are read, outside and inside of each [px].
-    n_rows : int
-        Rows of a block.
-    most : int, optional
-        About how many blocks of each outline are read, at even distances; all of them by default.
+    Up to the depths (outside, and inside of each) from the outlines [px], in blocks of ``n_rows``;
+    about ``most`` blocks of each outline at even distances, all of them by default.
     """
     nodes = _nodes(camera, edges, np.array(v))
     rows = nodes.rows(n_rows)
@@ -121,7 +74,8 @@ def read_profiles(
         if np.any(one.hidden):
             n, own = len(one.hidden), slice(*np.searchsorted(edge, [k, k + 1]))
             free[own] &= ~one.hidden[np.clip((position[own] * n).astype(np.intp), 0, n - 1)]
-    rows = rows.some(np.repeat(free, n_rows))
+    kept = np.repeat(free, n_rows)
+    rows = _Rows(rows.edge[kept], rows.along[kept], rows.node[kept], rows.part[kept])
     edge = edge[free]
     centre, tangent = nodes.at(rows, nodes.offset), nodes.at(rows, nodes.slope)
     cosine = 1.0 / np.sqrt(1.0 + tangent**2)
@@ -157,18 +111,13 @@ def read_profiles(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
+class _Rows(NamedTuple):
     """Rows of pixels (columns, where an outline is flat) that outlines cross, edge by edge."""
 
     edge: IntArray  # (n,)
     along: Array  # (n,) y of rows, x of columns [px]
     node: IntArray  # (n,) the node before it, among those of all edges
     part: Array  # (n,) how far it is towards the next
-
-    def some(self, chosen: BoolArray) -> "_Rows":
-        """Return a selection."""
-        return _Rows(self.edge[chosen], self.along[chosen], self.node[chosen], self.part[chosen])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
-"""Radii that pictures contradict: how wide bars are against what the model says (section 3.1).
+"""Radii that pictures contradict: how wide edge pairs are against the model (section 3.1).
 
 Lines place a camera, widths hardly do; so a leg that is seen wider or thinner at its place has
-another radius than the model says. Bars of wrong edges agree on nothing: bars of most views must.
+another radius than the model says. Pairs of wrong edges agree on nothing: those of most views must.
 Where light and shade meet on a leg they may agree all the same, so that only parts are asked whose
 outlines were not found.
 """
@@ -18,15 +18,13 @@ from legcal.perception.agreement import Agreement, Picture, Poses, agreement, im
 from legcal.vision import EQUAL_RADII
 
 FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
-TOLERANCES = (0.018, 0.018, 0.012, 0.012)  # of an axis from its bar, on the sensor plane
-MATCHED = 0.25  # agreement of a piece with its bar that counts
+TOLERANCES = (0.018, 0.018, 0.012, 0.012)  # of an axis from its pair, on the sensor plane
+MATCHED = 0.25  # agreement of a piece with its pair that counts
 PREFERRED = 1.15  # by what a farther factor must be better than a nearer one
-DIFFERENT, LEFT = (
-    0.08,
-    0.02,
-)  # from the model, as a logarithm: less does no harm, and once corrected
+DIFFERENT = 0.08  # from the model, as a logarithm: less does no harm
+LEFT = 0.02  # the same once corrected
 SURE = 4.0  # standard errors
-FEWEST = 3  # bars of a part in a view
+FEWEST = 3  # pairs of a part in a view
 TIGHT = 0.025  # robust standard deviation of their logarithms: else some are of other edges
 NOISE = 0.01  # of what a view says
 CONSISTENT = 0.09  # logarithms from views of one part, or of parts that are wrong alike
@@ -38,21 +36,11 @@ Part = tuple[int, float]  # leg, and radius in the model [m]
 
 @dataclass(frozen=True, eq=False)
 class OtherRadii:
-    """What pictures say of radii.
+    """What pictures say of radii, by leg and radius in the model."""
 
-    Attributes
-    ----------
-    factor : dict of float
-        By how much radii differ from the model, by leg and radius; those that do not are left out.
-    sigma : dict of float
-        Standard error of the logarithms of these.
-    common : float
-        The factor of all parts, if they differ alike; 0 otherwise.
-    """
-
-    factor: dict[Part, float]
-    sigma: dict[Part, float]
-    common: float = 0.0
+    factor: dict[Part, float]  # by how much they differ from the model; others are left out
+    sigma: dict[Part, float]  # standard error of the logarithms of these
+    common: float = 0.0  # the factor of all parts, if they differ alike; 0 otherwise
 
     def corrected(self, cylinders: Sequence[Sequence[Cylinder]]) -> list[tuple[Cylinder, ...]]:
         """Return the cylinders of all legs with the radii that were found."""
@@ -116,14 +104,9 @@ def other_radii(
 ) -> OtherRadii:
     """Return the radii that differ from the model.
 
-    Parameters
-    ----------
-    views : iterable of (int, sequence of Picture, Poses)
-        A view, pictures of it, and T_camera_base where they put the camera.
-    different : float
-        Logarithm of the factor from which on a radius is another one.
-    alone : bool
-        Whether all parts cannot differ alike.
+    By views, pictures of them, and T_camera_base where they put the camera; ``different`` is the
+    logarithm of the factor from which on a radius is another one, ``alone`` that all parts cannot
+    differ alike.
     """
     samples: dict[Part, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for view, pictures, placed in views:
@@ -142,7 +125,7 @@ def other_radii(
     if not alone and abs(common) > different and of_several:
         factor = float(np.exp(common))
         return OtherRadii(dict.fromkeys(samples, factor), sigma, factor)
-    bias = common if of_several else 0.0  # of bars, whatever the leg
+    bias = common if of_several else 0.0  # of pairs, whatever the leg
     differing = {
         part: float(np.exp(value - bias))
         for part, (value, sigma_value) in known.items()
@@ -154,7 +137,7 @@ def other_radii(
 def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
     """Return the logarithm on which views of a part agree, and its standard error.
 
-    Bars of a part that something hides, or of wrong edges, do not agree with each other.
+    EdgePairs of a part that something hides, or of wrong edges, do not agree with each other.
     """
     middles: list[float] = []
     asked = [np.array(values) for values in views if len(values) >= FEWEST]
@@ -175,7 +158,7 @@ def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
 def _densest(values: Array) -> float:
     """Return the middle of the shortest interval with more than half of the values.
 
-    Few bars of inner edges, where light and shade meet, do not move it as they move a median.
+    Few pairs of inner edges, where light and shade meet, do not move it as they move a median.
     """
     ordered = np.sort(values)
     most = len(ordered) // 2 + 1
@@ -184,7 +167,7 @@ def _densest(values: Array) -> float:
 
 
 def _by_lines(pictures: Sequence[Picture], placed: Poses) -> Poses:
-    """Return a pose by where bars are, which widths hardly move: joints stay as in the model."""
+    """Return a pose by where pairs are, which widths hardly move: joints stay as in the model."""
     pose = Poses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
     for tolerance in TOLERANCES:
         found = [_whatever_the_width(picture, pose, tolerance) for picture in pictures]
@@ -193,7 +176,7 @@ def _by_lines(pictures: Sequence[Picture], placed: Poses) -> Poses:
 
 
 def _whatever_the_width(picture: Picture, pose: Poses, tolerance: float) -> Agreement:
-    """Return the bars that suit the pieces best with some radius; farther ones need be better."""
+    """Return the pairs that suit the pieces best with some radius; farther ones need be better."""
     targets = picture.targets
     best = agreement(picture, pose, tolerance)
     for factor in FACTORS[1:]:
@@ -202,28 +185,28 @@ def _whatever_the_width(picture: Picture, pose: Poses, tolerance: float) -> Agre
         better = found.value > np.maximum(PREFERRED * best.value, MATCHED)
         best = Agreement(
             np.where(better, found.value, best.value),
-            np.where(better, found.bar, best.bar),
+            np.where(better, found.pair, best.pair),
             best.visible,
         )
     return best
 
 
 def _logarithms(picture: Picture, pose: Poses) -> list[tuple[Part, float]]:
-    """Return the logarithms of the widths of a picture's bars against the model's."""
+    """Return the logarithms of the widths of a picture's pairs against the model's."""
     targets = picture.targets
-    if len(targets) == 0 or len(picture.bars) == 0:
+    if len(targets) == 0 or len(picture.pairs) == 0:
         return []
     R, t = picture.R @ pose.R[0], picture.R @ pose.t[0] + picture.t
     found = _whatever_the_width(picture, pose, TOLERANCES[-1])
-    best, bar = found.value[0], found.bar[0]
+    best, pair = found.value[0], found.pair[0]
     best = np.where(best >= MATCHED, best, 0.0)
     logarithms = []
     for k in np.flatnonzero(best > 0.0).tolist():
-        if np.count_nonzero((bar == bar[k]) & (best > 0.0)) > 1:  # whose bar it is, is not known
+        if np.count_nonzero((pair == pair[k]) & (best > 0.0)) > 1:  # whose pair it is, is not known
             continue
         ends = targets.ends[k] @ R.T + t
-        expected = _width(ends, float(targets.radius[k]), picture.bars.middle[bar[k]])
-        seen = float(picture.bars.width[bar[k]].mean())
+        expected = _width(ends, float(targets.radius[k]), picture.pairs.middle[pair[k]])
+        seen = float(picture.pairs.width[pair[k]].mean())
         part = (int(targets.leg[k]), float(targets.radius[k]))
         logarithms.append((part, float(np.log(seen / expected))))
     return logarithms
@@ -241,14 +224,7 @@ def _width(ends: Array, radius: float, middle: Array) -> float:
 
 
 def radius_notes(found: OtherRadii, legs: Sequence[str]) -> list[str]:
-    """Return what is to be said of radii that differ from the model.
-
-    Parameters
-    ----------
-    found : OtherRadii
-    legs : sequence of str
-        Names of the legs.
-    """
+    """Return what is to be said of radii that differ from the model."""
     if not found.factor:
         return []
     if found.common:

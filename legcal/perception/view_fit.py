@@ -1,11 +1,12 @@
 """The camera of a view and its legs, fitted to outlines that were measured once.
 
-Bars place a camera to some millimetres and leave out legs that have none. Outlines are far better
-known: a fit of the camera, of where the view sees the joints, and of what each image adds to the
-platform joints says where all legs are, how well that is known, and which legs do not fit.
+Edge pairs place a camera to some millimetres and leave out legs that have none. Outlines are far
+better known: a fit of the camera, of where the view sees the joints, and of what each image adds to
+the platform joints says where all legs are, how well that is known, and which legs do not fit.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -14,11 +15,182 @@ from legcal.data import Outlines
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import main_cylinders
-from legcal.perception.search import Group, Search
+from legcal.perception.agreement import NEAREST, exchanged
+from legcal.perception.placement import Group, Search
 from legcal.vision import Camera, outlines_of_axis
 
+JOINT_SIGMA = 6e-3  # of the joint centres of the nominal model in all images, at first [m]
+JOINT_SIGMAS = 1.5e-3, 12e-3  # the least and the largest that legs may show
+IMAGE_SIGMA = 2e-3  # of the platform joints in an image besides, at first [m]
+IMAGE_SIGMAS = 0.7e-3, 12e-3  # the least and the largest that images may show
+TURN_SIGMA, PLACE_SIGMA = 0.3, 0.15  # of the pose that was recognised: angle, part of the distance
+MOST_TURN, MOST_PLACE = 0.2, 0.1  # of a step: angle, part of the distance
+STEPS, FIXED_STEPS = 8, 2  # of Gauss-Newton, and those before standard deviations are estimated
+ROBUST = 2.0  # standard deviations from which on a leg of an image counts less
+WORTH, MOST_OUTLINES = 2.0, 4  # of an outline as evidence: half a square, of a leg in an image
+MISFIT = 3.5  # standard deviations from the fit, of a leg in an image
+LARGEST_SHIFT = 4.0  # of a leg, in standard deviations
+LONE_SHIFT = 2.5  # the same of a leg of which only single outlines were found
+MOST_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
+SUITS = 0.85  # of the most evidence that outlines can give
+SHIFT_COST = 0.25  # of shifts, less than half a square: some are the pose's
+LEAST_EVIDENCE = 8.0, 1.2  # and for each image
 EDGE_SIGMA = 0.3  # of an outline: what its covariance does not know, as a wrong gamma [px]
 NUDGE = 1e-6  # of finite differences [m]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFit:
+    """Where a group of views sees the legs, by outlines."""
+
+    T_base_group: RigidTransform  # the camera pose
+    shift: Array  # (n_legs, 2, 3) of A and B against the model, in the base link [m]
+    covariance: Array  # (6 + 6 n_legs,) squared: of the motion of the machine about its middle in
+    # the frame of the group, rotation vector and displacement, and of the shifts [rad, m]
+    joint_sigma: float  # of the joint centres of the model, as the legs show it [m]
+    image_sigma: float  # of the platform joints in an image besides [m]
+    row: IntArray  # (n,) legs in images that have outlines
+    leg: IntArray  # (n,)
+    n_outlines: IntArray  # (n,) how many of each
+    own: Array  # (n, 3) what their images add to B [m]
+    distance: Array  # (n,) how far their outlines are from the fit, in standard deviations
+    middle: Array  # (3,) of the machine in the base link [m]
+    evidence: float  # what it is worth that each outline was found near where the fit has it, less
+    # half of the squares of how far they are off and of the shifts
+
+    @property
+    def suits(self) -> bool:
+        """Whether nearly all outlines suit the fit as well as they can."""
+        most = WORTH * np.minimum(self.n_outlines, MOST_OUTLINES).sum()
+        return self.evidence >= SUITS * float(most)
+
+    @property
+    def misfits(self) -> BoolArray:
+        """Legs in images that are too far from where the other legs have them, (n,)."""
+        shift = np.abs(self.shift).max(axis=(1, 2)) / self.joint_sigma
+        alone = np.ones(len(self.shift), dtype=np.bool_)
+        alone[self.leg[self.n_outlines > 1]] = False
+        far = shift > np.where(alone, LONE_SHIFT, LARGEST_SHIFT)
+        return np.asarray((self.distance > MISFIT) | far[self.leg])
+
+    def joints(self, A_base: Array, B_base: Array) -> tuple[Array, Array]:
+        """Return joint centres (n_rows, n_legs, 3) where the images of the group see them [m]."""
+        B = B_base + self.shift[:, 1]
+        B[self.row, self.leg] += self.own
+        return A_base + self.shift[:, 0], B
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the outlines tell the pose from those around it: else legs may be others."""
+        return bool(self.turn_sigma <= MOST_TURN_SIGMA)
+
+    @property
+    def turn_sigma(self) -> float:
+        """Standard deviation of the rotation about the axis that is known worst [rad]."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+
+def fit_view(
+    search: Search,
+    group: Group,
+    T_base_group: RigidTransform,
+    shift: Array,
+    outlines: Outlines,
+) -> ViewFit | None:
+    """Fit the camera and the joints of a group of views to its used outlines.
+
+    From where they were recognised, with shifts (n_legs, 2, 3) of A and B against the model [m].
+    None without any outline.
+    """
+    lines = lines_of(search, group, outlines)
+    if lines is None:
+        return None
+    middle = np.concatenate([lines.A, lines.B]).mean(axis=0)
+    T = T_base_group.inv()
+    begin = _State(T.rotation.as_matrix(), T.translation, shift, np.zeros((lines.n_items, 3)))
+    state, weight = begin, np.ones(lines.n_items)
+    joint_sigma, image_sigma = JOINT_SIGMA, IMAGE_SIGMA
+    try:
+        equations = equations_of(group, lines, state, middle)
+        for step in range(STEPS):
+            sigmas = joint_sigma, image_sigma
+            normal = _normal_equations(lines, equations, state, begin, weight, sigmas, middle)
+            state = _moved(state, normal, lines, middle)
+            equations = equations_of(group, lines, state, middle)
+            square, own_square = _squared_distances(lines, equations, state, image_sigma)
+            weight = 1.0 / (1.0 + square / (lines.size * ROBUST**2))
+            if step >= FIXED_STEPS:  # most legs and images are alike
+                variance = np.diag(np.linalg.inv(normal.H))[6:].reshape(state.shift.shape)
+                of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]
+                of_image = np.sum(weight * own_square) / (3.0 * weight.sum())
+                joint_sigma = float(np.clip(np.sqrt(np.median(of_leg)), *JOINT_SIGMAS))
+                image_sigma = float(np.clip(np.sqrt(of_image), *IMAGE_SIGMAS))
+    except NotVisible:
+        return None
+    sigmas = joint_sigma, image_sigma
+    normal = _normal_equations(lines, equations, state, begin, weight, sigmas, middle)
+    pose = RigidTransform.from_components(state.t, Rotation.from_matrix(state.R)).inv()
+    return ViewFit(
+        pose,
+        state.shift,
+        np.asarray(np.linalg.inv(normal.H), dtype=np.float64),
+        joint_sigma,
+        image_sigma,
+        lines.item_row,
+        lines.item_leg,
+        lines.size // 2,
+        state.own,
+        np.sqrt(square / lines.size),
+        middle,
+        _evidence(lines, equations, state, joint_sigma),
+    )
+
+
+def least_evidence(group: Group) -> float:
+    """Return how much evidence outlines must give: more images show more that suits by chance."""
+    return LEAST_EVIDENCE[0] + LEAST_EVIDENCE[1] * len(group.rows)
+
+
+def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
+    """Return how well a fit knows where legs are seen, (n_rows, n_legs) [px].
+
+    One standard deviation across each leg, at the joint where it is known worse; infinite for
+    legs that reach behind the camera, and in images of other views.
+    """
+    m, n_legs = search.measurements, search.n_legs
+    A, B = fit.joints(search.A_base, search.B_base)
+    T_group_base = fit.T_base_group.inv()
+    centre = T_group_base.apply(fit.middle)
+    sigma = np.full((m.n_rows, n_legs), np.inf)
+    for v in group.views:
+        rows = [row for row in group.rows if m.view[row] == v]
+        T, camera = group.T_group_camera[v].inv(), m.views[v].camera
+        X_group = T_group_base.apply(np.stack([A[rows], B[rows]], axis=2).reshape(-1, 3))
+        X = T.apply(X_group).reshape(-1, 2, 3)
+        front = X[..., 2].min(axis=1) > NEAREST
+        X = np.where(front[:, None, None], X, [[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+        ends = X[..., :2] / X[..., 2:]
+        thin, edge = np.zeros(len(X)), np.zeros(len(X), dtype=np.intp)
+        D = offsets_of(X, thin, edge, ends, metric_of(camera, ends))[1] @ T.rotation.as_matrix()
+        J = derivatives_by(D, X_group.reshape(-1, 2, 3) - centre, T_group_base.rotation.as_matrix())
+        leg = np.tile(np.arange(n_legs), len(rows))
+        place = np.concatenate(
+            [np.broadcast_to(np.arange(6), (len(leg), 6)), 6 + 6 * leg[:, None] + np.arange(6)], 1
+        )
+        of_leg = fit.covariance[place[:, :, None], place[:, None, :]]
+        variance = np.einsum("nei,nij,nej->ne", J[..., :12], of_leg, J[..., :12])
+        variance += fit.image_sigma**2 * np.sum(J[..., 12:] ** 2, axis=-1)
+        worst = np.sqrt(variance.max(axis=1))
+        sigma[rows] = np.where(front, worst, np.inf).reshape(len(rows), n_legs)
+    return sigma
+
+
+def reversed_pose(search: Search, group: Group, T_base_group: RigidTransform) -> RigidTransform:
+    """Return the pose at which a flat machine looks alike from far: near and far exchanged."""
+    X = np.concatenate([search.A_base[group.rows], search.B_base[group.rows]]).reshape(-1, 3)
+    T = T_base_group.inv()
+    R, t = exchanged(T.rotation.as_matrix()[None], T.translation[None], X)
+    return RigidTransform.from_components(t[0], Rotation.from_matrix(R[0])).inv()
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,27 +262,11 @@ def lines_of(search: Search, group: Group, outlines: Outlines) -> Lines | None:
 def offsets_of(
     X: Array, radius: Array, edge: IntArray, ends: Array, metric: Array
 ) -> tuple[Array, Array]:
-    """Return how far points are from outlines, and the derivatives by the joints of the legs.
+    """Return how far points are from outlines (n, 2) [px], and derivatives (n, 2, 2, 3) by A and B.
 
-    Parameters
-    ----------
-    X : (n, 2, 3) array
-        A and B in the frame of the camera [m].
-    radius : (n,) array
-        Radii [m].
-    edge : (n,) array of int
-        0 for the outline of epsilon +1, 1 for that of epsilon -1.
-    ends : (n, 2, 2) array
-        Two points on the sensor plane.
-    metric : (n, 2, 2, 2) array
-        What makes normals of lines on the sensor plane those in the picture there [1/px].
-
-    Returns
-    -------
-    offset : (n, 2) array
-        In the picture [px].
-    derivative : (n, 2, 2, 3) array
-        By A and B [px/m].
+    Of the outlines (0 where epsilon is +1, 1 where it is -1) of cylinders with A and B (n, 2, 3) in
+    the frame of the camera [m] and radii (n,), at two points (n, 2, 2) of the sensor plane with
+    their :func:`metric_of`.
     """
     nudges = NUDGE * np.concatenate([np.zeros((1, 6)), np.eye(6)]).reshape(7, 1, 2, 3)
     moved = X + nudges
@@ -138,44 +294,16 @@ def derivatives_by(D: Array, from_centre: Array, R: Array) -> Array:
     return np.concatenate([turning, D.sum(axis=2), of_A, of_B, of_B], axis=-1)
 
 
-JOINT_SIGMA = 6e-3  # of the joint centres of the nominal model in all images, at first [m]
-JOINT_SIGMAS = 1.5e-3, 12e-3  # the least and the largest that legs may show
-IMAGE_SIGMA = 2e-3  # of the platform joints in an image besides, at first [m]
-IMAGE_SIGMAS = 0.7e-3, 12e-3  # the least and the largest that images may show
-TURN_SIGMA, PLACE_SIGMA = 0.3, 0.15  # of the pose that was recognised: angle, part of the distance
-MOST_TURN, MOST_PLACE = 0.2, 0.1  # of a step: angle, part of the distance
+class _State(NamedTuple):
+    """Where everything is."""
+
+    R: Array  # (3, 3) of T_group_base
+    t: Array  # (3,)
+    shift: Array  # (n_legs, 2, 3) of A and B of the legs against the model, in the base link [m]
+    own: Array  # (n_items, 3) what its image adds to B of each leg [m]
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """Where everything is.
-
-    Attributes
-    ----------
-    R, t : (3, 3) and (3,) array
-        T_group_base.
-    shift : (n_legs, 2, 3) array
-        Of A and B of the legs against the model, in the base link [m].
-    own : (n_items, 3) array
-        What its image adds to B of each leg [m].
-    """
-
-    R: Array
-    t: Array
-    shift: Array
-    own: Array
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Standard deviations of the model's joint centres, and of what images add to B [m]."""
-
-    joint: float
-    image: float
-
-
-@dataclass(frozen=True, eq=False)
-class Normal:
+class _Normal(NamedTuple):
     """Normal equations of the pose and the shifts, and what gives the images' own parts."""
 
     H: Array
@@ -184,7 +312,7 @@ class Normal:
     start: Array  # (n_items, 3) own part without them
 
 
-def equations_of(group: Group, lines: Lines, state: State, middle: Array) -> tuple[Array, Array]:
+def equations_of(group: Group, lines: Lines, state: _State, middle: Array) -> tuple[Array, Array]:
     """Return whitened offsets (n, 2) and their derivatives (n, 2, 15).
 
     By the motion of the machine about its middle, the shifts of A and B of the leg, and the own
@@ -205,19 +333,20 @@ def equations_of(group: Group, lines: Lines, state: State, middle: Array) -> tup
     return (lines.whitening @ offset[..., None])[..., 0], lines.whitening @ J
 
 
-def normal_equations(
+def _normal_equations(
     lines: Lines,
     equations: tuple[Array, Array],
-    state: State,
-    begin: State,
+    state: _State,
+    begin: _State,
     weight: Array,
-    spread: Spread,
+    sigmas: tuple[float, float],
     middle: Array,
-) -> Normal:
-    """Return the normal equations without the images' own parts."""
+) -> _Normal:
+    """Return the normal equations without the images' own parts, by sigmas of joints and images."""
+    joint_sigma, image_sigma = sigmas
     M, b = _by_item(lines, *equations)
-    M[:, 12:, 12:] += np.eye(3) / spread.image**2
-    b[:, 12:] -= state.own / spread.image**2
+    M[:, 12:, 12:] += np.eye(3) / image_sigma**2
+    b[:, 12:] -= state.own / image_sigma**2
     solved = np.linalg.solve(M[:, 12:, 12:], np.concatenate([M[:, 12:, :12], b[:, 12:, None]], -1))
     back, start = solved[..., :12], solved[..., 12]
     S = (M[:, :12, :12] - M[:, :12, 12:] @ back) * weight[:, None, None]
@@ -236,9 +365,9 @@ def normal_equations(
     H[np.arange(6), np.arange(6)] += known
     g[:6] -= known * np.concatenate([turned, centre - before])
     joints = np.arange(6, n)
-    H[joints, joints] += spread.joint**-2
-    g[6:] -= state.shift.ravel() / spread.joint**2
-    return Normal(H, g, back, start)
+    H[joints, joints] += joint_sigma**-2
+    g[6:] -= state.shift.ravel() / joint_sigma**2
+    return _Normal(H, g, back, start)
 
 
 def _by_item(lines: Lines, residual: Array, J: Array) -> tuple[Array, Array]:
@@ -247,7 +376,7 @@ def _by_item(lines: Lines, residual: Array, J: Array) -> tuple[Array, Array]:
     return lines.summed(Jt @ J), -lines.summed((Jt @ residual[..., None])[..., 0])
 
 
-def moved(state: State, normal: Normal, lines: Lines, middle: Array) -> State:
+def _moved(state: _State, normal: _Normal, lines: Lines, middle: Array) -> _State:
     """Return the state after a step, not too far."""
     step = np.linalg.solve(normal.H, normal.b)
     centre = state.R @ middle + state.t
@@ -264,24 +393,11 @@ def moved(state: State, normal: Normal, lines: Lines, middle: Array) -> State:
     own = state.own + normal.start - (normal.back @ of_item[..., None])[..., 0]
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     t = turn @ (state.t - centre) + centre + step[3:6]
-    return State(turn @ state.R, t, state.shift + shifts.reshape(state.shift.shape), own)
+    return _State(turn @ state.R, t, state.shift + shifts.reshape(state.shift.shape), own)
 
 
-def spread_of(
-    lines: Lines, normal: Normal, state: State, weight: Array, own_square: Array
-) -> Spread:
-    """Return the standard deviations that the legs show, most of them alike."""
-    variance = np.diag(np.linalg.inv(normal.H))[6:].reshape(state.shift.shape)
-    of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]
-    of_image = np.sum(weight * own_square) / (3.0 * weight.sum())
-    return Spread(
-        float(np.clip(np.sqrt(np.median(of_leg)), *JOINT_SIGMAS)),
-        float(np.clip(np.sqrt(of_image), *IMAGE_SIGMAS)),
-    )
-
-
-def squared_distances(
-    lines: Lines, equations: tuple[Array, Array], state: State, sigma: float
+def _squared_distances(
+    lines: Lines, equations: tuple[Array, Array], state: _State, sigma: float
 ) -> tuple[Array, Array]:
     """Return squared distances of items from the fit, and squares of their own parts [m^2]."""
     residual, J = equations
@@ -295,168 +411,12 @@ def squared_distances(
     return square + np.sum(g * own, axis=1), np.sum(own**2, axis=1) + np.trace(V, axis1=1, axis2=2)
 
 
-STEPS, FIXED_STEPS = 8, 2  # of Gauss-Newton, and those before standard deviations are estimated
-ROBUST = 2.0  # standard deviations from which on a leg of an image counts less
-WORTH, MOST_OUTLINES = 2.0, 4  # of an outline as evidence: half a square, of a leg in an image
-MISFIT = 3.5  # standard deviations from the fit, of a leg in an image
-LARGEST_SHIFT = 4.0  # of a leg, in standard deviations
-LONE_SHIFT = 2.5  # the same of a leg of which only single outlines were found
-MOST_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
-SUITS = 0.85  # of the most evidence that outlines can give
-SHIFT_COST = 0.25  # of shifts, less than half a square: some are the pose's
-LEAST_EVIDENCE = 8.0, 1.2  # and for each image
-
-
-@dataclass(frozen=True, eq=False)
-class ViewFit:
-    """Where a group of views sees the legs, by outlines.
-
-    Attributes
-    ----------
-    T_base_group : RigidTransform
-        The camera pose.
-    shift : (n_legs, 2, 3) array
-        Where A and B of the legs are, against the model, in the base link [m].
-    covariance : (6 + 6 n_legs, 6 + 6 n_legs) array
-        Of the motion of the machine about its middle in the frame of the group, rotation vector
-        and displacement, and of the shifts [rad, m].
-    joint_sigma : float
-        Standard deviation of the joint centres of the model, as the legs show it [m].
-    image_sigma : float
-        Standard deviation of the platform joints in an image besides [m].
-    row, leg : (n,) array of int
-        Legs in images that have outlines.
-    n_outlines : (n,) array of int
-        How many of each.
-    own : (n, 3) array
-        What their images add to B [m].
-    distance : (n,) array
-        How far their outlines are from the fit, in standard deviations.
-    middle : (3,) array
-        The middle of the machine in the base link [m].
-    evidence : float
-        How much its outlines speak for the fit: what it is worth that each was found near where the
-        fit has it, less half of the squares of how far they are off and of the shifts.
-    """
-
-    T_base_group: RigidTransform
-    shift: Array
-    covariance: Array
-    joint_sigma: float
-    image_sigma: float
-    row: IntArray
-    leg: IntArray
-    n_outlines: IntArray
-    own: Array
-    distance: Array
-    middle: Array
-    evidence: float
-
-    @property
-    def suits(self) -> bool:
-        """Whether nearly all outlines suit the fit as well as they can."""
-        most = WORTH * np.minimum(self.n_outlines, MOST_OUTLINES).sum()
-        return self.evidence >= SUITS * float(most)
-
-    @property
-    def misfits(self) -> BoolArray:
-        """Legs in images that are too far from where the other legs have them, (n,)."""
-        shift = np.abs(self.shift).max(axis=(1, 2)) / self.joint_sigma
-        alone = np.ones(len(self.shift), dtype=np.bool_)
-        alone[self.leg[self.n_outlines > 1]] = False
-        far = shift > np.where(alone, LONE_SHIFT, LARGEST_SHIFT)
-        return np.asarray((self.distance > MISFIT) | far[self.leg])
-
-    def joints(self, A_base: Array, B_base: Array) -> tuple[Array, Array]:
-        """Return joint centres (n_rows, n_legs, 3) where the images of the group see them [m]."""
-        B = B_base + self.shift[:, 1]
-        B[self.row, self.leg] += self.own
-        return A_base + self.shift[:, 0], B
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether the outlines tell the pose from those around it: else legs may be others."""
-        return bool(self.turn_sigma <= MOST_TURN_SIGMA)
-
-    @property
-    def turn_sigma(self) -> float:
-        """Standard deviation of the rotation about the axis that is known worst [rad]."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
-
-
-def fit_view(
-    search: Search,
-    group: Group,
-    T_base_group: RigidTransform,
-    shift: Array,
-    outlines: Outlines,
-) -> ViewFit | None:
-    """Fit the camera and the joints of a group of views to its used outlines.
-
-    Parameters
-    ----------
-    search : Search
-        The images and the model.
-    group : Group
-        Views that are placed together.
-    T_base_group : RigidTransform
-        Where they were recognised.
-    shift : (n_legs, 2, 3) array
-        Where A and B of the legs are, against the model, in the base link [m].
-    outlines : Outlines
-        Of these and other views.
-
-    Returns
-    -------
-    ViewFit or None
-        None without any outline.
-    """
-    lines = lines_of(search, group, outlines)
-    if lines is None:
-        return None
-    middle = np.concatenate([lines.A, lines.B]).mean(axis=0)
-    T = T_base_group.inv()
-    begin = State(T.rotation.as_matrix(), T.translation, shift, np.zeros((lines.n_items, 3)))
-    state, spread, weight = begin, Spread(JOINT_SIGMA, IMAGE_SIGMA), np.ones(lines.n_items)
-    try:
-        equations = equations_of(group, lines, state, middle)
-        for step in range(STEPS):
-            normal = normal_equations(lines, equations, state, begin, weight, spread, middle)
-            state = moved(state, normal, lines, middle)
-            equations = equations_of(group, lines, state, middle)
-            square, own_square = squared_distances(lines, equations, state, spread.image)
-            weight = 1.0 / (1.0 + square / (lines.size * ROBUST**2))
-            if step >= FIXED_STEPS:
-                spread = spread_of(lines, normal, state, weight, own_square)
-    except NotVisible:
-        return None
-    normal = normal_equations(lines, equations, state, begin, weight, spread, middle)
-    pose = RigidTransform.from_components(state.t, Rotation.from_matrix(state.R)).inv()
-    return ViewFit(
-        pose,
-        state.shift,
-        np.asarray(np.linalg.inv(normal.H), dtype=np.float64),
-        spread.joint,
-        spread.image,
-        lines.item_row,
-        lines.item_leg,
-        lines.size // 2,
-        state.own,
-        np.sqrt(square / lines.size),
-        middle,
-        _evidence(lines, equations, state, spread),
-    )
-
-
-def least_evidence(group: Group) -> float:
-    """Return how much evidence outlines must give: more images show more that suits by chance."""
-    return LEAST_EVIDENCE[0] + LEAST_EVIDENCE[1] * len(group.rows)
-
-
-def _evidence(lines: Lines, equations: tuple[Array, Array], state: State, spread: Spread) -> float:
+def _evidence(
+    lines: Lines, equations: tuple[Array, Array], state: _State, joint_sigma: float
+) -> float:
     """Return how much outlines speak for a state, each leg of an image by itself."""
-    square, _ = squared_distances(lines, equations, state, IMAGE_SIGMA)
+    square, _ = _squared_distances(lines, equations, state, IMAGE_SIGMA)
     found = np.minimum(0.5 * lines.size, MOST_OUTLINES)
     of_legs = np.maximum(WORTH * found - 0.5 * square, 0.0).sum()
-    joint = max(JOINT_SIGMA, spread.joint)
+    joint = max(JOINT_SIGMA, joint_sigma)
     return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)

@@ -10,12 +10,14 @@ that no other line near its prediction rivals may stand alone.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
+import cv2
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.picture import Grey, edge_sharpness, sample
-from legcal.vision import Band, Camera
+from legcal.perception.light import Grey, Samples
+from legcal.vision import Band, Camera, Piece, PredictedLeg
 
 BLOCK_LENGTH = 8.0  # [px]
 ROWS = 4  # rows of a block
@@ -25,28 +27,21 @@ KEPT = 8
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
 LEAST_SCORE = 0.15
 LONE_SCORE = 0.5  # of an edge that may stand alone
-LONE_FORETOLD = 0.35  # the same where other legs say where it is
+LONE_VOUCHED = 0.35  # the same where other legs say where it is
 RIVAL = 0.6  # of its score, which no other line may reach
 RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
+NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
+BESIDE = 0.8  # what an edge counts in the columns beside it
+NEAR_PREDICTION = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """Two edges of a band.
+class EdgePair:
+    """The two edges of a part, good to about a pixel."""
 
-    Attributes
-    ----------
-    v : (2, 2) array
-        Offsets of edge 1 and edge 2 at both ends of the band [px], good to about a pixel.
-    found : (2,) array of bool
-        False for an edge that was not found and is put where the width of the part demands.
-    alone : (2,) array of bool
-        Whether each edge is convincing without the other.
-    """
-
-    v: Array
-    found: BoolArray
-    alone: BoolArray
+    v: Array  # (2, 2) offsets of edge 1 and edge 2 at both ends of the band [px]
+    found: BoolArray  # (2,) False for an edge that is put where the width of the part demands
+    alone: BoolArray  # (2,) whether each edge is convincing without the other
 
     def suits(self, width: Array) -> bool:
         """Say whether both edges were found at the distance of the part's outlines (2,) [px]."""
@@ -56,73 +51,66 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
-class PairSearch:
-    """Where the outlines of a part are looked for.
+class Part:
+    """A part of a leg where it is predicted in an image, and its edges once they are found."""
 
-    Attributes
-    ----------
-    band : Band
-        Frame along the part.
-    predicted : (2, 2) array
-        Offsets v of edge 1 and edge 2 at both ends of the band [px].
-    hidden : (n_blocks,) array of bool
-        Which of the :func:`block_positions` other legs hide.
-    window : float
-        Largest distance of an edge from its prediction, at either end [px].
-    foretold : bool
-        Whether other legs vouch for the prediction, so that one edge near it is enough.
-    """
+    leg: PredictedLeg
+    piece: Piece
+    band: Band  # the frame along the part
+    predicted: Array  # (2, 2) offsets of edge 1 and 2 at both ends of the band [px]
+    hidden: BoolArray  # (n_blocks,) which of the block_positions other legs hide
+    window: float  # largest distance of an edge from its prediction, at either end [px]
+    vouched: bool  # whether other legs vouch for the prediction: one edge near it is enough
+    pair: EdgePair | None = None
 
-    band: Band
-    predicted: Array
-    hidden: BoolArray
-    window: float
-    foretold: bool = False
+    @property
+    def edges(self) -> EdgePair:
+        """The edges of a part that has been found."""
+        if self.pair is None:
+            raise ValueError("the edges of this part were not found")
+        return self.pair
+
+    @property
+    def half_width(self) -> float:
+        """Half of the width that the edges have in the middle [px]."""
+        return float(0.5 * np.mean(self.edges.v[1] - self.edges.v[0]))
+
+    @property
+    def near(self) -> Array:
+        """Offsets as predicted if an edge was found no farther than it is known, (2, 2) [px].
+
+        One is enough: the width says where the other outline is, which shading hides.
+        """
+        is_near = np.abs(self.edges.v - self.predicted).max(axis=1) <= NEAR_PREDICTION
+        return self.predicted if np.any(is_near & self.edges.found) else self.edges.v
 
 
-def find_pairs(grey: Grey, camera: Camera, searches: Sequence[PairSearch]) -> list[Pair | None]:
-    """Find the two outlines of parts.
-
-    Parameters
-    ----------
-    grey : Grey
-        The image.
-    camera : Camera
-        The camera.
-    searches : sequence of PairSearch
-        Where the outlines of each part are looked for.
-
-    Returns
-    -------
-    list of Pair or None
-        None where no two edges are convincing, nor one alone.
-    """
-    if not searches:
+def find_pairs(grey: Grey, camera: Camera, parts: Sequence[Part]) -> list[EdgePair | None]:
+    """Find both edges of parts; None where no two edges are convincing, nor one alone."""
+    if not parts:
         return []
-    lines = _edge_lines(grey, camera, searches)
-    return [_pair(*one) for one in zip(searches, lines[::2], lines[1::2], strict=True)]
+    lines = _edge_lines(grey, camera, parts)
+    return [_pair(*one) for one in zip(parts, lines[::2], lines[1::2], strict=True)]
 
 
-def _pair(search: PairSearch, *lines: tuple[Array, Array]) -> Pair | None:
+def _pair(part: Part, *lines: tuple[Array, Array]) -> EdgePair | None:
     """Return the two outlines of a part among lines near each of them."""
-    predicted = search.predicted
-    together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], search.window)
-    lone = [
-        _alone(*candidates, LONE_FORETOLD if search.foretold else LONE_SCORE)
-        for candidates in lines
-    ]
+    predicted = part.predicted
+    together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], part.window)
+    least = LONE_VOUCHED if part.vouched else LONE_SCORE
+    lone = [_alone(*candidates, least) for candidates in lines]
     if together is not None:
         shifts = np.stack([lines[edge][0][i] for edge, i in enumerate(together)])
         alone = np.array([i == k for i, k in zip(together, lone, strict=True)])
-        return Pair(predicted + shifts, np.ones(2, dtype=np.bool_), alone)
+        return EdgePair(predicted + shifts, np.ones(2, dtype=np.bool_), alone)
     scores = [0.0 if i is None else lines[edge][1][i] for edge, i in enumerate(lone)]
     edge = int(np.argmax(scores))
     i = lone[edge]
     rivalled = max(lines[1 - edge][1], default=0.0) >= LONE_SCORE
-    if i is None or (rivalled and not search.foretold):
+    if i is None or (rivalled and not part.vouched):
         return None  # two clear edges at another distance are not those of this part
     found = np.arange(2) == edge
-    return Pair(predicted + lines[edge][0][i], found, found)
+    return EdgePair(predicted + lines[edge][0][i], found, found)
 
 
 def _best_pair(
@@ -160,41 +148,64 @@ def block_positions(band: Band) -> Array:
     return np.asarray((np.arange(n) + 0.5) * (band.length / n))
 
 
-def _edge_lines(
-    grey: Grey, camera: Camera, searches: Sequence[PairSearch]
-) -> list[tuple[Array, Array]]:
+def _edge_lines(grey: Grey, camera: Camera, parts: Sequence[Part]) -> list[tuple[Array, Array]]:
     """Return lines near both edges of each part: shifts at both ends (n, 2) [px], scores (n,)."""
-    halves = [int(np.ceil(search.window)) for search in searches]
+    halves = [int(np.ceil(part.window)) for part in parts]
     reach = max(halves) + MARGIN
     far = np.array([-float(reach), float(reach)])
     ends, hidden = [], []
-    for search in searches:
-        n_rows = len(search.hidden) * ROWS
+    for part in parts:
+        n_rows = len(part.hidden) * ROWS
         rows = (np.arange(n_rows) + 0.5) / n_rows
-        centre = search.predicted[:, :1] + np.diff(search.predicted, axis=1) * rows
+        centre = part.predicted[:, :1] + np.diff(part.predicted, axis=1) * rows
         v = centre[..., None] + far
-        ends.append(search.band.points((rows * search.band.length)[:, None], v).reshape(-1, 2, 2))
-        hidden += [search.hidden] * 2
+        ends.append(part.band.points((rows * part.band.length)[:, None], v).reshape(-1, 2, 2))
+        hidden += [part.hidden] * 2
     pixels = camera.distort(np.concatenate(ends))
     # So near an edge the lens moves pixels in proportion to their distance from it.
-    part = np.linspace(0.0, 1.0, 2 * reach + 1, dtype=np.float32)
-    first, change = (
-        pixels[:, 0].astype(np.float32),
-        np.diff(pixels, axis=1)[:, 0].astype(np.float32),
-    )
-    x, y = (first[:, k : k + 1] + change[:, k : k + 1] * part for k in (0, 1))
-    values, inside = sample(grey, camera, x, y)
-    n_columns = len(part)
+    share = np.linspace(0.0, 1.0, 2 * reach + 1, dtype=np.float32)
+    first, change = (x.astype(np.float32) for x in (pixels[:, 0], np.diff(pixels, axis=1)[:, 0]))
+    x, y = (first[:, k : k + 1] + change[:, k : k + 1] * share for k in (0, 1))
+    inside = (x >= 0.5) & (x <= camera.width - 1.5) & (y >= 0.5) & (y <= camera.height - 1.5)
+    values = np.asarray(cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    n_columns = len(share)
     seen = inside.reshape(-1, ROWS, n_columns).all(axis=1) & ~np.concatenate(hidden)[:, None]
     profiles = values.reshape(-1, ROWS, n_columns).mean(axis=1)
     bounds = np.cumsum([0, *(len(one) for one in hidden)])
-    votes = edge_sharpness(profiles, seen, bounds) * seen
+    votes = _sharpness(profiles, seen, bounds) * seen
     lines = []
     for k, half in enumerate(np.repeat(halves, 2).tolist()):
         own = slice(bounds[k], bounds[k + 1]), slice(reach - half, reach + half + 1)
         n_seen = int(seen[bounds[k] : bounds[k + 1]].any(axis=1).sum())
         lines.append(_lines(votes[own] / max(1, n_seen), half))
     return lines
+
+
+def _sharpness(profiles: Samples, seen: BoolArray, bounds: IntArray) -> Samples:
+    """Return how much each column of profiles (n_blocks, n) looks like an edge, 0 to 1.
+
+    The maxima of the smoothed gradient along each profile against the median of its patch, widened
+    by one column to each side, where they count less. ``bounds`` are the first blocks of patches.
+    """
+    smooth = cv2.GaussianBlur(profiles, (5, 1), 0.8)
+    gradient = np.zeros_like(profiles)
+    gradient[:, 1:-1] = np.abs(smooth[:, 2:] - smooth[:, :-2]) * (seen[:, 2:] & seen[:, :-2])
+    beside = np.ones((1, 3), dtype=np.uint8)
+    wide = np.asarray(cv2.dilate(gradient, beside), dtype=np.float32)
+    peak = np.where(gradient >= wide, gradient, np.float32(0.0))
+    typical = [
+        _median(gradient[first:last][seen[first:last]]) for first, last in pairwise(bounds.tolist())
+    ]
+    level = np.repeat((NOISE_LEVELS * np.array(typical)) ** 2 + 1e-3, np.diff(bounds))
+    sharpness = np.asarray(peak**2 / (peak**2 + level[:, None]), dtype=np.float32)
+    widened = np.asarray(cv2.dilate(sharpness, beside), dtype=np.float32)
+    return np.asarray(np.maximum(sharpness, np.float32(BESIDE) * widened), dtype=np.float32)
+
+
+def _median(values: Samples) -> float:
+    """Return the middle value, the upper one of two; 0 of none."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle]) if len(values) else 0.0
 
 
 def _lines(votes: Array, half: int) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Pairs of edges that may be the two outlines of a cylinder.
+"""Straight edges of a whole picture, and pairs of them that may be the outlines of a cylinder.
 
 A cylinder shows two nearly parallel edges, one where the picture gets brighter across it and one
 where it gets darker; a lit one before something grey may do the same at both. What it is not told
@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.picture import Grey, reduce
+from legcal.perception.light import Grey, reduce
 from legcal.vision import Camera
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
@@ -29,25 +29,24 @@ DARK = 1.0 / 30.0  # part of the brightest light
 MOST = 400  # pieces of a picture, longest first
 STEEPNESSES = 64  # that are told apart in the order of pixels: each one takes time
 
+CONVERGENCE = np.deg2rad(9.0)  # of two outlines: a leg that points at the camera
+NARROWEST, WIDEST = 2.5, 130.0  # [reduced px]
+SLENDER = 1.5  # length in widths
+LEAST_OVERLAP = 0.35  # of the longer edge
+SAME_WAY = 0.5  # what a pair counts at both of whose edges the picture changes the same way
+MOST_PAIRS = 48  # pairs of a picture
+MOST_OF_EDGE = 4  # pairs to which one edge belongs
+ALIKE = 0.35, 0.2  # of a pair that says the same as another: distance, widths in widths
+
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Straight edges.
+    """Straight edges on the sensor plane."""
 
-    Attributes
-    ----------
-    ends : (n, 2, 2) array
-        Both ends on the sensor plane. On the way from the first to the second the picture is
-        brighter on the left-hand side, as one sees it: in the direction (dy, -dx).
-    covered : (n,) array
-        Share of the length on which the edge was seen.
-    pixel : float
-        Size of a pixel of the reduced picture on the sensor plane.
-    """
-
-    ends: Array
-    covered: Array
-    pixel: float
+    ends: Array  # (n, 2, 2) on the way from the first to the second the picture is brighter on the
+    # left-hand side, as one sees it: in the direction (dy, -dx)
+    covered: Array  # (n,) share of the length on which the edge was seen
+    pixel: float  # size of a pixel of the reduced picture
 
     def __len__(self) -> int:
         """Return the number of edges."""
@@ -55,17 +54,7 @@ class Segments:
 
 
 def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> Segments:
-    """Return the straight edges of a picture.
-
-    Parameters
-    ----------
-    grey : Grey
-        The picture.
-    camera : Camera
-        Its camera.
-    long_side : int
-        The picture is reduced by the largest whole factor that leaves its longer side this long.
-    """
+    """Return the straight edges of a picture, whose longer side is reduced to ``long_side`` px."""
     factor = int(np.clip(max(grey.shape) // long_side, 1, LARGEST_FACTOR))
     pieces = _pieces(reduce(grey, factor))
     focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
@@ -159,45 +148,19 @@ def _fitted(pieces: Array, length: Array, label: IntArray) -> tuple[Array, Array
     )
 
 
-CONVERGENCE = np.deg2rad(9.0)  # of two outlines: a leg that points at the camera
-NARROWEST, WIDEST = 2.5, 130.0  # [reduced px]
-SLENDER = 1.5  # length in widths
-LEAST_OVERLAP = 0.35  # of the longer edge
-SAME_WAY = 0.5  # what a pair counts at both of whose edges the picture changes the same way
-MOST_bars = 48  # bars of a picture
-MOST_OF_EDGE = 4  # bars to which one edge belongs
-ALIKE = 0.35, 0.2  # of a bar that says the same as another: distance, widths in widths
-
-
 @dataclass(frozen=True, eq=False)
-class Bars:
-    """Candidate cylinders of a picture, best first, on its sensor plane.
+class EdgePairs:
+    """Candidate cylinders of a picture, best first, on its sensor plane."""
 
-    Attributes
-    ----------
-    middle : (n, 2) array
-        The middle of the axis.
-    along : (n, 2) array
-        Unit direction of the axis.
-    half_length : (n,) array
-        From the middle to the ends.
-    width : (n, 2) array
-        Distance of the edges at both ends; the first one is against ``along``.
-    merit : (n,) array
-        Length on which both edges were seen.
-    pixel : float
-        How well edges are known.
-    """
-
-    middle: Array
-    along: Array
-    half_length: Array
-    width: Array
-    merit: Array
-    pixel: float
+    middle: Array  # (n, 2) of the axis
+    along: Array  # (n, 2) unit direction of the axis
+    half_length: Array  # (n,) from the middle to the ends
+    width: Array  # (n, 2) distance of the edges at both ends; the first one is against ``along``
+    merit: Array  # (n,) length on which both edges were seen
+    pixel: float  # how well edges are known
 
     def __len__(self) -> int:
-        """Return the number of bars."""
+        """Return the number of pairs."""
         return len(self.middle)
 
     @property
@@ -205,9 +168,9 @@ class Bars:
         """Unit normals (n, 2) of the axes."""
         return np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
 
-    def take(self, chosen: IntArray | BoolArray) -> "Bars":
-        """Return some of the bars."""
-        return Bars(
+    def take(self, chosen: IntArray | BoolArray) -> "EdgePairs":
+        """Return some of the pairs."""
+        return EdgePairs(
             self.middle[chosen],
             self.along[chosen],
             self.half_length[chosen],
@@ -217,16 +180,8 @@ class Bars:
         )
 
 
-def find_bars(segments: Segments, most: int = MOST_bars) -> Bars:
-    """Return the pairs of edges that may be a cylinder.
-
-    Parameters
-    ----------
-    segments : Segments
-        Straight edges.
-    most : int
-        How many are kept.
-    """
+def find_edge_pairs(segments: Segments, most: int = MOST_PAIRS) -> EdgePairs:
+    """Return the best pairs of edges that may be a cylinder."""
     ends, pixel = segments.ends, segments.pixel
     i, j = np.triu_indices(len(ends), 1)
     along = ends[:, 1] - ends[:, 0]
@@ -270,7 +225,7 @@ def find_bars(segments: Segments, most: int = MOST_bars) -> Bars:
     chosen = chosen[_distinct(start[chosen], stop[chosen], width.mean(axis=0)[chosen])][:most]
     start, stop = start[chosen], stop[chosen]
     full = np.linalg.norm(stop - start, axis=1)
-    return Bars(
+    return EdgePairs(
         0.5 * (start + stop),
         (stop - start) / full[:, None],
         0.5 * full,
@@ -294,11 +249,11 @@ def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int, most: int) -> In
 
 
 def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
-    """Return which bars (n,), best first, do not lie within better ones of the same width."""
+    """Return which pairs (n,), best first, do not lie within better ones of the same width."""
     along = stop - start
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]
-    # Ends of bar j in the frame of bar i.
+    # Ends of pair j in the frame of pair i.
     to_ends = np.stack([start, stop], axis=1)[None] - start[:, None, None]
     place = np.einsum("ijkx,ix->ijk", to_ends, along)
     aside = to_ends[..., 1] * along[:, None, None, 0] - to_ends[..., 0] * along[:, None, None, 1]

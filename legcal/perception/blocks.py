@@ -1,55 +1,187 @@
-"""A straight line through the blocks of one outline, robust, with an honest covariance.
+"""Blocks of pixels along outlines, fitted one by one, and robust lines through them.
 
-Neighbouring blocks share what the limb model leaves out (texture, shading, the lens), so
-the covariance rests on the scatter and the correlation that are seen, and never falls
-below what the model is known to be good for.
+A line settles where most blocks of its outline have their edge. Neighbouring blocks share what the
+limb model leaves out (texture, shading, the lens), so the covariance of a line rests on the scatter
+and the correlation that are seen, and never falls below what the model is known to be good for.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.limb import N_BASIS, Samples, basis
+from legcal.perception.light import Grey, Samples, evened_weights, to_light
+from legcal.perception.limb import N_BASIS, basis
+from legcal.perception.profiles import Edge, read_profiles
+from legcal.vision import Camera
+
+DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
+SHALLOWEST = 0.8  # largest used depth, in half-widths
+ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
+LEAST_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
+SOME_CLIPPED = 0.1  # share of the blocks of an image from which on they are that long
+ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on longer ones are made, so many times
+ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
+VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
+CONVERGED = 0.1  # movement of every line below which the rounds end [px]
 
 BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
 BLUR_BLOCKS = 16
 BLUR_ROUNDS = 2
-DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
 # Prior precision of the amplitudes, in units of the contrast of a block.
 RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
 BEND = (0, 1, 4)  # functions of the limb model without an edge
 STEP = 0.8  # largest step of a block [px]
 
+TUKEY = 4.0  # sigmas at which a block counts no longer
+N_ROUNDS = 10
+N_SCALES = 3  # rounds in which the scale of the scatter is estimated
+LEAST_SCATTER = 0.01  # [px]
+COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
+LEAST_BLOCKS = 4
+
+
+def depth_for_blur(blur: float) -> float:
+    """Return how far from an outline pixels are used [px]: little more than the blur reaches.
+
+    The further inside, the less the shading is that of a limb.
+    """
+    return DEPTH[0] + DEPTH[1] * blur
+
+
+@dataclass(eq=False)
+class Blocks:
+    """The blocks of all edges of an image, and how far their lines have moved."""
+
+    d: Samples  # (n, m) from the lines at which they were read
+    grey: Samples  # (n, m) proportional to light
+    weight: Samples  # (n, m)
+    gain: Array  # (n,)
+    bounds: IntArray  # (n_edges + 1,) first block of each edge
+    position: Array  # (n,) as fractions of the bands
+    half_width: Samples  # (n, 1)
+    clipped: Samples  # (n,) up to where the background saturates the picture [px], or -inf
+    moved: Array  # (n,) [px]
+    contrast: Array  # (n,) step to the leg [grey levels]
+    sharp: Array  # (n,) how clearly it is a step and not a bend of the shading [chi^2]
+    lines: list["Line | None"]
+
+    @classmethod
+    def read(
+        cls,
+        grey: Grey,
+        camera: Camera,
+        edges: Sequence[Edge],
+        v: Sequence[Array],
+        blur: float,
+        most: int | None = None,
+    ) -> "Blocks":
+        """Read the unhidden blocks of all edges; about ``most`` short ones of each, if given."""
+        outer = depth_for_blur(blur)
+        rows = ROWS
+        if most is None:
+            rows *= int(np.clip(np.rint(blur / ROWS_PER_BLUR), 1, 4))
+            shortest = min(edge.band.length * float(np.mean(~edge.hidden)) for edge in edges)
+            rows = max(rows, ROWS * int(np.clip(shortest / (ROWS * ENOUGH), 1, LONGEST)))
+        half_width = np.array([edge.half_width for edge in edges])
+        depths = outer, np.minimum(outer, SHALLOWEST * half_width)
+        read = read_profiles(grey, camera, edges, v, depths, rows, most)
+        if rows < LEAST_ROWS_CLIPPED and np.mean(read.clipped > -np.inf) > SOME_CLIPPED:
+            # Too few pixels of a sharp step are left in short blocks.
+            read = read_profiles(grey, camera, edges, v, depths, LEAST_ROWS_CLIPPED, most)
+        light, weight = to_light(read.grey, read.inside, camera.gamma)
+        n = len(read.position)
+        return cls(
+            read.d,
+            light,
+            weight,
+            read.gain,
+            read.bounds,
+            read.position,
+            np.repeat(half_width, np.diff(read.bounds)).astype(np.float32)[:, None],
+            read.clipped,
+            np.zeros(n),
+            np.zeros(n),
+            np.zeros(n),
+            [None] * len(edges),
+        )
+
+    def samples(self, blocks: slice | BoolArray) -> tuple[Samples, Samples, Samples, Samples]:
+        """Return distances from the current lines, grey levels, weights, half-widths."""
+        d = self.d[blocks] - self.moved[blocks, None].astype(np.float32)
+        return d, self.grey[blocks], self.weight[blocks], self.half_width[blocks]
+
+    def even_noise(self, kept: BoolArray, blur: float) -> None:
+        """Weigh the pixels by the noise that is seen on both sides of each edge."""
+        d = self.samples(slice(None))[0]
+        self.weight = evened_weights(d, self.grey, self.weight, self.bounds, kept, blur)
+
+    def of_edges(self, values: Array) -> list[Array]:
+        """Return values (n,) of blocks, edge by edge."""
+        return np.split(values, self.bounds[1:-1])
+
+    def merit(self) -> Array:
+        """Return how much each block tells of the blur: nothing where half of the step is cut."""
+        return np.where(self.clipped > self.moved, 0.0, np.abs(self.contrast))
+
+    def kept(self) -> BoolArray:
+        """Return which blocks lie on the lines of their edges, (n,)."""
+        nothing = [np.zeros(n, dtype=np.bool_) for n in np.diff(self.bounds)]
+        lines = zip(self.lines, nothing, strict=True)
+        return np.concatenate([none if line is None else line.kept for line, none in lines])
+
+    def unmove(self) -> None:
+        """Put lines back to where they were read; blocks that lay on them stay kept.
+
+        Blocks by themselves hardly tell where a limb is that rises from the level of the
+        background: lines that were near the outline must not settle elsewhere.
+        """
+        self.moved[:] = 0.0
+        self.lines = [
+            None if line is None else replace(line, ends=np.zeros(2)) for line in self.lines
+        ]
+
+    def settle(self, blur: float, n_rounds: int) -> None:
+        """Fit the blocks and a line to each edge in turn, until no line moves any more."""
+        active = np.ones(len(self.lines), dtype=np.bool_)
+        counts = np.diff(self.bounds)
+        largest = min(VAGUE[0] * blur, VAGUE[1]) ** 2
+        for _ in range(n_rounds):
+            chosen = np.repeat(active, counts)
+            fit = fit_blocks(*self.samples(chosen), blur)
+            self.contrast[chosen] = fit.contrast(self.half_width[chosen], blur)
+            self.sharp[chosen] = fit.sharpness()
+            bounds = np.concatenate([[0], np.cumsum(counts[active])])
+            gain, position, before = (x[chosen] for x in (self.gain, self.position, self.moved))
+            shift = (before + fit.shift) / gain  # a line holds the whole shift
+            lines = fit_lines(bounds, position, shift, fit.variance / gain**2, largest)
+            after = before.copy()
+            for k, (i, line) in enumerate(zip(np.flatnonzero(active).tolist(), lines, strict=True)):
+                self.lines[i], own = line, slice(bounds[k], bounds[k + 1])
+                if line is None:
+                    active[i] = False
+                    continue
+                along = line.ends[0] + (line.ends[1] - line.ends[0]) * position[own]
+                after[own] = along * gain[own]
+                active[i] = np.abs(after[own] - before[own]).max() > CONVERGED
+            self.moved[chosen] = after
+            if not np.any(active):
+                break
+
 
 @dataclass(frozen=True, eq=False)
 class BlockFit:
-    """Where the outline lies in every block.
+    """Where the outline lies in every block, (n,) each."""
 
-    Attributes
-    ----------
-    shift : (n,) array
-        Distance of the outline from the current line, positive towards the inside [px].
-    variance : (n,) array
-        Its variance by the noise of the block [px^2]; infinite where nothing is seen.
-    noise : (n,) array
-        Mean square residual of the block [grey levels^2].
-    freedom : (n,) array
-        Samples of the block beyond what is fitted, at least one.
-    amplitude : (n, 5) array
-        Of the functions of the limb model [grey levels].
-    normal, right, power : (n, 5, 5), (n, 5) and (n,) array
-        Products of these functions, of them with the grey levels, and of grey levels.
-    """
-
-    shift: Array
-    variance: Array
-    noise: Array
-    freedom: Array
-    amplitude: Array
-    normal: Array
-    right: Array
-    power: Array
+    shift: Array  # of the outline from the current line, positive towards the inside [px]
+    variance: Array  # of it by the noise of the block [px^2]; infinite where nothing is seen
+    noise: Array  # mean square residual [grey levels^2]
+    freedom: Array  # samples beyond what is fitted, at least one
+    amplitude: Array  # (n, 5) of the functions of the limb model [grey levels]
+    normal: Array  # (n, 5, 5) products of these functions
+    right: Array  # (n, 5) of them with the grey levels
+    power: Array  # of grey levels
 
     def contrast(self, half_width: Samples, blur: float) -> Array:
         """Return the steps (n,) to the leg, a pixel and a half inside [grey levels]."""
@@ -72,16 +204,9 @@ def fit_blocks(
 ) -> BlockFit:
     """Fit the limb model to blocks, by one Gauss-Newton step from the current line.
 
-    Parameters
-    ----------
-    d, grey : (n, m) array of float32
-        Distances inside the current line [px] and grey levels, proportional to light.
-    weight : (n, m) array of float32
-        Inverse noise of the samples in some unit; zero for those that are not to be used.
-    half_width : (n, 1) array of float32
-        Half-width of the cylinder [px].
-    blur : float or (n, 1) array of float32
-        Standard deviation of the blur [px].
+    Distances inside the line [px], grey levels proportional to light, and inverse noise in some
+    unit (zero for samples that are not to be used), all (n, m); half-widths (n, 1) and the blur,
+    or (n, 1) blurs, in px.
     """
     X, slopes = basis(d, half_width, blur)
     n_samples = np.count_nonzero(weight, axis=1).astype(np.float64)
@@ -139,14 +264,9 @@ def _regularised_inverse(normal: Array, right: Array, power: Array, n_samples: A
 def estimate_blur(
     d: Samples, grey: Samples, weight: Samples, half_width: Samples, merit: Array
 ) -> float:
-    """Return the blur [px] that explains the best blocks of an image best.
+    """Return the blur [px] that explains those blocks of an image best that have most merit (n,).
 
-    Parameters
-    ----------
-    d, grey, weight, half_width
-        As for :func:`fit_blocks`.
-    merit : (n,) array
-        How much each block tells, such as its contrast.
+    The other arguments are as for :func:`fit_blocks`.
     """
     best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
     d, grey, weight, half_width = d[best], grey[best], weight[best], half_width[best]
@@ -157,11 +277,6 @@ def estimate_blur(
     bend = left - 2.0 * middle + right
     offset = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
     return float(blurs[i] * (blurs[1] / blurs[0]) ** offset)
-
-
-def depth_for_blur(blur: float) -> float:
-    """Return how far from an outline pixels are used [px]: little more than the blur reaches."""
-    return DEPTH[0] + DEPTH[1] * blur
 
 
 def _misfits(
@@ -177,37 +292,16 @@ def _misfits(
     return np.asarray(np.log(fit.noise + 1e-3).reshape(n, -1).mean(axis=1))
 
 
-TUKEY = 4.0  # sigmas at which a block counts no longer
-N_ROUNDS = 10
-N_SCALES = 3  # rounds in which the scale of the scatter is estimated
-LEAST_SCATTER = 0.01  # [px]
-COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
-LEAST_BLOCKS = 4
-
-
 @dataclass(frozen=True, eq=False)
-class StraightFit:
-    """A line through blocks.
+class Line:
+    """A line through the blocks of an outline, with those that lie on it."""
 
-    Attributes
-    ----------
-    ends : (2,) array
-        Shift of the outline at t = 0 and at t = length [px of the band].
-    kept : (n,) array of bool
-        The blocks that lie on it.
-    agreement : float
-        Share of the blocks that show an edge at all which lie on the line.
-    position, residual, variance : (n_kept,) array
-        Places of the kept blocks as fractions of the length, their distances from the line
-        [px], and the variances of these by noise, scaled to the scatter seen [px^2].
-    """
-
-    ends: Array
-    kept: BoolArray
-    agreement: float
-    position: Array
-    residual: Array
-    variance: Array
+    ends: Array  # (2,) shift of the outline at t = 0 and at t = length [px of the band]
+    kept: BoolArray  # (n,) the blocks that lie on it
+    agreement: float  # share of the blocks that show an edge at all which lie on the line
+    position: Array  # (n_kept,) as fractions of the length
+    residual: Array  # (n_kept,) distances from the line [px]
+    variance: Array  # (n_kept,) of these by noise, scaled to the scatter seen [px^2]
 
     @property
     def first(self) -> float:
@@ -235,41 +329,14 @@ class StraightFit:
         return np.asarray(0.5 * (covariance + covariance.T) + bias)
 
 
-def fit_straight(
-    position: Array, shift: Array, variance: Array, largest: float = np.inf
-) -> StraightFit | None:
-    """Fit a line to the shifts of blocks by iteratively reweighted least squares.
-
-    Parameters
-    ----------
-    position : (n,) array
-        Places of the blocks as fractions of the length.
-    shift : (n,) array
-        Shifts of the outline there [px].
-    variance : (n,) array
-        Their variances by noise [px^2], infinite where a block shows nothing.
-    largest : float
-        Blocks with this variance or a larger one are left out [px^2].
-
-    Returns
-    -------
-    StraightFit or None
-        None if fewer than ``LEAST_BLOCKS`` blocks agree.
-    """
-    return fit_straights(np.array([0, len(position)]), position, shift, variance, largest)[0]
-
-
-def fit_straights(
+def fit_lines(
     bounds: IntArray, position: Array, shift: Array, variance: Array, largest: float = np.inf
-) -> list[StraightFit | None]:
-    """Fit a line to each of several outlines, as :func:`fit_straight` does to one.
+) -> list[Line | None]:
+    """Fit a line to each of several outlines by iteratively reweighted least squares.
 
-    Parameters
-    ----------
-    bounds : (n_edges + 1,) array of int
-        The first block of each outline.
-    position, shift, variance, largest
-        Of the blocks of all outlines, one outline after the other.
+    From positions (n,) as fractions of the length, shifts [px], and their variances by noise
+    [px^2] of all blocks, one outline after the other; those of variance ``largest`` or more are
+    left out. None where fewer than ``LEAST_BLOCKS`` blocks agree.
     """
     counts = np.diff(bounds)
     filled = np.arange(int(counts.max(initial=0))) < counts[:, None]  # (n_edges, n_most)
@@ -316,7 +383,7 @@ def fit_straights(
     residual = moved - ends[:, :1] - (ends[:, 1:] - ends[:, :1]) * along
     scaled = floored * factor[:, None] ** 2
     return [
-        StraightFit(
+        Line(
             ends[i],
             on_line[i, : counts[i]],
             float(np.count_nonzero(on_line[i]) / n_usable[i]),

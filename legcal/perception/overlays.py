@@ -1,4 +1,4 @@
-"""One image with what was found in it.
+"""One image with what was found in it drawn over it.
 
 Widths of lines and sizes of letters grow with the picture, and small pictures are enlarged, so
 that both are legible when the picture fills a screen.
@@ -8,78 +8,47 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
 
-from legcal.data import Dataset, Outlines
-from legcal.geometry import Array, Image, IntArray
-from legcal.machine import Cylinder
+from legcal.data import Outlines
+from legcal.geometry import Array, Image
 from legcal.perception.outline import OUTSIDE
-from legcal.vision import Camera, PredictedLeg, band_of_leg, predict_legs
+from legcal.vision import Camera, PredictedLeg, band_of_leg
 
+Kind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted"]
+N_POINTS = 40  # of a curve
+OTHER_FAILS = "other outline fails"
 
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """The result of :func:`legcal.detect`, in the order of the files.
+Picture = NDArray[np.uint8]
 
-    Attributes
-    ----------
-    dataset : Dataset
-        What was searched.
-    outlines : Outlines
-        All outlines: detected, given and edited.
-    A_base, B_base : (n_rows, n_legs, 3) array
-        Joint centres at every row, where each view sees them, in the base link [m].
-    cylinders : sequence, for each leg a sequence of Cylinder
-        What can be seen of the legs, with the radii that outlines were searched by.
-    T_base_camera : tuple of RigidTransform or None
-        The camera of every view; None where nothing is known of it.
-    rows : (n,) array of int
-        The rows that have an image.
-    unplaced : dict
-        Why the cameras of some views could not be placed, by name of the view; they are left where
-        they were expected, and no outline of theirs is here but those that were given.
-    notes : tuple of str
-        What else a reader should know.
-    """
-
-    dataset: Dataset
-    outlines: Outlines
-    A_base: Array
-    B_base: Array
-    cylinders: Sequence[Sequence[Cylinder]]
-    T_base_camera: tuple[RigidTransform | None, ...]
-    rows: IntArray
-    unplaced: dict[str, str]
-    notes: tuple[str, ...]
-
-    def view_of(self, row: int) -> str:
-        """Return the name of the view of a row."""
-        measurements = self.dataset.measurements
-        return measurements.views[int(measurements.view[row])].name
-
-    def predicted(self, row: int) -> list[PredictedLeg]:
-        """Return where the legs of a row should be seen; none where the camera is not known."""
-        measurements, legs = self.dataset.measurements, self.dataset.mechanism.legs
-        view = int(measurements.view[row])
-        T = self.T_base_camera[view]
-        if T is None:
-            return []
-        used = measurements.views[view].legs
-        found = predict_legs(
-            measurements.views[view].camera,
-            T,
-            self.A_base[row],
-            self.B_base[row],
-            self.cylinders,
-            row,
-        )
-        return [leg for leg in found if used is None or legs[leg.leg].name in used]
-
+SCREEN = 1600  # longer side from which on a picture is not enlarged [px]
+MOST_ENLARGED = 4
+PER_LINE, PER_LETTER = 1000.0, 75.0  # longer sides in a line's width, and in a letter's height
+COLOURS: dict[Kind, tuple[int, int, int]] = {  # blue, green, red
+    "edge 1": (80, 230, 60),
+    "edge 2": (255, 170, 40),
+    "axis": (0, 225, 255),
+    "rejected": (70, 70, 255),
+    "predicted": (30, 150, 255),
+}
+_MEANING: dict[Kind, str] = {
+    "edge 1": "edge 1",
+    "edge 2": "edge 2",
+    "axis": "axis",
+    "rejected": "rejected",
+    "predicted": "expected here, not found",
+}
+_WHITE = (255, 255, 255)
+_DARK = (32, 32, 32)
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_LETTER = 22.0  # height of a letter of this font at scale 1 [px]
+_FRACTION_BITS = 4  # of coordinates that OpenCV draws at
+_SMALLER = 0.8  # letters of reasons and of the legend
+_DASH, _GAP = 9.0, 7.0  # in widths of a line
 
 _PLACES = (0.5, 0.3, 0.7, 0.15, 0.85)  # along a curve
 _ORDER = 0.02  # of the area of a text, by which an earlier place is preferred
@@ -87,113 +56,18 @@ _ON_LINE = 0.1  # of the area of a text, that each point of a line under it cost
 _ON_TEXT, _OUTSIDE = 4.0, 10.0  # times the area on other texts, and outside the picture
 
 
-@dataclass(eq=False)
-class LabelPlaces:
-    """The texts of a picture.
-
-    Attributes
-    ----------
-    width, height : int
-        Of the picture [px].
-    lines : (n, 2) array
-        Points of all that is drawn [px].
-    boxes : list of (4,) array
-        Left, top, right and bottom of the texts that have a place.
-    """
-
-    width: int
-    height: int
-    lines: Array
-    boxes: list[Array] = field(default_factory=list)
-
-    def place(
-        self, curve: Array, size: tuple[int, int], distance: float
-    ) -> tuple[tuple[int, int], Array]:
-        """Return the left top corner of a text beside a curve, and keep its place.
-
-        Parameters
-        ----------
-        curve : (n, 2) array
-            What the text names [px].
-        size : tuple of two int
-            Width and height of the text [px].
-        distance : float
-            From the curve, at least [px].
-
-        Returns
-        -------
-        corner : tuple of two int
-        leader : (2, 2) array
-            From the curve to the text [px].
-        """
-        extent = np.array(size, dtype=np.float64)
-        candidates = []
-        for place in _PLACES:
-            i = min(int(place * len(curve)), len(curve) - 2)
-            along = curve[i + 1] - curve[i]
-            normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
-            reach = distance + 0.5 * float(np.abs(normal) @ extent)
-            for side in (reach, -reach, reach + distance, -reach - distance):
-                candidates.append((curve[i], curve[i] + side * normal - 0.5 * extent))
-        costs = [
-            self._cost(corner, extent) + _ORDER * k * extent.prod()
-            for k, (_, corner) in enumerate(candidates)
-        ]
-        anchor, best = candidates[int(np.argmin(costs))]
-        limit = np.maximum([self.width, self.height] - extent, 0.0)
-        corner = np.clip(np.rint(best), 0.0, np.floor(limit))
-        self.boxes.append(np.concatenate([corner, corner + extent]))
-        leader = np.array([anchor, np.clip(anchor, corner, corner + extent)])
-        return (int(corner[0]), int(corner[1])), leader
-
-    def _cost(self, corner: Array, extent: Array) -> float:
-        """Return what speaks against a place, as an area [px^2]."""
-        area = float(extent.prod())
-        low, high = corner, corner + extent
-        inside = np.minimum(high, [self.width, self.height]) - np.maximum(low, 0.0)
-        cost = _OUTSIDE * (area - float(np.maximum(inside, 0.0).prod()))
-        for box in self.boxes:
-            overlap = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
-            cost += _ON_TEXT * float(np.maximum(overlap, 0.0).prod())
-        under = np.all((self.lines > low) & (self.lines < high), axis=1)
-        return cost + _ON_LINE * area * float(np.count_nonzero(under))
-
-
-Kind = Literal["edge 1", "edge 2", "axis", "rejected", "predicted"]
-N_POINTS = 40  # of a curve
-OTHER_FAILS = "other outline fails"
-
-
-@dataclass(frozen=True, eq=False)
-class Mark:
-    """A curve of the picture.
-
-    Attributes
-    ----------
-    kind : {"edge 1", "edge 2", "axis", "rejected", "predicted"}
-    points : (n, 2) array
-        Its points [px].
-    """
+class Mark(NamedTuple):
+    """A curve of the picture."""
 
     kind: Kind
-    points: Array
+    points: Array  # (n, 2) [px]
 
 
-@dataclass(frozen=True, eq=False)
-class PartMarks:
-    """What is drawn of a part of a leg.
+class PartMarks(NamedTuple):
+    """What is drawn of a part of a leg."""
 
-    Attributes
-    ----------
-    name : str
-        The leg, and the part where the leg has several.
-    reason : str
-        Why an outline of it is not used, shortened; "" if both are.
-    marks : tuple of Mark
-    """
-
-    name: str
-    reason: str
+    name: str  # the leg, and the part where the leg has several
+    reason: str  # why an outline of it is not used, shortened; "" if both are
     marks: tuple[Mark, ...]
 
 
@@ -212,16 +86,7 @@ def marks_of_image(
 ) -> list[PartMarks]:
     """Return what is drawn over an image, one entry for each part of a leg in it.
 
-    Parameters
-    ----------
-    camera : Camera
-        Its camera.
-    outlines : Outlines
-        Those of this image.
-    predicted : sequence of PredictedLeg
-        Where its legs should be.
-    leg_names : sequence of str
-        The legs of the mechanism.
+    By its outlines, and where its legs should be.
     """
     of_leg = {leg.leg: leg for leg in predicted}
     several = {leg.leg for leg in predicted if len(leg.pieces) > 1}
@@ -310,50 +175,10 @@ def _prediction(camera: Camera, leg: PredictedLeg, i: int) -> list[Mark]:
     ]
 
 
-Picture = NDArray[np.uint8]
-
-SCREEN = 1600  # longer side from which on a picture is not enlarged [px]
-MOST_ENLARGED = 4
-PER_LINE, PER_LETTER = 1000.0, 75.0  # longer sides in a line's width, and in a letter's height
-COLOURS: dict[Kind, tuple[int, int, int]] = {  # blue, green, red
-    "edge 1": (80, 230, 60),
-    "edge 2": (255, 170, 40),
-    "axis": (0, 225, 255),
-    "rejected": (70, 70, 255),
-    "predicted": (30, 150, 255),
-}
-_MEANING: dict[Kind, str] = {
-    "edge 1": "edge 1",
-    "edge 2": "edge 2",
-    "axis": "axis",
-    "rejected": "rejected",
-    "predicted": "expected here, not found",
-}
-_WHITE = (255, 255, 255)
-_DARK = (32, 32, 32)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_LETTER = 22.0  # height of a letter of this font at scale 1 [px]
-_FRACTION_BITS = 4  # of coordinates that OpenCV draws at
-_SMALLER = 0.8  # letters of reasons and of the legend
-_DASH, _GAP = 9.0, 7.0  # in widths of a line
-
-
 def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Picture:
-    """Return an image with lines, names and reasons drawn over it, and a legend below.
+    """Return a grey image with lines, names and reasons over it, and a legend below, BGR.
 
-    Parameters
-    ----------
-    image : (height, width) array
-        Grey levels 0 to 255.
-    parts : sequence of PartMarks
-        What to draw.
-    caption : str
-        Stands in the legend.
-
-    Returns
-    -------
-    (height, width, 3) array of uint8
-        Blue, green, red.
+    The caption stands in the legend.
     """
     longer = max(image.shape)
     factor = int(np.clip(np.ceil(SCREEN / longer), 1, MOST_ENLARGED))
@@ -462,3 +287,52 @@ def _legend(width: int, letter: float, line: int, caption: str) -> Picture:
         cv2.putText(strip, meaning, at, _FONT, _SMALLER * scale, _WHITE, thick, cv2.LINE_AA)
         x += 3.6 * letter + w + 2.0 * letter
     return strip
+
+
+@dataclass(eq=False)
+class LabelPlaces:
+    """The texts of a picture, each where it hides least."""
+
+    width: int  # of the picture [px]
+    height: int
+    lines: Array  # (n, 2) points of all that is drawn [px]
+    boxes: list[Array] = field(default_factory=list)  # (4,) left, top, right, bottom of texts
+
+    def place(
+        self, curve: Array, size: tuple[int, int], distance: float
+    ) -> tuple[tuple[int, int], Array]:
+        """Return the left top corner of a text (width, height) [px] beside a curve (n, 2).
+
+        It keeps its place, at least a distance from the curve [px]; and a leader (2, 2) to it.
+        """
+        extent = np.array(size, dtype=np.float64)
+        candidates = []
+        for place in _PLACES:
+            i = min(int(place * len(curve)), len(curve) - 2)
+            along = curve[i + 1] - curve[i]
+            normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
+            reach = distance + 0.5 * float(np.abs(normal) @ extent)
+            for side in (reach, -reach, reach + distance, -reach - distance):
+                candidates.append((curve[i], curve[i] + side * normal - 0.5 * extent))
+        costs = [
+            self._cost(corner, extent) + _ORDER * k * extent.prod()
+            for k, (_, corner) in enumerate(candidates)
+        ]
+        anchor, best = candidates[int(np.argmin(costs))]
+        limit = np.maximum([self.width, self.height] - extent, 0.0)
+        corner = np.clip(np.rint(best), 0.0, np.floor(limit))
+        self.boxes.append(np.concatenate([corner, corner + extent]))
+        leader = np.array([anchor, np.clip(anchor, corner, corner + extent)])
+        return (int(corner[0]), int(corner[1])), leader
+
+    def _cost(self, corner: Array, extent: Array) -> float:
+        """Return what speaks against a place, as an area [px^2]."""
+        area = float(extent.prod())
+        low, high = corner, corner + extent
+        inside = np.minimum(high, [self.width, self.height]) - np.maximum(low, 0.0)
+        cost = _OUTSIDE * (area - float(np.maximum(inside, 0.0).prod()))
+        for box in self.boxes:
+            overlap = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
+            cost += _ON_TEXT * float(np.maximum(overlap, 0.0).prod())
+        under = np.all((self.lines > low) & (self.lines < high), axis=1)
+        return cost + _ON_LINE * area * float(np.count_nonzero(under))

@@ -1,0 +1,582 @@
+"""What is wrong with images, views and rough poses, each named once.
+
+Images that are black, overexposed, empty or blurred are found before anything else. Images in which
+few legs were found where the others of their view show theirs are judged once more: with the
+readings of all other images, with the cameras of the other views, and mirrored. An explanation must
+be clearly better than the reading itself. Whatever is wrong is left out with a reason.
+
+The blur is that of the sharpest edges. An edge of blur sigma that is blurred by s besides has a
+slope proportional to (sigma^2 + s^2)^(-1/2); slopes after two such s give sigma, whatever the step.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data import Measurements, Outlines, is_edited
+from legcal.geometry import BoolArray, IntArray
+from legcal.perception.agreement import Picture, Poses, agreement, targets_of
+from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
+from legcal.perception.detection import NOT_PLACED
+from legcal.perception.light import Grey, reduce
+from legcal.perception.lines import EdgePairs
+from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.perception.placement import Placement, Search, corners_of
+from legcal.workers import Run
+
+BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
+NEARLY_ALL = 0.5  # percent of an image that may be otherwise
+LEAST_RANGE = 10.0  # of an image in which something can be seen [grey levels]
+REDUCTION = 8  # before the range is taken, so that noise does not count
+SCALES = (0.95, 2.5)  # at which slopes are compared, standard deviations [px]
+# The first is that of the filter of slopes alone. The second is taken from means of four pixels,
+# where that filter is twice as wide.
+_BLUR_OF_HALF = 0.5 * math.sqrt(SCALES[1] ** 2 - 4.0 * SCALES[0] ** 2 - 0.25)
+SPARSE = 6  # every such row and column is enough for percentiles
+DIRECTIONS = 4  # of edges: what moves is blurred in one
+WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
+STRONG = 95.0  # percentile of the slopes from which on they count
+FEWEST_EDGES, FEWEST_PART = 40, 0.1  # places of a direction, and of all
+LARGEST_BLUR = 8.0  # that the scales can tell [px]
+MUCH_BLURRED = (2.0, 1.2)  # against others: factor, and more [px]
+SHARP = 40.0  # percentile of blurs, for what is usual
+FEWEST = 3  # images of a view or camera, to be compared
+
+TOLERANCE = 0.006  # of an axis from its bar [m]
+UNPLACED = 0.015  # the same of a leg that nothing has moved from where the model has it
+CLEAR = 0.35  # share of the legs that explain
+BETTER = 2.0, 0.15  # the same against the reading's: factor, more
+AS_USUAL = 0.5  # of the share that the other images of the view reach
+ALIKE = 0.85  # of the best explanation: then another one is about as good
+MIRRORED = "the image is mirrored"  # reasons
+TURNED = "the image is upside down"
+_FLIPS = ((LEFT_RIGHT, MIRRORED), (UP_DOWN, MIRRORED), (UPSIDE_DOWN, TURNED))
+
+FEW = 0.5  # found, against other images
+WITNESSES = 3  # good images that tell how much of the legs they show
+SHOWN = 0.5  # share of a leg's length in each of them, from which on it is clearly visible
+USUALLY = 0.3  # the least that images of a view must find to be compared with
+GOOD = 75.0  # percentile of what images find, for what good ones do
+NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
+NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
+
+FAR_OFF = (0.06, np.deg2rad(6.0))  # three times what a rough pose is good to: [m], angle
+FAR_PART = 0.06  # of the distance of the camera, where that is more
+BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
+
+
+class Explanation(NamedTuple):
+    """What an image shows."""
+
+    own: float  # share of the legs, by visible length, that are where its reading has them
+    reason: str = ""  # what it shows instead; "" where nothing explains it clearly
+    remedy: str = ""  # what to do then
+
+
+class OutlineCount(NamedTuple):
+    """How many outlines of an image were found, of those that it should show."""
+
+    used: int
+    visible: int
+
+    @property
+    def share(self) -> float:
+        """Their ratio."""
+        return self.used / self.visible
+
+
+def diagnose(
+    search: Search,
+    placement: Placement,
+    outlines: Outlines,
+    rows: IntArray,
+    defects: Mapping[int, str],
+    run: Run,
+) -> tuple[Placement, dict[int, str]]:
+    """Return the placement with what is to be said, and why images are left out, by row.
+
+    Of the rows searched, some with defects by themselves. Views all of whose images have one are
+    not placed, and said once.
+    """
+    view = search.measurements.view
+    usable = [row for row in rows.tolist() if row not in defects]
+    lost = set(view[rows].tolist()) - set(view[usable].tolist())
+    placement = _without_views(search.measurements, placement, sorted(lost), defects)
+    found = _found(outlines, [r for r in usable if placement.T_base_camera[view[r]] is not None])
+    doubted = _doubted(found, view)
+    usual = _usual(search, placement, found, doubted, run)
+    task = partial(explain, search, placement, usual, doubted=frozenset(doubted))
+    reasons = dict(defects)
+    notes = [
+        f"{_image_name(search.measurements, row)}: was left out: {why}; take it again."
+        for row, why in sorted(defects.items())
+        if view[row] not in lost
+    ]
+    for row, explanation in zip(doubted, run(task, doubted), strict=True):
+        reason, note = judged(search.measurements, row, explanation, usual, found)
+        notes.append(note)
+        if reason:
+            reasons[row] = reason
+    notes += _leg_notes(search, placement, outlines, found, reasons)
+    return replace(placement, notes=(*placement.notes, *notes)), reasons
+
+
+def reject_images(outlines: Outlines, reasons: Mapping[int, str]) -> Outlines:
+    """Return outlines with those of some images rejected; edited ones stay.
+
+    Those that an image should not show keep the reason for that, so that they do not count as
+    expected there.
+    """
+    out = np.isin(outlines.row, list(reasons)) & ~is_edited(outlines)
+    reason = tuple(
+        reasons[row] if is_out and not why.startswith(NOT_IN_SIGHT) else why
+        for row, is_out, why in zip(
+            outlines.row.tolist(), out.tolist(), outlines.reason, strict=True
+        )
+    )
+    return replace(outlines, used=outlines.used & ~out, reason=reason)
+
+
+def is_visible(outlines: Outlines) -> BoolArray:
+    """Return which outlines an image should show."""
+    hidden = (*NOT_IN_SIGHT, NOT_PLACED)
+    return np.array([not why.startswith(hidden) for why in outlines.reason], dtype=np.bool_)
+
+
+def _without_views(
+    measurements: Measurements,
+    placement: Placement,
+    lost: Sequence[int],
+    defects: Mapping[int, str],
+) -> Placement:
+    """Return the placement with views unplaced all of whose images show nothing."""
+    cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
+    for v in lost:
+        name = measurements.views[v].name
+        own = [row for row in defects if measurements.view[row] == v]
+        cameras[v] = None
+        unplaced[name] = (
+            f"view {name}: its camera could not be placed: found nothing to see in its {len(own)} "
+            f"image{'s' * (len(own) != 1)} ({measurements.image[own[0]]}: {defects[own[0]]}), "
+            "needed photographs of the legs; take them again."
+        )
+    return replace(placement, T_base_camera=tuple(cameras), unplaced=unplaced)
+
+
+def judged(
+    measurements: Measurements,
+    row: int,
+    explanation: Explanation,
+    usual: Mapping[int, float],
+    found: Mapping[int, OutlineCount],
+) -> tuple[str, str]:
+    """Return why an image is left out, "" if it is not, and the sentence that says so."""
+    name, count = _image_name(measurements, row), found[row]
+    much = f"{count.used} of {count.visible} outlines where its reading has the legs"
+    if explanation.reason:
+        return (
+            explanation.reason,
+            f"{name}: was left out: {explanation.reason}; {explanation.remedy}.",
+        )
+    view = int(measurements.view[row])
+    if explanation.own >= FEW * usual[view]:
+        return "", (
+            f"{name}: shows little of the legs: found {much}, in other images most; look at "
+            "its light and sharpness."
+        )
+    return NOTHING_LIKE, (
+        f"{name}: was left out: found {much}, and nothing else that it shows; check that it is a "
+        "photograph of this machine, taken by this camera at this reading."
+    )
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How an image was exposed [grey levels]."""
+
+    dark: float  # what nearly all of the image is brighter than
+    bright: float  # what nearly all of it is darker than
+    range: float  # between the darkest and the brightest places
+    blur: float  # standard deviation of the blur of its sharp edges [px]
+
+    @property
+    def defect(self) -> str:
+        """Why nothing can be seen in the image, "" if something may."""
+        if self.bright < BLACK:
+            return f"the image is black, at most {self.bright:.0f} of 255 grey levels"
+        if self.dark > WHITE:
+            return f"the image is overexposed, at least {self.dark:.0f} of 255 grey levels"
+        if self.range < LEAST_RANGE:
+            return f"the image shows nothing, all of it within {self.range:.0f} of 255 grey levels"
+        return ""
+
+
+def expose(grey: Grey) -> Exposure:
+    """Return how an image was exposed."""
+    small = reduce(grey, max(1, min(REDUCTION, min(grey.shape) // 16)))
+    low, high = np.percentile(small, [NEARLY_ALL, 100.0 - NEARLY_ALL])
+    dark, bright = np.percentile(grey[::SPARSE, ::SPARSE], [NEARLY_ALL, 100.0 - NEARLY_ALL])
+    return Exposure(float(dark), float(bright), float(high - low), _blur(grey))
+
+
+def _blur(grey: Grey) -> float:
+    """Return the blur of sharp edges [px], in all directions but one."""
+    fine, coarse, angle = _edges(grey)
+    direction = np.rint(angle / (np.pi / DIRECTIONS)).astype(np.intp) % DIRECTIONS
+    least = max(FEWEST_EDGES, int(FEWEST_PART * len(fine)))  # else they are corners of others
+    of_direction = [direction == d for d in range(DIRECTIONS)]
+    chosen = [own for own in of_direction if np.count_nonzero(own) >= least]
+    blurs = sorted(_blur_of(fine[own], coarse[own]) for own in chosen)
+    # Shades of one direction may be soft everywhere; what moves is sharp in one direction only.
+    return blurs[min(1, len(blurs) - 1)] if blurs else 0.0
+
+
+def _edges(grey: Grey) -> tuple[Grey, Grey, Grey]:
+    """Return slopes of edges in their middle, fine and coarse, and their directions [rad]."""
+    height, width = (2 * (size // 2) for size in grey.shape)
+    slope = cv2.magnitude(*_slopes(grey[:height, :width]))
+    rows = np.maximum(slope[::2], slope[1::2])
+    fine = np.maximum(rows[:, ::2], rows[:, 1::2])  # the greatest of four pixels
+    half = cv2.GaussianBlur(reduce(grey, 2), (0, 0), _BLUR_OF_HALF)
+    x, y = _slopes(np.asarray(half, dtype=np.float32))
+    coarse = cv2.magnitude(x, y)
+    # Beside the middle of an edge the ratio says nothing.
+    edge = fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))
+    edge &= coarse >= np.percentile(coarse[::SPARSE, ::SPARSE], WEAK)
+    coarse = np.maximum(0.5 * coarse[edge], np.float32(1e-3))  # by pixels of the whole image
+    return fine[edge], coarse, np.arctan2(y[edge], x[edge])
+
+
+def _blur_of(fine: Grey, coarse: Grey) -> float:
+    """Return the blur of the strongest of some edges by their slopes, fine and coarse."""
+    strong = coarse >= np.partition(coarse, -FEWEST_EDGES)[-FEWEST_EDGES]
+    strong |= coarse >= np.percentile(coarse, STRONG)
+    ratio = float(np.median(fine[strong] / coarse[strong]))
+    one, two = (s**2 for s in SCALES)
+    # ratio^2 = (sigma^2 + s2^2) / (sigma^2 + s1^2)
+    squared = (two - ratio**2 * one) / max(ratio**2 - 1.0, 1e-3)
+    return float(np.sqrt(np.clip(squared, 0.0, LARGEST_BLUR**2)))
+
+
+def _slopes(grey: Grey) -> tuple[Grey, Grey]:
+    """Return both slopes of an image, a little blurred."""
+    x, y = (cv2.Sobel(grey, cv2.CV_32F, i, 1 - i, ksize=5) for i in (1, 0))
+    return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)
+
+
+def image_defects(
+    exposures: Mapping[int, Exposure], view: Mapping[int, int], camera: Mapping[int, int]
+) -> dict[int, str]:
+    """Return why images cannot be used: by themselves, or beside others, by row.
+
+    ``view`` and ``camera`` are those of each row: images of a view show about the same through the
+    same lens. Where a view has few, as of a camera in the hand, all of its camera are compared.
+    """
+    found = {row: why for row, exposure in exposures.items() if (why := exposure.defect)}
+    good = {row: exposure.blur for row, exposure in exposures.items() if row not in found}
+    for row, blur in good.items():
+        others, whose = [b for r, b in good.items() if view[r] == view[row]], "view"
+        if len(others) < FEWEST:
+            others, whose = [b for r, b in good.items() if camera[r] == camera[row]], "camera"
+        if len(others) < FEWEST:
+            continue
+        usual = float(np.percentile(others, SHARP))
+        factor, more = MUCH_BLURRED
+        if blur > max(factor * usual, usual + more):
+            found[row] = (
+                f"the image is blurred by {blur:.1f} px, the others of its {whose} by {usual:.1f}"
+            )
+    return found
+
+
+def share_shown(
+    search: Search, placement: Placement, row: int, *, legs: IntArray | None = None
+) -> float:
+    """Return the share of the legs, by visible length, that an image shows where they should be.
+
+    Of the legs that its view is said to show, or of others; the view must have been placed.
+    """
+    view = int(search.measurements.view[row])
+    picture = _picture(search, search.pairs(row, view), row, view, legs)
+    return _share(picture, placement, view, TOLERANCE if legs is None else UNPLACED)
+
+
+def explain(
+    search: Search,
+    placement: Placement,
+    usual: Mapping[int, float],
+    row: int,
+    *,
+    doubted: Collection[int] = (),
+) -> Explanation:
+    """Return what an image of a placed view shows whose legs are not where its reading has them.
+
+    ``usual`` is the share of the legs that good images of each view show, by :func:`share_shown`;
+    ``doubted`` are all images in doubt: readings that others show are hardly those of this one.
+    """
+    measurements = search.measurements
+    view = int(measurements.view[row])
+    pairs = search.pairs(row, view)
+    picture = _picture(search, pairs, row, view)
+    own = _share(picture, placement, view)
+    others = [
+        (
+            _share(replace(picture, pairs=flipped(pairs, picture.corners, flip)), placement, view),
+            why,
+        )
+        for flip, why in _FLIPS
+    ]
+    tried = [(share, why, "replace it by the original") for share, why in others]
+    rows = _other_readings(search, row)
+    readings = [
+        (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows
+    ]
+    for share, other in _best(readings, doubted):
+        why = f"it shows the reading given for image {measurements.image[other]}"
+        tried.append((share, why, "check which image belongs to which row"))
+    for w, other_view in enumerate(measurements.views):
+        if w == view or placement.T_base_camera[w] is None or not _same_size(search, view, w):
+            continue
+        same = other_view.camera is measurements.views[view].camera
+        seen = pairs if same else search.pairs(row, w)
+        there = [row, *(other for other in rows if measurements.view[other] == w)]
+        readings = [
+            (_share(_picture(search, seen, other, w), placement, w), other) for other in there
+        ]
+        for share, other in _best(readings, doubted):
+            at = (
+                ""
+                if other == row
+                else f" at the reading given for image {measurements.image[other]}"
+            )
+            why = f"it was taken by the camera of view {other_view.name}{at}"
+            tried.append((share, why, "check which image belongs to which row"))
+    share, why, remedy = max(tried, key=lambda one: one[0])
+    factor, more = BETTER
+    least = max(CLEAR, AS_USUAL * usual.get(view, 0.0), factor * own, own + more)
+    return Explanation(own, why, remedy) if share >= least else Explanation(own)
+
+
+def _best(
+    readings: Sequence[tuple[float, int]], doubted: Collection[int]
+) -> list[tuple[float, int]]:
+    """Return the reading that suits best, if no other one suits about as well.
+
+    Where its own image is in doubt, images were exchanged: then only readings of such are rivals.
+    """
+    ranked = sorted(readings, key=lambda one: -one[0])
+    if ranked and ranked[0][1] in doubted:
+        ranked = [one for one in ranked if one[1] in doubted]
+    if len(ranked) > 1 and ranked[1][0] > ALIKE * ranked[0][0]:
+        return []
+    return ranked[:1]
+
+
+def _other_readings(search: Search, row: int) -> list[int]:
+    """Return a row with an image of each other pose, of the same view where there is one."""
+    measurements = search.measurements
+    own, view = int(measurements.pose[row]), int(measurements.view[row])
+    of_pose: dict[int, int] = {}
+    for other, image in enumerate(measurements.image):
+        pose = int(measurements.pose[other])
+        if pose != own and image and (pose not in of_pose or measurements.view[other] == view):
+            of_pose[pose] = other
+    return list(of_pose.values())
+
+
+def _same_size(search: Search, view: int, other: int) -> bool:
+    """Say whether the cameras of two views take images of one size."""
+    one, two = (search.measurements.views[v].camera for v in (view, other))
+    return (one.width, one.height) == (two.width, two.height)
+
+
+def _picture(
+    search: Search, pairs: EdgePairs, row: int, view: int, legs: IntArray | None = None
+) -> Picture:
+    """Return pairs with what a view should show at the reading of a row."""
+    wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
+    targets = targets_of(search.A_base[row], search.B_base[row], search.cylinders, wanted)
+    return Picture(pairs, targets, corners_of(search.measurements.views[view].camera))
+
+
+def _share(
+    picture: Picture, placement: Placement, view: int, tolerance: float = TOLERANCE
+) -> float:
+    """Return the share of the visible length of the legs on which a picture has their pairs."""
+    T = placement.T_base_camera[view]
+    if T is None or len(picture.targets) == 0:
+        return 0.0
+    T = T.inv()
+    pose = Poses(T.rotation.as_matrix()[None], T.translation[None], placement.shift[view][None])
+    seen = agreement(picture, pose, tolerance)
+    share = picture.targets.share
+    visible = float((seen.visible @ share)[0])
+    return float(seen.one_pair_each[0] @ share) / visible if visible > 0.0 else 0.0
+
+
+def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
+    """Return how many outlines were found in images that should show any, by row."""
+    visible = is_visible(outlines)
+    counts = {}
+    for row in rows:
+        own = (outlines.row == row) & visible
+        if own.any():
+            counts[row] = OutlineCount(int(outlines.used[own].sum()), int(own.sum()))
+    return counts
+
+
+def _doubted(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
+    """Return the images in which far fewer outlines were found than in others of their view.
+
+    Where a view has few images, all others are compared with.
+    """
+    doubted = []
+    for row, count in found.items():
+        own = [other.share for r, other in found.items() if view[r] == view[row]]
+        every = [other.share for other in found.values()]
+        usual = float(np.percentile(own if len(own) >= WITNESSES else every, GOOD))
+        if usual >= USUALLY and count.share < FEW * usual:
+            doubted.append(row)
+    return doubted
+
+
+def _usual(
+    search: Search,
+    placement: Placement,
+    found: Mapping[int, OutlineCount],
+    doubted: Sequence[int],
+    run: Run,
+) -> dict[int, float]:
+    """Return how much of the legs good images show, for views with images in doubt.
+
+    There is always a good one: an image is in doubt where others show far more.
+    """
+    views = np.unique(search.measurements.view[list(doubted)]).tolist() if doubted else []
+    usual = {}
+    for v in views:
+        good = {row: count for row, count in found.items() if row not in doubted}
+        rows = _witnesses(search.measurements, good, v)
+        task = partial(share_shown, search, placement)
+        usual[v] = float(np.median(list(run(task, rows))))
+    return usual
+
+
+def _witnesses(
+    measurements: Measurements, found: Mapping[int, OutlineCount], view: int
+) -> list[int]:
+    """Return the images of a view in which most was found; of all views if it has none."""
+    own = [row for row in found if measurements.view[row] == view]
+    return sorted(own or found, key=lambda row: -found[row].share)[:WITNESSES]
+
+
+def _image_name(measurements: Measurements, row: int) -> str:
+    """Return what an image is called in notes."""
+    view = measurements.views[int(measurements.view[row])]
+    return f"view {view.name}, image {measurements.image[row]}"
+
+
+def _leg_notes(
+    search: Search,
+    placement: Placement,
+    outlines: Outlines,
+    found: Mapping[int, OutlineCount],
+    reasons: Mapping[int, str],
+) -> list[str]:
+    """Return what is to be said of the legs that views are said to show."""
+    measurements, names = search.measurements, search.leg_names
+    notes = []
+    for v, view in enumerate(measurements.views):
+        rows = [r for r in found if measurements.view[r] == v and r not in reasons]
+        if view.legs is None or not rows:
+            continue
+        own = np.isin(outlines.row, rows)
+        used = set(outlines.leg[own & outlines.used].tolist())
+        for leg in np.flatnonzero(search.wanted[v]).tolist():
+            mine = own & (outlines.leg == leg)
+            if leg in used or not used or not mine.any():
+                continue
+            why = Counter(outlines.reason[i] for i in np.flatnonzero(mine).tolist())
+            notes.append(
+                f"view {view.name}: legs names {names[leg]}, of which none of its images shows an "
+                f"outline that can be used ({why.most_common(1)[0][0]}); look at legcal detect, "
+                "or leave it out there."
+            )
+        good = {row: found[row] for row in rows}
+        notes += _left_out_legs(search, placement, v, _witnesses(measurements, good, v))
+    return notes
+
+
+def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[int]) -> list[str]:
+    """Return a note on legs that a view leaves out although its images show them clearly."""
+    clear = [
+        name
+        for leg, name in enumerate(search.leg_names)
+        if not search.wanted[v, leg]
+        and search.cylinders[leg]
+        and all(share_shown(search, placement, row, legs=np.array([leg])) >= SHOWN for row in rows)
+    ]
+    if not clear:
+        return []
+    return [
+        f"view {search.measurements.views[v].name}: legs leaves out {', '.join(clear)}, which "
+        "its images show clearly; name them there to use them."
+    ]
+
+
+def _far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float = 1.0) -> bool:
+    """Say whether a rough pose is farther from a pose than rough ones are."""
+    distance = float(np.linalg.norm(T_base_camera.translation))
+    apart, angle = _apart(hint, T_base_camera)
+    nearest, part = reach * FAR_OFF[0], reach * FAR_PART
+    return apart > max(nearest, part * distance) or angle > reach * FAR_OFF[1]
+
+
+def hint_notes(
+    names: Sequence[str],
+    hints: Sequence[RigidTransform | None],
+    cameras: Sequence[RigidTransform | None],
+    reach: float = 1.0,
+) -> list[str]:
+    """Return what is to be said of rough T_base_camera of views that the images contradict.
+
+    ``cameras`` are as the images have them, None where a view could not be placed; ``reach`` is how
+    many times farther than rough poses are they may be.
+    """
+    notes = []
+    for name, hint, T in zip(names, hints, cameras, strict=True):
+        if hint is None or T is None or not _far_off(hint, T, reach):
+            continue
+        apart, angle = _apart(hint, T)
+        x, y, z = T.translation
+        other = next(
+            (
+                other
+                for other, camera in zip(names, cameras, strict=True)
+                if other != name and camera is not None and not _far_off(hint, camera, reach)
+            ),
+            None,
+        )
+        remedy = (
+            "correct it in dataset.yaml"
+            if other is None
+            else f"it suits view {other}: check whether views or their images were exchanged"
+        )
+        notes.append(
+            f"view {name}: its T_base_camera is wrong: found it {1e3 * apart:.0f} mm and "
+            f"{np.degrees(angle):.0f} deg from where the images put the camera (xyz: [{x:.3f}, "
+            f"{y:.3f}, {z:.3f}]), needed a rough pose; {remedy}."
+        )
+    return notes
+
+
+def _apart(one: RigidTransform, other: RigidTransform) -> tuple[float, float]:
+    """Return distance [m] and angle [rad] between two poses."""
+    off = one.inv() * other
+    return float(np.linalg.norm(off.translation)), float(off.rotation.magnitude())

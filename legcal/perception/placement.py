@@ -1,0 +1,184 @@
+"""What is searched for in images, and where their cameras and legs are believed to be.
+
+A :class:`Search` is the nominal model at every reading. A :class:`Placement` is what flows through
+the room: first rough cameras and the nominal model, then what was recognised, then what views
+fitted to outlines say, then a joint fit. Each says how far from it outlines may be, so that looking
+again is measuring with a better placement.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.data import Measurements
+from legcal.errors import NotVisible
+from legcal.geometry import Array, BoolArray, Image, IntArray
+from legcal.machine import Cylinder
+from legcal.perception.agreement import Picture, Targets, targets_of
+from legcal.perception.light import to_grey
+from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
+from legcal.perception.radii import NO_OTHER_RADII, OtherRadii
+from legcal.vision import Camera
+
+Load = Callable[[int], Image]  # of a row, 8 or 16 bit, grey or colour (BGR)
+Joined = Sequence[RigidTransform | None] | None  # T_board_camera of views that show a board
+
+JOINT_ERROR = 4e-3  # of predicted joint centres: the nominal model's joints and platform pose [m]
+PIXEL_ERROR = 3.0  # added to every window [px]
+NEAR_FIT_PX = 3.0  # how far outlines may be from a joint fit
+NEAR_IMAGES = 6  # of a group that are searched where a rough pose is given, at first
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What is searched for; it travels to worker processes."""
+
+    load: Load
+    measurements: Measurements
+    A_base: Array  # (n_rows, n_legs, 3) joint centres by the nominal model, in the base link [m]
+    B_base: Array
+    cylinders: Sequence[Sequence[Cylinder]]  # what can be seen of each leg
+    wanted: BoolArray  # (n_views, n_legs) legs that each view is said to show
+    leg_names: Sequence[str]
+    edge_pairs: Mapping[int, EdgePairs] = field(default_factory=dict)  # of rows seen before
+
+    @property
+    def n_legs(self) -> int:
+        """Number of legs."""
+        return len(self.cylinders)
+
+    def picture(self, row: int) -> Picture:
+        """Return what the image of a row shows, and what it should."""
+        view = int(self.measurements.view[row])
+        camera = self.measurements.views[view].camera
+        return Picture(self.pairs(row, view), self.targets(row, view), corners_of(camera))
+
+    def pairs(self, row: int, view: int) -> EdgePairs:
+        """Return the edge pairs of an image as if the camera of a view had taken it."""
+        if view == int(self.measurements.view[row]) and row in self.edge_pairs:
+            return self.edge_pairs[row]
+        camera = self.measurements.views[view].camera
+        return find_edge_pairs(find_segments(to_grey(self.load(row)), camera))
+
+    def targets(self, row: int, view: int) -> Targets:
+        """Return the legs at the reading of a row that a view is said to show."""
+        legs = np.flatnonzero(self.wanted[view])
+        return targets_of(self.A_base[row], self.B_base[row], self.cylinders, legs)
+
+    def retargeted(self, row: int, picture: Picture) -> Picture:
+        """Return what an image shows with what it should show by other cylinders."""
+        return replace(picture, targets=self.targets(row, int(self.measurements.view[row])))
+
+
+def corners_of(camera: Camera) -> Array:
+    """Return the least and the greatest x and y (2, 2) of the sensor plane that an image shows."""
+    x, y = camera.width - 1.0, camera.height - 1.0
+    border = np.array(
+        [[0, 0], [x, 0], [0, y], [x, y], [x / 2, 0], [0, y / 2], [x / 2, y], [x, y / 2]]
+    )
+    xy = camera.undistort(border)
+    return np.array([xy.min(axis=0), xy.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where cameras and joint centres are believed to be, and how far outlines may be from there.
+
+    Outlines are looked for within ``pixel_error`` and what ``joint_error`` makes in an image, or
+    within ``window``, for which other legs vouch.
+    """
+
+    A_base: Array  # (n_rows, n_legs, 3) where the view of each row sees them, in the base link [m]
+    B_base: Array
+    T_base_camera: tuple[RigidTransform | None, ...]  # of each view; None: not known
+    joint_error: float | Array = JOINT_ERROR  # (n_views, n_legs) [m]
+    pixel_error: float = PIXEL_ERROR  # [px]
+    window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
+    blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known
+    shift: Array = field(default_factory=lambda: np.zeros(0))  # (n_views, n_legs, 2, 3), see below
+    radii: OtherRadii = NO_OTHER_RADII  # that images contradict; cameras are placed by theirs
+    unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
+    notes: tuple[str, ...] = ()  # what else a reader should know
+
+    def __post_init__(self) -> None:
+        if len(self.shift) == 0:  # of A and B in each view against the nominal model [m]
+            zeros = np.zeros((len(self.T_base_camera), self.A_base.shape[1], 2, 3))
+            object.__setattr__(self, "shift", zeros)
+
+    @classmethod
+    def of_fit(
+        cls,
+        A_base: Array,
+        B_base: Array,
+        T_base_camera: Sequence[RigidTransform | None],
+        blur: Sequence[float] = (),
+    ) -> "Placement":
+        """Return the placement of a joint fit, with the usual blur of each view [px]."""
+        cameras = tuple(T_base_camera)
+        return cls(A_base, B_base, cameras, 0.0, NEAR_FIT_PX, blur=tuple(blur))
+
+    def shifted(self, search: Search, shift: Array) -> "Placement":
+        """Return joint centres where views see them, (n_views, n_legs, 2, 3) from the model [m]."""
+        of_row = shift[search.measurements.view]
+        A, B = search.A_base + of_row[:, :, 0], search.B_base + of_row[:, :, 1]
+        return replace(self, A_base=A, B_base=B, shift=shift)
+
+    def require_one(self) -> None:
+        """Raise NotVisible, one sentence for each view, if no view could be placed."""
+        if self.unplaced and all(T is None for T in self.T_base_camera):
+            raise NotVisible(list(dict.fromkeys(self.unplaced.values())))
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """What a reader should know, with the views that could not be placed."""
+        return (*dict.fromkeys(self.unplaced.values()), *self.notes)
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Views whose cameras are placed together, since they know how they stand to each other."""
+
+    views: list[int]
+    T_group_camera: dict[int, RigidTransform]  # by view
+    rows: list[int]  # all images to use
+    some: list[int]  # a few of them
+    view_of_row: dict[int, int]
+    hint: RigidTransform | None  # T_base_group, roughly
+
+    def pictures(self, of_row: Mapping[int, Picture], rows: Sequence[int]) -> list[Picture]:
+        """Return the pictures of some rows, in the frame of the group."""
+        found = []
+        for row in rows:
+            T = self.T_group_camera[self.view_of_row[row]].inv()
+            found.append(replace(of_row[row], R=T.rotation.as_matrix(), t=T.translation))
+        return found
+
+
+def group_views(
+    measurements: Measurements,
+    rows: IntArray,
+    hints: Sequence[RigidTransform | None],
+    joined: Joined,
+) -> list[Group]:
+    """Return the views of rows that stand alone, and those that are joined by T_board_camera.
+
+    Hints are rough T_base_camera of each view.
+    """
+    view_of = {int(row): int(measurements.view[row]) for row in rows}
+    views = sorted(set(view_of.values()))
+    together = [v for v in views if joined is not None and joined[v] is not None]
+    groups = [[v] for v in views if v not in together] + ([together] if together else [])
+    found = []
+    for group in groups:
+        own = [row for row, v in view_of.items() if v in group]
+        T = {v: RigidTransform.identity() for v in group}
+        if joined is not None and group == together:
+            T = {v: joined_v for v in group if (joined_v := joined[v]) is not None}
+        given = [(hint, T[v]) for v in group if (hint := hints[v]) is not None]
+        hint = None if not given else given[0][0] * given[0][1].inv()
+        spread = np.unique(np.rint(np.linspace(0, len(own) - 1, min(NEAR_IMAGES, len(own)))))
+        some = [own[k] for k in spread.astype(int).tolist()]
+        found.append(Group(group, T, own, some, view_of, hint))
+    return found
