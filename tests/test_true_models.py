@@ -23,7 +23,7 @@ from legcal.machine.leg import Demand, LegGeometry, LegKind
 from legcal.machine.load import load_mechanism
 from legcal.machine.model import Mechanism
 from legcal.machine.parameters import geometries, in_links, parametrization_of, vector_of
-from legcal.machine.urdf import patch_radii
+from legcal.machine.urdf import UrdfPatch
 from legcal.simulation import truth
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.session import simulate
@@ -261,10 +261,12 @@ def test_other_cylinders_keep_their_radii_and_their_places_in_the_file() -> None
     content = b"""<robot name="a"><link name="x"><collision><geometry>
     <cylinder radius="1" length="1"/></geometry></collision><visual><geometry>
     <box size="1 1 1"/></geometry></visual><visual><geometry>
-    <cylinder radius="2" length="1"/></geometry></visual><visual><geometry>
+    <cylinder radius='2' length="1"/></geometry></visual><visual><geometry>
     <cylinder length="1" radius='3'/></geometry></visual></link></robot>"""
-    assert patch_radii(content, {("x", 1): 0.25}) == content.replace(b"'3'", b"'0.25'")
-    assert patch_radii(content, {("x", 0): 0.25}) == content.replace(b'"2"', b'"0.25"')
+    for number, old in enumerate((b"'2'", b"'3'")):
+        patch = UrdfPatch(content)
+        patch.set_radius("x", number, 0.25)
+        assert patch.content() == content.replace(old, b"'0.25'").replace(b"'", b'"')
 
 
 def _five_parallel_rods(folder: Path) -> Path:

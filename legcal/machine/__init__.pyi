@@ -72,12 +72,10 @@ from .poses import workspace as workspace
 from .sensitivity import freedoms as freedoms
 from .sensitivity import pose_equations as pose_equations
 from .sensitivity import pose_sensitivity as pose_sensitivity
-from .urdf import Origin as Origin
 from .urdf import Urdf as Urdf
+from .urdf import UrdfPatch as UrdfPatch
 from .urdf import number_list as number_list
 from .urdf import parse_robot as parse_robot
-from .urdf import patch_origins as patch_origins
-from .urdf import patch_radii as patch_radii
 from .written import Axes as Axes
 from .written import calibrated_axis as calibrated_axis
 from .written import check_closes as check_closes

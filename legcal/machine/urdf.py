@@ -1,20 +1,18 @@
-"""Changing attribute values of a URDF in place: every other byte of the file stays as it was."""
+"""URDF files: read as a checked tree, and written again with other numbers."""
 
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
-from xml.parsers import expat
 
 import numpy as np
 from lxml import etree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError
-from legcal.geometry import Array, motion_of
+from legcal.geometry import Array, motion_of, roll_pitch_yaw
 from legcal.machine.files import read_file
 
 
@@ -420,171 +418,82 @@ def _limits(
     return lower, upper
 
 
-_ATTRIBUTES = {
-    name: re.compile(rb"""(?<=\s)%s\s*=\s*(?:"([^"]*)"|'([^']*)')""" % name.encode())
-    for name in ("xyz", "rpy", "radius")
-}
+class UrdfPatch:
+    """A URDF whose numbers change; comments, order, unknown tags and line ends stay.
 
-
-@dataclass(frozen=True, eq=False)
-class Origin:
-    """What is written into the origin of a joint."""
-
-    xyz: Array | None = None  # (3,) position in the parent link [m]; None where it stays as it is
-    rpy: Array | None = None  # (3,) angles about fixed x, y, z [rad]
-
-
-@dataclass(frozen=True)
-class _Span:
-    """Where a value stands in the file, or is to stand, as byte offsets."""
-
-    start: int
-    end: int
-    before: bytes = b""
-    after: bytes = b""
-
-
-def patch_origins(content: bytes, origins: Mapping[str, Origin]) -> bytes:
-    """Return a URDF with some joint origins changed.
-
-    Values are written with 17 significant digits where they need them. The tags, quotes, comments,
-    white space and line ends of the file are not touched.
+    A file in which nothing changed is left byte for byte. Numbers are written so that they are read
+    back exactly.
     """
-    tags = _origin_tags(content)
-    missing = sorted(set(origins) - set(tags))
-    if missing:
-        raise ModelError(
-            f"The URDF could not be changed: found no joint '{missing[0]}', needed the joints of "
-            "the mechanism; give the URDF that was loaded."
+
+    def __init__(self, content: bytes) -> None:
+        parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
+        self._content = content
+        self._robot = etree.fromstring(content, parser)
+        self._changed = False
+
+    def set_origin(self, joint: str, xyz: Array | None = None, rpy: Array | None = None) -> None:
+        """Write position [m] and angles about fixed x, y, z [rad] of a joint; None lets them be.
+
+        Raises ModelError if the file has no such joint.
+        """
+        element = next((e for e in self._robot.findall("joint") if e.get("name") == joint), None)
+        if element is None:
+            raise ModelError(
+                f"The URDF could not be changed: found no joint '{joint}', needed the joints of "
+                "the mechanism; give the URDF that was loaded."
+            )
+        origin = element.find("origin")
+        if origin is None:
+            origin = etree.Element("origin")
+            element.insert(0, origin)
+        self._write(origin, xyz=xyz, rpy=rpy)
+
+    def set_radius(self, link: str, number: int, radius: float) -> None:
+        """Write the radius [m] of one of the visual cylinders of a link, counted from 0."""
+        cylinders = [
+            shape
+            for element in self._robot.findall("link")
+            if element.get("name") == link
+            for geometry in element.findall("visual/geometry")
+            for shape in list(geometry.iterchildren(etree.Element))[:1]
+            if shape.tag == "cylinder"
+        ]
+        self._write(cylinders[number], radius=np.array([radius]))
+
+    def add_frame(self, parent: str, child: str, link: str, joint: str, T: RigidTransform) -> None:
+        """Add a link, and a fixed joint between parent and child, of which it is one."""
+        robot = self._robot
+        body = etree.SubElement(robot, "link", name=link)
+        element = etree.SubElement(robot, "joint", name=joint, type="fixed")
+        etree.SubElement(element, "parent", link=parent)
+        etree.SubElement(element, "child", link=child)
+        origin = etree.SubElement(element, "origin")
+        self._write(
+            origin, xyz=np.asarray(T.translation), rpy=roll_pitch_yaw(T.rotation.as_matrix())
         )
-    changes = [
-        change
-        for joint, origin in origins.items()
-        for change in _changes(content, tags[joint], origin)
-    ]
-    return _changed(content, changes)
+        before = body.getprevious()
+        if before is not None:
+            before.tail = "\n  "
+        body.tail, element.tail = "\n  ", "\n"
 
+    def content(self) -> bytes:
+        """Return the file as it is now."""
+        if not self._changed:
+            return self._content
+        before = self._content
+        tree = self._robot.getroottree()
+        encoding = tree.docinfo.encoding or "utf-8"
+        text: bytes = etree.tostring(tree, encoding=encoding, xml_declaration=False)
+        if before.removeprefix(b"\xef\xbb\xbf").startswith(b"<?xml"):
+            text = before[: before.index(b"?>") + 2] + b"\n" + text
+        if before.endswith(b"\n"):
+            text += b"\n"
+        has_crlf = before.count(b"\n") == before.count(b"\r\n") > 0
+        return text.replace(b"\n", b"\r\n") if has_crlf else text
 
-def patch_radii(
-    content: bytes,
-    radii: Mapping[tuple[str, int], float],  # [m]
-) -> bytes:
-    """Return a URDF with other radii of some visual cylinders, otherwise as it was."""
-    tags = _cylinder_tags(content)
-    return _changed(
-        content,
-        [
-            (_span_in_tag(content, tags[place], "radius"), repr(float(R)).encode())
-            for place, R in radii.items()
-        ],
-    )
-
-
-def _changed(content: bytes, changes: Sequence[tuple[_Span, bytes]]) -> bytes:
-    """Return a file with values at the places of some spans."""
-    pieces, at = [], 0
-    for span, value in sorted(changes, key=lambda change: change[0].start):
-        pieces += [content[at : span.start], span.before, value, span.after]
-        at = span.end
-    return b"".join([*pieces, content[at:]])
-
-
-def _cylinder_tags(content: bytes) -> dict[tuple[str, int], int]:
-    """Return where the tag of every visual cylinder stands, by link and number in it."""
-    tags: dict[tuple[str, int], int] = {}
-    path: list[str] = []
-    link, count, is_first = "", 0, True
-    parser = expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal link, count, is_first
-        if path == ["robot"] and tag == "link":
-            link, count = attributes["name"], 0
-        elif path == ["robot", "link", "visual"] and tag == "geometry":
-            is_first = True
-        elif path == ["robot", "link", "visual", "geometry"]:
-            if tag == "cylinder" and is_first:
-                tags[link, count] = parser.CurrentByteIndex
-                count += 1
-            is_first = False
-        path.append(tag)
-
-    def end(_tag: str) -> None:
-        path.pop()
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.Parse(content, True)
-    return tags
-
-
-def _origin_tags(content: bytes) -> dict[str, tuple[int, bool]]:
-    """Return where the origin of every joint of a URDF stands, or would, and whether it does."""
-    tags: dict[str, tuple[int, bool]] = {}
-    path: list[str] = []
-    joint: list[str] = []
-    parser = expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if path == ["robot"] and tag == "joint":
-            joint[:] = [attributes["name"]]
-            at = _tag_end(content, parser.CurrentByteIndex)
-            if content[at - 2 : at] != b"/>":
-                tags[joint[0]] = at, False
-        elif path == ["robot", "joint"] and tag == "origin":
-            tags[joint[0]] = parser.CurrentByteIndex, True
-        path.append(tag)
-
-    def end(_tag: str) -> None:
-        path.pop()
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.Parse(content, True)
-    return tags
-
-
-def _changes(content: bytes, tag: tuple[int, bool], origin: Origin) -> list[tuple[_Span, bytes]]:
-    """Return the values that change in an origin, in the order in which they are written."""
-    at, is_written = tag
-    values = [
-        (name, " ".join(repr(float(x)) for x in value).encode())
-        for name, value in (("xyz", origin.xyz), ("rpy", origin.rpy))
-        if value is not None
-    ]
-    if is_written:
-        return [(_span_in_tag(content, at, name), value) for name, value in values]
-    if not values:
-        return []
-    written = b" ".join(b'%s="%s"' % (name.encode(), value) for name, value in values)
-    return [(_Span(at, at, b"<origin ", b"/>"), written)]
-
-
-def same_point(one: Array, two: Array) -> bool:
-    """Say whether two points differ by no more than the rounding of their computation."""
-    return bool(np.abs(one - two).max() < 4e-16)
-
-
-def _tag_end(content: bytes, start: int) -> int:
-    """Return the offset after the ``>`` of a start tag; quoted values may hold one."""
-    quote = b""
-    for at in range(start, len(content)):
-        byte = content[at : at + 1]
-        if quote:
-            quote = b"" if byte == quote else quote
-        elif byte in (b'"', b"'"):
-            quote = byte
-        elif byte == b">":
-            return at + 1
-    return len(content)
-
-
-def _span_in_tag(content: bytes, start: int, name: str) -> _Span:
-    """Return the span of an attribute's value in a tag, or where an origin is to have it."""
-    tag = content[start : _tag_end(content, start)]
-    found = _ATTRIBUTES[name].search(tag)
-    if found is None:
-        at = start + len(b"<origin")
-        return _Span(at, at, b' %s="' % name.encode(), b'"')
-    group = 1 if found.group(1) is not None else 2
-    return _Span(start + found.start(group), start + found.end(group))
+    def _write(self, element: etree._Element, **values: Array | None) -> None:
+        """Write numbers as attributes of an element."""
+        for name, numbers in values.items():
+            if numbers is not None:
+                element.set(name, " ".join(repr(float(x)) for x in numbers))
+                self._changed = True

@@ -34,7 +34,7 @@ from legcal.machine.parameters import (
     vector_of,
 )
 from legcal.machine.schema import mechanism_yaml
-from legcal.machine.urdf import Origin, UrdfJoint, patch_origins, same_point
+from legcal.machine.urdf import UrdfJoint, UrdfPatch
 
 
 class Handle(NamedTuple):
@@ -135,6 +135,7 @@ class Handles:
 
 
 ROUNDING = 1e-14  # [rad]: what turns less does not turn
+ROUNDING_M = 4e-16  # [m]: what moves less does not move
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,29 +167,21 @@ class Motion:
         return RigidTransform.from_components(self.about + arm + self.shift, self.turn * T.rotation)
 
 
-@dataclass(frozen=True, eq=False)
-class MovedOrigin:
-    """The new origin of a joint."""
-
-    T_parent_origin: RigidTransform  # in its parent link [m]
-    is_turned: bool  # whether its orientation changes too
-
-
-def moved_origins(mechanism: Mechanism, legs: Sequence[LegGeometry]) -> dict[str, MovedOrigin]:
-    """Return the origin of every joint that carries a number of a leg."""
+def moved_origins(
+    mechanism: Mechanism, legs: Sequence[LegGeometry]
+) -> dict[str, tuple[RigidTransform, bool]]:
+    """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
     handles = Handles(mechanism)
-    found: dict[str, MovedOrigin] = {}
+    found: dict[str, tuple[RigidTransform, bool]] = {}
 
     def move(handle: Handle, motion: Motion, body: str) -> None:
         """Move a joint by a motion that is given in a link of its body."""
         joint, T_body_link = handle.joint, handles.bodies.T_body_link
-        before = found.get(joint.name, MovedOrigin(joint.T_parent_origin, False))
+        T_parent_origin, is_turned = found.get(joint.name, (joint.T_parent_origin, False))
         there = T_body_link[joint.parent].inv() * T_body_link[body]
         seen = motion.seen_from(there) if body != joint.parent else motion
         seen = seen.inv() if handle.is_inverse else seen
-        found[joint.name] = MovedOrigin(
-            seen.of(before.T_parent_origin), before.is_turned or seen.turn is not None
-        )
+        found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
     for leg, chain, wanted in zip(
         mechanism.legs, mechanism.leg_chains, in_links(mechanism, legs), strict=True
@@ -351,16 +344,15 @@ def write_urdf(mechanism: Mechanism, legs: Sequence[LegGeometry], destination: P
     Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
     or axes the mechanism may close elsewhere.
     """
-    changed: dict[str, Origin] = {}
-    for name, moved in moved_origins(mechanism, legs).items():
-        before, after = mechanism.urdf.joints[name].T_parent_origin, moved.T_parent_origin
-        xyz, rpy = np.asarray(after.translation), None
-        if moved.is_turned:
-            rpy = roll_pitch_yaw(after.rotation.as_matrix())
-        stays = same_point(xyz, np.asarray(before.translation))
+    patch = UrdfPatch(mechanism.urdf.content)
+    for name, (after, is_turned) in moved_origins(mechanism, legs).items():
+        before = mechanism.urdf.joints[name].T_parent_origin
+        xyz = np.asarray(after.translation)
+        stays = np.abs(xyz - before.translation).max() < ROUNDING_M
+        rpy = roll_pitch_yaw(after.rotation.as_matrix()) if is_turned else None
         if rpy is not None or not stays:
-            changed[name] = Origin(None if stays else xyz, rpy)
-    destination.write_bytes(patch_origins(mechanism.urdf.content, changed))
+            patch.set_origin(name, None if stays else xyz, rpy)
+    destination.write_bytes(patch.content())
 
 
 def write_calibrated_yaml(

@@ -21,6 +21,7 @@ from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
 from legcal.machine import (
     LegGeometry,
     Mechanism,
+    UrdfPatch,
     check_closes,
     footed,
     geometries,
@@ -30,7 +31,6 @@ from legcal.machine import (
     model_name,
     moved_legs,
     parametrization_of,
-    patch_radii,
     write_urdf,
 )
 from legcal.simulation.solids import Cylinder, solids_of
@@ -271,7 +271,10 @@ def write_model_with(
     for path in (yaml_path, urdf_path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_urdf(nominal, legs, urdf_path)
-    urdf_path.write_bytes(patch_radii(urdf_path.read_bytes(), radii))
+    patch = UrdfPatch(urdf_path.read_bytes())
+    for (link, number), radius in radii.items():
+        patch.set_radius(link, number, radius)
+    urdf_path.write_bytes(patch.content())
     text = mechanism_text(replace(nominal, home=home), f"../urdf/{urdf_path.name}")
     yaml_path.write_text(text, encoding="utf-8")
     return yaml_path

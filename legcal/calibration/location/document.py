@@ -6,12 +6,9 @@ they are there already, as an earlier location leaves them, their origins are ch
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
@@ -41,7 +38,7 @@ from legcal.files import (
     validate,
 )
 from legcal.geometry import roll_pitch_yaw
-from legcal.machine import Mechanism, Origin, Urdf, load_mechanism, patch_origins, write_model
+from legcal.machine import Mechanism, Urdf, UrdfPatch, load_mechanism, write_model
 
 WHAT = "location file"
 KEY = "legcal_location"
@@ -347,20 +344,26 @@ def with_frames(
         )
     urdf = mechanism.urdf
     T_root_base = _from_root(urdf, mechanism.base)
-    origins: dict[str, Origin] = {}
-    added: list[str] = []
+    patch = UrdfPatch(urdf.content)
+
+    def place(joint: str, T: RigidTransform) -> None:
+        patch.set_origin(joint, np.asarray(T.translation), roll_pitch_yaw(T.rotation.as_matrix()))
+
     if world in urdf.links:
         joint = _joint_of_world(mechanism, world)
         T_child_base = urdf.joints[joint].T_parent_origin.inv() * T_root_base
-        origins[joint] = _origin(location.T_world_base * T_child_base.inv())
+        place(joint, location.T_world_base * T_child_base.inv())
     else:
         T_world_root = location.T_world_base * T_root_base.inv()
-        added += _elements(urdf, world, urdf.root, world, T_world_root)
+        patch.add_frame(
+            world, urdf.root, world, _unused_joint(urdf, world, urdf.root), T_world_root
+        )
     if tool in urdf.links:
-        origins[_joint_of_tool(mechanism, tool)] = _origin(location.T_platform_tool)
+        place(_joint_of_tool(mechanism, tool), location.T_platform_tool)
     else:
-        added += _elements(urdf, mechanism.platform, tool, tool, location.T_platform_tool)
-    return _inserted(patch_origins(urdf.content, origins), added)
+        joint = _unused_joint(urdf, mechanism.platform, tool)
+        patch.add_frame(mechanism.platform, tool, tool, joint, location.T_platform_tool)
+    return patch.content()
 
 
 def _from_root(urdf: Urdf, base: str) -> RigidTransform:
@@ -413,53 +416,12 @@ def _joint_of_tool(mechanism: Mechanism, tool: str) -> str:
     )
 
 
-def _elements(urdf: Urdf, parent: str, child: str, link: str, T: RigidTransform) -> list[str]:
-    """Return a new link and the fixed joint between it and its neighbour, a line each."""
-    taken = {*urdf.links, *urdf.joints}
+def _unused_joint(urdf: Urdf, parent: str, child: str) -> str:
+    """Return a free name of a fixed joint between two links."""
     joint = f"{parent}_{child}_frame"
-    while joint in taken:
+    while joint in urdf.links or joint in urdf.joints:
         joint += "_"
-    origin = _origin(T)
-    return [
-        f"<link name={quoteattr(link)}/>",
-        f'<joint name={quoteattr(joint)} type="fixed"><parent link={quoteattr(parent)}/>'
-        f"<child link={quoteattr(child)}/>"
-        f'<origin xyz="{_numbers(origin.xyz)}" rpy="{_numbers(origin.rpy)}"/></joint>',
-    ]
-
-
-def _origin(T: RigidTransform) -> Origin:
-    """Return a motion as a URDF has it."""
-    return Origin(np.asarray(T.translation), roll_pitch_yaw(T.rotation.as_matrix()))
-
-
-def _numbers(values: np.ndarray | None) -> str:
-    """Return numbers with all their digits."""
-    return "" if values is None else " ".join(repr(float(x)) for x in values)
-
-
-def _inserted(content: bytes, lines: Sequence[str]) -> bytes:
-    """Return a URDF with lines before the end of the robot."""
-    if not lines:
-        return content
-    end = _end_of_robot(content)
-    newline = b"\r\n" if b"\r\n" in content else b"\n"
-    text = b"".join(b"  " + line.encode() + newline for line in lines)
-    before = content[:end]
-    if before.rstrip(b" \t").endswith(b"\n"):
-        before = before.rstrip(b" \t")
-    else:
-        text = newline + text
-    return before + text + content[end:]
-
-
-def _end_of_robot(content: bytes) -> int:
-    """Return the offset of ``</robot>``."""
-    ends: list[int] = []
-    parser = expat.ParserCreate()
-    parser.EndElementHandler = lambda tag: ends.append(parser.CurrentByteIndex)
-    parser.Parse(content, True)
-    return ends[-1]
+    return joint
 
 
 def check_same(before: Mechanism, after: Mechanism) -> None:
