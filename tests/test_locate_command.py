@@ -257,7 +257,7 @@ def test_the_world_goes_above_a_root_that_carries_the_base(found: Location, tmp_
         '<child link="base"/><origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/></joint>\n</robot>'
     )
     mechanism = load_mechanism(_machine_with(tmp_path, ("</robot>", table)))
-    yaml_path, urdf_path = write_located_model(mechanism, found, tmp_path / "out")
+    yaml_path, _ = write_located_model(mechanism, found, tmp_path / "out")
     written = load_mechanism(yaml_path).urdf
     joint = written.joints["world_table_frame"]
     on_table = RigidTransform.from_components(

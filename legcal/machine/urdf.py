@@ -483,7 +483,7 @@ class UrdfPatch:
         before = self._content
         tree = self._robot.getroottree()
         encoding = tree.docinfo.encoding or "utf-8"
-        text: bytes = etree.tostring(tree, encoding=encoding, xml_declaration=False)
+        text = cast("bytes", etree.tostring(tree, encoding=encoding, xml_declaration=False))
         if before.removeprefix(b"\xef\xbb\xbf").startswith(b"<?xml"):
             text = before[: before.index(b"?>") + 2] + b"\n" + text
         if before.endswith(b"\n"):
