@@ -17,7 +17,7 @@ from legcal.calibration.identify.analysis import identifiability_of_dataset, rec
 from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.machine.leg import to_vector
-from legcal.report.calibrate_table import summary
+from legcal.report import summary
 from legcal.simulation.cameras import PAPER_VIEWS
 from legcal.simulation.machine import Machine
 

@@ -20,7 +20,7 @@ from legcal.calibration.identify.session import planned_session
 from legcal.data.corners import found_corners
 from legcal.errors import UsageError
 from legcal.machine.model import Mechanism
-from legcal.report.identify_tables import identify_table
+from legcal.report.identify import identify_table
 from legcal.vision.board import Board
 
 LEGS = tuple(f"leg{j}" for j in range(1, 7))

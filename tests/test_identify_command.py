@@ -25,7 +25,7 @@ from legcal.data.dataset import load_dataset
 from legcal.errors import UsageError
 from legcal.machine.assembly import Family, create_model, describe_family
 from legcal.machine.model import Mechanism
-from legcal.report.identify_tables import _hidden, _two_digits
+from legcal.report.identify import _hidden, _two_digits
 
 PAPER = ("leg1,leg2,leg3,leg4", "leg3,leg4,leg5,leg6", "leg1,leg2,leg5,leg6")
 MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))

@@ -22,7 +22,7 @@ from legcal.calibration.identify.session import at_base_joints
 from legcal.data.dataset import load_dataset
 from legcal.data.holdout import dataset_at
 from legcal.geometry.types import Array
-from legcal.report.identify_tables import _intrinsics
+from legcal.report.identify import _intrinsics
 from legcal.vision.cylinder import outlines_of_axis
 
 

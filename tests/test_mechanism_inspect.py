@@ -13,7 +13,7 @@ from rich.console import Console
 from legcal.machine.assembly import Family, create_model, describe_family
 from legcal.machine.document import describe
 from legcal.machine.load import load_mechanism
-from legcal.report.tables import inspect_table
+from legcal.report import inspect_table
 
 
 def _table(description: dict[str, object]) -> str:

@@ -26,7 +26,7 @@ from legcal.calibration.noise import (
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.machine.load import load_mechanism
-from legcal.report.tables import noise_table
+from legcal.report import noise_table
 
 FLAT = "images/p1_2.png"  # shows nothing
 
@@ -57,7 +57,7 @@ def spoiled(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     """Run the command in this process, without others, and return its exit code."""
-    monkeypatch.setattr("legcal.cli.commands.MOST_WORKERS", 1)
+    monkeypatch.setattr("legcal.cli.options.MOST_WORKERS", 1)
     monkeypatch.setattr(sys, "argv", ["legcal", "noise", *map(str, words)])
     with pytest.raises(SystemExit) as stop:
         cli.main()

@@ -9,7 +9,7 @@ from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 from rich.console import Console
 
 from legcal import evaluate, load_mechanism
-from legcal.report.tables import accuracy_table
+from legcal.report import accuracy_table
 
 
 def _with_a_telescope(folder: Path) -> Path:

@@ -2,9 +2,10 @@ from .accuracy import Evaluation as Evaluation
 from .accuracy import evaluate as evaluate
 from .camera import CameraCalibration as CameraCalibration
 from .camera import calibrate_camera as calibrate_camera
+from .changes import Explanation as Explanation
 from .checking import SIGNIFICANCE as SIGNIFICANCE
+from .checking import Check as Check
 from .checking import check as check
-from .checking import check_summary as check_summary
 from .detecting import detect as detect
 from .identify.analysis import answer as answer
 from .identify.analysis import identifiability as identifiability
@@ -51,9 +52,8 @@ from .noise import Spread as Spread
 from .noise import measure_noise as measure_noise
 from .noise import noise_document as noise_document
 from .pipeline import calibrate as calibrate
-from .result import ParameterRow as ParameterRow
-from .result import board_lines as board_lines
-from .result import held_out_lines as held_out_lines
-from .result import parameter_rows as parameter_rows
-from .result import result_document as result_document
+from .result import Holdout as Holdout
+from .result import PlatformBlock as PlatformBlock
+from .result import Result as Result
+from .result import result_of as result_of
 from .verdict import Calibration as Calibration

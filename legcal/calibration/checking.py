@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from legcal.calibration.changes import (
-    Explanation,
     Movement,
     difference,
     judge_movement,
@@ -31,6 +30,8 @@ from legcal.calibration.joint_fit import (
 from legcal.calibration.run import start_run
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.estimation import NoiseModel
+from legcal.files import Document
 from legcal.geometry import Array
 from legcal.machine import (
     Mechanism,
@@ -44,10 +45,58 @@ from legcal.progress import Report, no_progress
 from legcal.vision import camera_numbers, intrinsic_names
 from legcal.workers import worker_pool
 
-if TYPE_CHECKING:
-    from rich.console import RenderableType
+SIGNIFICANCE = 0.01
+_LARGEST_SIGNIFICANCE = 0.5
+_PLAUSIBLE = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
 
-_SHOWN = 3  # explanations
+
+class ExplanationBlock(Document):
+    """What may have changed, by how much, and what it leaves unexplained."""
+
+    what: str
+    components: list[str]
+    units: list[str]
+    values: list[float]
+    sigma: list[float]
+    remaining: float
+    p_value: float
+
+
+class MovedPlatform(Document):
+    """How far the platform is from where the earlier result has it."""
+
+    dX_m: float
+    dE_rad: float
+    sigma_dX_m: float
+    sigma_dE_rad: float
+
+
+class CheckResiduals(Document):
+    """What was left of the new observations."""
+
+    chi2: float
+    dof: int
+    rms_px: float | None
+
+
+class CheckDocument(Document):
+    """What ``legcal calibrate --check --json`` prints."""
+
+    legcal_check: int
+    result: str
+    moved: bool
+    significance: float
+    p_value: float
+    statistic: float
+    dof: int
+    of: int
+    noise_dof: int
+    verdict: str
+    explanations: list[ExplanationBlock]
+    platform: MovedPlatform
+    images: int
+    residuals: CheckResiduals
+    notes: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +131,8 @@ class Check:
     def sentence(self) -> str:
         """The answer in words."""
         movement, pair = self.movement, self.at_platform
-        told = (
-            f"probability {_probability(movement.p_value)} if nothing did, significance "
-            f"{100 * movement.significance:g} %"
-        )
+        p = "below 1e-6" if movement.p_value < 1e-6 else f"{movement.p_value:.2g}"
+        told = f"probability {p} if nothing did, significance {100 * movement.significance:g} %"
         known = (
             f"{1e3 * pair.expected_displacement:.3f} mm / "
             f"{np.degrees(pair.expected_rotation):.4f} deg (1 sigma)"
@@ -103,108 +150,40 @@ class Check:
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``--json`` prints."""
-        movement, pair = self.movement, self.at_platform
-        return {
-            "legcal_check": 1,
-            "result": str(self.earlier.folder),
-            "moved": movement.moved,
-            "significance": movement.significance,
-            "p_value": movement.p_value,
-            "statistic": movement.statistic,
-            "dof": movement.dof,
-            "of": len(self.earlier.names),
-            "noise_dof": movement.noise_dof,
-            "verdict": self.sentence,
-            "explanations": [_explanation(e) for e in movement.explanations],
-            "platform": {
-                "dX_m": pair.displacement,
-                "dE_rad": pair.rotation,
-                "sigma_dX_m": pair.expected_displacement,
-                "sigma_dE_rad": pair.expected_rotation,
-            },
-            "images": self.dataset.measurements.n_rows,
-            "residuals": {
-                "chi2": self.solution.chi2,
-                "dof": self.solution.dof,
-                "rms_px": self.solution.rms_px,
-            },
-            "notes": list(self.notes),
-        }
-
-
-def check_summary(check: Check) -> RenderableType:
-    """Return what people read."""
-    from rich.console import Group
-    from rich.text import Text
-
-    movement = check.movement
-    images = check.dataset.measurements.n_rows
-    lines = [f"Note: {note}" for note in check.notes]
-    lines.append(
-        f"{images} image{'s' * (images != 1)} compared with {check.earlier.folder}: {movement.dof} "
-        f"of {len(check.earlier.names)} directions of the parameters, "
-        f"statistic {movement.statistic:.1f}."
-    )
-    lines += _explanation_lines(movement)
-    style = "bold red" if movement.moved else "bold green"
-    return Group(*(Text(line) for line in lines), Text(check.sentence, style=style))
-
-
-def _explanation_lines(movement: Movement) -> list[str]:
-    """Return what explains a movement."""
-    if not movement.explanations:
-        return []
-    first = movement.explanations[0]
-    if first.p_value < movement.significance:
-        return [
-            f"No single leg explains it; {first.change.what} explains most "
-            f"({_amount(first)}; {first.remaining:.1f} of {movement.statistic:.1f} are left)."
-        ]
-    lines = [f"It is explained by {first.change.what}: {_amount(first)}."]
-    others = [e.change.what for e in movement.explanations[1 : 1 + _SHOWN]]
-    if others:
-        lines.append(f"These images cannot tell that from: {', '.join(others)}.")
-    return lines
-
-
-def _amount(explanation: Explanation) -> str:
-    """Return by how much something changed, in words."""
-    change = explanation.change
-    parts = []
-    for name, unit, value, sigma in zip(
-        change.components,
-        change.units,
-        explanation.values.tolist(),
-        explanation.sigma.tolist(),
-        strict=True,
-    ):
-        scale, shown = (1e3, "mm") if unit == "m" else (180.0 / np.pi, "deg")
-        parts.append(f"{name} {scale * value:+.3f} {shown} (1 sigma {scale * sigma:.3f})")
-    return ", ".join(parts)
-
-
-def _explanation(explanation: Explanation) -> dict[str, Any]:
-    """Return an explanation as JSON has it."""
-    change = explanation.change
-    return {
-        "what": change.what,
-        "components": list(change.components),
-        "units": list(change.units),
-        "values": explanation.values.tolist(),
-        "sigma": explanation.sigma.tolist(),
-        "remaining": explanation.remaining,
-        "p_value": explanation.p_value,
-    }
-
-
-def _probability(p: float) -> str:
-    """Return a probability as people read it."""
-    return "below 1e-6" if p < 1e-6 else f"{p:.2g}"
-
-
-SIGNIFICANCE = 0.01
-_LARGEST_SIGNIFICANCE = 0.5
-_PLAUSIBLE = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
+        movement, pair, solution = self.movement, self.at_platform, self.solution
+        return CheckDocument(
+            legcal_check=1,
+            result=str(self.earlier.folder),
+            moved=movement.moved,
+            significance=movement.significance,
+            p_value=movement.p_value,
+            statistic=movement.statistic,
+            dof=movement.dof,
+            of=len(self.earlier.names),
+            noise_dof=movement.noise_dof,
+            verdict=self.sentence,
+            explanations=[
+                ExplanationBlock(
+                    what=found.change.what,
+                    components=list(found.change.components),
+                    units=list(found.change.units),
+                    values=found.values.tolist(),
+                    sigma=found.sigma.tolist(),
+                    remaining=found.remaining,
+                    p_value=found.p_value,
+                )
+                for found in movement.explanations
+            ],
+            platform=MovedPlatform(
+                dX_m=pair.displacement,
+                dE_rad=pair.rotation,
+                sigma_dX_m=pair.expected_displacement,
+                sigma_dE_rad=pair.expected_rotation,
+            ),
+            images=self.dataset.measurements.n_rows,
+            residuals=CheckResiduals(chi2=solution.chi2, dof=solution.dof, rms_px=solution.rms_px),
+            notes=list(self.notes),
+        ).document()
 
 
 def check(
@@ -243,12 +222,17 @@ def check(
     NotVisible, NotIdentifiable, DidNotConverge
         If the new images cannot be fitted, or say nothing.
     """
-    check_significance(significance)
+    if not 0.0 < significance <= _LARGEST_SIGNIFICANCE:
+        raise UsageError(
+            f"The earlier result could not be tested: found the significance {significance:g}, "
+            f"needed a probability above 0 and up to {_LARGEST_SIGNIFICANCE:g} (0.01 gives one "
+            "false alarm in a hundred checks); correct it."
+        )
     earlier = read_result(result)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     dataset = _as_calibrated(dataset, earlier)
-    known = _known(dataset, earlier)
-    choices = _choices(dataset, earlier, known)
+    prior = _Prior.of(dataset.mechanism, earlier)
+    choices = _choices(dataset, earlier, prior)
     with worker_pool(workers) as pool:
         run = start_run(dataset, pool, progress, choices, use_cache=True, every_leg=False)
         found = observe_and_fit(run, np.arange(dataset.measurements.n_rows))
@@ -259,55 +243,14 @@ def check(
         )
         raise NotVisible([refusal, *found.notes])
     solution = in_file_order(found.solution, found.part.own_order, dataset)
-    tested = _compare(dataset, earlier, solution, known, significance)
+    tested = _compare(dataset, earlier, solution, prior, significance)
     notes = (*dataset.notes, *found.notes, *found.doubts, *solution.notes)
     return replace(tested, notes=tuple(dict.fromkeys(notes)))
-
-
-def check_significance(significance: float) -> None:
-    """Refuse a significance that is none.
-
-    Raises
-    ------
-    UsageError
-        If it is not between 0 and 0.5.
-    """
-    if not 0.0 < significance <= _LARGEST_SIGNIFICANCE:
-        raise UsageError(
-            f"The earlier result could not be tested: found the significance {significance:g}, "
-            f"needed a probability above 0 and up to {_LARGEST_SIGNIFICANCE:g} (0.01 gives one "
-            "false alarm in a hundred checks); correct it."
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """The parameters that may have moved, where they were, and how far they may be now.
-
-    Attributes
-    ----------
-    names : tuple of str
-    old : (n,) array
-        Their earlier values.
-    covariance : (n, n) array
-        That of these, room along what was held included.
-    plausible : (n,) array
-        Standard deviations that leave room for whatever moved [m, rad].
-    furthest : float
-        That along directions that are held [m].
-    """
-
-    names: tuple[str, ...]
-    old: Array
-    covariance: Array
-    plausible: Array
-    furthest: float
 
 
 def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
     """Return new images with the calibrated model in place of the one that they name."""
     given, calibrated = dataset.mechanism, earlier.mechanism
-    different = ""
     if sorted(given.leg_names) != sorted(calibrated.leg_names):
         different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(given.leg_names)}"
     else:
@@ -336,47 +279,49 @@ def _difference(calibrated: Mechanism, given: Mechanism) -> str:
     return ""
 
 
-def _known(dataset: Dataset, earlier: EarlierResult) -> _Known:
-    """Return what the earlier result says of the parameters that are compared."""
-    mechanism = dataset.mechanism
-    legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
-    values = vector_of(found, legs, legs)
-    chosen = [found.names.index(name) for name in earlier.names]
-    length = float(np.mean([np.linalg.norm(vector) for vector in _leg_vectors(mechanism)]))
-    plausible = np.array([_PLAUSIBLE * (length if found.units[i] == "m" else 1.0) for i in chosen])
-    furthest = _PLAUSIBLE * length
-    covariance = _with_held(earlier.covariance, earlier.held, furthest)
-    return _Known(earlier.names, values[chosen], covariance, plausible, furthest)
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """The parameters that may have moved: where they were, and how far they may be now."""
+
+    names: tuple[str, ...]
+    old: Array  # (n,) earlier values
+    covariance: Array  # (n, n) of these, with room along what was held
+    plausible: Array  # (n,) standard deviations that leave room for whatever moved [m, rad]
+    furthest: float  # the same along directions that are held [m]
+
+    @classmethod
+    def of(cls, mechanism: Mechanism, earlier: EarlierResult) -> _Prior:
+        """Return what an earlier result says of the parameters of its mechanism."""
+        legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
+        values = vector_of(found, legs, legs)
+        chosen = [found.names.index(name) for name in earlier.names]
+        at_home = mechanism.home.apply(mechanism.B_platform) - mechanism.A_base
+        furthest = _PLAUSIBLE * float(np.mean(np.linalg.norm(at_home, axis=1)))
+        plausible = np.array([furthest if found.units[i] == "m" else _PLAUSIBLE for i in chosen])
+        covariance = earlier.covariance + furthest**2 * earlier.held.T @ earlier.held
+        return cls(earlier.names, values[chosen], covariance, plausible, furthest)
 
 
-def _with_held(covariance: Array, held: Array, furthest: float) -> Array:
-    """Return a covariance with room along what was held, of which nothing is known."""
-    return np.asarray(covariance + furthest**2 * held.T @ held)
-
-
-def _leg_vectors(mechanism: Mechanism) -> Array:
-    """Return the vectors from A to B at home, (n_legs, 3) [m]."""
-    return np.asarray(mechanism.home.apply(mechanism.B_platform) - mechanism.A_base)
-
-
-def _choices(dataset: Dataset, earlier: EarlierResult, known: _Known) -> Choices:
+def _choices(dataset: Dataset, earlier: EarlierResult, prior: _Prior) -> Choices:
     """Return priors that leave room for whatever may have moved."""
+    means, sigmas = prior.old.tolist(), prior.plausible.tolist()
     priors = {
-        name: Prior(float(mean), float(sigma))
-        for name, mean, sigma in zip(known.names, known.old, known.plausible, strict=True)
+        name: Prior(mean, sigma)
+        for name, mean, sigma in zip(prior.names, means, sigmas, strict=True)
     }
+    intrinsics = earlier.intrinsics
     for view in dataset.measurements.views:
-        for owner, numbers in earlier.cameras.items():
+        for owner, numbers in earlier.document.cameras.items():
             if numbers != camera_numbers(view.camera):
                 continue
             for key in intrinsic_names(view.camera):
-                if f"{owner}.{key}" in earlier.intrinsics:
-                    priors[f"{view.name}.{key}"] = Prior(*earlier.intrinsics[f"{owner}.{key}"])
+                if f"{owner}.{key}" in intrinsics:
+                    priors[f"{view.name}.{key}"] = Prior(*intrinsics[f"{owner}.{key}"])
     owned = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
     return Choices(
         fixed=frozenset(earlier.fixed),
         priors={name: prior for name, prior in priors.items() if name in owned},
-        least_shared_px=earlier.shared_px,
+        least_shared_px=earlier.document.residuals.shared_px,
     )
 
 
@@ -384,21 +329,21 @@ def _compare(
     dataset: Dataset,
     earlier: EarlierResult,
     solution: Solution,
-    known: _Known,
+    prior: _Prior,
     significance: float,
 ) -> Check:
     """Return what the fit of the new images says against the earlier result."""
     mechanism, parametrization = dataset.mechanism, solution.parametrization
-    columns = [parametrization.names.index(name) for name in known.names]
-    values = np.array([solution.values[name] for name in known.names])
-    covariance = _with_held(
-        solution.value_covariance[np.ix_(columns, columns)],
-        solution.held_basis[:, columns],
-        known.furthest,
-    )
+    columns = [parametrization.names.index(name) for name in prior.names]
+    values = np.array([solution.values[name] for name in prior.names])
+    held = solution.held_basis[:, columns]
+    covariance = solution.value_covariance[np.ix_(columns, columns)]
+    covariance = covariance + prior.furthest**2 * held.T @ held
     worse = _earlier_noise(solution, earlier)
-    found = difference(values, covariance, known.plausible, known.old, known.covariance, worse)
-    dof = noise_dof(solution.dof, covariance, known.plausible) if worse == 1.0 else earlier.dof
+    found = difference(values, covariance, prior.plausible, prior.old, prior.covariance, worse)
+    dof = earlier.document.residuals.dof
+    if worse == 1.0:
+        dof = noise_dof(solution.dof, covariance, prior.plausible)
     legs = geometries(mechanism)
     changes = possible_changes(
         mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
@@ -407,9 +352,9 @@ def _compare(
     poses = components(solution.T_Rb_Re)
     J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *poses)[:, :, columns]
     # Priors pull what was found to the earlier result by 1 - G.
-    G = np.eye(len(values)) - covariance / known.plausible**2
-    spread = worse * G @ covariance + G @ known.covariance @ G.T
-    shift = J @ (values - known.old)
+    G = np.eye(len(values)) - covariance / prior.plausible**2
+    spread = worse * G @ covariance + G @ prior.covariance @ G.T
+    shift = J @ (values - prior.old)
     variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
     at_platform = PlatformPair(
         _rms(shift[:, 3:] ** 2),
@@ -425,9 +370,10 @@ def _earlier_noise(solution: Solution, earlier: EarlierResult) -> float:
     claimed = solution.outlines.covariance[solution.outlines.used]
     if len(claimed) == 0:
         return 1.0
+    before = NoiseModel(**earlier.document.residuals.noise.document())
     now, then = (
         float(np.mean(np.trace(noise.covariance(claimed), axis1=1, axis2=2)))
-        for noise in (solution.noise, earlier.noise)
+        for noise in (solution.noise, before)
     )
     return max(then / now, 1.0)
 

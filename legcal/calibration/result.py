@@ -1,33 +1,42 @@
-"""The result folder: what a controller and a script read (formats, section 4)."""
+"""The result folder: what a controller and a script read, written and read back by one model.
+
+:class:`Result` is ``result.json``: its fields are the keys, in their order, and the schema by which
+an earlier result is read (formats, section 4).
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    StrictFloat,
+    StrictInt,
+    StrictStr,
+    model_serializer,
+)
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit import (
-    BOARD_SCALE,
-    HeldOut,
-    PlatformAccuracy,
-    PlatformError,
-    known_parameters,
-)
+from legcal.calibration.joint_fit import BOARD_SCALE, PlatformError, known_parameters
 from legcal.calibration.verdict import Calibration
-from legcal.data import (
-    CORNERS_NAME,
-    OBSERVATIONS_NAME,
-    Measurements,
-    write_corners,
-    write_observations,
+from legcal.data import CORNERS_NAME, OBSERVATIONS_NAME, write_corners, write_observations
+from legcal.errors import DatasetError, DidNotConverge
+from legcal.files import (
+    Document,
+    Number,
+    Version,
+    describe,
+    motion_to_xyz_quat,
+    read_text,
+    result_folder,
+    validate,
 )
-from legcal.errors import DidNotConverge
-from legcal.files import motion_to_xyz_quat, result_folder
 from legcal.machine import (
     LegGeometry,
     LegKind,
@@ -43,182 +52,422 @@ from legcal.machine import (
 )
 from legcal.vision import camera_numbers, shared_cameras
 
+RESULT_NAME, MODEL_NAME = "result.json", "calibrated.yaml"
+_RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m, rad]
+_FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what calibrated legs demand
 
-def board_document(calibration: Calibration) -> dict[str, Any]:
-    """Return where the board stands and how well its corners fit; nothing where there is none.
-
-    R_b is laid on the nominal one, so that ``T_base_board`` differs from what the dataset says of
-    it by where R_b really stands.
-    """
-    solution, found = calibration.solution, _place(calibration)
-    if found is None:
-        return {}
-    given = calibration.dataset.T_base_board
-    return {
-        "board": {
-            "T_base_board": motion_to_xyz_quat(found),
-            "given": None if given is None else motion_to_xyz_quat(given),
-            "scale": solution.values.get(BOARD_SCALE, 1.0),
-            "rms_px": solution.rms_corners_px,
-        }
-    }
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Axes = dict[str, Vector]  # unit vectors by leg
+Matrix = list[list[Number]]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
 
 
-def board_lines(calibration: Calibration) -> list[str]:
-    """Return the same in a sentence."""
-    solution, found, corners = calibration.solution, _place(calibration), calibration.corners
-    if found is None or corners is None:
-        return []
-    images = len(np.unique(corners.row[corners.used]))
-    line = (
-        f"Calibration board: {int(corners.used.sum())} of {len(corners)} corners used, in {images} "
-        f"images, {solution.rms_corners_px or 0.0:.3f} px rms."
-    )
-    given = calibration.dataset.T_base_board
-    if given is not None:
-        apart = given.inv() * found
-        line += (
-            f" It stands {1e3 * np.linalg.norm(apart.translation):.2f} mm and "
-            f"{np.degrees(apart.rotation.magnitude()):.3f} deg from where the dataset has it, if "
-            "the joints of the base stand where the nominal model has them."
-        )
-    return [line]
+class Pose(Document):
+    """A rigid motion."""
+
+    xyz: Vector
+    quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
 
 
-def _place(calibration: Calibration) -> RigidTransform | None:
-    """Return T_base_board, with R_b laid on the nominal one."""
-    T_Rb_board = calibration.solution.T_Rb_board
-    return None if T_Rb_board is None else calibration.dataset.mechanism.T_base_Rb * T_Rb_board
+class Legs(Document):
+    """The legs in R_b and R_e [m, rad]."""
+
+    base_joints: list[Vector]
+    platform_joints: list[Vector]
+    offsets: list[Number | None]  # the length of a constant leg, null for a passive one
+    base_axes: Axes  # of axes that are parameters
+    platform_axes: Axes
+    twists: dict[str, Number]
 
 
-def held_out_document(held_out: HeldOut) -> dict[str, Any]:
-    """Return the block ``holdout`` of ``result.json``."""
-    pair = held_out.at_platform
-    return {
-        "images": held_out.n_images,
-        "poses": held_out.n_poses,
-        "outlines": held_out.outlines,
-        "wrong": held_out.wrong,
-        "rms_px": held_out.rms_px,
-        "expected_px": held_out.expected_px,
-        "views": held_out.rms_px_of_view,
-        "platform": None
-        if pair is None
-        else {
-            "poses": len(held_out.displacement),
-            "dX_m": pair.displacement,
-            "expected_dX_m": pair.expected_displacement,
-            "dE_rad": pair.rotation,
-            "expected_dE_rad": pair.expected_rotation,
-        },
-    }
-
-
-def held_out_lines(held_out: HeldOut) -> list[str]:
-    """Return the sentences of the summary."""
-    of = f"{held_out.n_images} image{'s' * (held_out.n_images != 1)} kept aside"
-    if held_out.rms_px is None or held_out.expected_px is None:
-        return [f"Held out: {of} show no outline that could be compared."]
-    views = ", ".join(f"{name} {rms:.3f}" for name, rms in held_out.rms_px_of_view.items())
-    lines = [
-        f"Held out: {of}: {held_out.outlines - held_out.wrong} of {held_out.outlines} outlines are "
-        f"{held_out.rms_px:.3f} px (rms) from where the fit of the others foretells them, "
-        f"{held_out.expected_px:.3f} px were expected ({views})."
-    ]
-    pair = held_out.at_platform
-    if pair is None:
-        return [*lines, "They show too few legs at once to tell the platform's pose alone."]
-    return [
-        *lines,
-        f"At the platform, its pose by what {len(held_out.displacement)} of {held_out.n_poses} "
-        f"poses show alone is {1e3 * pair.displacement:.3f} mm / {np.degrees(pair.rotation):.4f} "
-        f"deg (rms) from that by the readings; {1e3 * pair.expected_displacement:.3f} mm / "
-        f"{np.degrees(pair.expected_rotation):.4f} deg were expected.",
-    ]
-
-
-@dataclass(frozen=True)
-class ParameterRow:
-    """One parameter.
-
-    Attributes
-    ----------
-    name : str
-        Its name.
-    value, nominal : float
-        As calibrated, and in the model or camera file [unit]; axes are turns of the nominal ones.
-    sigma : float or None
-        Standard deviation [unit]; None where it was not estimated.
-    unit : {"m", "rad", "px", ""}
-        Nothing for coefficients of distortion.
-    status : {"estimated", "fixed", "weak"}
-        A weak one takes part in a direction that nothing determines.
-    """
+class ParameterRow(Document):
+    """One parameter."""
 
     name: str
-    value: float
-    nominal: float
-    sigma: float | None
-    unit: str
-    status: str
+    value: Number  # [unit]; axes are turns of the nominal ones
+    nominal: Number  # in the model or camera file
+    sigma: Positive | None  # None where it was not estimated
+    unit: str  # m, rad, px, or nothing for coefficients of distortion
+    status: Literal["estimated", "fixed", "weak"]  # weak: part of a direction that is held
 
 
-def parameter_rows(calibration: Calibration) -> list[ParameterRow]:
-    """Return all kinematic parameters, the radii that were observed, and intrinsics looked for."""
+class Kinematic(Document):
+    """What is known of all kinematic parameters."""
+
+    names: list[str]
+    covariance: Matrix  # zero where they are fixed and along what is held
+    held: Matrix  # how they change along each held direction, by a metre
+
+
+class WeakCombination(Document):
+    """A combination of parameters that is known badly."""
+
+    direction: str
+    parameters: list[str]
+    components: list[Number]
+    sigma_m: Number
+
+
+class ViewPlace(Document):
+    """Where the camera of a view stands."""
+
+    T_base_camera: Pose
+
+
+class Gamma(Document):
+    """The gamma that outlines show of a camera."""
+
+    views: list[str]
+    gamma: Number
+    sigma: Number
+
+
+class Staged(Legs):
+    """What the four steps gave."""
+
+    diagnostics: list[str]
+
+
+class NoSteps(Document):
+    """Why the four steps gave nothing."""
+
+    failure: str
+
+
+class Stages(Document):
+    """What single parts of the method gave."""
+
+    staged: Staged | NoSteps
+
+
+class Noise(Document):
+    """The noise of the outlines."""
+
+    scale: Positive
+    bias_px: NotNegative
+    tilt_px: NotNegative
+
+
+class Residuals(Document):
+    """What was left of the observations."""
+
+    chi2: Number
+    dof: int
+    rms_px: Number | None
+    rms_axes: Number | None
+    noise: Noise
+    shared_px: dict[str, NotNegative]
+
+
+class BoardPlace(Document):
+    """Where the calibration board stands, R_b laid on the nominal one."""
+
+    T_base_board: Pose
+    given: Pose | None
+    scale: Number
+    rms_px: Number | None
+
+
+class PoseAccuracy(Document):
+    """Change and predicted error at one pose."""
+
+    pose: str | None
+    images: list[str]
+    change_dX_m: Number
+    change_dE_rad: Number
+    sigma_dX_m: Number
+    sigma_dE_rad: Number
+
+
+class WorkspaceAccuracy(Document):
+    """The predicted error all over the travel."""
+
+    poses: int
+    sigma_dX_m: Number
+    sigma_dE_rad: Number
+    sigma_dX_max_m: Number
+    sigma_dE_max_rad: Number
+
+
+class SensitivityRow(Document):
+    """What an error in what counts as known would do to the platform."""
+
+    what: str
+    dX_m: Number
+    dE_rad: Number
+    dX_max_m: Number
+    dE_max_rad: Number
+
+
+class PlatformBlock(Document):
+    """Change and predicted error of the platform, means and maxima over poses."""
+
+    poses: int
+    change_dX_m: Number
+    change_dE_rad: Number
+    sigma_dX_m: Number
+    sigma_dE_rad: Number
+    sigma_dX_max_m: Number
+    sigma_dE_max_rad: Number
+    per_pose: list[PoseAccuracy]
+    workspace: WorkspaceAccuracy | None
+    sensitivities: list[SensitivityRow]
+
+
+class HoldoutPlatform(Document):
+    """The pose by readings against that by an image alone, root mean squares."""
+
+    poses: int
+    dX_m: Number
+    expected_dX_m: Number
+    dE_rad: Number
+    expected_dE_rad: Number
+
+
+class Holdout(Document):
+    """What the images that were kept aside say of the fit."""
+
+    images: int
+    poses: int
+    outlines: int
+    wrong: int
+    rms_px: Number | None
+    expected_px: Number | None
+    views: dict[str, Number]
+    platform: HoldoutPlatform | None
+
+
+class Result(Document):
+    """``result.json``."""
+
+    legcal_result: Version
+    status: Literal["converged"]
+    verdict: str
+    trustworthy: bool
+    legs: list[str]  # the order of what follows
+    base_joints: list[Vector]
+    platform_joints: list[Vector]
+    offsets: list[Number | None]
+    base_axes: Axes
+    platform_axes: Axes
+    twists: dict[str, Number]
+    nominal_axes: dict[str, Axes]  # that turns count from, by side
+    parameters: Annotated[list[ParameterRow], Field(min_length=1)]
+    covariance: Matrix  # of the estimated parameters, in their order
+    kinematic: Kinematic
+    weakest: list[WeakCombination]
+    held: list[str]
+    views: dict[str, ViewPlace]
+    cameras: dict[str, dict[str, StrictInt | StrictFloat | StrictStr]]  # as they came
+    gammas: list[Gamma]
+    stages: Stages
+    residuals: Residuals
+    board: BoardPlace | None = None  # left out without a board
+    start: str
+    platform: PlatformBlock | None
+    holdout: Holdout | None = None  # left out without images that were kept aside
+    notes: list[str]
+
+    @model_serializer(mode="wrap")
+    def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found: dict[str, Any] = handler(self)
+        absent = [key for key in ("board", "holdout") if found[key] is None]
+        return {key: value for key, value in found.items() if key not in absent}
+
+    @classmethod
+    def read(cls, path: Path) -> Result:
+        """Return the result in a file.
+
+        Raises
+        ------
+        DatasetError
+            If it is missing, or no such document.
+        """
+        content = read_text(path, "result of an earlier calibration")
+        try:
+            found = json.loads(content)
+        except (ValueError, RecursionError) as error:
+            raise refused(path, "no JSON", "the document of a calibration") from error
+        if not isinstance(found, dict) or "legcal_result" not in found:
+            what = "another document" if isinstance(found, dict) else describe(found)
+            raise refused(path, what, "one with 'legcal_result: 1'")
+        return validate(cls, found, path)
+
+
+def refused(path: Path, found: str, needed: str) -> DatasetError:
+    """Return why a result could not be read."""
+    return DatasetError(
+        f"{path}: the result of the earlier calibration could not be read: found {found}, needed "
+        f"{needed}; give the folder that legcal calibrate wrote."
+    )
+
+
+def result_of(calibration: Calibration) -> Result:
+    """Return the document of a calibration."""
+    solution, dataset = calibration.solution, calibration.dataset
+    mechanism, measurements = dataset.mechanism, dataset.measurements
+    names, views, steps = mechanism.leg_names, measurements.views, calibration.steps
+    owners = shared_cameras([view.name for view in views], [view.camera for view in views])
+    o, axes = solution.outlines, dataset.axes
+    shown = np.unique(measurements.view[o.row[o.used] if axes is None else axes.row]).tolist()
+    T_base_Rb = mechanism.T_base_Rb
+    return Result(
+        legcal_result=1,
+        status="converged",
+        verdict=calibration.verdict.sentence,
+        trustworthy=calibration.verdict.trustworthy,
+        legs=list(names),
+        **_legs(names, solution.legs),
+        nominal_axes=nominal_axes(names, geometries(mechanism)),
+        parameters=_parameters(calibration),
+        covariance=solution.covariance.tolist(),
+        kinematic=Kinematic(
+            names=list(solution.parametrization.names),
+            covariance=solution.value_covariance.tolist(),
+            held=solution.held_basis.tolist(),
+        ),
+        weakest=[
+            WeakCombination(
+                direction=describe_direction([name for name, _ in weak.parts], names),
+                parameters=[name for name, _ in weak.parts],
+                components=[component for _, component in weak.parts],
+                sigma_m=weak.sigma,
+            )
+            for weak in solution.weak
+        ],
+        held=list(solution.held),
+        views={
+            views[v].name: ViewPlace(T_base_camera=_pose(T_base_Rb * solution.T_camera_Rb[v].inv()))
+            for v in shown
+        },
+        cameras={v.name: camera_numbers(v.camera) for v in views if v.name in set(owners)},
+        gammas=[
+            Gamma(views=list(one.views), gamma=one.gamma, sigma=one.gamma * one.sigma)
+            for one in solution.gammas
+        ],
+        stages=Stages(
+            staged=NoSteps(failure=steps.failure)
+            if steps.legs is None
+            else Staged(**_legs(names, steps.legs), diagnostics=list(steps.diagnostics))
+        ),
+        residuals=Residuals(
+            chi2=solution.chi2,
+            dof=solution.dof,
+            rms_px=solution.rms_px,
+            rms_axes=solution.rms_axes,
+            noise=Noise(**asdict(solution.noise)),
+            shared_px=dict(solution.shared_px),
+        ),
+        board=_board(calibration),
+        start=solution.start,
+        platform=_platform(calibration),
+        holdout=_holdout(calibration),
+        notes=list(calibration.notes),
+    )
+
+
+def _legs(names: Sequence[str], legs: Sequence[LegGeometry]) -> dict[str, Any]:
+    """Return the fields of :class:`Legs`."""
+    named = list(zip(names, legs, strict=True))
+    return {
+        "base_joints": [leg.A.tolist() for leg in legs],
+        "platform_joints": [leg.B.tolist() for leg in legs],
+        "offsets": [None if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs],
+        "base_axes": {n: leg.base_axis.tolist() for n, leg in named if leg.base_axis is not None},
+        "platform_axes": {
+            n: leg.platform_axis.tolist() for n, leg in named if leg.platform_axis is not None
+        },
+        "twists": {name: leg.twist for name, leg in named if leg.twist is not None},
+    }
+
+
+def _pose(T: RigidTransform) -> Pose:
+    return Pose(**motion_to_xyz_quat(T))
+
+
+def _parameters(calibration: Calibration) -> list[ParameterRow]:
+    """Return all kinematic parameters, the radii that were observed, and estimated intrinsics."""
     solution, dataset = calibration.solution, calibration.dataset
     mechanism = dataset.mechanism
     found = parametrization_of(mechanism, twists=True)
-    values = dict(solution.values)
-    numbers = vector_of(found, solution.legs, geometries(mechanism))
-    values |= zip(found.names, numbers.tolist(), strict=True)
-    sigma_of = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
+    numbers = vector_of(found, solution.legs, geometries(mechanism)).tolist()
+    values = {**solution.values, **dict(zip(found.names, numbers, strict=True))}
+    sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
     with_board = dataset.board is not None
     known = known_parameters(mechanism, dataset.measurements.views, with_board=with_board).by_name
     return [
         ParameterRow(
-            name,
-            values[name],
-            parameter.nominal,
-            sigma_of.get(name),
-            parameter.unit,
-            solution.status.get(name, "fixed"),
+            name=name,
+            value=values[name],
+            nominal=parameter.nominal,
+            sigma=sigma.get(name),
+            unit=parameter.unit,
+            status=solution.status.get(name, "fixed"),
         )
         for name, parameter in known.items()
         if name in values
     ]
 
 
-def platform_document(calibration: Calibration) -> dict[str, Any] | None:
-    """Return the block ``platform``; None where the motors do not determine the pose."""
-    platform = calibration.platform
+def _board(calibration: Calibration) -> BoardPlace | None:
+    """Return where the board stands, which differs from what the dataset says by where R_b is."""
+    solution, dataset = calibration.solution, calibration.dataset
+    if solution.T_Rb_board is None:
+        return None
+    given = dataset.T_base_board
+    return BoardPlace(
+        T_base_board=_pose(dataset.mechanism.T_base_Rb * solution.T_Rb_board),
+        given=None if given is None else _pose(given),
+        scale=solution.values.get(BOARD_SCALE, 1.0),
+        rms_px=solution.rms_corners_px,
+    )
+
+
+def _platform(calibration: Calibration) -> PlatformBlock | None:
+    """Return what all this means at the platform."""
+    platform, measurements = calibration.platform, calibration.dataset.measurements
     if platform is None:
         return None
-    change, sigma = platform.change, platform.sigma
-    return {
-        "poses": len(sigma.displacement),
-        "change_dX_m": change.mean_displacement,
-        "change_dE_rad": change.mean_rotation,
-        **_sigma(sigma),
-        "per_pose": _per_pose(platform, calibration.dataset.measurements),
-        "workspace": None
-        if platform.workspace is None
-        else {"poses": len(platform.workspace.displacement), **_sigma(platform.workspace)},
-        "sensitivities": [
-            {
-                "what": found.what,
-                "dX_m": found.error.mean_displacement,
-                "dE_rad": found.error.mean_rotation,
-                "dX_max_m": found.error.max_displacement,
-                "dE_max_rad": found.error.max_rotation,
-            }
-            for found in platform.effects
+    labels = measurements.pose_labels or ("",) * measurements.n_poses
+    images: list[list[str]] = [[] for _ in labels]
+    for pose, image in zip(measurements.pose.tolist(), measurements.image, strict=True):
+        if image:
+            images[pose].append(image)
+    change, sigma, workspace = platform.change, platform.sigma, platform.workspace
+    return PlatformBlock(
+        change_dX_m=change.mean_displacement,
+        change_dE_rad=change.mean_rotation,
+        **_predicted(sigma),
+        per_pose=[
+            PoseAccuracy(
+                pose=label or None,
+                images=images[k],
+                change_dX_m=change.displacement[k],
+                change_dE_rad=change.rotation[k],
+                sigma_dX_m=sigma.displacement[k],
+                sigma_dE_rad=sigma.rotation[k],
+            )
+            for k, label in enumerate(labels)
         ],
-    }
+        workspace=None if workspace is None else WorkspaceAccuracy(**_predicted(workspace)),
+        sensitivities=[
+            SensitivityRow(
+                what=effect.what,
+                dX_m=effect.error.mean_displacement,
+                dE_rad=effect.error.mean_rotation,
+                dX_max_m=effect.error.max_displacement,
+                dE_max_rad=effect.error.max_rotation,
+            )
+            for effect in platform.effects
+        ],
+    )
 
 
-def _sigma(error: PlatformError) -> dict[str, float]:
-    """Return mean and maximum of a predicted error."""
+def _predicted(error: PlatformError) -> dict[str, Any]:
+    """Return the fields of :class:`WorkspaceAccuracy`."""
     return {
+        "poses": len(error.displacement),
         "sigma_dX_m": error.mean_displacement,
         "sigma_dE_rad": error.mean_rotation,
         "sigma_dX_max_m": error.max_displacement,
@@ -226,72 +475,30 @@ def _sigma(error: PlatformError) -> dict[str, float]:
     }
 
 
-def _per_pose(platform: PlatformAccuracy, measurements: Measurements) -> list[dict[str, Any]]:
-    """Return change and predicted error of every pose, with the images that show it."""
-    labels = measurements.pose_labels or ("",) * measurements.n_poses
-    images: list[list[str]] = [[] for _ in labels]
-    for pose, image in zip(measurements.pose.tolist(), measurements.image, strict=True):
-        if image:
-            images[pose].append(image)
-    errors = (
-        platform.change.displacement,
-        platform.change.rotation,
-        platform.sigma.displacement,
-        platform.sigma.rotation,
+def _holdout(calibration: Calibration) -> Holdout | None:
+    """Return what images that were kept aside say."""
+    held_out = calibration.held_out
+    if held_out is None:
+        return None
+    pair = held_out.at_platform
+    return Holdout(
+        images=held_out.n_images,
+        poses=held_out.n_poses,
+        outlines=held_out.outlines,
+        wrong=held_out.wrong,
+        rms_px=held_out.rms_px,
+        expected_px=held_out.expected_px,
+        views=held_out.rms_px_of_view,
+        platform=None
+        if pair is None
+        else HoldoutPlatform(
+            poses=len(held_out.displacement),
+            dX_m=pair.displacement,
+            expected_dX_m=pair.expected_displacement,
+            dE_rad=pair.rotation,
+            expected_dE_rad=pair.expected_rotation,
+        ),
     )
-    keys = ("change_dX_m", "change_dE_rad", "sigma_dX_m", "sigma_dE_rad")
-    columns = zip(*(values.tolist() for values in errors), strict=True)
-    return [
-        {"pose": label or None, "images": shown, **dict(zip(keys, values, strict=True))}
-        for label, shown, values in zip(labels, images, columns, strict=True)
-    ]
-
-
-_RELOADED = 1e-11  # how far reloaded parameters may be from the written ones [m, rad]
-_FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what calibrated legs demand
-
-
-def result_document(calibration: Calibration) -> dict[str, Any]:
-    """Return the document of ``result.json``."""
-    solution, mechanism = calibration.solution, calibration.dataset.mechanism
-    return {
-        "legcal_result": 1,
-        "status": "converged",
-        "verdict": calibration.verdict.sentence,
-        "trustworthy": calibration.verdict.trustworthy,
-        "legs": list(mechanism.leg_names),
-        **_geometry(mechanism.leg_names, solution.legs),
-        "nominal_axes": nominal_axes(mechanism.leg_names, geometries(mechanism)),
-        "parameters": [asdict(row) for row in parameter_rows(calibration)],
-        "covariance": solution.covariance.tolist(),
-        "kinematic": {
-            "names": list(solution.parametrization.names),
-            "covariance": solution.value_covariance.tolist(),
-            "held": solution.held_basis.tolist(),
-        },
-        "weakest": _weakest(calibration),
-        "held": list(solution.held),
-        "views": _views(calibration),
-        "cameras": _cameras(calibration),
-        "gammas": [
-            {"views": list(one.views), "gamma": one.gamma, "sigma": one.gamma * one.sigma}
-            for one in solution.gammas
-        ],
-        "stages": {"staged": _steps(calibration)},
-        "residuals": {
-            "chi2": solution.chi2,
-            "dof": solution.dof,
-            "rms_px": solution.rms_px,
-            "rms_axes": solution.rms_axes,
-            "noise": asdict(solution.noise),
-            "shared_px": dict(solution.shared_px),
-        },
-        **board_document(calibration),
-        "start": solution.start,
-        "platform": platform_document(calibration),
-        **_held_out(calibration),
-        "notes": list(calibration.notes),
-    }
 
 
 def write_result(calibration: Calibration, destination: Path) -> None:
@@ -308,43 +515,27 @@ def write_result(calibration: Calibration, destination: Path) -> None:
         If the written model does not load as what was computed.
     """
     dataset, solution = calibration.dataset, calibration.solution
+    mechanism = dataset.mechanism
     stale = [Path(OBSERVATIONS_NAME), Path(CORNERS_NAME)]
     with result_folder(destination, stale=stale) as folder:
-        urdf, yaml = folder / "calibrated.urdf", folder / "calibrated.yaml"
-        write_urdf(dataset.mechanism, solution.legs, urdf)
-        write_calibrated_yaml(dataset.mechanism, yaml, urdf.name, _home(calibration))
-        _check_written(yaml, solution.legs)
-        document = json.dumps(result_document(calibration), indent=1, allow_nan=False)
-        (folder / "result.json").write_text(document + "\n", encoding="utf-8")
-        if dataset.axes is None:
-            write_observations(
-                folder / OBSERVATIONS_NAME,
-                solution.outlines,
-                dataset.measurements,
-                dataset.mechanism.leg_names,
+        urdf, yaml = folder / "calibrated.urdf", folder / MODEL_NAME
+        write_urdf(mechanism, solution.legs, urdf)
+        home = home_with(mechanism, solution.legs, _FURTHEST)
+        if home is None:
+            raise DidNotConverge(
+                f"{mechanism.yaml_path}: the calibrated model could not be written: found no "
+                "closed pose of its legs near legcal.home, needed one; check legcal.home and the "
+                "nominal model; nothing was written."
             )
+        write_calibrated_yaml(mechanism, yaml, urdf.name, None if home is mechanism.home else home)
+        _check_written(yaml, solution.legs)
+        document = json.dumps(result_of(calibration).document(), indent=1, allow_nan=False)
+        (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
+        if dataset.axes is None:
+            table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
+            write_observations(table, solution.outlines, measurements, mechanism.leg_names)
         if calibration.corners is not None:
-            corners = folder / CORNERS_NAME
-            write_corners(corners, calibration.corners, dataset.measurements)
-
-
-def _held_out(calibration: Calibration) -> dict[str, Any]:
-    """Return what images that were kept aside say, nothing where there are none."""
-    held_out = calibration.held_out
-    return {} if held_out is None else {"holdout": held_out_document(held_out)}
-
-
-def _home(calibration: Calibration) -> RigidTransform | None:
-    """Return where the calibrated legs close near home, None if at home itself."""
-    mechanism = calibration.dataset.mechanism
-    home = home_with(mechanism, calibration.solution.legs, _FURTHEST)
-    if home is None:
-        raise DidNotConverge(
-            f"{mechanism.yaml_path}: the calibrated model could not be written: found no closed "
-            "pose of its legs near legcal.home, needed one; check legcal.home and the nominal "
-            "model; nothing was written."
-        )
-    return None if home is mechanism.home else home
+            write_corners(folder / CORNERS_NAME, calibration.corners, dataset.measurements)
 
 
 def _check_written(yaml: Path, legs: Sequence[LegGeometry]) -> None:
@@ -359,63 +550,3 @@ def _check_written(yaml: Path, legs: Sequence[LegGeometry]) -> None:
             f"{off:.1e} m or rad from the computed ones; at most {_RELOADED:.0e} is allowed; "
             "nothing was written; please report this."
         )
-
-
-def _geometry(names: Sequence[str], legs: Sequence[LegGeometry]) -> dict[str, Any]:
-    """Return what the legs are in R_b and R_e."""
-    named = list(zip(names, legs, strict=True))
-    return {
-        "base_joints": [leg.A.tolist() for leg in legs],
-        "platform_joints": [leg.B.tolist() for leg in legs],
-        "offsets": [None if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs],
-        "base_axes": {n: leg.base_axis.tolist() for n, leg in named if leg.base_axis is not None},
-        "platform_axes": {
-            n: leg.platform_axis.tolist() for n, leg in named if leg.platform_axis is not None
-        },
-        "twists": {name: leg.twist for name, leg in named if leg.twist is not None},
-    }
-
-
-def _weakest(calibration: Calibration) -> list[dict[str, Any]]:
-    """Return the combinations of parameters that are known worst."""
-    leg_names = calibration.dataset.mechanism.leg_names
-    return [
-        {
-            "direction": describe_direction([name for name, _ in weak.parts], leg_names),
-            "parameters": [name for name, _ in weak.parts],
-            "components": [component for _, component in weak.parts],
-            "sigma_m": weak.sigma,
-        }
-        for weak in calibration.solution.weak
-    ]
-
-
-def _views(calibration: Calibration) -> dict[str, Any]:
-    """Return where the cameras stand whose images show a leg."""
-    solution, dataset = calibration.solution, calibration.dataset
-    measurements = dataset.measurements
-    outlines, axes = solution.outlines, dataset.axes
-    shown = outlines.row[outlines.used] if axes is None else axes.row
-    T_base_Rb = dataset.mechanism.T_base_Rb
-    return {
-        measurements.views[v].name: {
-            "T_base_camera": motion_to_xyz_quat(T_base_Rb * solution.T_camera_Rb[v].inv())
-        }
-        for v in np.unique(measurements.view[shown]).tolist()
-    }
-
-
-def _cameras(calibration: Calibration) -> dict[str, Any]:
-    """Return the numbers that cameras came with, by the view whose name their intrinsics have."""
-    views = calibration.dataset.measurements.views
-    owners = set(shared_cameras([view.name for view in views], [view.camera for view in views]))
-    return {view.name: camera_numbers(view.camera) for view in views if view.name in owners}
-
-
-def _steps(calibration: Calibration) -> dict[str, Any]:
-    """Return what the four steps gave, or why they gave nothing."""
-    steps = calibration.steps
-    if steps.legs is None:
-        return {"failure": steps.failure}
-    names = calibration.dataset.mechanism.leg_names
-    return {**_geometry(names, steps.legs), "diagnostics": list(steps.diagnostics)}

@@ -8,11 +8,8 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, print_json, print_table
+from legcal.cli.options import DatasetArgument, JsonOption, image_workers, show
 from legcal.errors import UsageError
-from legcal.processors import processors
-
-MOST_WORKERS = 4  # processes that search images; each takes about 150 MB
 
 
 class Criteria(StrEnum):
@@ -34,9 +31,7 @@ _PARAMETERS = "Parameters by name (or a pattern: '*.offset'); each may be repeat
 
 
 def calibrate(
-    dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
-    ],
+    dataset: DatasetArgument,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="OUT", help="The result folder to write."),
@@ -76,8 +71,7 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Look for what is fixed otherwise (camera), and for radii and twists without a "
-            "prior.",
+            help="Estimate what is fixed otherwise (camera), and radii and twists without a prior.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None,
@@ -86,7 +80,7 @@ def calibrate(
         typer.Option(
             metavar="PART",
             help="Keep this part of the images aside (0.2: a fifth) and tell how well the fit of "
-            "the others foretells them.",
+            "the others predicts them.",
             rich_help_panel=_TESTS,
         ),
     ] = None,
@@ -109,18 +103,23 @@ def calibrate(
     ] = None,
 ) -> None:
     """Compute the calibrated model from images and encoder readings, or check an earlier one."""
-    others = {
-        "--output": output,
-        "--prior": prior,
-        "--fix": fix,
-        "--free": free,
-        "--holdout": holdout,
-        "--fresh": fresh or None,
-        "--criteria": None if criteria is Criteria.DEFAULT else criteria,
-        "--transformation": transformation,
-    }
     if check is not None:
-        _refuse("--check", [name for name, value in others.items() if value is not None])
+        others = {
+            "--output": output,
+            "--prior": prior,
+            "--fix": fix,
+            "--free": free,
+            "--holdout": holdout,
+            "--fresh": fresh or None,
+            "--criteria": None if criteria is Criteria.DEFAULT else criteria,
+            "--transformation": transformation,
+        }
+        named = [name for name, value in others.items() if value is not None]
+        if named:
+            raise UsageError(
+                f"The command could not be run: found {', '.join(named)} beside --check, which "
+                "writes nothing and takes all of it from the earlier result; leave one of them out."
+            )
         _check(dataset, check, significance, as_json=as_json)
         return
     if significance is not None:
@@ -133,59 +132,43 @@ def calibrate(
             "The calibration could not be run: found no --output (-o), needed the result folder to "
             "write; name one, or the result to test with --check."
         )
-    from legcal.calibration import calibrate as run
-    from legcal.calibration import result_document
-    from legcal.report import progress_on_stderr
+    from legcal import calibration, report
 
-    with progress_on_stderr() as progress:
-        calibration = run(
+    with report.progress_on_stderr() as progress:
+        found = calibration.calibrate(
             dataset,
             output=output,
             progress=progress,
             criteria=criteria.value,
             transformation=None if transformation is None else transformation.value,
             use_cache=not fresh,
-            workers=min(processors(), MOST_WORKERS),
+            workers=image_workers(),
             priors=prior or (),
             fixed=fix or (),
             free=free or (),
             holdout=holdout,
         )
-    if as_json:
-        print_json(result_document(calibration))
-    else:
-        from legcal.report import summary
-
-        print_table(summary(calibration, output))
-    if not calibration.verdict.trustworthy:
+    show(
+        as_json,
+        lambda: calibration.result_of(found).document(),
+        lambda: report.summary(found, output),
+    )
+    if not found.verdict.trustworthy:
         raise typer.Exit(1)
 
 
 def _check(dataset: Path, result: Path, significance: float | None, *, as_json: bool) -> None:
     """Test an earlier result with new images."""
-    from legcal.calibration import SIGNIFICANCE, check, check_summary
-    from legcal.report import progress_on_stderr
+    from legcal import calibration, report
 
-    with progress_on_stderr() as progress:
-        found = check(
+    with report.progress_on_stderr() as progress:
+        found = calibration.check(
             dataset,
             result,
-            significance=SIGNIFICANCE if significance is None else significance,
+            significance=calibration.SIGNIFICANCE if significance is None else significance,
             progress=progress,
-            workers=min(processors(), MOST_WORKERS),
+            workers=image_workers(),
         )
-    if as_json:
-        print_json(found.document())
-    else:
-        print_table(check_summary(found))
+    show(as_json, found.document, lambda: report.check_summary(found))
     if found.movement.moved:
         raise typer.Exit(1)
-
-
-def _refuse(option: str, others: list[str]) -> None:
-    """Refuse options beside one that does not go with them."""
-    if others:
-        raise UsageError(
-            f"The command could not be run: found {', '.join(others)} beside {option}, which "
-            "writes nothing and takes all of it from the earlier result; leave one of them out."
-        )

@@ -1,4 +1,4 @@
-"""``legcal noise``."""
+"""The commands beside ``calibrate``, ``simulate`` and ``study``."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from typing import Annotated
 
 import typer
 
-from legcal.cli.calibrate import MOST_WORKERS
-from legcal.cli.options import JsonOption, ModelArgument, WorkersOption, print_json, print_table
+from legcal.cli.options import (
+    DatasetArgument,
+    JsonOption,
+    ModelArgument,
+    WorkersOption,
+    image_workers,
+    show,
+)
 from legcal.errors import UsageError
-from legcal.processors import processors
 
 
 class Model(StrEnum):
@@ -49,30 +54,22 @@ def camera(
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate a camera from photographs of a chessboard, ChArUco board or AprilGrid."""
-    from legcal.calibration import calibrate_camera
-    from legcal.report import progress_on_stderr
+    from legcal import calibration, report
 
-    with progress_on_stderr() as progress:
-        found = calibrate_camera(
+    with report.progress_on_stderr() as progress:
+        found = calibration.calibrate_camera(
             images,
             board,
             model=model.value,
             output=output,
             progress=progress,
-            workers=workers or min(processors(), MOST_WORKERS),
+            workers=image_workers(workers),
         )
-    if as_json:
-        print_json(found.document())
-    else:
-        from legcal.report import camera_table
-
-        print_table(camera_table(found, output))
+    show(as_json, found.document, lambda: report.camera_table(found, output))
 
 
 def detect(
-    dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
-    ],
+    dataset: DatasetArgument,
     output: Annotated[
         Path,
         typer.Option(
@@ -87,24 +84,15 @@ def detect(
     as_json: JsonOption = False,
 ) -> None:
     """Find the outlines of the legs and show them over the images, to see what went wrong."""
-    from legcal.calibration import detect as run
+    from legcal import calibration, report
     from legcal.perception import detection_document, picture_names
-    from legcal.report import progress_on_stderr
 
-    with progress_on_stderr() as progress:
-        found = run(
-            dataset,
-            output=output,
-            progress=progress,
-            workers=workers or min(processors(), MOST_WORKERS),
+    with report.progress_on_stderr() as progress:
+        found = calibration.detect(
+            dataset, output=output, progress=progress, workers=image_workers(workers)
         )
     document = detection_document(found, picture_names(found))
-    if as_json:
-        print_json(document)
-    else:
-        from legcal.perception import detection_table
-
-        print_table(detection_table(document, output))
+    show(as_json, lambda: document, lambda: report.detection_table(document, output))
     if found.unplaced or document["used"] == 0:
         raise typer.Exit(1)
 
@@ -125,15 +113,10 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Compare two models: platform errors of eq (20), and every parameter."""
-    from legcal.calibration import evaluate as run
+    from legcal import calibration, report
 
-    evaluation = run(model, reference, dataset=dataset)
-    if as_json:
-        print_json(evaluation.document())
-    else:
-        from legcal.report import accuracy_table
-
-        print_table(accuracy_table(evaluation))
+    found = calibration.evaluate(model, reference, dataset=dataset)
+    show(as_json, found.document, lambda: report.accuracy_table(found))
 
 
 def identify(
@@ -174,16 +157,11 @@ def identify(
     as_json: JsonOption = False,
 ) -> None:
     """Say which parameters a calibration can find, and what would mend what is missing."""
-    from legcal.calibration import answer
+    from legcal import calibration, report
 
     views = [text.split(",") for text in view or []]
-    report = answer(model, views, images, board=board, hand_held=hand_held)
-    if as_json:
-        print_json(report.document())
-    else:
-        from legcal.report import identify_table
-
-        print_table(identify_table(report))
+    found = calibration.answer(model, views, images, board=board, hand_held=hand_held)
+    show(as_json, found.document, lambda: report.identify_table(found))
 
 
 def inspect(
@@ -199,21 +177,14 @@ def inspect(
     ] = None,
 ) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
-    from legcal.machine import describe, load_mechanism
+    from legcal import machine, report
 
-    mechanism = load_mechanism(model)
-    description = describe(mechanism)
+    mechanism = machine.load_mechanism(model)
+    description = machine.describe(mechanism)
     if write is not None:
-        from legcal.machine import write_model
-
-        for path in write_model(mechanism, write):
+        for path in machine.write_model(mechanism, write):
             typer.echo(f"Wrote {path}.", err=True)
-    if as_json:
-        print_json(description)
-    else:
-        from legcal.report import inspect_table
-
-        print_table(inspect_table(description))
+    show(as_json, lambda: description, lambda: report.inspect_table(description))
 
 
 def locate(
@@ -253,13 +224,7 @@ def locate(
     as_json: JsonOption = False,
 ) -> None:
     """Find the base in the world and the tool in the platform from measured tool poses."""
-    from legcal.calibration import (
-        LOCATION_FILE,
-        location_document,
-        write_located_model,
-        write_location,
-    )
-    from legcal.calibration import locate as run
+    from legcal import calibration, report
     from legcal.files import ANGLE, LENGTH, parse_quantity
     from legcal.machine import load_mechanism
 
@@ -272,9 +237,9 @@ def locate(
     def quantity(text: str | None, units: Mapping[str, float], what: str) -> float | None:
         return None if text is None else parse_quantity(text, units, what)
 
-    LOCATION_FILE.check_place(output)
+    calibration.LOCATION_FILE.check_place(output)
     mechanism = load_mechanism(model)
-    location = run(
+    location = calibration.locate(
         mechanism,
         poses,
         position_sigma=quantity(position_sigma, LENGTH, "--position-sigma"),
@@ -284,16 +249,17 @@ def locate(
     )
     written = []
     if urdf is not None:
-        paths = write_located_model(mechanism, location, urdf, world=world_link, tool=tool_link)
+        paths = calibration.write_located_model(
+            mechanism, location, urdf, world=world_link, tool=tool_link
+        )
         written += [str(path) for path in paths]
-    write_location(location, output)
+    calibration.write_location(location, output)
     written.append(str(output))
-    if as_json:
-        print_json(location_document(location) | {"written": written})
-    else:
-        from legcal.report import location_table
-
-        print_table(location_table(location, written))
+    show(
+        as_json,
+        lambda: calibration.location_document(location) | {"written": written},
+        lambda: report.location_table(location, written),
+    )
     if not location.trustworthy:
         raise typer.Exit(1)
 
@@ -358,7 +324,9 @@ def new(
     as_json: JsonOption = False,
 ) -> None:
     """Write a model, YAML and URDF, from a table of joints or a few dimensions."""
-    from legcal.machine import create_model, describe, described
+    from rich.text import Text
+
+    from legcal import machine, report
 
     dimensions = {
         "base_radius": base_radius,
@@ -372,19 +340,16 @@ def new(
         "leg_radius": leg_radius,
         "tilt": tilt,
     }
-    asked = described(table, family=family, unit=unit, name=name, dimensions=dimensions)
-    created = create_model(asked, output, force=force)
-    description = describe(created.mechanism)
-    if as_json:
-        paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
-        print_json(description | {"paths": paths})
-    else:
-        from rich.text import Text
-
-        from legcal.report import inspect_table
-
-        print_table(inspect_table(description))
-        print_table(Text(f"\nwritten: {created.yaml_path} {created.urdf_path}", overflow="ignore"))
+    asked = machine.described(table, family=family, unit=unit, name=name, dimensions=dimensions)
+    created = machine.create_model(asked, output, force=force)
+    description = machine.describe(created.mechanism)
+    paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
+    written = f"written: {paths['yaml']} {paths['urdf']}"
+    show(
+        as_json,
+        lambda: description | {"paths": paths},
+        lambda: report.report(report.inspect_table(description), Text(written, overflow="ignore")),
+    )
 
 
 def noise(
@@ -394,16 +359,8 @@ def noise(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how precisely images tell where legs are, from repeated images of the same poses."""
-    from legcal.calibration import measure_noise
-    from legcal.report import progress_on_stderr
+    from legcal import calibration, report
 
-    with progress_on_stderr() as progress:
-        found = measure_noise(dataset, progress=progress, workers=min(processors(), MOST_WORKERS))
-    if as_json:
-        from legcal.calibration import noise_document
-
-        print_json(noise_document(found))
-    else:
-        from legcal.report import noise_table
-
-        print_table(noise_table(found))
+    with report.progress_on_stderr() as progress:
+        found = calibration.measure_noise(dataset, progress=progress, workers=image_workers())
+    show(as_json, lambda: calibration.noise_document(found), lambda: report.noise_table(found))

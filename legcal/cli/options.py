@@ -1,17 +1,21 @@
-"""What commands print: tables for people, or one JSON document."""
+"""What commands share: options, and what they print: tables for people, or one JSON document."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from legcal.errors import OutOfResources
+from legcal.processors import processors
+
+MOST_WORKERS = 4  # processes that search images; each takes about 150 MB
 
 ModelArgument = Annotated[
     str,
@@ -19,6 +23,9 @@ ModelArgument = Annotated[
         metavar="MODEL",
         help="A mechanism YAML, a URDF, an MJCF file, a robot.yaml folder or a shipped name.",
     ),
+]
+DatasetArgument = Annotated[
+    Path, typer.Argument(metavar="DATASET", help="The folder that holds dataset.yaml.")
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")
@@ -31,6 +38,21 @@ WorkersOption = Annotated[
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+
+def image_workers(asked: int | None = None) -> int:
+    """Return in how many processes to search images."""
+    return asked or min(processors(), MOST_WORKERS)
+
+
+def show(
+    as_json: bool, document: Callable[[], dict[str, Any]], table: Callable[[], RenderableType]
+) -> None:
+    """Print the document or the table."""
+    if as_json:
+        print_json(document())
+    else:
+        print_table(table())
 
 
 def print_table(renderable: RenderableType) -> None:

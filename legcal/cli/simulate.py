@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import legcal.cli.simulate_options as opt
-from legcal.cli.calibrate import MOST_WORKERS
-from legcal.cli.options import JsonOption, ModelArgument, print_json, print_table
-from legcal.processors import processors
+from legcal.cli.options import (
+    JsonOption,
+    ModelArgument,
+    image_workers,
+    print_json,
+    print_table,
+)
 
 
 def simulate(
@@ -75,7 +79,7 @@ def simulate(
     )
     nominal = load_mechanism(model)
     settings = requested(request, nominal)
-    workers = min(processors(), MOST_WORKERS)
+    workers = image_workers()
     with progress_on_stderr() as progress:
         made = run(nominal, output, settings, force=force, workers=workers, progress=progress)
     if as_json:

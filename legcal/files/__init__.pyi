@@ -25,6 +25,7 @@ from .quantity import Stated as Stated
 from .quantity import parse_quantity as parse_quantity
 from .quantity import read_prior as read_prior
 from .quantity import read_value as read_value
+from .schema import Document as Document
 from .schema import FileSchema as FileSchema
 from .schema import Metres as Metres
 from .schema import Name as Name

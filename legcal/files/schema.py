@@ -94,6 +94,16 @@ class FileSchema(BaseModel):
     )
 
 
+class Document(BaseModel):
+    """A JSON document that is written: its fields are the keys, in their order."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    def document(self) -> dict[str, Any]:
+        """Return what ``--json`` prints."""
+        return self.model_dump()
+
+
 class _Loader(yaml.SafeLoader):
     """Safe YAML: keys are text, repeated keys are refused, 2e-6 is a number and 6:25 is none."""
 

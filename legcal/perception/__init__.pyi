@@ -16,10 +16,10 @@ from .outline import find_parts as find_parts
 from .outline import measure as measure
 from .outline import part_outlines as part_outlines
 from .overview import DETECTION as DETECTION
+from .overview import PAGE as PAGE
 from .overview import Detection as Detection
 from .overview import check_detection_destination as check_detection_destination
 from .overview import detection_document as detection_document
-from .overview import detection_table as detection_table
 from .overview import picture_names as picture_names
 from .overview import write_detection as write_detection
 from .photographs import Observed as Observed

@@ -17,9 +17,6 @@ from urllib.parse import quote
 
 import cv2
 import numpy as np
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data import (
@@ -49,7 +46,6 @@ PICTURES = "overlays"
 QUALITY_JPEG = 88
 _SAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 _LONGEST = 80  # letters of a name
-_TABLE_COLUMNS = ("images", "legs found", "outlines used", "contrast", "length", "residual")
 _HEAD = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
 body {{ font: 15px/1.45 system-ui, sans-serif; margin: 1.5em; color: #222; }}
@@ -444,42 +440,3 @@ def _is_place(name: Path) -> bool:
         return False
     own = {Path(OBSERVATIONS_NAME), Path(PAGE), Path(DETECTION.marker)}
     return name in own or (name.parts[0] == PICTURES and name.suffix == ".jpg")
-
-
-def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
-    """Return the figures of a detection, by its document, as people read them."""
-    views = document["views"]
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("view", overflow="fold")
-    for column in _TABLE_COLUMNS:
-        table.add_column(column, justify="right")
-    for name, view in views.items():
-        table.add_row(
-            Text(name),
-            str(view["images"]),
-            f"{view['legs_found']}/{view['legs_visible']}",
-            f"{view['used']}/{view['outlines']}",
-            *(
-                "-" if view[key] is None else f"{view[key]:.{digits}f}{unit}"
-                for key, digits, unit in (
-                    ("contrast", 0, ""),
-                    ("length", 0, " px"),
-                    ("residual", 2, " px"),
-                )
-            ),
-        )
-    rejected: Counter[str] = Counter()
-    for view in views.values():
-        rejected.update(view["rejected"])
-    heading = Text.assemble(
-        (document["mechanism"], "bold"),
-        f": {document['used']} of {document['outlines']} outlines used in "
-        f"{document['images']} images",
-    )
-    lines: list[RenderableType] = [heading, Text(), table, Text()]
-    if rejected:
-        told = ", ".join(f"{n} {why}" for why, n in rejected.most_common())
-        lines += [Text(f"Not used: {told}."), Text()]
-    lines += [Text(view["problem"], style="red") for view in views.values() if view["problem"]]
-    lines += [Text(f"note: {note}", style="dim") for note in document["notes"]]
-    return Group(*lines, Text(f"Look at {output / PAGE}."))

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.earlier import MODEL_NAME, RESULT_NAME, EarlierResult, read_result
+from legcal.calibration.earlier import EarlierResult, read_result
 from legcal.calibration.location.model import Frames, Noise, PosePairs, ToolPoses, cross_matrices
+from legcal.calibration.result import MODEL_NAME, RESULT_NAME
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (

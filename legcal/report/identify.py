@@ -1,11 +1,11 @@
-"""The tables of ``legcal identify``: conditions, ranks, weak directions and remedies."""
+"""What people read of identifiability: conditions, ranks, weak directions and remedies."""
 
 from __future__ import annotations
 
 from itertools import groupby
 from math import degrees
 
-from rich.console import Group, RenderableType
+from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -19,6 +19,8 @@ from legcal.calibration import (
     views_in_words,
 )
 from legcal.machine import joined, leg_labels
+from legcal.report.render import report as blocks
+from legcal.report.render import table
 
 _CONDITIONS = {
     "eq12": "base joints and axes (12)",
@@ -38,42 +40,34 @@ _LEGEND = (
     "as printed: the rank with the equations of the paper as it prints them\n"
     "known length law: a leg with a reading (length = reading + offset), or constant"
 )
-_NEEDS = {"staged": "the four steps", "full": "the fit of everything"}
+_NEEDS = {"staged": "the four steps", "full": "the joint fit"}
 _MOST_WEAK = 6  # directions shown
 _MOST_MENDED = 3
 _FAR, _HALF_TURN = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
 def identify_table(report: Identifiability) -> RenderableType:
-    """Return an identifiability report as people read it, on 80 columns.
-
-    Parameters
-    ----------
-    report : Identifiability
-        The report.
-    """
-    parts: list[RenderableType] = [_heading(report), Text()]
-    if report.recommendation is not None:
-        parts += [_recommendation(report), Text()]
-    parts += [_conditions(report), Text(), _ranks(report), Text(_LEGEND, style="dim")]
-    tables = [("step by step", report.staged), ("everything at once", report.full)]
+    """Return an identifiability report as people read it, on 80 columns."""
+    weak = [("step by step", report.staged), ("everything at once", report.full)]
     if _directions(report.staged) == _directions(report.full):
-        tables = [("step by step or at once", report.full)]
-    for title, ranks in tables:
-        if ranks.weak:
-            parts += [Text(), _weak(title, ranks)]
-    if report.remedies:
-        parts += [Text(), _remedies(report)]
-    parts += [Text(), Text(_board(report.board, report.full.of))]
-    parts += [Text(_intrinsics(camera)) for camera in report.intrinsics]
-    return Group(*parts, Text(), *_verdict(report))
+        weak = [("step by step or at once", report.full)]
+    return blocks(
+        _heading(report),
+        None if report.recommendation is None else _recommendation(report),
+        _conditions(report),
+        [_ranks(report), Text(_LEGEND, style="dim")],
+        *(_weak(title, ranks) if ranks.weak else None for title, ranks in weak),
+        _remedies(report) if report.remedies else None,
+        [_board(report.board, report.full.of), *(_intrinsics(one) for one in report.intrinsics)],
+        _verdict(report),
+    )
 
 
-def _heading(report: Identifiability) -> RenderableType:
+def _heading(report: Identifiability) -> list[str]:
     """Return what is judged."""
     space = "spatial" if report.spatial else "planar"
     r = f", {report.r} with a revolute joint at the base" if report.r else ""
-    lines = [Text(f"{space}, {report.n} legs ({report.n_ac} of known length law{r})")]
+    lines = [f"{space}, {report.n} legs ({report.n_ac} of known length law{r})"]
     labels = leg_labels(report.legs)
     first = 0
     for (view, images), group in groupby(zip(report.views, report.images, strict=True)):
@@ -82,67 +76,60 @@ def _heading(report: Identifiability) -> RenderableType:
         which = f"view {last}" if last == first + 1 else f"views {first + 1}{between}{last}"
         each = "" if last == first + 1 else " each"
         legs = ", ".join(labels[name] for name in view)
-        lines.append(Text(f"{which}: legs {legs} in {images} image{'s' * (images != 1)}{each}"))
+        lines.append(f"{which}: legs {legs} in {images} image{'s' * (images != 1)}{each}")
         first = last
     if report.board.present:
-        lines.append(Text("a calibration board on the base in every view"))
-    return Group(*lines)
+        lines.append("a calibration board on the base in every view")
+    return lines
 
 
-def _recommendation(report: Identifiability) -> RenderableType:
+def _recommendation(report: Identifiability) -> list[str | RenderableType]:
     """Return the sets of views that suffice."""
     if not report.recommendation:
-        return Text("No set of views was found that suffices; all legs in one view are judged.")
-    labels = leg_labels(report.legs)
-    table = _plain_table("smallest sets of views that suffice", "legs each", "sigma \\[mm]")
+        return ["No set of views was found that suffices; all legs in one view are judged."]
+    labels, rows = leg_labels(report.legs), []
     for found in report.recommendation:
         number = len(found.views)
         views = views_in_words([",".join(labels[name] for name in view) for view in found.views])
         sigma = "" if found.platform_sigma is None else f"{1e3 * found.platform_sigma.dX_m:.2g}"
         judged = "  *" if found.views == report.views else ""
-        table.add_row(
-            f"{number} view{'s' * (number != 1)}: {views}", str(found.legs_a_view), sigma + judged
-        )
+        words = f"{number} view{'s' * (number != 1)}: {views}"
+        rows.append((words, str(found.legs_a_view), sigma + judged))
+    columns = ("smallest sets of views that suffice", ">legs each", "sigma [mm]")
     legend = "sigma: of the platform, to expect; *: judged here"
-    return Group(table, Text(legend, style="dim"))
+    return [table(*columns, rows=rows), Text(legend, style="dim")]
 
 
 def _conditions(report: Identifiability) -> Table:
     """Return the paper's conditions."""
-    table = _plain_table("condition of the paper", "equations", "unknowns", "")
+    rows = []
     for c in report.conditions:
         legs = f": {legs_in_words(c.legs, report.legs)}" if c.legs else ""
         numbers = ("", "") if c.equations is None else (str(c.equations), str(c.unknowns))
-        verdict = f"{'ok' if c.ok else 'fails'}{legs}"
         remark = "" if c.needed else ", not needed with the board"
-        table.add_row(_CONDITIONS[c.name], *numbers, f"{verdict}{remark}")
-    return table
+        rows.append((_CONDITIONS[c.name], *numbers, f"{'ok' if c.ok else 'fails'}{legs}{remark}"))
+    return table("condition of the paper", ">equations", ">unknowns", "", rows=rows)
 
 
 def _ranks(report: Identifiability) -> Table:
     """Return the ranks of the steps and of everything at once."""
-    table = _plain_table("rank of the equations", "rank", "of", "as printed")
     by_name = {(s.name, s.criteria): s for s in report.steps}
+    rows = []
     for name, title in _STEPS.items():
         default, printed = by_name[name, "default"], by_name[name, "literal"]
         other = f"{printed.rank} of {printed.of}"
-        table.add_row(title, str(default.rank), str(default.of), other)
-    table.add_row("the four steps", str(report.staged.rank), str(report.staged.of), "")
-    table.add_row("everything at once", str(report.full.rank), str(report.full.of), "")
-    return table
+        rows.append((title, str(default.rank), str(default.of), other))
+    for title, ranks in (("the four steps", report.staged), ("everything at once", report.full)):
+        rows.append((title, str(ranks.rank), str(ranks.of), ""))
+    return table("rank of the equations", ">rank", ">of", "as printed", rows=rows)
 
 
 def _weak(title: str, ranks: Ranks) -> Table:
     """Return the directions that are not determined."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column(f"not determined {title}", overflow="fold", ratio=1)
-    table.add_column(r"hides \[mm]", justify="right")
-    table.add_column(r"\[deg]", justify="right")
-    for weak in ranks.weak[:_MOST_WEAK]:
-        table.add_row(weak.direction, *_hidden(weak))
+    rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MOST_WEAK]]
     if len(ranks.weak) > _MOST_WEAK:
-        table.add_row(f"and {len(ranks.weak) - _MOST_WEAK} more (see --json)", "", "")
-    return table
+        rows.append((f"and {len(ranks.weak) - _MOST_WEAK} more (see --json)", "", ""))
+    return table(f"not determined {title}", ">hides [mm]", ">[deg]", rows=rows)
 
 
 def _directions(ranks: Ranks) -> list[str]:
@@ -207,52 +194,43 @@ def _intrinsics(found: CameraIntrinsics) -> str:
 
 def _remedies(report: Identifiability) -> Table:
     """Return what would help."""
-    table = _plain_table("what would mend it", "steps", "at once", "")
-    for r in report.remedies:
-        of = report.full.of
-        enough = "enough" if r.enough else "helps"
-        table.add_row(r.remedy, f"{r.staged_rank}/{of}", f"{r.full_rank}/{of}", enough)
-    return table
+    of = report.full.of
+    rows = [
+        (
+            r.remedy,
+            f"{r.staged_rank}/{of}",
+            f"{r.full_rank}/{of}",
+            "enough" if r.enough else "helps",
+        )
+        for r in report.remedies
+    ]
+    return table("what would mend it", ">steps", ">at once", "", rows=rows)
 
 
-def _verdict(report: Identifiability) -> list[RenderableType]:
+def _verdict(report: Identifiability) -> list[str | RenderableType]:
     """Return what follows."""
     harmless = sum(weak.harmless for weak in report.full.weak)
-    lines: list[RenderableType] = []
+    lines: list[str | RenderableType] = []
     if report.identifiable:
         rest = f", but for {harmless} directions that do not move the platform" if harmless else ""
-        lines.append(Text(f"Identifiable: everything at once determines all parameters{rest}."))
+        lines.append(f"Identifiable: everything at once determines all parameters{rest}.")
         if not report.staged.complete:
-            lines.append(Text("The steps alone do not: calibration starts from the nominal model."))
+            lines.append("The steps alone do not: calibration starts from the nominal model.")
     else:
         lines.append(Text("NOT identifiable: see what is not determined.", style="bold"))
     if report.platform_sigma is not None:
         sigma = report.platform_sigma
-        lines.append(
-            Text(
-                f"Platform sigma to expect: {_two_digits(1e3 * sigma.dX_m)} mm, "
-                f"{_two_digits(degrees(sigma.dE_rad))} deg, from outlines good to 0.1 px "
-                "at both ends of a leg.",
-                style="dim",
-            )
+        expected = (
+            f"Platform sigma to expect: {_two_digits(1e3 * sigma.dX_m)} mm, "
+            f"{_two_digits(degrees(sigma.dE_rad))} deg, from outlines good to 0.1 px "
+            "at both ends of a leg."
         )
+        lines.append(Text(expected, style="dim"))
     weak = (*report.staged.weak, *report.full.weak)
     if any(direction.dX_m is not None and not direction.harmless for direction in weak):
-        lines.append(
-            Text(
-                "What a direction hides is the platform's error for 1 mm in its largest component.",
-                style="dim",
-            )
-        )
+        hidden = "What a direction hides is the platform's error for 1 mm in its largest component."
+        lines.append(Text(hidden, style="dim"))
     failed = [_CONDITIONS[c.name] for c in report.conditions if c.fails]
     if failed:
-        lines.append(Text(f"The paper's conditions fail: {joined(failed)}."))
-    return [*lines, *(Text(f"note: {note}") for note in report.notes)]
-
-
-def _plain_table(*columns: str) -> Table:
-    """Return a table whose middle columns are numbers."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for k, title in enumerate(columns):
-        table.add_column(title, justify="left" if k in (0, len(columns) - 1) else "right")
-    return table
+        lines.append(f"The paper's conditions fail: {joined(failed)}.")
+    return [*lines, *(f"note: {note}" for note in report.notes)]

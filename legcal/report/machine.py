@@ -1,0 +1,155 @@
+"""What people read of a mechanism, and of where its base and tool are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import degrees
+from typing import Any
+
+import numpy as np
+from rich.console import RenderableType
+from rich.text import Text
+
+from legcal.calibration import Location
+from legcal.geometry import roll_pitch_yaw
+from legcal.report.render import heading, report, table
+
+_TURNS = ("roll, x", "pitch, y", "yaw, z")
+MOST_ROWS = 60  # of residuals; the file has them all
+
+
+def inspect_table(description: dict[str, Any]) -> RenderableType:
+    """Return the document of ``inspect`` as people read it, lengths in millimetres."""
+    motors, mobility, legs = description["motors"], description["mobility"], description["legs"]
+    verdict = "the motors determine the pose" if motors == mobility else "NOT determined by motors"
+    if motors > mobility:
+        verdict = "more than it needs"
+    if mobility == 0:
+        verdict = "it cannot move"
+    title = heading(
+        description["name"],
+        f": {'spatial' if description['spatial'] else 'planar'}, {len(legs)} legs, "
+        f"mobility {mobility}, {motors} motors ({verdict})",
+    )
+    A, B = (_points([leg[end] for leg in legs]) for end in ("A", "B"))
+    rows = [
+        (
+            leg["name"],
+            leg["type"] if leg["actuated"] else f"{leg['type']} {leg['kind']}",
+            A_text,
+            B_text,
+            _length(leg),
+            ", ".join(dict.fromkeys(f"{1e3 * c['radius']:.4g}" for c in leg["cylinders"]))
+            or "none",
+        )
+        for leg, A_text, B_text in zip(legs, A, B, strict=True)
+    ]
+    kinds = max(4, *(0 if leg["actuated"] else len(leg["kind"]) for leg in legs))
+    columns = ("leg", "type", ">A in base [mm]", ">B in platform [mm]", ">length [mm]", ">R [mm]")
+    axes = [
+        (
+            leg["name"],
+            _direction(leg["base_axis"]),
+            _direction(leg["platform_axis"]),
+            "" if leg["twist"] is None else f"{degrees(leg['twist']) + 0.0:.3f}",
+        )
+        for leg in legs
+        if leg["base_axis"] or leg["platform_axis"]
+    ]
+    of_axes = ("leg", ">axis at base", ">axis at platform", ">twist [deg]")
+    legend = f"R_b and R_e stand on the joints of {description['n_d']} legs; q is the reading."
+    return report(
+        title,
+        table(*columns, rows=rows, least={1: kinds}),
+        table(*of_axes, rows=axes) if axes else None,
+        [Text(legend, style="dim"), *(f"note: {note}" for note in description["diagnostics"])],
+    )
+
+
+def _direction(axis: Sequence[float] | None) -> str:
+    """Return a unit vector, or nothing where there is no axis."""
+    return "" if axis is None else " ".join(f"{round(x, 4) + 0.0:7.4f}" for x in axis)
+
+
+def _points(points: Sequence[Sequence[float]]) -> list[str]:
+    """Return points in millimetres, decimals aligned."""
+    words = [[f"{round(1e3 * x, 1) + 0.0:.1f}" for x in point] for point in points]
+    width = max(len(word) for row in words for word in row)
+    return [" ".join(word.rjust(width) for word in row) for row in words]
+
+
+def _radii(leg: dict[str, Any]) -> str:
+    """Return the different radii of a leg in millimetres."""
+    return ", ".join(dict.fromkeys(f"{1e3 * c['radius']:.4g}" for c in leg["cylinders"]))
+
+
+def _length(leg: dict[str, Any]) -> str:
+    """Return the length law of a leg in millimetres."""
+    q0 = f"{1e3 * leg['q0']:.3f}"
+    return q0 if leg["kind"] == "constant" else f"{q0} {'+' if leg['sign'] > 0 else '-'} q"
+
+
+def location_table(location: Location, written: Sequence[str]) -> RenderableType:
+    """Return base and tool with their residuals, in mm and degrees."""
+    frames, sigma = [], location.sigma.reshape(2, 6)
+    for i, (name, T) in enumerate(
+        (("T_world_base", location.T_world_base), ("T_platform_tool", location.T_platform_tool))
+    ):
+        for component, value, s in zip("xyz", T.translation, sigma[i, :3], strict=True):
+            frames.append((name, component, f"{1e3 * value:z.4f}", f"{1e3 * s:.4f}", "mm"))
+        if i == 1 and not location.has_tool_orientation:
+            frames.append((name, "rotation", "not measured", "", ""))
+            continue
+        # Sigma of an angle is that of a turn about the axis.
+        angles = roll_pitch_yaw(T.rotation.as_matrix())
+        for component, value, s in zip(_TURNS, angles, sigma[i, 3:], strict=True):
+            value, s = np.degrees(value), np.degrees(s)
+            frames.append((name, component, f"{value:z.5f}", f"{s:.5f}", "deg"))
+    residuals = [
+        (
+            str(row.row),
+            f"{1e3 * np.linalg.norm(row.position):.4f}",
+            "" if row.rotation is None else f"{np.degrees(np.linalg.norm(row.rotation)):.4f}",
+            "used" if row.used else "left out",
+        )
+        for row in location.rows[:MOST_ROWS]
+    ]
+    if len(location.rows) > MOST_ROWS:
+        residuals.append(("...", "", "", f"{len(location.rows) - MOST_ROWS} more in the file"))
+    good = {"located": "bold green", "located in part": "bold yellow", "doubtful": "bold red"}
+    return report(
+        table("frame", "component", ">value", ">sigma", "unit", rows=frames),
+        table(">row", ">position [mm]", ">orientation [deg]", "verdict", rows=residuals),
+        [
+            *(f"Note: {note}" for note in location.notes),
+            _noise_line(location),
+            *(
+                f"Row {row.row} was left out: {row.reason}."
+                for row in location.rows
+                if not row.used
+            ),
+            *(f"Written to {path}." for path in written),
+            Text(location.sentence, style=good[location.status]),
+        ],
+    )
+
+
+def _noise_line(location: Location) -> str:
+    """Return how precise the measurement is, and where that comes from."""
+    noise = location.noise
+    stated = {True: "stated", False: "from the residuals"}
+    words = f"position {1e3 * noise.position:.3g} mm ({stated[noise.position_stated]})"
+    if noise.angle is not None:
+        angle = f"{np.degrees(noise.angle):.3g} deg"
+        words += f", orientation {angle} ({stated[noise.angle_stated]})"
+    others = [
+        "errors of the readings" * (noise.reading > 0.0),
+        "the covariance of the model" * noise.model,
+    ]
+    known = [other for other in others if other]
+    counted = f"; {' and '.join(known)} counted in" if known else ""
+    p_value = "" if location.p_value is None else f", p {location.p_value:.2g}"
+    return (
+        f"Noise of a component: {words}{counted}. chi2 {location.chi2:.1f} at {location.dof} "
+        f"degrees of freedom{p_value}."
+    )

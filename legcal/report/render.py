@@ -1,0 +1,58 @@
+"""The one renderer of text tables, and of what stands around them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+Cells = Sequence[str | Text]
+
+
+def table(
+    *columns: str,
+    rows: Iterable[Cells],
+    title: str = "",
+    least: Mapping[int, int] | None = None,
+) -> Table:
+    """Return a plain table; a column whose name begins with ">" holds numbers, flush right.
+
+    ``least`` are the characters that a column keeps on a narrow terminal.
+    """
+    found = Table(
+        title=Text(title) if title else None,
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+    )
+    for k, column in enumerate(columns):
+        is_number = column.startswith(">")
+        found.add_column(
+            Text(column.removeprefix(">")),
+            justify="right" if is_number else "left",
+            overflow="fold",
+            no_wrap=is_number,
+            min_width=(least or {}).get(k),
+        )
+    for row in rows:
+        found.add_row(*(cell if isinstance(cell, Text) else Text(cell) for cell in row))
+    return found
+
+
+def report(*blocks: str | RenderableType | Sequence[str | RenderableType] | None) -> Group:
+    """Return blocks one below the other, an empty line between; a block may have several lines."""
+    parts: list[RenderableType] = []
+    for block in blocks:
+        lines = [block] if isinstance(block, str) or not isinstance(block, Sequence) else [*block]
+        shown = [Text(line) if isinstance(line, str) else line for line in lines if line]
+        if shown:
+            parts += [Text(), *shown] if parts else shown
+    return Group(*parts)
+
+
+def heading(name: str, rest: str) -> Text:
+    """Return what a report is of, the name in bold."""
+    return Text.assemble((name, "bold"), rest)
