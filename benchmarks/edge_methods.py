@@ -8,8 +8,8 @@ from rendered_cylinders import Photographed, interpolated
 
 from legcal.calibration.canny import edge_points
 from legcal.geometry.types import Array
+from legcal.perception.edges import measure_edges
 from legcal.perception.light import Grey
-from legcal.perception.measure import measure_edges
 from legcal.perception.profiles import Edge
 from legcal.vision.cylinder import EPSILON
 

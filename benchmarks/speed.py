@@ -29,7 +29,7 @@ from legcal.geometry.types import Image
 from legcal.machine.kinematics import forward_kinematics
 from legcal.perception import Photographs, Placement, measure_photographs, place
 from legcal.perception.detection import measure_outlines
-from legcal.perception.diagnostics import expose
+from legcal.perception.image_quality import expose
 from legcal.perception.light import to_grey
 from legcal.perception.look_again import look_again
 from legcal.perception.placement import group_views

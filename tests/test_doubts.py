@@ -22,16 +22,14 @@ from legcal.errors import NotIdentifiable
 from legcal.perception.diagnostics import (
     NOTHING_LIKE,
     Explanation,
-    Exposure,
     OutlineCount,
     _best,
     _usual,
-    expose,
     hint_notes,
-    image_defects,
     judged,
     reject_images,
 )
+from legcal.perception.image_quality import Exposure, expose, image_defects
 from legcal.perception.light import to_grey
 from legcal.perception.overview import Detection
 from legcal.perception.photographs import Observed, observe

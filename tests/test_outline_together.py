@@ -222,7 +222,7 @@ def test_outlines_of_which_nothing_is_seen_know_no_gamma() -> None:
 def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
     """Blocks by themselves hardly know where it is, and together no better than they say."""
     blocks = outline(LIMB, (0.0, 0.0), 0.55, noise=1.0)
-    blocks.settle(0.55, 2)
+    blocks.fit(0.55, 2)
     assert blocks.lines[0] is not None
     assert np.abs(blocks.lines[0].ends).max() > 0.1
     blocks.unmove()

@@ -15,9 +15,10 @@ from legcal.machine.kinematics import forward_kinematics
 from legcal.machine.model import Mechanism
 from legcal.perception import recognise as recognising
 from legcal.perception.agreement import Picture, Poses, Targets, agreement, improved, targets_of
-from legcal.perception.camera_search import Candidates, place_camera, place_near, pose_starts
+from legcal.perception.camera_search import Candidates, place_camera, place_near
 from legcal.perception.lines import EdgePairs, Segments, find_edge_pairs, find_segments
 from legcal.perception.placement import Placement, Search
+from legcal.perception.pose_starts import pose_starts
 from legcal.perception.recognise import recognise
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.perception.agreement import Poses, agreement
-from legcal.perception.camera_search import MOST, joined, pose_starts
+from legcal.perception.pose_starts import MOST, pose_starts
 
 
 def _turns(poses: Poses, T: RigidTransform) -> tuple[Array, Array]:
@@ -83,6 +83,6 @@ def test_sets_of_poses_are_put_together() -> None:
     rng = np.random.default_rng(1)
     R = Rotation.random(5, rng=rng).as_matrix()
     poses = Poses.rigid(R, rng.normal(size=(5, 3)), 4)
-    both = joined([poses.take(np.array([0, 1])), poses.take(np.array([4]))])
+    both = Poses.joined([poses.take(np.array([0, 1])), poses.take(np.array([4]))])
     np.testing.assert_array_equal(both.R, R[[0, 1, 4]])
     assert both.shift.shape == (3, 4, 2, 3)

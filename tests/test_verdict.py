@@ -8,7 +8,7 @@ import pytest
 from legcal.geometry.types import Array
 from legcal.perception.blocks import Line
 from legcal.perception.edge_pairs import EdgePair
-from legcal.perception.measure import MeasuredEdge
+from legcal.perception.edges import MeasuredEdge
 from legcal.perception.outline import NARROW_BIAS, WRONG_WIDTH, Verdict, verdict
 
 WIDTH = np.array([20.0, 18.0])  # by the radius [px]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, IntArray
 from legcal.machine import Cylinder
@@ -83,6 +84,29 @@ class Poses:
     def rigid(cls, R: Array, t: Array, n_legs: int) -> "Poses":
         """Return poses at which all legs are where the model has them."""
         return cls(R, t, np.zeros((len(R), n_legs, 2, 3)))
+
+    @classmethod
+    def none(cls, n_legs: int) -> "Poses":
+        """Return no pose."""
+        return cls.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
+
+    @classmethod
+    def one(cls, T_base_camera: RigidTransform, shift: Array) -> "Poses":
+        """Return one pose, with shifts (n_legs, 2, 3)."""
+        T = T_base_camera.inv()
+        return cls(T.rotation.as_matrix()[None], T.translation[None], shift[None])
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Poses]") -> "Poses":
+        """Return all poses of some sets."""
+        return cls(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("R", "t", "shift"))
+        )
+
+    def T_base_camera(self, i: int = 0) -> RigidTransform:
+        """Return a pose the other way round."""
+        R = Rotation.from_matrix(self.R[i])
+        return RigidTransform.from_components(self.t[i], R).inv()
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -367,17 +391,9 @@ def _moved(poses: Poses, xi: Array, shift: Array, centre: Array) -> Poses:
     moved = np.linalg.norm(np.cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
     distance = np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
     xi = xi / np.maximum(np.maximum(turned, moved / (MOST_PLACE * distance)), 1.0)[:, None]
-    turn = _rotations(xi[:, :3])
+    turn = Rotation.from_rotvec(xi[:, :3]).as_matrix()
     t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]
     return Poses(turn @ poses.R, t, shift)
-
-
-def _rotations(vectors: Array) -> Array:
-    """Return the rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    K = _cross(vectors / np.maximum(angle, 1e-12)[:, None])
-    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + s * K + (1.0 - c) * (K @ K))
 
 
 def _vector_product(x: Array, y: Array) -> Array:
@@ -395,17 +411,17 @@ def _cross(vectors: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
 
 
-def exchanged(R: Array, t: Array, X: Array) -> tuple[Array, Array]:
-    """Return the poses R (n, 3, 3), t (n, 3) that show points X (m, 3) of a flat machine alike.
+def exchanged(poses: Poses, X: Array) -> Poses:
+    """Return the poses that show points X (m, 3) of a flat machine alike as seen from far.
 
-    As seen from far: the machine is reflected in its own plane, which leaves a flat one as it is,
-    and in the plane through its middle that faces the camera.
+    The machine is reflected in its own plane, which leaves a flat one as it is, and in the plane
+    through its middle that faces the camera.
     """
     middle = X.mean(axis=0)
     normal = np.linalg.svd(X - middle, full_matrices=False)[2][2]
-    at = R @ middle + t
+    at = poses.R @ middle + poses.t
     facing = at / np.linalg.norm(at, axis=1, keepdims=True)
     in_plane = np.eye(3) - 2.0 * np.outer(normal, normal)
     in_depth = np.eye(3) - 2.0 * facing[:, :, None] * facing[:, None, :]
-    turned = in_depth @ R @ in_plane
-    return turned, at - turned @ middle
+    turned = in_depth @ poses.R @ in_plane
+    return Poses.rigid(turned, at - turned @ middle, poses.shift.shape[1])

@@ -1,6 +1,6 @@
 """Blocks of pixels along outlines, fitted one by one, and robust lines through them.
 
-A line settles where most blocks of its outline have their edge. Neighbouring blocks share what the
+A line converges to where most blocks of its outline have their edge. Neighbouring blocks share what the
 limb model leaves out (texture, shading, the lens), so the covariance of a line rests on the scatter
 and the correlation that are seen, and never falls below what the model is known to be good for.
 """
@@ -135,14 +135,14 @@ class Blocks:
         """Put lines back to where they were read; blocks that lay on them stay kept.
 
         Blocks by themselves hardly tell where a limb is that rises from the level of the
-        background: lines that were near the outline must not settle elsewhere.
+        background: lines that were near the outline must not converge elsewhere.
         """
         self.moved[:] = 0.0
         self.lines = [
             None if line is None else replace(line, ends=np.zeros(2)) for line in self.lines
         ]
 
-    def settle(self, blur: float, n_rounds: int) -> None:
+    def fit(self, blur: float, n_rounds: int) -> None:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""
         active = np.ones(len(self.lines), dtype=np.bool_)
         counts = np.diff(self.bounds)

@@ -9,35 +9,22 @@ left and right exchanged.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.agreement import (
-    WIDTH_ERROR,
     Agreement,
     Picture,
     Poses,
-    Targets,
     agreement,
     distances,
     exchanged,
     improved,
-    seen_width,
 )
 from legcal.perception.lines import EdgePairs
-
-N_FIRST, N_SECOND = 20, 40  # best pairs that are tried as the first one, and as the second
-LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
-LONGER = 1.25, 3.0  # a pair is at most so much longer than the piece that it shows: factor, radii
-CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
-WIDTH_REACH = 2.5  # standard deviations of the width of the second pair
-SLACK = 0.2  # of the place along a piece, in its lengths
-TURNED = 1.05  # how far from a solution pairs and legs may be that allow none, as a cosine
-CROSSING = 0.03  # sine between axes seen, below which the second pair does not tell the place
-MOST = 3000  # poses of a picture
+from legcal.perception.pose_starts import pose_starts
 
 # Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
 # lead over the next pose in legs of all images together, and as a part.
@@ -146,8 +133,7 @@ class Candidates:
 
     def pose(self, i: int = 0) -> RigidTransform:
         """Return T_base_camera of a pose."""
-        R = Rotation.from_matrix(self.poses.R[i])
-        return RigidTransform.from_components(self.poses.t[i], R).inv()
+        return self.poses.T_base_camera(i)
 
 
 def place_camera(
@@ -158,28 +144,29 @@ def place_camera(
     Pictures are of one camera pose at different readings; ``starts`` says how many more of them
     suggest poses, as long as there is a doubt.
     """
-    by_merit = np.argsort([-_merit(p) for p in pictures], kind="stable").tolist()
-    best_first = [pictures[k] for k in by_merit]
-    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
-    best = _judged(pictures, nothing)
+    merits = [float(p.pairs.merit[:8].sum()) if len(p.pairs) else 0.0 for p in pictures]
+    best_first = [pictures[k] for k in np.argsort(-np.array(merits), kind="stable").tolist()]
+    best = _judged(pictures, Poses.none(n_legs))
     done = 0
     for n in starts:
         if done >= len(pictures):
             break
         suggested = [_starts(picture, n_legs) for picture in best_first[done : done + n]]
         done += n
-        poses = joined([best.poses, *suggested])
+        poses = Poses.joined([best.poses, *suggested])
         if len(poses) == 0:
             continue
         poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
         some = best_first[: max(SOME_PICTURES, done)]
-        score = supports(some, poses, TOLERANCES[3])[0].sum(axis=1)
+        score = scores(some, poses, TOLERANCES[3])
         poses = poses.take(_distinct(poses, score, KEPT[2]))
-        poses = joined([poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))])
+        poses = Poses.joined(
+            [poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))]
+        )
         poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
-        score = supports(some, poses, TOLERANCES[-1])[0].sum(axis=1)
+        score = scores(some, poses, TOLERANCES[-1])
         poses = poses.take(_best(score, KEPT[3]))
-        poses = joined([poses, _polished(some[:POLISHING], poses)])
+        poses = Poses.joined([poses, _polished(some[:POLISHING], poses)])
         best = _judged(pictures, refined(pictures, poses, LAST, JOINT_ERROR))
         if best.is_clear:
             break
@@ -196,17 +183,15 @@ def _polished(pictures: Sequence[Picture], poses: Poses) -> Poses:
     for i in range(min(N_POLISHED, len(poses))):
         around = _around(pictures, poses.R[i], poses.t[i], n_legs)
         around = refined(pictures, around, POLISH, JOINT_ERROR)
-        score = supports(pictures, around, POLISH[-1])[0].sum(axis=1)
+        score = scores(pictures, around, POLISH[-1])
         found.append(around.take(_best(score, 1)))
-    return joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
+    return Poses.joined([*found, poses.take(np.zeros(0, dtype=np.intp))])
 
 
 def _reversed(pictures: Sequence[Picture], poses: Poses) -> Poses:
     """Return the poses that show a flat machine alike from far: near and far exchanged."""
     ends = np.concatenate([picture.targets.ends.reshape(-1, 3) for picture in pictures])
-    if len(ends) == 0:
-        return poses
-    return Poses.rigid(*exchanged(poses.R, poses.t, ends), poses.shift.shape[1])
+    return exchanged(poses, ends) if len(ends) else poses
 
 
 def _around(pictures: Sequence[Picture], R: Array, t: Array, n_legs: int) -> Poses:
@@ -238,7 +223,7 @@ def with_first(placed: Candidates, i: int, pose: Poses, pictures: Sequence[Pictu
     order = np.array([i, *(k for k in range(len(placed.poses)) if k != i)], dtype=np.intp)
     return replace(
         placed,
-        poses=joined([pose, placed.poses.take(order[1:])]),
+        poses=Poses.joined([pose, placed.poses.take(order[1:])]),
         support=placed.support[order],
         expected=placed.expected[order],
         score=placed.score[order],
@@ -328,14 +313,10 @@ def _starts(picture: Picture, n_legs: int) -> Poses:
     # From the frame of the picture to that of the poses.
     back = picture.R.T
     poses = Poses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
-    poses = poses.take(_best(supports([picture], poses, TOLERANCES[0])[0].sum(axis=1), KEPT[0]))
+    poses = poses.take(_best(scores([picture], poses, TOLERANCES[0]), KEPT[0]))
     poses = refined([picture], poses, TOLERANCES[:3])
-    score = supports([picture], poses, TOLERANCES[2])[0].sum(axis=1)
+    score = scores([picture], poses, TOLERANCES[2])
     return poses.take(_distinct(poses, score, KEPT[1]))
-
-
-def _merit(picture: Picture) -> float:
-    return float(picture.pairs.merit[:8].sum()) if len(picture.pairs) else 0.0
 
 
 def refined(
@@ -351,14 +332,12 @@ def refined(
     return poses
 
 
-def supports(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> tuple[Array, Array]:
-    """Return the support and the expected number of legs, both (n_poses, n_pictures)."""
-    support, expected = [], []
-    for picture in pictures:
-        found = agreement(picture, poses, tolerance)
-        support.append(found.one_pair_each @ picture.targets.share)
-        expected.append(found.visible @ picture.targets.share)
-    return np.stack(support, axis=1), np.stack(expected, axis=1)
+def scores(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> Array:
+    """Return how many legs agree with each pose in all pictures together, (n_poses,)."""
+    found = [agreement(picture, poses, tolerance).one_pair_each for picture in pictures]
+    shares = [picture.targets.share for picture in pictures]
+    support = [value @ share for value, share in zip(found, shares, strict=True)]
+    return np.asarray(np.stack(support, axis=1).sum(axis=1))
 
 
 def _best(score: Array, n: int) -> IntArray:
@@ -414,169 +393,3 @@ def is_mirrored(own: Candidates, other: Candidates) -> bool:
         return other.is_clear
     lead = float(other.score[0] - own.score[0])
     return other.is_convincing and lead >= max(LEAD, LEAD_PART * float(other.score[0]))
-
-
-def joined(parts: Sequence[Poses]) -> Poses:
-    """Return all poses of some sets."""
-    R, t, shift = ([getattr(p, name) for p in parts] for name in ("R", "t", "shift"))
-    return Poses(np.concatenate(R), np.concatenate(t), np.concatenate(shift))
-
-
-class _Firsts(NamedTuple):
-    """Pairs taken for legs, each with a lean: all about a start but the turn and the place."""
-
-    u: Array  # (n, 3) direction in the camera frame, from base to platform
-    P: Array  # (n, 3) where the middle of the piece is put [m]
-    slack: Array  # (n,) how far along the leg it may be instead [m]
-    pair: IntArray  # (n,)
-    target: IntArray  # (n,)
-
-
-def pose_starts(picture: Picture, n_legs: int) -> Poses:
-    """Return camera poses that put two legs where two pairs of a picture are."""
-    pairs, targets = (
-        picture.pairs.take(np.arange(min(N_SECOND, len(picture.pairs)))),
-        picture.targets,
-    )
-    nothing = Poses.rigid(np.zeros((0, 3, 3)), np.zeros((0, 3)), n_legs)
-    if len(pairs) < 2 or len(set(targets.leg.tolist())) < 2:
-        return nothing
-    firsts = _firsts(pairs, targets)
-    if len(firsts.u) == 0:
-        return nothing
-    middle = targets.ends.mean(axis=1)
-    piece = targets.ends[:, 1] - targets.ends[:, 0]
-    length = np.linalg.norm(piece, axis=1)
-    direction = piece / length[:, None]
-    # All in frames whose x axis is the first leg: of the camera, and of the base link.
-    U_c, U_b = _triads(firsts.u), _triads(direction)[firsts.target]
-    rays, planes = _rays(pairs), _planes(pairs)
-    n_all, ray_all = planes @ U_c, rays @ U_c  # (n_firsts, n_pairs, 3)
-    P_all = np.einsum("fxi,fx->fi", U_c, firsts.P)
-    w_all = direction @ U_b  # (n_firsts, n_targets, 3)
-    d_all = (middle[None] - middle[firsts.target][:, None]) @ U_b
-    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
-    n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
-    across = n[:, 0]
-    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < CROSSING, np.inf, across)
-    good = np.flatnonzero(np.abs(place) <= firsts.slack[f])
-    f, k, m = f[good], k[good], m[good]
-    cosine, sine, place = cosine[good], sine[good], place[good]
-    # Where the second pair's middle is on the second leg, and how wide it should be there.
-    X = d[good] + P[good]
-    X[:, 0] += place
-    v, ray = _turned(w_all[f, m], cosine, sine), ray_all[f, k]
-    vX, vr, Xr = _dot(v, X), _dot(v, ray), _dot(X, ray)
-    along = -(_dot(X, X) * vr - vX * Xr) / _safe(vX * vr - Xr)
-    depth = _dot(U_c[f, 2], X + along[:, None] * v)
-    flat = np.linalg.norm(planes[k][:, :2], axis=1)
-    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
-    seen = seen_width(pairs)[k]
-    # The depth of the first leg is no better known.
-    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, pairs.pixel / seen)
-    off = np.abs(np.log(expected / seen)) / (WIDTH_REACH * sigma)
-    good_along = np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]
-    good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
-    merit = pairs.merit[k] + pairs.merit[firsts.pair[f]]
-    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MOST]]
-    f, place = f[good], place[good]
-    R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
-    where = firsts.P[f] + place[:, None] * firsts.u[f]
-    t = where - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
-    return Poses.rigid(R, t, n_legs)
-
-
-def _turns(
-    firsts: _Firsts, targets: Targets, n: Array, w: Array
-) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
-    """Return the turns about a first leg that lay a second one into the plane of a second pair.
-
-    Indices of the first, the second pair and the second piece, and cosine and sine of the turn,
-    from the normals n (n_firsts, n_pairs, 3) of the planes and the directions w (n_firsts,
-    n_targets, 3) of the pieces.
-    """
-    n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
-    c0 = n[..., 0] * w[..., 0]
-    c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
-    c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
-    good = c0**2 <= TURNED**2 * (c1**2 + c2**2)
-    good &= (np.arange(n.shape[1]) != firsts.pair[:, None])[:, :, None]
-    good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
-    f, k, m = np.nonzero(good)
-    c0, c1, c2 = (c[good].astype(np.float64) for c in (c0, c1, c2))
-    step = np.arccos(np.clip(-c0 / np.maximum(np.hypot(c1, c2), 1e-12), -1.0, 1.0))
-    base = np.arctan2(c2, c1)
-    turn = np.concatenate([base + step, base - step])
-    f, k, m = (np.concatenate([x, x]) for x in (f, k, m))
-    return f, k, m, np.cos(turn), np.sin(turn)
-
-
-def _firsts(pairs: EdgePairs, targets: Targets) -> _Firsts:
-    """Take the best pairs for every piece, with all leans that their edges allow."""
-    n = min(N_FIRST, len(pairs))
-    first = pairs.take(np.arange(n))
-    rays, planes = _rays(first), _planes(first)
-    along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
-    ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    side = np.cross(ray, planes)  # in the plane of the axis, across the ray
-    side *= np.sign(_dot(side, along))[:, None]
-    width = seen_width(first)
-    cone = np.log(first.width[:, 1] / first.width[:, 0])[:, None, None]
-    sigma = (CONE + 1.5 * pairs.pixel / width)[:, None, None]
-    length = np.linalg.norm(targets.ends[:, 1] - targets.ends[:, 0], axis=1)
-    flat = np.linalg.norm(planes[:, :2], axis=1)
-    z = 2.0 * targets.radius / (width * flat)[:, None]  # (n, n_targets)
-    v = np.cos(LEANS)[:, None] * side[:, None] + np.sin(LEANS)[:, None] * ray[:, None]
-    # The ends of the pair on an axis along v, and how their widths differ.
-    steep = np.maximum(np.abs(np.einsum("nlx,nx->nl", v, along)), 0.2)
-    reach = (first.half_length[:, None] / steep)[:, None, :] * z[..., None]  # (n, n_targets, leans)
-    z0, z1 = z[..., None] - reach * v[:, None, :, 2], z[..., None] + reach * v[:, None, :, 2]
-    longest = LONGER[0] * length + LONGER[1] * targets.radius
-    good = (np.minimum(z0, z1) > 0.0) & (2.0 * reach <= longest[:, None])
-    ratio = np.log(np.where(good, z0, 1.0) / np.where(good, z1, 1.0))
-    good &= np.abs(ratio - cone) <= 3.0 * sigma
-    i, j, lean = np.nonzero(good)
-    slack = np.maximum(0.5 * length[j] - reach[good], 0.0) + SLACK * length[j]
-    u, P = v[i, lean], z[i, j][:, None] * rays[i]
-    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, slack, i, j)))
-
-
-def _rays(pairs: EdgePairs) -> Array:
-    """Return the points (x, y, 1) of the middles, (n, 3)."""
-    return np.concatenate([pairs.middle, np.ones((len(pairs), 1))], axis=1)
-
-
-def _planes(pairs: EdgePairs) -> Array:
-    """Return the unit normals (n, 3) of the planes of the axes and the camera centre."""
-    along = np.concatenate([pairs.along, np.zeros((len(pairs), 1))], axis=1)
-    planes = np.cross(along, _rays(pairs))
-    return np.asarray(planes / np.linalg.norm(planes, axis=1, keepdims=True))
-
-
-def _triads(u: Array) -> Array:
-    """Return right-handed orthonormal matrices (n, 3, 3) whose first columns are u."""
-    other = np.eye(3)[np.argmin(np.abs(u), axis=1)]
-    v = np.cross(u, other)
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    return np.stack([u, v, np.cross(u, v)], axis=2)
-
-
-def _about_x(cosine: Array, sine: Array) -> Array:
-    """Return rotations (n, 3, 3) about the x axis."""
-    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
-    rows = [one, zero, zero, zero, cosine, -sine, zero, sine, cosine]
-    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
-
-
-def _turned(x: Array, cosine: Array, sine: Array) -> Array:
-    """Return vectors (n, 3) turned about the x axis."""
-    y, z = x[:, 1], x[:, 2]
-    return np.stack([x[:, 0], cosine * y - sine * z, sine * y + cosine * z], axis=-1)
-
-
-def _dot(x: Array, y: Array) -> Array:
-    return np.asarray(np.einsum("ni,ni->n", x, y))
-
-
-def _safe(x: Array) -> Array:
-    return np.where(np.abs(x) < 1e-12, 1e-12, x)

@@ -44,7 +44,7 @@ SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # un
 
 
 class JointLines(NamedTuple):
-    """Lines of outlines, by how far they lie inside those on which the blocks had settled."""
+    """Lines of outlines, by how far they lie inside those on which the blocks had converged."""
 
     ends: Array  # (n_edges, 2) where the band begins and where it ends [px of the band]
     covariance: Array  # (n_edges, 2, 2) of these [px^2], by noise and by what shading may be
@@ -106,7 +106,7 @@ def _even_blur(found: _Round, seen: BoolArray) -> tuple[float, float]:
 class _Pixels:
     """The pixels of short blocks, of which a few make a block of the pool."""
 
-    d: Array  # (n, m) from the lines on which the blocks had settled [px]
+    d: Array  # (n, m) from the lines on which the blocks had converged [px]
     weight: Array  # (n, m)
     light: Array  # (n, m) times the weight, less the mean of the edge
     gain: Array  # (n,)

@@ -15,8 +15,8 @@ import numpy as np
 from legcal.data import Outlines, join_outlines
 from legcal.geometry import Array, IntArray
 from legcal.perception.edge_pairs import EdgePair, Part, block_positions, find_pairs
+from legcal.perception.edges import MeasuredEdge, measure_edges
 from legcal.perception.light import Grey
-from legcal.perception.measure import MeasuredEdge, measure_edges
 from legcal.perception.profiles import Edge
 from legcal.vision import EPSILON, Camera, PredictedLeg, band_of_leg, hidden_by
 

@@ -28,13 +28,11 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder, Mechanism
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
-    Exposure,
     diagnose,
-    expose,
-    image_defects,
     is_visible,
     reject_images,
 )
+from legcal.perception.image_quality import Exposure, expose, image_defects
 from legcal.perception.light import to_grey
 from legcal.perception.lines import EdgePairs
 from legcal.perception.look_again import look_again

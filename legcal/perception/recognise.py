@@ -257,8 +257,7 @@ def _decided_by_outlines(
     fit = looks[best].fit
     if fit is None or not _is_decided(looks, candidates, few):
         return replace(candidates, by_outlines=False)
-    T = fit.T_base_group.inv()
-    pose = Poses(T.rotation.as_matrix()[None], T.translation[None], fit.shift[None])
+    pose = Poses.one(fit.T_base_group, fit.shift)
     of_group = group.pictures(pictures, [r for r in group.rows if r in pictures])
     return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 

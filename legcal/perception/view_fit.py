@@ -15,7 +15,7 @@ from legcal.data import Outlines
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import main_cylinders
-from legcal.perception.agreement import NEAREST, exchanged
+from legcal.perception.agreement import NEAREST, Poses, exchanged
 from legcal.perception.placement import Group, Search
 from legcal.vision import Camera, outlines_of_axis
 
@@ -129,9 +129,9 @@ def fit_view(
         return None
     sigmas = joint_sigma, image_sigma
     normal = _normal_equations(lines, equations, state, begin, weight, sigmas, middle)
-    pose = RigidTransform.from_components(state.t, Rotation.from_matrix(state.R)).inv()
+    pose = Poses(state.R[None], state.t[None], state.shift[None])
     return ViewFit(
-        pose,
+        pose.T_base_camera(),
         state.shift,
         np.asarray(np.linalg.inv(normal.H), dtype=np.float64),
         joint_sigma,
@@ -188,9 +188,8 @@ def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
 def reversed_pose(search: Search, group: Group, T_base_group: RigidTransform) -> RigidTransform:
     """Return the pose at which a flat machine looks alike from far: near and far exchanged."""
     X = np.concatenate([search.A_base[group.rows], search.B_base[group.rows]]).reshape(-1, 3)
-    T = T_base_group.inv()
-    R, t = exchanged(T.rotation.as_matrix()[None], T.translation[None], X)
-    return RigidTransform.from_components(t[0], Rotation.from_matrix(R[0])).inv()
+    pose = Poses.one(T_base_group, np.zeros((search.n_legs, 2, 3)))
+    return exchanged(pose, X).T_base_camera()
 
 
 @dataclass(frozen=True, eq=False)

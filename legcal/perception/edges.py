@@ -2,7 +2,7 @@
 
 First rounds on a few blocks pull the lines in, with a wide blur and then with that of the image as
 its best blocks show it: where it is wrong, lines lie beside their outlines, and where they do, the
-blur seems wide. Then lines settle robustly on blocks that are fitted apart. At last all blocks of
+blur seems wide. Then lines converge robustly on blocks that are fitted apart. At last all blocks of
 an outline that lie on its line are fitted together, and the blur to all outlines.
 """
 
@@ -71,7 +71,7 @@ def measure_edges(
             return [None] * len(edges), FIRST_BLUR
         blur = FIRST_BLUR
         for _ in range(FIRST_ROUNDS):
-            blocks.settle(blur, 1)
+            blocks.fit(blur, 1)
             blur = estimate_blur(*blocks.samples(slice(None)), blocks.merit())
         v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     joint = None
@@ -80,7 +80,7 @@ def measure_edges(
         blocks = Blocks.read(grey, camera, edges, v, tried)
         if len(blocks.moved) == 0:
             return [None] * len(edges), tried
-        blocks.settle(tried, LAST_ROUNDS)
+        blocks.fit(tried, LAST_ROUNDS)
         if not together:
             break
         if near:

@@ -1,0 +1,184 @@
+"""Camera poses that two edge pairs suggest, each taken for a leg.
+
+A pair taken for a leg tells its axis but for how much it leans towards the camera, and by its width
+how far it is; what is left is a turn about that axis, which lays a second leg into the plane of a
+second pair. Many poses per picture come out of it, most of them wrong.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from legcal.geometry import Array, IntArray
+from legcal.perception.agreement import WIDTH_ERROR, Picture, Poses, Targets, seen_width
+from legcal.perception.lines import EdgePairs
+
+N_FIRST, N_SECOND = 20, 40  # best pairs that are tried as the first one, and as the second
+LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
+LONGER = 1.25, 3.0  # a pair is at most so much longer than the piece that it shows: factor, radii
+CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
+WIDTH_REACH = 2.5  # standard deviations of the width of the second pair
+SLACK = 0.2  # of the place along a piece, in its lengths
+TURNED = 1.05  # how far from a solution pairs and legs may be that allow none, as a cosine
+CROSSING = 0.03  # sine between axes seen, below which the second pair does not tell the place
+MOST = 3000  # poses of a picture
+
+
+class _Firsts(NamedTuple):
+    """Pairs taken for legs, each with a lean: all about a start but the turn and the place."""
+
+    u: Array  # (n, 3) direction in the camera frame, from base to platform
+    P: Array  # (n, 3) where the middle of the piece is put [m]
+    slack: Array  # (n,) how far along the leg it may be instead [m]
+    pair: IntArray  # (n,)
+    target: IntArray  # (n,)
+
+
+def pose_starts(picture: Picture, n_legs: int) -> Poses:
+    """Return camera poses that put two legs where two pairs of a picture are."""
+    pairs, targets = (
+        picture.pairs.take(np.arange(min(N_SECOND, len(picture.pairs)))),
+        picture.targets,
+    )
+    nothing = Poses.none(n_legs)
+    if len(pairs) < 2 or len(set(targets.leg.tolist())) < 2:
+        return nothing
+    firsts = _firsts(pairs, targets)
+    if len(firsts.u) == 0:
+        return nothing
+    middle = targets.ends.mean(axis=1)
+    piece = targets.ends[:, 1] - targets.ends[:, 0]
+    length = np.linalg.norm(piece, axis=1)
+    direction = piece / length[:, None]
+    # All in frames whose x axis is the first leg: of the camera, and of the base link.
+    U_c, U_b = _triads(firsts.u), _triads(direction)[firsts.target]
+    rays, planes = _rays(pairs), _planes(pairs)
+    n_all, ray_all = planes @ U_c, rays @ U_c  # (n_firsts, n_pairs, 3)
+    P_all = np.einsum("fxi,fx->fi", U_c, firsts.P)
+    w_all = direction @ U_b  # (n_firsts, n_targets, 3)
+    d_all = (middle[None] - middle[firsts.target][:, None]) @ U_b
+    f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
+    n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
+    across = n[:, 0]
+    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < CROSSING, np.inf, across)
+    good = np.flatnonzero(np.abs(place) <= firsts.slack[f])
+    f, k, m = f[good], k[good], m[good]
+    cosine, sine, place = cosine[good], sine[good], place[good]
+    # Where the second pair's middle is on the second leg, and how wide it should be there.
+    X = d[good] + P[good]
+    X[:, 0] += place
+    v, ray = _turned(w_all[f, m], cosine, sine), ray_all[f, k]
+    vX, vr, Xr = _dot(v, X), _dot(v, ray), _dot(X, ray)
+    along = -(_dot(X, X) * vr - vX * Xr) / _safe(vX * vr - Xr)
+    depth = _dot(U_c[f, 2], X + along[:, None] * v)
+    flat = np.linalg.norm(planes[k][:, :2], axis=1)
+    expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
+    seen = seen_width(pairs)[k]
+    # The depth of the first leg is no better known.
+    sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, pairs.pixel / seen)
+    off = np.abs(np.log(expected / seen)) / (WIDTH_REACH * sigma)
+    good_along = np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]
+    good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
+    merit = pairs.merit[k] + pairs.merit[firsts.pair[f]]
+    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MOST]]
+    f, place = f[good], place[good]
+    R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
+    where = firsts.P[f] + place[:, None] * firsts.u[f]
+    t = where - np.einsum("nij,nj->ni", R, middle[firsts.target[f]])
+    return Poses.rigid(R, t, n_legs)
+
+
+def _turns(
+    firsts: _Firsts, targets: Targets, n: Array, w: Array
+) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
+    """Return the turns about a first leg that lay a second one into the plane of a second pair.
+
+    Indices of the first, the second pair and the second piece, and cosine and sine of the turn,
+    from the normals n (n_firsts, n_pairs, 3) of the planes and the directions w (n_firsts,
+    n_targets, 3) of the pieces.
+    """
+    n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
+    c0 = n[..., 0] * w[..., 0]
+    c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
+    c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
+    good = c0**2 <= TURNED**2 * (c1**2 + c2**2)
+    good &= (np.arange(n.shape[1]) != firsts.pair[:, None])[:, :, None]
+    good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
+    f, k, m = np.nonzero(good)
+    c0, c1, c2 = (c[good].astype(np.float64) for c in (c0, c1, c2))
+    step = np.arccos(np.clip(-c0 / np.maximum(np.hypot(c1, c2), 1e-12), -1.0, 1.0))
+    base = np.arctan2(c2, c1)
+    turn = np.concatenate([base + step, base - step])
+    f, k, m = (np.concatenate([x, x]) for x in (f, k, m))
+    return f, k, m, np.cos(turn), np.sin(turn)
+
+
+def _firsts(pairs: EdgePairs, targets: Targets) -> _Firsts:
+    """Take the best pairs for every piece, with all leans that their edges allow."""
+    n = min(N_FIRST, len(pairs))
+    first = pairs.take(np.arange(n))
+    rays, planes = _rays(first), _planes(first)
+    along = np.concatenate([first.along, np.zeros((n, 1))], axis=1)
+    ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    side = np.cross(ray, planes)  # in the plane of the axis, across the ray
+    side *= np.sign(_dot(side, along))[:, None]
+    width = seen_width(first)
+    cone = np.log(first.width[:, 1] / first.width[:, 0])[:, None, None]
+    sigma = (CONE + 1.5 * pairs.pixel / width)[:, None, None]
+    length = np.linalg.norm(targets.ends[:, 1] - targets.ends[:, 0], axis=1)
+    flat = np.linalg.norm(planes[:, :2], axis=1)
+    z = 2.0 * targets.radius / (width * flat)[:, None]  # (n, n_targets)
+    v = np.cos(LEANS)[:, None] * side[:, None] + np.sin(LEANS)[:, None] * ray[:, None]
+    # The ends of the pair on an axis along v, and how their widths differ.
+    steep = np.maximum(np.abs(np.einsum("nlx,nx->nl", v, along)), 0.2)
+    reach = (first.half_length[:, None] / steep)[:, None, :] * z[..., None]  # (n, n_targets, leans)
+    z0, z1 = z[..., None] - reach * v[:, None, :, 2], z[..., None] + reach * v[:, None, :, 2]
+    longest = LONGER[0] * length + LONGER[1] * targets.radius
+    good = (np.minimum(z0, z1) > 0.0) & (2.0 * reach <= longest[:, None])
+    ratio = np.log(np.where(good, z0, 1.0) / np.where(good, z1, 1.0))
+    good &= np.abs(ratio - cone) <= 3.0 * sigma
+    i, j, lean = np.nonzero(good)
+    slack = np.maximum(0.5 * length[j] - reach[good], 0.0) + SLACK * length[j]
+    u, P = v[i, lean], z[i, j][:, None] * rays[i]
+    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, slack, i, j)))
+
+
+def _rays(pairs: EdgePairs) -> Array:
+    """Return the points (x, y, 1) of the middles, (n, 3)."""
+    return np.concatenate([pairs.middle, np.ones((len(pairs), 1))], axis=1)
+
+
+def _planes(pairs: EdgePairs) -> Array:
+    """Return the unit normals (n, 3) of the planes of the axes and the camera centre."""
+    along = np.concatenate([pairs.along, np.zeros((len(pairs), 1))], axis=1)
+    planes = np.cross(along, _rays(pairs))
+    return np.asarray(planes / np.linalg.norm(planes, axis=1, keepdims=True))
+
+
+def _triads(u: Array) -> Array:
+    """Return right-handed orthonormal matrices (n, 3, 3) whose first columns are u."""
+    other = np.eye(3)[np.argmin(np.abs(u), axis=1)]
+    v = np.cross(u, other)
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    return np.stack([u, v, np.cross(u, v)], axis=2)
+
+
+def _about_x(cosine: Array, sine: Array) -> Array:
+    """Return rotations (n, 3, 3) about the x axis."""
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    rows = [one, zero, zero, zero, cosine, -sine, zero, sine, cosine]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def _turned(x: Array, cosine: Array, sine: Array) -> Array:
+    """Return vectors (n, 3) turned about the x axis."""
+    y, z = x[:, 1], x[:, 2]
+    return np.stack([x[:, 0], cosine * y - sine * z, sine * y + cosine * z], axis=-1)
+
+
+def _dot(x: Array, y: Array) -> Array:
+    return np.asarray(np.einsum("ni,ni->n", x, y))
+
+
+def _safe(x: Array) -> Array:
+    return np.where(np.abs(x) < 1e-12, 1e-12, x)
