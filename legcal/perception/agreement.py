@@ -391,9 +391,17 @@ def _moved(poses: Poses, xi: Array, shift: Array, centre: Array) -> Poses:
     moved = np.linalg.norm(np.cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
     distance = np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
     xi = xi / np.maximum(np.maximum(turned, moved / (MOST_PLACE * distance)), 1.0)[:, None]
-    turn = Rotation.from_rotvec(xi[:, :3]).as_matrix()
+    turn = _rotations(xi[:, :3])
     t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]
     return Poses(turn @ poses.R, t, shift)
+
+
+def _rotations(vectors: Array) -> Array:
+    """Return the rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    K = _cross(vectors / np.maximum(angle, 1e-12)[:, None])
+    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.asarray(np.eye(3) + s * K + (1.0 - c) * (K @ K))
 
 
 def _vector_product(x: Array, y: Array) -> Array:

@@ -1,8 +1,9 @@
 """Blocks of pixels along outlines, fitted one by one, and robust lines through them.
 
-A line converges to where most blocks of its outline have their edge. Neighbouring blocks share what the
-limb model leaves out (texture, shading, the lens), so the covariance of a line rests on the scatter
-and the correlation that are seen, and never falls below what the model is known to be good for.
+A line converges to where most blocks of its outline have their edge. Neighbouring blocks share what
+the limb model leaves out (texture, shading, the lens), so the covariance of a line rests on the
+scatter and the correlation that are seen, and never falls below what the model is known to be good
+for.
 """
 
 from collections.abc import Sequence
