@@ -15,8 +15,7 @@ from legcal import calibrate, load_dataset, load_mechanism
 from legcal.calibration.joint_fit.constraints import platform_poses
 from legcal.calibration.verdict import Calibration
 from legcal.data.axes import axes_from_outlines
-from legcal.machine.kinematics import pose_differences
-from legcal.machine.leg import KinematicParameters, point_like_legs, to_vector
+from legcal.machine import KinematicParameters, point_like_legs, pose_differences, to_vector
 from legcal.paper.four_steps import run_steps
 from legcal.paper.nominal import nominal_mechanism
 

@@ -25,9 +25,7 @@ from legcal.calibration.joint_fit.biases import KINDS
 from legcal.calibration.joint_fit.state import components
 from legcal.calibration.verdict import Calibration
 from legcal.geometry.types import Array
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries, vector_of
-from legcal.machine.sensitivity import pose_sensitivity
+from legcal.machine import Mechanism, geometries, pose_sensitivity, vector_of
 from legcal.simulation.session import simulate
 from legcal.simulation.settings import SimulationSettings
 

@@ -18,10 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import random_configurations, singularity
+from legcal.machine import (
+    Follower,
+    Mechanism,
+    forward_kinematics,
+    inverse_kinematics,
+    load_mechanism,
+    random_configurations,
+    singularity,
+)
 
 MODELS = Path(__file__).parents[1] / "models"
 STEP = 0.01  # of the travel

@@ -24,8 +24,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Location, ToolPoses, load_mechanism, locate
 from legcal.geometry.types import Array
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import random_configurations
+from legcal.machine import Mechanism, random_configurations
 
 POSES = 20
 SIGMA_POSITION = 0.02e-3  # [m]

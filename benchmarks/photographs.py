@@ -20,9 +20,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import random_configurations
+from legcal.machine import Mechanism, load_mechanism, random_configurations
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import prepare_scene
 from legcal.simulation.solids import PlacedSolid, dressed, link_poses, placed

@@ -14,10 +14,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.run import nominal_poses
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, BoolArray, Image
-from legcal.machine.leg import Cylinder as Visible
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine import Cylinder as Visible
+from legcal.machine import LegKind, Mechanism, load_mechanism
 from legcal.simulation.cameras import look_at
 from legcal.simulation.poses import Sampling, commanded_poses
 from legcal.simulation.rendering.appearance import Appearance, Light

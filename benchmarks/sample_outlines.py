@@ -20,8 +20,7 @@ from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.machine.kinematics import forward_kinematics
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism, forward_kinematics
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.recognise import recognise

@@ -26,7 +26,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import no_outlines
 from legcal.geometry.types import Image
-from legcal.machine.kinematics import forward_kinematics
+from legcal.machine import forward_kinematics
 from legcal.perception import Photographs, Placement, measure_photographs, place
 from legcal.perception.detection import measure_outlines
 from legcal.perception.image_quality import expose

@@ -16,7 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from legcal.errors import LegcalError
-from legcal.machine.leg import KinematicParameters
+from legcal.machine import KinematicParameters
 from legcal.paper.four_steps import run_steps
 from legcal.paper.nominal import Criteria
 from legcal.simulation.cameras import cameras_around

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from legcal.machine import LegKind, Mechanism, main_cylinders
 from legcal.machine.assembly import create_model
 from legcal.machine.description import Description
 from legcal.machine.description_table import read_description
-from legcal.machine.leg import LegKind, main_cylinders
-from legcal.machine.model import Mechanism
 
 ROOT = Path(__file__).parents[1]
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))
@@ -54,9 +53,9 @@ def check_same(mechanism: Mechanism, machine: Description) -> None:
         assert leg.type == f"{entry.type.base}{slider}{entry.type.platform}"
         assert leg.kind is entry.kind
         assert leg.sign == 1
-        np.testing.assert_allclose(leg.A_base, entry.A_base, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(leg.A, entry.A_base, rtol=0, atol=1e-12)
         if entry.type.platform:
-            np.testing.assert_allclose(leg.B_platform, entry.B_platform, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(leg.B, entry.B_platform, rtol=0, atol=1e-12)
             if entry.offset is not None:
                 assert abs(leg.q0 - entry.offset) < 1e-12
         if entry.travel is not None:

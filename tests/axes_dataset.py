@@ -11,7 +11,7 @@ import yaml
 from legcal.data.axes import write_axes
 from legcal.data.measurements import Measurements
 from legcal.files import motion_to_xyz_quat
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.studies.paper import simulate_session

@@ -11,7 +11,7 @@ from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
 from legcal.data.measurements import Measurements
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters, from_vector, point_like_legs, to_vector
+from legcal.machine import KinematicParameters, from_vector, point_like_legs, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.studies.paper import simulate_session

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism, load_mechanism
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import null_space
 
-from legcal.calibration.joint_fit.constraints import on_constraints, pose_rows
+from legcal.calibration.joint_fit.constraints import on_constraints
 from legcal.calibration.joint_fit.problem import FitProblem, Linearization, linearize
 from legcal.calibration.joint_fit.residuals import Places, Rows
 from legcal.calibration.joint_fit.state import State
 from legcal.geometry.types import Array
+from legcal.machine import pose_equations
 
 STEP = 1e-6
 
@@ -65,7 +66,7 @@ def by_differences(
 
 def violations(problem: FitProblem, state: State) -> Array:
     """Return how far poses are from what joints, lengths and the plane demand [m or rad]."""
-    rows = pose_rows(state.legs, state.R_pose, state.t_pose)
+    rows = pose_equations(state.legs, state.R_pose, state.t_pose)
     held = rows.values[:, ~rows.measured].ravel()
     if problem.legs.spatial:
         return held

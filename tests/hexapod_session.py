@@ -10,7 +10,7 @@ from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.leg import (
+from legcal.machine import (
     KinematicParameters,
     LegGeometry,
     LegKind,

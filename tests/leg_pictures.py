@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.machine.leg import Cylinder
+from legcal.machine import Cylinder
 from legcal.perception.agreement import Picture, Targets, targets_of
 from legcal.perception.lines import Segments, find_edge_pairs
 from legcal.vision.cylinder import outlines_of_axis

@@ -11,10 +11,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.location.model import Frames, PosePairs, ToolPoses, predicted, turned
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import inverse_kinematics
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import Configurations, random_configurations
+from legcal.machine import (
+    Configurations,
+    Mechanism,
+    inverse_kinematics,
+    load_mechanism,
+    random_configurations,
+)
 
 SIGMA_POSITION = 0.02e-3
 SIGMA_ANGLE = float(np.radians(0.01))

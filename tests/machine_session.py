@@ -14,11 +14,15 @@ from legcal.calibration.joint_fit.state import FittedLegs, components, fitted_le
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import platform_in_base
-from legcal.machine.leg import LegGeometry, LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries, moved_legs
+from legcal.machine import (
+    LegGeometry,
+    LegKind,
+    Mechanism,
+    geometries,
+    load_mechanism,
+    moved_legs,
+    platform_in_base,
+)
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.studies.paper import closed_poses, moved_poses
 from legcal.simulation.visibility import silhouette

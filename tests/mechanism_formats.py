@@ -8,7 +8,7 @@ import yaml
 from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism
 from legcal.machine.tree import origin
 from legcal.machine.urdf import UrdfJoint
 

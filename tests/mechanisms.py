@@ -1,5 +1,6 @@
 """Mechanism files of one hexapod in many layouts, for tests."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -251,3 +252,9 @@ def poses_near_home(machine: Geometry, count: int, seed: int = 5) -> list[RigidT
         )
         for _ in range(count)
     ]
+
+
+def displaced(T: RigidTransform, step: Sequence[float] | Array) -> RigidTransform:
+    """Return a pose after a rotation about its origin [rad] and a displacement [m], in the base."""
+    turn = Rotation.from_rotvec(np.asarray(step)[:3])
+    return RigidTransform.from_components(T.translation + np.asarray(step)[3:], turn * T.rotation)

@@ -7,7 +7,7 @@ import numpy as np
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import ENCODING, QUALITY, Outlines
 from legcal.geometry.types import Array
-from legcal.machine.leg import Cylinder, Leg, LegKind
+from legcal.machine import Cylinder, Leg, LegKind
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -24,8 +24,8 @@ LEGS = tuple(
         platform_joint="S",
         kind=LegKind.ACTUATED,
         prismatic=f"{name}_slider",
-        A_base=np.zeros(3),
-        B_platform=np.zeros(3),
+        A=np.zeros(3),
+        B=np.zeros(3),
         q0=0.3,
         sign=1,
         travel=(0.0, 0.1),

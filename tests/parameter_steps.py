@@ -7,10 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters, LegGeometry
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import Parametrization, footed, geometries, moved_legs
+from legcal.machine import (
+    KinematicParameters,
+    LegGeometry,
+    Mechanism,
+    Parametrization,
+    footed,
+    geometries,
+    load_mechanism,
+    moved_legs,
+)
 from legcal.machine.written import write_calibrated_yaml, write_urdf
 
 

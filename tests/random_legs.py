@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.machine.equations import linearize
-from legcal.machine.leg import LegGeometry, LegKind
+from legcal.machine import LegGeometry, LegKind, linearize
 
 
 def leg_and_pose(joints: str, seed: int) -> tuple[LegGeometry, Array, Array]:

@@ -14,9 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.files import motion_to_xyz_quat
 from legcal.geometry.types import Array
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import random_configurations
+from legcal.machine import Mechanism, load_mechanism, random_configurations
 from legcal.simulation.cameras import look_at
 from legcal.vision.camera import Camera
 from legcal.vision.in_view import visible_pieces

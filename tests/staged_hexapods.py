@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters, from_vector, to_vector
+from legcal.machine import KinematicParameters, from_vector, to_vector
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise

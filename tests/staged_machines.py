@@ -12,8 +12,7 @@ from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.leg import LegGeometry, LegKind
-from legcal.machine.parameters import moved_legs
+from legcal.machine import LegGeometry, LegKind, moved_legs
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.paper.leg_directions import (

@@ -8,8 +8,7 @@ import pytest
 from authoring import ROOT, write_table
 
 from legcal.cli import main
-from legcal.machine.document import describe
-from legcal.machine.load import load_mechanism
+from legcal.machine import describe, load_mechanism
 
 
 def _run(

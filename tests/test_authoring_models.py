@@ -13,13 +13,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.motions import roll_pitch_yaw
+from legcal.machine import (
+    LegKind,
+    forward_kinematics,
+    inverse_kinematics,
+    load_mechanism,
+    singularity,
+)
 from legcal.machine.assembly import assemble, create_model, urdf_text, yaml_text
 from legcal.machine.description_table import read_description
 from legcal.machine.files import shipped_names
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.poses import singularity
 
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
 NUMBER = re.compile(r"(?<![\w.-])-?\d+\.\d+(?:e[-+]\d+)?")
@@ -244,7 +247,7 @@ def test_a_passive_slider_reads_its_length_and_moves_freely(
         travel=travel,
     )
     leg = mechanism.legs[0]
-    length = float(np.linalg.norm(mechanism.home.apply(leg.B_platform) - leg.A_base))
+    length = float(np.linalg.norm(mechanism.home.apply(leg.B) - leg.A))
     assert (leg.kind, leg.q0) == (LegKind.PASSIVE, 0.0)
     np.testing.assert_allclose(leg.travel, [0.5 * length, 1.5 * length])
 

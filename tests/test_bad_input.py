@@ -16,7 +16,7 @@ from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
 from legcal.files.folder import check_destination, result_folder
 from legcal.files.schema import closest, parse_yaml
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 
 __all__ = ["folder"]
 

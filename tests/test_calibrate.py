@@ -16,7 +16,7 @@ from thinned import thinned
 from legcal import LegcalError, calibrate, evaluate, load_dataset, load_mechanism
 from legcal.calibration.identify.analysis import check_identifiable
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.machine.parameters import geometries, parametrization_of, vector_of
+from legcal.machine import geometries, parametrization_of, vector_of
 
 
 def _table(folder: Path) -> list[list[str]]:

@@ -16,7 +16,7 @@ from legcal import calibrate, load_dataset, load_mechanism
 from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
 from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.machine.leg import to_vector
+from legcal.machine import to_vector
 from legcal.report import summary
 from legcal.simulation.cameras import PAPER_VIEWS
 from legcal.simulation.machine import Machine

@@ -19,7 +19,7 @@ from legcal.calibration.verdict import Calibration
 from legcal.data.corners import found_corners
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.machine.parameters import geometries, vector_of
+from legcal.machine import geometries, vector_of
 from legcal.simulation.settings import Level
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera

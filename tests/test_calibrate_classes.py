@@ -12,9 +12,7 @@ from simulated import settings
 from legcal import calibrate, evaluate
 from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.errors import LegcalError, NotIdentifiable, NotVisible
-from legcal.machine.kinematics import pose_differences
-from legcal.machine.load import load_mechanism
-from legcal.machine.parameters import geometries
+from legcal.machine import geometries, load_mechanism, pose_differences
 from legcal.simulation.session import simulate
 
 Row = dict[str, str]

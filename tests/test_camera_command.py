@@ -20,7 +20,7 @@ from legcal.data.dataset import wishes_of_call
 from legcal.data.measurements import View
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array, IntArray
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 from legcal.vision.board import Board, board_of
 from legcal.vision.camera import DistortionModel, intrinsic_values
 from legcal.vision.camera_file import read_camera

@@ -10,7 +10,7 @@ from legcal.calibration.canny import canny_parts, edge_points
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.machine.leg import Cylinder
+from legcal.machine import Cylinder
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.vision.camera import Camera

@@ -17,8 +17,7 @@ from legcal import calibrate, check
 from legcal.calibration.fitting import Found, observe_and_fit
 from legcal.cli.app import app
 from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
-from legcal.machine.load import load_mechanism
-from legcal.machine.parameters import geometries, moved_legs, parametrization_of, vector_of
+from legcal.machine import geometries, load_mechanism, moved_legs, parametrization_of, vector_of
 from legcal.machine.written import turns_between
 from legcal.simulation.session import simulate
 

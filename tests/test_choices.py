@@ -10,7 +10,7 @@ from legcal import load_mechanism
 from legcal.calibration.joint_fit.choices import NO_CHOICES, Prior
 from legcal.calibration.joint_fit.parameters import resolve
 from legcal.data.dataset import wishes_of_call
-from legcal.machine.parameters import parametrization_of
+from legcal.machine import parametrization_of
 
 
 @pytest.mark.parametrize("model", ["hexapod", "hexapod-rod", "3-upu-tilted", "3-rpr", "tricept"])

@@ -8,7 +8,7 @@ from simulated import settings
 
 import legcal
 from legcal.errors import DidNotConverge
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism
 from legcal.simulation import poses as module
 from legcal.simulation.poses import Sampling, commanded_poses, draw_poses
 from legcal.simulation.truth import write_true_model

@@ -12,12 +12,15 @@ from thinned import thinned
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
-from legcal.machine.closing import leg_vectors
-from legcal.machine.kinematics import forward_kinematics
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import Configurations, random_configurations
+from legcal.machine import (
+    Configurations,
+    LegKind,
+    Mechanism,
+    forward_kinematics,
+    leg_vectors,
+    load_mechanism,
+    random_configurations,
+)
 
 
 def _lines(mechanism: Mechanism, T: RigidTransform) -> float:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, ModelError
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism
 
 __all__ = ["folder"]
 

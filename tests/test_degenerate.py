@@ -18,7 +18,7 @@ from legcal import calibrate, simulate
 from legcal.calibration.joint_fit.parameters import known_parameters
 from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism
 
 LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
 SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]

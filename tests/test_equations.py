@@ -11,8 +11,7 @@ from random_legs import changed, leg_and_pose, twist_of
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
-from legcal.machine.equations import linearize
-from legcal.machine.leg import Demand
+from legcal.machine import Demand, linearize
 
 FAST = settings(deadline=None, max_examples=20)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -12,7 +12,7 @@ from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array
-from legcal.machine.parameters import moved_legs
+from legcal.machine import moved_legs
 from legcal.vision.camera import Camera, with_intrinsics
 
 PART = 1e-3  # of the mistakes that are told

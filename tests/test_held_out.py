@@ -24,7 +24,7 @@ from legcal.calibration.joint_fit.state import FittedLegs, motions
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.estimation.noise import NoiseModel
-from legcal.machine.leg import LegGeometry
+from legcal.machine import LegGeometry
 from legcal.simulation.studies.outlines import Noise, StartErrors, design_of, draw_session
 
 MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")

@@ -7,8 +7,7 @@ from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
 from legcal.calibration.identify.analysis import identifiability
 from legcal.errors import ModelError
-from legcal.machine.home import legs_outside
-from legcal.machine.load import load_mechanism
+from legcal.machine import legs_outside, load_mechanism
 
 
 def _with_home(folder: Path, z: float) -> Path:

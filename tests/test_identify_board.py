@@ -19,7 +19,7 @@ from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import planned_session
 from legcal.data.corners import found_corners
 from legcal.errors import UsageError
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism
 from legcal.report.identify import identify_table
 from legcal.vision.board import Board
 

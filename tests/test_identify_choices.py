@@ -11,7 +11,7 @@ from legcal.calibration.joint_fit.choices import Choices, Prior
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at
 from legcal.errors import NotIdentifiable
-from legcal.machine.parameters import parametrization_of
+from legcal.machine import parametrization_of
 
 
 @cache

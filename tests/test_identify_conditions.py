@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from random_legs import closed_leg
 from staged_hexapods import exact_session
 
-from legcal.machine.leg import LegGeometry, LegKind
+from legcal.machine import LegGeometry, LegKind
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 from legcal.simulation.cameras import PAPER_VIEWS
 

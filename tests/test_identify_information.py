@@ -27,10 +27,7 @@ from legcal.calibration.identify.session import (
     at_platform_joints,
 )
 from legcal.geometry.types import Array
-from legcal.machine.equations import linearize
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.parameters import parametrize
+from legcal.machine import LegKind, linearize, load_mechanism, parametrize
 
 FAST = settings(deadline=None, max_examples=10)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -16,11 +16,15 @@ from legcal.calibration.identify.session import (
     random_poses,
 )
 from legcal.errors import DidNotConverge
-from legcal.machine.equations import linearize
-from legcal.machine.kinematics import forward_kinematics_many
-from legcal.machine.leg import Demand, LegGeometry, LegKind
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries
+from legcal.machine import (
+    Demand,
+    LegGeometry,
+    LegKind,
+    Mechanism,
+    forward_kinematics_many,
+    geometries,
+    linearize,
+)
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 

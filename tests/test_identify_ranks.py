@@ -14,7 +14,7 @@ from legcal.calibration.identify.analysis import identifiability
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.session import planned_session
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 WEAK_JOINT = ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5))

@@ -12,8 +12,7 @@ from staged_hexapods import exact_session
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session, planned_session
 from legcal.geometry.types import Array
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism, load_mechanism
 from legcal.paper import joints_in_base as rigid_parts
 from legcal.paper import joints_in_base as scalar_products
 from legcal.paper import offsets

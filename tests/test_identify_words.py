@@ -3,7 +3,7 @@
 import pytest
 
 from legcal.calibration.identify.session import legs_in_words, views_in_words
-from legcal.machine.parameters import describe_direction, joined, leg_labels
+from legcal.machine import describe_direction, joined, leg_labels
 
 LEGS = ("leg1", "leg2", "leg3", "leg4")
 

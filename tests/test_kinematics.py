@@ -14,17 +14,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
-from legcal.machine.chain import ClosedChain, Closure
-from legcal.machine.closing import close_at, leg_vectors, mobility, platform_pose
-from legcal.machine.kinematics import (
+from legcal.machine import (
+    LegKind,
+    Mechanism,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
-    outside_travel,
+    leg_vectors,
+    load_mechanism,
+    platform_pose,
 )
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine.chain import ClosedChain, Closure
+from legcal.machine.kinematics import close_at, outside_travel
+from legcal.machine.mobility import mobility
 
 
 @pytest.fixture(scope="module")

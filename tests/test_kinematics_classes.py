@@ -8,30 +8,26 @@ import numpy as np
 import pytest
 from layouts import Layout, LegLayout, write_machine
 from machines import MACHINES, of_types
-from mechanisms import ROOT
+from mechanisms import ROOT, displaced
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.errors import NotIdentifiable, UsageError
-from legcal.machine.closing import (
-    free_motions,
-    freedoms,
-    generic_configurations,
-    leg_vectors,
-    mobility,
-    slider_columns,
-)
-from legcal.machine.equations import constraints_at, demands_at, moved
-from legcal.machine.kinematics import (
+from legcal.machine import (
     Follower,
+    LegKind,
+    Mechanism,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
+    leg_vectors,
+    load_mechanism,
+    random_configurations,
+    slider_columns,
 )
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import random_configurations, side
+from legcal.machine.equations import constraints_at, demands_at
+from legcal.machine.mobility import free_motions, generic_configurations, mobility, side
+from legcal.machine.mobility import freedoms_at as freedoms
 
 MOBILITY = {
     "3-rpr": 3,
@@ -127,7 +123,7 @@ def test_closed_forms_have_the_derivatives_of_the_closures(shipped: Mechanism) -
         local = shipped.chain.twist(shipped.base, shipped.platform) @ motions
         R = T.rotation.as_matrix()
         twist = np.concatenate([R @ local[3:], R @ local[:3]])  # as the legs' equations have it
-        rates = demands_at(shipped, T).jacobian @ twist
+        rates = demands_at(shipped, T).by_pose[0] @ twist
         measured = demands_at(shipped, T).measured
         assert np.abs(rates[~measured]).max(initial=0.0) < 1e-9  # no demand is broken
         columns = slider_columns(shipped, shipped.motors)[1]
@@ -135,11 +131,11 @@ def test_closed_forms_have_the_derivatives_of_the_closures(shipped: Mechanism) -
         np.testing.assert_allclose(rates[measured], signs[:, None] * motions[columns], atol=1e-9)
         for numeric in np.eye(6):
             ahead, behind = (
-                demands_at(shipped, moved(T, s * numeric)).values for s in (step, -step)
+                demands_at(shipped, displaced(T, s * numeric)).values[0] for s in (step, -step)
             )
             np.testing.assert_allclose(
                 (ahead - behind) / (2.0 * step),
-                demands_at(shipped, T).jacobian @ numeric,
+                demands_at(shipped, T).by_pose[0] @ numeric,
                 atol=1e-7,
             )
 
@@ -233,7 +229,7 @@ def test_without_a_determinant_a_path_is_followed_in_small_changes(
 ) -> None:
     mechanism = load_mechanism(name)
     drawn = random_configurations(mechanism, 3, 9)
-    monkeypatch.setattr("legcal.machine.poses.side", lambda *_: 0.0)
+    monkeypatch.setattr("legcal.machine.kinematics.side", lambda *_: 0.0)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
         found = forward_kinematics(mechanism, q)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
@@ -252,13 +248,13 @@ def test_without_a_determinant_a_path_is_followed_in_small_changes(
 def test_poses_that_legs_forbid_are_refused(name: str, step: tuple[float, ...], found: str) -> None:
     mechanism = load_mechanism(name)
     with pytest.raises(UsageError, match=f"The platform cannot stand there: .*{found}"):
-        inverse_kinematics(mechanism, moved(mechanism.home, step))
+        inverse_kinematics(mechanism, displaced(mechanism.home, step))
 
 
 def test_a_start_that_legs_forbid_is_refused() -> None:
     mechanism = load_mechanism("3-rps")
     q = inverse_kinematics(mechanism, mechanism.home)
-    start = moved(mechanism.home, [0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
+    start = displaced(mechanism.home, [0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
     with pytest.raises(UsageError, match=r"followed from its start: found leg .* mm off"):
         forward_kinematics(mechanism, q, start=start)
 

@@ -11,11 +11,18 @@ from thinned import thinned
 from legcal.calibration import accuracy
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
-from legcal.machine.closing import slider_columns
-from legcal.machine.kinematics import forward_kinematics, forward_kinematics_many
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import SHORTEST, follow, follow_pose, random_configurations, side, walk
+from legcal.machine import (
+    Mechanism,
+    follow,
+    forward_kinematics,
+    forward_kinematics_many,
+    load_mechanism,
+    random_configurations,
+    slider_columns,
+)
+from legcal.machine.kinematics import SHORTEST, follow_pose
+from legcal.machine.mobility import side
+from legcal.machine.solver import walk
 
 
 def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
@@ -128,7 +135,7 @@ def test_a_way_is_walked_in_halved_steps_up_to_what_is_in_the_way() -> None:
 
     assert walk(attempt, 0.01) == pytest.approx(0.6, abs=0.02)
     assert tried[:3] == [1.0, 0.5, 1.0]
-    assert walk(lambda _: True, 0.01, 0.3) == 1.0
+    assert walk(lambda _: True, 0.01) == 1.0
 
 
 def test_machines_that_share_no_reading_are_given_up_early(monkeypatch: pytest.MonkeyPatch) -> None:

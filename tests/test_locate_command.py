@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal import Location, cli, load_location, load_mechanism, locate, write_location
 from legcal.calibration.location.document import location_document, with_frames, write_located_model
 from legcal.errors import DatasetError, ModelError, UsageError
-from legcal.machine.closing import platform_pose
+from legcal.machine import platform_pose
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ from legcal.calibration.location.model import (
 )
 from legcal.calibration.location.problem import PlatformMotions, motions_by_readings
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import forward_kinematics
+from legcal.machine import forward_kinematics
 
 STATED = (np.array([SIGMA_POSITION, SIGMA_ANGLE]), (True, True))
 UNKNOWN = (np.array([1e-3, 1e-2]), (False, False))

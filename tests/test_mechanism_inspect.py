@@ -10,9 +10,8 @@ import pytest
 from mechanisms import Layout, write_hexapod
 from rich.console import Console
 
+from legcal.machine import describe, load_mechanism
 from legcal.machine.assembly import Family, create_model, describe_family
-from legcal.machine.document import describe
-from legcal.machine.load import load_mechanism
 from legcal.report import inspect_table
 
 

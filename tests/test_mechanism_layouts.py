@@ -22,11 +22,14 @@ from machines import MACHINES, of_types
 from thinned import thinned
 
 from legcal.errors import OutOfClass
-from legcal.machine.closing import readings_at
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import Leg
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine import (
+    Leg,
+    Mechanism,
+    forward_kinematics,
+    inverse_kinematics,
+    load_mechanism,
+    readings_at,
+)
 
 LAYOUTS = {
     "hung from the base": Layout(),
@@ -66,8 +69,8 @@ def _check(mechanism: Mechanism, machine: Machine, layout: Layout) -> None:
         _check_leg(leg, spec, layout.of(j))
         base_axis, platform_axis, twist = expected_axes(machine, j)
         A, B = spec.A, expected_B(machine, j)
-        _close(leg.A_base, A)
-        _close(leg.B_platform, B)
+        _close(leg.A, A)
+        _close(leg.B, B)
         _close(leg.base_axis, base_axis)
         _close(leg.platform_axis, platform_axis)
         _close(leg.twist, twist)
@@ -148,7 +151,7 @@ def test_a_planar_machine_may_be_written_with_few_digits(
     mechanism = load_mechanism(path)
     assert (mechanism.spatial, mechanism.mobility) == (False, 3)
     for j, leg in enumerate(mechanism.legs):
-        np.testing.assert_allclose(leg.A_base, drawn.legs[j].A, atol=1e-5)
+        np.testing.assert_allclose(leg.A, drawn.legs[j].A, atol=1e-5)
     step = mechanism.sign * np.array([0.01, -0.02, 0.03])
     q = inverse_kinematics(mechanism, mechanism.home) + step
     T = forward_kinematics(mechanism, q)
@@ -236,8 +239,8 @@ def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
         assert [chain.idle_spins for chain in mechanism.leg_chains] == [idle] * 3
         assert all(leg.twist is None for leg in mechanism.legs)
         for j, leg in enumerate(mechanism.legs):
-            _close(leg.A_base, machine.legs[j].A)
-            _close(leg.B_platform, expected_B(machine, j))
+            _close(leg.A, machine.legs[j].A)
+            _close(leg.B, expected_B(machine, j))
 
 
 @pytest.mark.parametrize("drawn", ["RR", "R"])

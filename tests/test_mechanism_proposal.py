@@ -12,7 +12,7 @@ from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 from thinned import thinned
 
 from legcal.errors import OutOfClass
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 from legcal.machine.topology import _leg_names
 
 LAYOUTS = {

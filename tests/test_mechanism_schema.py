@@ -7,7 +7,7 @@ import pytest
 from mechanisms import ROOT, SHIPPED_URDF, SHIPPED_YAML
 
 from legcal.errors import LegcalError, ModelError, OutOfClass
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 
 SHIPPED = SHIPPED_YAML.read_text()
 

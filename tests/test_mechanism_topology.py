@@ -21,10 +21,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, UsageError
 from legcal.geometry.types import Array
-from legcal.machine.closing import mobility
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
+from legcal.machine import LegKind, forward_kinematics, inverse_kinematics, load_mechanism
+from legcal.machine.mobility import mobility
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

@@ -7,7 +7,7 @@ import pytest
 from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
 from legcal.errors import ModelError
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 from legcal.machine.urdf import read_urdf
 
 SHIPPED = SHIPPED_URDF.read_text()

@@ -12,8 +12,7 @@ from legcal.calibration.changes import (
 )
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.load import load_mechanism
-from legcal.machine.parameters import geometries, parametrization_of
+from legcal.machine import geometries, load_mechanism, parametrization_of
 
 N = 6
 PRIOR = np.array([5e-3, 5e-3, 5e-3, 5e-3, 0.05, 0.05])

@@ -25,7 +25,7 @@ from legcal.calibration.noise import (
 )
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 from legcal.report import noise_table
 
 FLAT = "images/p1_2.png"  # shows nothing

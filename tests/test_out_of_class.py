@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from legcal.errors import LegcalError, OutOfClass
 from legcal.geometry.types import Array
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism
 
 Z = (0.0, 0.0, 1.0)
 Joint = tuple[str, Array, Array]  # type, point and axis in the base link

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.machine.leg import Cylinder
+from legcal.machine import Cylinder
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.recognise import recognise
@@ -317,7 +317,7 @@ def test_tube_and_rod_are_two_parts() -> None:
 def test_the_sample_is_detected_from_its_nominal_model() -> None:
     """Nine of the photographs; the benchmark sample_outlines.py measures all of them."""
     from legcal.data.dataset import load_dataset
-    from legcal.machine.kinematics import forward_kinematics
+    from legcal.machine import forward_kinematics
 
     folder = ROOT / "examples" / "hexapod"
     dataset = load_dataset(folder)

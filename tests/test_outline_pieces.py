@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from legcal.machine.leg import Cylinder
+from legcal.machine import Cylinder
 from legcal.vision.in_view import END_COVER, Piece, visible_pieces
 
 

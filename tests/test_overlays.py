@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.machine.leg import Cylinder
+from legcal.machine import Cylinder
 from legcal.perception.overlays import (
     COLOURS,
     LabelPlaces,

@@ -12,11 +12,16 @@ from legcal import evaluate
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
 from legcal.calibration.joint_fit.solution import Sensitivity
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import forward_kinematics_many, platform_in_base, pose_differences
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries, parametrization_of
-from legcal.machine.poses import random_configurations
+from legcal.machine import (
+    Mechanism,
+    forward_kinematics_many,
+    geometries,
+    load_mechanism,
+    parametrization_of,
+    platform_in_base,
+    pose_differences,
+    random_configurations,
+)
 
 
 def _accuracy(
@@ -87,7 +92,7 @@ def test_without_a_workspace_errors_are_told_at_the_readings(
 ) -> None:
     nominal = load_mechanism("hexapod")
     q = random_configurations(nominal, 2, 0).readings
-    monkeypatch.setattr("legcal.machine.poses.NEARER", np.zeros(0))
+    monkeypatch.setattr("legcal.machine.configurations.NEARER", np.zeros(0))
     accuracy = _accuracy(nominal, nominal, q, np.eye(30), Sensitivity("anything", np.ones((30, 1))))
     assert accuracy.workspace is None
     assert len(accuracy.effects[0].error.displacement) == 2

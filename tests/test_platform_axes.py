@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.machine.equations import linearize
-from legcal.machine.leg import Demand, LegGeometry, LegKind
+from legcal.machine import Demand, LegGeometry, LegKind, linearize
 from legcal.paper.platform_joints import fixed_direction, locate_passive_end, revolute_axis
 from legcal.paper.platform_pose import (
     closure_of_leg,

@@ -16,12 +16,17 @@ from legcal.calibration.joint_fit.platform import (
 )
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.kinematics import forward_kinematics_many, platform_in_base
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries, parametrization_of, parametrize
-from legcal.machine.poses import random_configurations
+from legcal.machine import (
+    LegKind,
+    Mechanism,
+    forward_kinematics_many,
+    geometries,
+    load_mechanism,
+    parametrization_of,
+    parametrize,
+    platform_in_base,
+    random_configurations,
+)
 
 MACHINES = ("hexapod-rod", "hexapod-strut", "3-rpr", "3-rps", "3-spr", "3-upu-tilted", "tricept")
 

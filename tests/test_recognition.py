@@ -11,8 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal import load_mechanism
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, Image
-from legcal.machine.kinematics import forward_kinematics
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism, forward_kinematics
 from legcal.perception import recognise as recognising
 from legcal.perception.agreement import Picture, Poses, Targets, agreement, improved, targets_of
 from legcal.perception.camera_search import Candidates, place_camera, place_near

@@ -3,7 +3,7 @@
 import leg_pictures as lp
 import numpy as np
 
-from legcal.machine.leg import Cylinder
+from legcal.machine import Cylinder
 from legcal.perception.agreement import targets_of
 
 

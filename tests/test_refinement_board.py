@@ -17,7 +17,7 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
-from legcal.machine.parameters import vector_of
+from legcal.machine import vector_of
 from legcal.vision.board import Board
 
 

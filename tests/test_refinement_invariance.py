@@ -12,8 +12,7 @@ from legcal.calibration.joint_fit.constraints import Start
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.state import FittedLegs
-from legcal.machine.leg import LegGeometry
-from legcal.machine.parameters import moved_legs
+from legcal.machine import LegGeometry, moved_legs
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
 SCALE = 2.5

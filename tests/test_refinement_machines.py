@@ -22,8 +22,7 @@ from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, FittedLegs, State, components
 from legcal.estimation.noise import NoiseModel
 from legcal.geometry.types import Array
-from legcal.machine.leg import radius_name
-from legcal.machine.parameters import parametrize
+from legcal.machine import parametrize, radius_name
 
 
 def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> Session:

@@ -26,7 +26,7 @@ from legcal.calibration.joint_fit.state import FittedLegs, RefinementSettings
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters
+from legcal.machine import KinematicParameters
 
 
 @pytest.fixture(scope="module")

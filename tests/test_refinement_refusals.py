@@ -24,8 +24,7 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.files import motion_from_xyz_quat
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
+from legcal.machine import LegKind, load_mechanism
 
 
 @pytest.fixture(scope="module")

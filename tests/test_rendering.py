@@ -10,8 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism, load_mechanism
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.rays import PixelRays
 from legcal.simulation.rendering.scene import prepare_scene, render

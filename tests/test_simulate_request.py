@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from legcal.errors import UsageError
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
+from legcal.machine import LegKind, load_mechanism
 from legcal.simulation.poses import Sampling
 from legcal.simulation.request import Request, requested
 from legcal.simulation.settings import Level, SimulationSettings

@@ -13,8 +13,7 @@ from boards import CHARUCO
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.files import motion_from_xyz_quat
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism, load_mechanism
 from legcal.perception.boards import camera_poses
 from legcal.simulation.board import chosen_board
 from legcal.simulation.request import Request, requested

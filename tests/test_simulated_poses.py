@@ -15,12 +15,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.geometry.types import Array
-from legcal.machine.closing import leg_vectors
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import REGULAR, Configurations, side, singularity
+from legcal.machine import (
+    REGULAR,
+    Configurations,
+    LegKind,
+    Mechanism,
+    forward_kinematics,
+    inverse_kinematics,
+    leg_vectors,
+    load_mechanism,
+    singularity,
+)
+from legcal.machine.mobility import side
 from legcal.simulation.poses import (
     JITTER,
     Clearance,

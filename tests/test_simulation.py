@@ -11,8 +11,7 @@ from staged_hexapods import exact_session, noisy_session
 
 from legcal.errors import DidNotConverge
 from legcal.geometry.lines import moment
-from legcal.machine.leg import to_vector
-from legcal.machine.load import load_mechanism
+from legcal.machine import load_mechanism, to_vector
 from legcal.simulation.cameras import cameras_around, look_at, sample_camera
 from legcal.simulation.machine import (
     extreme_poses,
@@ -20,8 +19,8 @@ from legcal.simulation.machine import (
     hexapod,
     leg_vectors,
     perturb,
+    poses_with_lengths,
     random_poses,
-    solve_poses,
 )
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
 from legcal.simulation.poses import JITTER
@@ -50,7 +49,7 @@ def test_forward_kinematics_returns_the_lengths_it_was_given(seed: int) -> None:
     machine = perturb(hexapod(), rng, 0.002)
     lengths = rng.uniform(0.40, 0.44, (1, 6))
     start = RigidTransform.concatenate([machine.home])
-    pose = solve_poses(machine.parameters, lengths, start)
+    pose = poses_with_lengths(machine.parameters, lengths, start)
     found = np.linalg.norm(leg_vectors(machine.parameters, pose), axis=-1)
     assert np.abs(found - lengths).max() < 1e-13
 
@@ -91,13 +90,13 @@ def test_poses_solved_together_are_those_solved_alone() -> None:
     machine = perturb(hexapod(), np.random.default_rng(4), 0.002)
     lengths = np.random.default_rng(1).uniform(0.40, 0.44, (5, 6))
     start = RigidTransform.concatenate([machine.home] * 5)
-    together = solve_poses(machine.parameters, lengths, start).as_matrix()
+    together = poses_with_lengths(machine.parameters, lengths, start).as_matrix()
     for pose, row in zip(together, lengths, strict=True):
-        alone = solve_poses(machine.parameters, row[None], start[:1]).as_matrix()
+        alone = poses_with_lengths(machine.parameters, row[None], start[:1]).as_matrix()
         assert np.abs(pose - alone).max() < 1e-13
     lengths[3, 0] = 5.0
     with pytest.raises(DidNotConverge, match="A simulated pose was not found"):
-        solve_poses(machine.parameters, lengths, start)
+        poses_with_lengths(machine.parameters, lengths, start)
 
 
 @pytest.mark.parametrize("uniform", [True, False])

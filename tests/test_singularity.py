@@ -7,17 +7,22 @@ import numpy as np
 import pytest
 from layouts import Layout, LegSpec, Machine, write_machine
 from machines import planar, ring
-from mechanisms import ROOT
+from mechanisms import ROOT, displaced
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
-from legcal.machine.closing import leg_vectors
-from legcal.machine.equations import demands_at, moved
-from legcal.machine.kinematics import Follower, forward_kinematics, inverse_kinematics
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import dimensionless, side, singularity
+from legcal.machine import (
+    Follower,
+    LegKind,
+    Mechanism,
+    forward_kinematics,
+    inverse_kinematics,
+    leg_vectors,
+    load_mechanism,
+    singularity,
+)
+from legcal.machine.equations import demands_at
+from legcal.machine.mobility import dimensionless, side
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 
@@ -30,8 +35,8 @@ def _turned(mechanism: Mechanism, degrees: float, height: float = 0.4) -> RigidT
 
 def test_leg_lines_alone_say_the_same_as_all_equations_of_a_hexapod() -> None:
     mechanism = load_mechanism("hexapod-strut")
-    T = moved(mechanism.home, [0.1, 0.2, -0.1, 0.02, 0.03, 0.01])
-    jacobian = demands_at(mechanism, T).jacobian
+    T = displaced(mechanism.home, [0.1, 0.2, -0.1, 0.02, 0.03, 0.01])
+    jacobian = demands_at(mechanism, T).by_pose[0]
     lengths = np.linalg.norm(leg_vectors(mechanism, T), axis=1)
     centre = T.rotation.apply(mechanism.B_platform.mean(axis=0))
     moments = (jacobian[:, :3] - np.cross(centre, jacobian[:, 3:])) / lengths.mean()
@@ -65,7 +70,7 @@ def test_similar_hexagons_in_the_same_order_are_singular_everywhere(tmp_path: Pa
     )
     mechanism = load_mechanism(write_machine(tmp_path, Machine(legs, home), Layout()))
     for step in ([0.0] * 6, [0.2, 0.1, -0.1, 0.03, 0.02, 0.05]):
-        assert singularity(mechanism, moved(home, step)) < 1e-12
+        assert singularity(mechanism, displaced(home, step)) < 1e-12
 
 
 def test_a_hexapod_whose_legs_lie_in_its_base_is_singular() -> None:
@@ -98,7 +103,7 @@ def test_a_planar_platform_is_singular_where_its_legs_meet_in_a_point(tmp_path: 
 def test_the_measure_is_the_concurrency_determinant_of_a_planar_platform(tmp_path: Path) -> None:
     mechanism = load_mechanism(write_machine(tmp_path, planar(), Layout()))
     for angle in np.linspace(-1.0, 1.0, 9):
-        T = moved(mechanism.home, [0.0, 0.0, angle, 0.01, 0.02, 0.0])
+        T = displaced(mechanism.home, [0.0, 0.0, angle, 0.01, 0.02, 0.0])
         vectors = leg_vectors(mechanism, T)
         u = vectors / np.linalg.norm(vectors, axis=1)[:, None]
         A = mechanism.A_base

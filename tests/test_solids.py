@@ -9,8 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine import Mechanism, load_mechanism
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.solids import (
     Box,

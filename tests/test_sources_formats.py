@@ -15,8 +15,7 @@ from legcal import load_mechanism
 from legcal.cli import main
 from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries
+from legcal.machine import Mechanism, geometries
 from legcal.machine.written import reload_and_check, write_calibrated_yaml, write_model, write_urdf
 
 MACHINES = ("hexapod", "3-upu", "3-rpr", "tricept", "hexapod-strut")
@@ -40,7 +39,7 @@ def assert_same_analysis(found: Mechanism, expected: Mechanism) -> None:
     )
     assert len(found.motors) == len(expected.motors)
     for wanted in expected.legs:
-        leg = min(found.legs, key=lambda leg: float(np.linalg.norm(leg.A_base - wanted.A_base)))
+        leg = min(found.legs, key=lambda leg: float(np.linalg.norm(leg.A - wanted.A)))
         assert (leg.type, leg.kind, leg.sign) == (wanted.type, wanted.kind, wanted.sign)
         assert leg.prismatic == wanted.prismatic
         assert _difference(np.array(leg.travel), np.array(wanted.travel)) == 0.0

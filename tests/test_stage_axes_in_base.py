@@ -14,7 +14,7 @@ from legcal.data.measurements import Measurements, View
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine.leg import LegGeometry, LegKind
+from legcal.machine import LegGeometry, LegKind
 from legcal.paper.base_unknowns import BaseUnknowns, camera_starts, turned_axis
 from legcal.paper.joints_in_base import build_rigid, build_scalar_products, locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras, oriented

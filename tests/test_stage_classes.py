@@ -10,8 +10,7 @@ from staged_machines import Observed, Steps, planned, shipped, three_steps
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import planned_session
 from legcal.errors import NotIdentifiable
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
+from legcal.machine import LegKind, load_mechanism
 from legcal.paper.joints_in_base import locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
 from legcal.paper.nominal import Criteria

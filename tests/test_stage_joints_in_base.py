@@ -8,7 +8,7 @@ from staged_hexapods import exact_session, five_millimetres_away
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.leg import KinematicParameters
+from legcal.machine import KinematicParameters
 from legcal.paper.joints_in_base import JointsInBase, build_scalar_products, locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
 from legcal.paper.nominal import Criteria

@@ -10,7 +10,7 @@ from staged_machines import shipped, three_steps
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import BoolArray
-from legcal.machine.leg import LegKind
+from legcal.machine import LegKind
 from legcal.paper.joints_in_base import locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
 from legcal.paper.leg_directions import (

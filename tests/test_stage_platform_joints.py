@@ -7,7 +7,7 @@ import pytest
 from staged_hexapods import exact_session, five_millimetres_away
 
 from legcal.errors import NotIdentifiable
-from legcal.machine.leg import KinematicParameters
+from legcal.machine import KinematicParameters
 from legcal.paper.four_steps import run_steps
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras

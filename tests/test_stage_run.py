@@ -11,7 +11,7 @@ from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_
 
 from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.geometry.types import IntArray
-from legcal.machine.leg import KinematicParameters
+from legcal.machine import KinematicParameters
 from legcal.paper.four_steps import StagedResult, run_steps
 from legcal.paper.nominal import Criteria
 from legcal.simulation.machine import Machine, extreme_poses

@@ -14,9 +14,14 @@ from legcal.calibration.identify.ranks import Analysis, determined
 from legcal.calibration.identify.session import planned_session
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
-from legcal.machine.leg import LegGeometry, LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.parameters import Parametrization, parametrize, vector_of
+from legcal.machine import (
+    LegGeometry,
+    LegKind,
+    Parametrization,
+    load_mechanism,
+    parametrize,
+    vector_of,
+)
 from legcal.paper import platform_joints
 from legcal.paper.four_steps import StagedResult, run_steps
 from legcal.paper.nominal import Criteria

@@ -14,8 +14,7 @@ from thinned import thinned
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.machine.leg import LegKind
-from legcal.machine.parameters import vector_of
+from legcal.machine import LegKind, vector_of
 from legcal.simulation.studies import bound as bound_study
 from legcal.simulation.studies import convergence as convergence_study
 from legcal.simulation.studies.bound import BoundJudge, BoundStatistics, BoundTally

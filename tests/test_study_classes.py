@@ -17,11 +17,8 @@ from legcal.calibration.joint_fit.constraints import Start
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.state import components, motions
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
+from legcal.machine import LegGeometry, load_mechanism, platform_in_base, vector_of
 from legcal.machine.files import shipped_names
-from legcal.machine.kinematics import platform_in_base
-from legcal.machine.leg import LegGeometry
-from legcal.machine.load import load_mechanism
-from legcal.machine.parameters import vector_of
 from legcal.simulation.studies import classes
 from legcal.simulation.studies.bound import ERRORS
 from legcal.simulation.studies.classes import CLASSES as EXPERIMENT

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from test_cli import run
 
 from legcal.errors import DidNotConverge, UsageError
-from legcal.machine.leg import KinematicParameters, from_vector, to_vector
+from legcal.machine import KinematicParameters, from_vector, to_vector
 from legcal.simulation.machine import Machine, hexapod, random_poses
 from legcal.simulation.studies import paper as estimators
 from legcal.simulation.studies.paper import (

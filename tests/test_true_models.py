@@ -18,11 +18,18 @@ from thinned import thinned
 from legcal.errors import ModelError, UsageError
 from legcal.geometry.motions import roll_pitch_yaw
 from legcal.geometry.types import Array
-from legcal.machine.equations import demanded
-from legcal.machine.leg import Demand, LegGeometry, LegKind
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries, in_links, parametrization_of, vector_of
+from legcal.machine import (
+    Demand,
+    LegGeometry,
+    LegKind,
+    Mechanism,
+    geometries,
+    load_mechanism,
+    parametrization_of,
+    pose_equations,
+    vector_of,
+)
+from legcal.machine.parameters import in_links
 from legcal.machine.urdf import UrdfPatch
 from legcal.simulation import truth
 from legcal.simulation.poses import draw_poses
@@ -98,7 +105,7 @@ def _check_equations(true: Mechanism, legs: tuple[LegGeometry, ...]) -> None:
     for T, readings in zip(poses.poses, poses.readings, strict=True):
         matrix = T.as_matrix()[None]
         for j, leg in enumerate(legs):
-            at = demanded(leg, matrix[:, :3, :3], matrix[:, :3, 3])
+            at = pose_equations([leg], matrix[:, :3, :3], matrix[:, :3, 3])
             for demand, value in zip(at.demands, at.values[0], strict=True):
                 is_read = demand is Demand.LENGTH and leg.kind is not LegKind.CONSTANT
                 wanted = true.legs[j].sign * readings[j] if is_read else 0.0
@@ -289,7 +296,7 @@ def test_errors_that_leave_no_closed_machine_are_refused(
     assert write_true_model(
         nominal, ParameterErrors(offsets=Spread(2e-3)), chance, tmp_path
     ).is_determined
-    with pytest.raises(ModelError, match=r"3 times a platform .*smaller errors"):
+    with pytest.raises(ModelError, match=r"found 3 times .*smaller errors"):
         write_true_model(nominal, ParameterErrors(lengths=Spread(2e-3)), chance, tmp_path)
     assert not list((tmp_path / "models").glob("*"))
 

@@ -12,11 +12,14 @@ from parameter_steps import with_joints
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass
-from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import KinematicParameters
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import geometries
+from legcal.machine import (
+    KinematicParameters,
+    Mechanism,
+    forward_kinematics,
+    geometries,
+    inverse_kinematics,
+    load_mechanism,
+)
 from legcal.machine.urdf import UrdfPatch
 from legcal.machine.written import (
     check_closes,

@@ -9,8 +9,7 @@ from thinned import thinned
 
 import legcal
 from legcal.geometry.types import Array
-from legcal.machine.model import Mechanism
-from legcal.machine.poses import Configurations
+from legcal.machine import Configurations, Mechanism
 from legcal.simulation.cameras import look_at, places_around, sample_camera
 from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
 from legcal.simulation.visibility import SEEN, LegView, Viewpoint, legs_in_image, take_images

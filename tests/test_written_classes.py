@@ -7,11 +7,17 @@ import numpy as np
 import pytest
 
 from legcal.errors import ModelError
-from legcal.machine.home import home_with
-from legcal.machine.leg import LegGeometry
-from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
-from legcal.machine.parameters import footed, geometries, moved_legs, parametrization_of, vector_of
+from legcal.machine import (
+    LegGeometry,
+    Mechanism,
+    footed,
+    geometries,
+    home_with,
+    load_mechanism,
+    moved_legs,
+    parametrization_of,
+    vector_of,
+)
 from legcal.machine.written import reload_and_check, write_calibrated_yaml, write_urdf
 
 

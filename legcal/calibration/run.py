@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit import (
     Choices,
     FittedLegs,
     components,
     fitted_legs,
-    platform_poses,
-    pose_rows,
     start_from,
 )
 from legcal.data import (
@@ -48,6 +46,7 @@ from legcal.machine import (
     geometries,
     joined,
     platform_in_base,
+    solve_poses,
 )
 from legcal.paper import Criteria, Transformation
 from legcal.perception import Photographs, detection_settings
@@ -238,12 +237,10 @@ def _least_squares(
     mechanism: Mechanism, q: Array, nearby: list[RigidTransform]
 ) -> tuple[tuple[RigidTransform, ...], Array]:
     """Return the poses at which the legs miss least, and the largest miss of each [m]."""
-    legs = geometries(mechanism)
-    lengths = mechanism.sign * q + mechanism.q0
-    poses = platform_poses(legs, lengths, nearby, mechanism.frame_legs)
-    rows = pose_rows(legs, *components(poses))
-    wanted = np.where(rows.measured, (mechanism.sign * q)[:, rows.leg], 0.0)
-    return poses, np.nanmax(np.abs(rows.values - wanted), axis=1, initial=0.0)
+    R, t = components(nearby)
+    found = solve_poses(geometries(mechanism), mechanism.frame_legs, R, t, mechanism.sign * q)
+    poses = RigidTransform.from_components(found.t, Rotation.from_matrix(found.R))
+    return tuple(poses), found.missed
 
 
 def _image_of(measurements: Measurements, pose: int) -> str:

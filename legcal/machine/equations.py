@@ -1,98 +1,278 @@
-"""Everything that a mechanism demands of a pose: the equations of all legs, and the plane.
+"""What legs demand of poses, with derivatives by the pose and by the numbers of the legs.
 
-A row holds by a reading (the length of an actuated leg) or by the mechanism alone (the length of a
-rod, a revolute axis, a twist, the plane of a planar mechanism). All rows are lengths: an
-equation without a unit counts at the far end of its leg. Freedoms are a rotation about the
-origin of the platform link and a displacement, in the base link.
+A row holds by a reading (the length of an actuated leg) or by the machine alone (the length of a
+rod, a revolute axis, a twist, the plane of a planar machine). Freedoms are a rotation about the
+origin of the platform's frame [rad] and a displacement [m], both in the frame of the base. The
+rows of :func:`linearize` are those of the paper; :func:`pose_equations` counts rows without a unit
+at the far end of their leg, so that all are lengths.
 """
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, BoolArray, motion_of, normal_basis
-from legcal.machine.leg import N_LOCAL, Demand, LegGeometry, LegKind, geometry_of
+from legcal.errors import NotIdentifiable
+from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.machine.leg import N_LOCAL, Demand, Leg, LegKind
 from legcal.machine.model import Mechanism
+from legcal.machine.parameters import Parametrization
 
 
 @dataclass(frozen=True, eq=False)
-class Linearization:
-    """The equations of one leg at poses.
+class PoseEquations:
+    """Equations at k poses, m rows each."""
 
-    Attributes
-    ----------
-    demands : tuple of Demand
-        What each row is about.
-    values : (k, m) array
-        |AB| - q0 [m] for the length, which the leg's s q is to equal; zero where a demand is met
-        for the other rows, which have no unit.
-    by_pose : (k, m, 6) array
-        Derivative by a small rotation of the platform about its origin [rad] and by its
-        displacement [m], both in the frame of the base.
-    by_local : (k, m, 12) array
-        Derivative by A, B, q0 [m], turns of the base axis and of the platform axis about the
-        first and second vector of :func:`legcal.geometry.lines.normal_basis`, and the twist [rad].
-        Exact where the demands are met.
+    values: Array  # (k, m) how far from met [m]; |AB| - q0 for a length, to equal the leg's s q
+    by_pose: Array  # (k, m, 6) derivative by rotation [rad] and displacement [m]
+    by_local: Array  # (k, m, 12) by the numbers of the row's leg, exact where the rows are met:
+    # A, B, q0 [m], turns of both axes about their normal_basis, twist [rad]; or (k, m, 0)
+    leg: IntArray  # (m,) the leg of each row, -1 for the plane
+    demands: tuple[Demand, ...]  # (m,) what each row is about
+    measured: BoolArray  # (m,) rows that hold by a reading
+
+    def of(self, rows: BoolArray) -> PoseEquations:
+        """Return some of the rows."""
+        return PoseEquations(
+            self.values[:, rows],
+            self.by_pose[:, rows],
+            self.by_local[:, rows],
+            self.leg[rows],
+            tuple(d for d, is_in in zip(self.demands, rows, strict=True) if is_in),
+            self.measured[rows],
+        )
+
+    def by_parameters(self, parametrization: Parametrization) -> Array:
+        """Return the derivatives by parameters, (k, m, p)."""
+        k, m, _ = self.by_local.shape
+        wide = np.zeros((k, m, len(parametrization) + 1))  # the last one for what is none
+        wide[:, np.arange(m)[:, None], parametrization.place[self.leg]] = self.by_local
+        return wide[..., :-1]
+
+
+def pose_equations(
+    legs: Sequence[Leg], R: Array, t: Array, *, by_local: bool = True
+) -> PoseEquations:
+    """Return what legs demand of poses R (k, 3, 3), t (k, 3) [m]; all rows are lengths.
+
+    Without *by_local* these derivatives have no columns, which takes two thirds of the time.
     """
+    if all(map(_is_point_like, legs)):
+        return _point_like(legs, R, t, by_local)
+    parts = []
+    for j, leg in enumerate(legs):
+        found = linearize(leg, R, t, by_local=by_local)
+        rows = np.array([leg.kind is not LegKind.PASSIVE] + [True] * (len(leg.demands) - 1))
+        arm = np.where(_are(Demand.LENGTH, leg.demands), 1.0, found.values[:, :1] + leg.q0)
+        parts.append(
+            PoseEquations(
+                arm * found.values,
+                arm[..., None] * found.by_pose,
+                arm[..., None] * found.by_local,
+                np.full(len(rows), j),
+                found.demands,
+                found.measured,
+            ).of(rows)
+        )
+    return _stacked(parts)
 
-    demands: tuple[Demand, ...]
-    values: Array
-    by_pose: Array
-    by_local: Array
 
+def linearize(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> PoseEquations:
+    """Return all equations of one leg at poses R (k, 3, 3), t (k, 3) [m], as the paper has them.
 
-def linearize(leg: LegGeometry, R: Array, t: Array, *, by_local: bool = True) -> Linearization:
-    """Return a leg's equations and their derivatives at poses of the platform.
-
-    Parameters
-    ----------
-    leg : LegGeometry
-        The leg.
-    R, t : (k, 3, 3) and (k, 3) array
-        Rotation and position [m] of the platform's frame in that of the base.
-    by_local : bool
-        Whether derivatives by the leg's numbers are wanted too; without them they are
-        (k, m, 0), in two thirds of the time.
-
-    Returns
-    -------
-    Linearization
+    Rows but that of the length have no unit; a passive leg has the row of its length too.
     """
     state = _State(leg, R, t, by_local)
     rows = [_ROWS[demand](state) for demand in leg.demands]
-    return Linearization(
-        leg.demands,
+    is_length = _are(Demand.LENGTH, leg.demands)
+    return PoseEquations(
         np.stack([row.value for row in rows], axis=1),
         np.stack([row.by_pose for row in rows], axis=1),
         np.stack([row.by_local for row in rows], axis=1),
+        np.zeros(len(rows), dtype=np.intp),
+        leg.demands,
+        is_length & (leg.kind is LegKind.ACTUATED),
     )
 
 
-def demanded(leg: LegGeometry, R: Array, t: Array, *, by_local: bool = True) -> Linearization:
-    """Return what a leg really demands at poses: a passive one nothing of its length.
+def equations_at(mechanism: Mechanism, R: Array, t: Array) -> PoseEquations:
+    """Return all equations of a machine, its plane too, at poses of its links, without by_local."""
+    found = pose_equations(mechanism.legs, R, t, by_local=False)
+    return found if mechanism.spatial else _stacked([found, _plane(mechanism, R, t)])
 
-    All rows are lengths [m]: those without a unit are counted at the far end of the leg. For the
-    rest see :func:`linearize`.
+
+def demands_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> PoseEquations:
+    """Return the same at one pose."""
+    matrix = T_base_platform.as_matrix()[None]
+    return equations_at(mechanism, matrix[:, :3, :3], matrix[:, :3, 3])
+
+
+def constraints_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> PoseEquations:
+    """Return the equations that hold at one pose whatever the readings are."""
+    demands = demands_at(mechanism, T_base_platform)
+    return demands.of(~demands.measured)
+
+
+def is_constrained(mechanism: Mechanism) -> bool:
+    """Say whether the machine itself forbids some poses, whatever the lengths of its sliders."""
+    return not mechanism.spatial or any(map(n_bonds, mechanism.legs))
+
+
+def n_bonds(leg: Leg) -> int:
+    """Return how many equations of a leg hold without a reading."""
+    return len(leg.demands) - (leg.kind is not LegKind.CONSTANT)
+
+
+def freedoms(frame_legs: Sequence[int]) -> tuple[int, ...]:
+    """Return which of the six components of a platform's motion in R_b are possible at all."""
+    return (0, 1, 2, 3, 4, 5) if len(frame_legs) == 3 else (2, 3, 4)
+
+
+_SINGULAR = 1e-9  # of the largest singular value
+
+
+def pose_sensitivity(
+    legs: Sequence[Leg],
+    parametrization: Parametrization,
+    frame_legs: Sequence[int],
+    R: Array,
+    t: Array,
+) -> Array:
+    """Return how parameters move R_e in R_b at given readings, (k, 6, p): rotation, displacement.
+
+    The equations of all legs hold before and after: F_pose d_pose + F_xi d_xi = 0. Where there are
+    more than freedoms (a 3-UPU that only translates) the platform goes where they are met best.
+
+    Raises
+    ------
+    NotIdentifiable
+        If readings and legs do not determine a pose.
     """
-    found = linearize(leg, R, t, by_local=by_local)
-    rows = slice(1 if leg.kind is LegKind.PASSIVE else 0, None)
-    is_length = np.array([d is Demand.LENGTH for d in found.demands[rows]], dtype=np.bool_)
-    arm = np.where(is_length, 1.0, found.values[:, :1] + leg.q0)
-    return Linearization(
-        found.demands[rows],
-        arm * found.values[:, rows],
-        arm[..., None] * found.by_pose[:, rows],
-        arm[..., None] * found.by_local[:, rows],
+    equations = pose_equations(legs, R, t)
+    columns = list(freedoms(frame_legs))
+    F = equations.by_pose[:, :, columns]
+    singular = np.linalg.svd(F, compute_uv=False)
+    few = singular.shape[1] < len(columns)
+    bad = np.flatnonzero((singular[:, -1] < _SINGULAR * singular[:, 0]) | few)
+    if len(bad):
+        raise NotIdentifiable(
+            f"The platform error could not be predicted: the {int(equations.measured.sum())} "
+            f"readings do not determine platform pose {bad[0] + 1}, where the machine is singular "
+            f"or has too few motors; {len(columns)} independent equations are needed; leave this "
+            "pose out."
+        )
+    moved = np.zeros((len(t), 6, len(parametrization)))
+    moved[:, columns] = -np.linalg.pinv(F) @ equations.by_parameters(parametrization)
+    return moved
+
+
+_WORDS = {
+    Demand.LENGTH: "off its constant length",
+    Demand.BASE_AXIS: "off the plane normal to its axis at the base",
+    Demand.PLATFORM_AXIS: "off the plane normal to its axis at the platform",
+    Demand.ALONG_1: "off the direction that it has in the platform",
+    Demand.ALONG_2: "off the direction that it has in the platform",
+    Demand.TWIST: "twisted at its end",
+    Demand.PLANE: "out of its plane",
+}
+_EXACT = 1e-9  # [m]
+
+
+def worst_in_words(mechanism: Mechanism, equations: PoseEquations, verb: str = "") -> str:
+    """Return the row furthest from met at the first pose: who (verb) how far how."""
+    row = int(np.argmax(np.abs(equations.values[0])))
+    leg, how = equations.leg[row], _WORDS[equations.demands[row]]
+    who = "the platform" if leg < 0 else f"leg '{mechanism.leg_names[leg]}'"
+    return " ".join(f"{who} {verb} {1e3 * abs(equations.values[0, row]):.3g} mm {how}".split())
+
+
+def unmet(mechanism: Mechanism, T_base_platform: RigidTransform) -> str | None:
+    """Return which constraint a pose does not meet, in words; None where it meets all.
+
+    A constraint counts as met within a nanometre, or as well as the machine meets it at home where
+    its axes are a little off (they may be, by up to a milliradian).
+    """
+    if not is_constrained(mechanism):
+        return None
+    here = constraints_at(mechanism, T_base_platform)
+    worst = np.abs(here.values).max()
+    if worst <= _EXACT:
+        return None
+    at_home = np.abs(constraints_at(mechanism, mechanism.home).values).max()
+    if worst <= _EXACT + 10.0 * at_home:
+        return None
+    return worst_in_words(mechanism, here, "would be")
+
+
+def _is_point_like(leg: Leg) -> bool:
+    """Say whether a leg demands its length and nothing else."""
+    return leg.kind is not LegKind.PASSIVE and leg.demands == (Demand.LENGTH,)
+
+
+def _point_like(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> PoseEquations:
+    """Return the lengths of all legs at once."""
+    A = np.array([leg.A for leg in legs]).reshape(-1, 3)
+    arms = np.array([leg.B for leg in legs]).reshape(-1, 3) @ np.swapaxes(R, 1, 2)
+    vectors = arms + t[:, None] - A
+    lengths = np.sqrt(np.einsum("knx,knx->kn", vectors, vectors))
+    u = vectors / lengths[..., None]
+    local = np.zeros((*lengths.shape, N_LOCAL if by_local else 0))
+    if by_local:
+        local[..., :3], local[..., 3:6], local[..., 6] = -u, u @ R, -1.0
+    return PoseEquations(
+        lengths - np.array([leg.q0 for leg in legs]),
+        np.concatenate([_cross(arms, u), u], axis=2),
+        local,
+        np.arange(len(legs)),
+        (Demand.LENGTH,) * len(legs),
+        np.array([leg.kind is LegKind.ACTUATED for leg in legs], dtype=np.bool_),
     )
+
+
+def _plane(mechanism: Mechanism, R: Array, t: Array) -> PoseEquations:
+    """Return the three equations that keep a platform in its plane, tilts at a mean leg's end."""
+    normal = mechanism.T_base_Rb.as_matrix()[:3, 2]
+    carried = R @ mechanism.T_platform_Re.as_matrix()[:3, 2]
+    arms = mechanism.B_platform @ np.swapaxes(R, 1, 2)
+    vectors = arms + t[:, None] - mechanism.A_base
+    scale = np.linalg.norm(vectors, axis=2).mean(axis=1)
+    values, by_pose = np.zeros((len(t), 3)), np.zeros((len(t), 3, 6))
+    values[:, 0] = (vectors @ normal).mean(axis=1)
+    by_pose[:, 0, :3] = np.cross(arms.mean(axis=1), normal)
+    by_pose[:, 0, 3:] = normal
+    for row, e in enumerate(normal_basis(normal), start=1):
+        values[:, row] = scale * (carried @ e)
+        by_pose[:, row, :3] = scale[:, None] * np.cross(carried, e)
+    none = np.zeros((len(t), 3, 0))
+    is_read = np.zeros(3, dtype=np.bool_)
+    return PoseEquations(values, by_pose, none, np.full(3, -1), (Demand.PLANE,) * 3, is_read)
+
+
+def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
+    """Return the rows of several together."""
+    return PoseEquations(
+        np.concatenate([part.values for part in parts], axis=1),
+        np.concatenate([part.by_pose for part in parts], axis=1),
+        np.concatenate([part.by_local for part in parts], axis=1),
+        np.concatenate([part.leg for part in parts]),
+        tuple(demand for part in parts for demand in part.demands),
+        np.concatenate([part.measured for part in parts]),
+    )
+
+
+def _are(which: Demand, demands: Sequence[Demand]) -> BoolArray:
+    """Return which rows are about one thing."""
+    return np.array([demand is which for demand in demands], dtype=np.bool_)
 
 
 class _State:
     """A leg at poses: its direction, and its axes turned into the frame of the base."""
 
-    def __init__(self, leg: LegGeometry, R: Array, t: Array, by_local: bool) -> None:
+    def __init__(self, leg: Leg, R: Array, t: Array, by_local: bool) -> None:
         self.leg, self.R, self.by_local = leg, R, by_local
         self.arm = R @ leg.B
         vector = self.arm + t - leg.A
@@ -242,7 +422,8 @@ def _basis_of(axis: bytes) -> Array:
 
 def _cross(a: Array, b: Array) -> Array:
     """Return vector products of rows or single vectors; np.cross is slow on few of them."""
-    (x, y, z), (i, j, k) = a.T, b.T
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    i, j, k = b[..., 0], b[..., 1], b[..., 2]
     first = y * k - z * j
     product = np.empty((*first.shape, 3))
     product[..., 0], product[..., 1], product[..., 2] = first, z * i - x * k, x * j - y * i
@@ -257,147 +438,3 @@ def _dot(a: Array, b: Array) -> Array:
 def _back(R: Array, vectors: Array) -> Array:
     """Return directions of the base's frame in that of the platform, (k, 3)."""
     return np.asarray((vectors[:, None] @ R)[:, 0])
-
-
-_WORDS = {
-    Demand.LENGTH: "off its constant length",
-    Demand.BASE_AXIS: "off the plane normal to its axis at the base",
-    Demand.PLATFORM_AXIS: "off the plane normal to its axis at the platform",
-    Demand.ALONG_1: "off the direction that it has in the platform",
-    Demand.ALONG_2: "off the direction that it has in the platform",
-    Demand.TWIST: "twisted at its end",
-}
-_EXACT = 1e-9  # [m]
-
-
-@dataclass(frozen=True, eq=False)
-class Demands:
-    """The equations of a mechanism at one pose.
-
-    Attributes
-    ----------
-    found : tuple of pairs of str
-        What a row that is not met means, in words: who, and how ("leg 'leg2'", "off its constant
-        length").
-    values : (m,) array
-        How far each row is from met [m]; for the length of an actuated leg |AB| - q0.
-    jacobian : (m, 6) array
-        Derivative by rotation [rad] and displacement [m] of the platform.
-    measured : (m,) array of bool
-        The rows that hold by a reading.
-    """
-
-    found: tuple[tuple[str, str], ...]
-    values: Array
-    jacobian: Array
-    measured: BoolArray
-
-    def of(self, rows: BoolArray) -> "Demands":
-        """Return some of the rows."""
-        chosen = tuple(f for f, is_in in zip(self.found, rows, strict=True) if is_in)
-        return Demands(chosen, self.values[rows], self.jacobian[rows], self.measured[rows])
-
-    def worst(self, verb: str = "") -> str:
-        """Return the row that is furthest from met, with the amount: who (verb) how far how."""
-        if not len(self.values):
-            return "nothing is demanded"
-        row = int(np.argmax(np.abs(self.values)))
-        who, how = self.found[row]
-        return " ".join(f"{who} {verb} {1e3 * abs(self.values[row]):.3g} mm {how}".split())
-
-
-def is_constrained(mechanism: Mechanism) -> bool:
-    """Say whether the mechanism itself forbids some poses, whatever the lengths of its sliders."""
-    return not mechanism.spatial or any(
-        leg.kind is LegKind.CONSTANT or len(geometry_of(leg).demands) > 1 for leg in mechanism.legs
-    )
-
-
-def demands_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Demands:
-    """Return all equations of a mechanism at a pose.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-    T_base_platform : RigidTransform
-        Pose of the platform link.
-
-    Returns
-    -------
-    Demands
-    """
-    matrix = T_base_platform.as_matrix()
-    R, t = matrix[None, :3, :3], matrix[None, :3, 3]
-    found: list[tuple[str, str]] = []
-    values: list[float] = []
-    rows: list[Array] = []
-    measured: list[bool] = []
-    for leg in mechanism.legs:
-        at = demanded(geometry_of(leg), R, t, by_local=False)
-        for demand, value, by_pose in zip(at.demands, at.values[0], at.by_pose[0], strict=True):
-            found.append((f"leg '{leg.name}'", _WORDS[demand]))
-            values.append(float(value))
-            rows.append(by_pose)
-            measured.append(demand is Demand.LENGTH and leg.kind is LegKind.ACTUATED)
-    if not mechanism.spatial:
-        for value, row in _plane(mechanism, matrix):
-            found.append(("the platform", "out of its plane"))
-            values.append(value)
-            rows.append(row)
-            measured.append(False)
-    return Demands(
-        tuple(found),
-        np.array(values),
-        np.array(rows).reshape(-1, 6),
-        np.array(measured, dtype=np.bool_),
-    )
-
-
-def constraints_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Demands:
-    """Return the equations that hold whatever the readings are."""
-    demands = demands_at(mechanism, T_base_platform)
-    return demands.of(~demands.measured)
-
-
-def unmet(mechanism: Mechanism, T_base_platform: RigidTransform) -> str | None:
-    """Return which constraint a pose does not meet, in words; None where it meets all.
-
-    A constraint counts as met within a nanometre, or as well as the mechanism meets it at home
-    where its axes are a little off (they may be, by up to a milliradian).
-    """
-    if not is_constrained(mechanism):
-        return None
-    here = constraints_at(mechanism, T_base_platform)
-    if np.abs(here.values).max() <= _EXACT:
-        return None
-    home = np.abs(constraints_at(mechanism, mechanism.home).values).max()
-    return here.worst("would be") if np.abs(here.values).max() > _EXACT + 10.0 * home else None
-
-
-def leg_scale(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
-    """Return the mean length of the legs at a pose [m]."""
-    B = T_base_platform.apply(mechanism.B_platform)
-    return float(np.linalg.norm(B - mechanism.A_base, axis=1).mean())
-
-
-def moved(T_base_platform: RigidTransform, step: Sequence[float] | Array) -> RigidTransform:
-    """Return a pose after a rotation [rad] and a displacement [m] as :class:`Demands` has them."""
-    change = np.asarray(step, dtype=np.float64)
-    matrix, turn = T_base_platform.as_matrix(), Rotation.from_rotvec(change[:3])
-    return motion_of(turn.as_matrix() @ matrix[:3, :3], matrix[:3, 3] + change[3:])
-
-
-def _plane(mechanism: Mechanism, matrix: Array) -> list[tuple[float, Array]]:
-    """Return the three equations that keep a platform in its plane, tilts at a mean leg's end."""
-    normal = mechanism.T_base_Rb.as_matrix()[:3, 2]
-    carried = matrix[:3, :3] @ mechanism.T_platform_Re.as_matrix()[:3, 2]
-    arms = mechanism.B_platform @ matrix[:3, :3].T
-    vectors = arms + matrix[:3, 3] - mechanism.A_base
-    scale = float(np.linalg.norm(vectors, axis=1).mean())
-    height = float((vectors @ normal).mean())
-    found = [(height, np.concatenate([np.cross(arms.mean(axis=0), normal), normal]))]
-    for e in normal_basis(normal):
-        gradient = np.concatenate([np.cross(carried, e), np.zeros(3)])
-        found.append((scale * float(e @ carried), scale * gradient))
-    return found

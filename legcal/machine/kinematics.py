@@ -1,18 +1,43 @@
-"""Poses of the platform as the paper has them: of R_e in R_b, and how two of them differ."""
+"""The pose at readings, the readings at a pose, and the closed chain at both.
+
+Poses are found from the equations of the legs, configurations from the closures of the URDF's tree
+in Pinocchio; both have one solver. Forward kinematics follows the closed chain from a known
+configuration in steps that cannot cross a singularity, so that the assembly mode is kept and no leg
+is flipped. Where the joints of the spanning tree stand in the way, the pose alone is followed
+and the chain closed where it ends.
+"""
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry import Array, product
-from legcal.machine.closing import close_near, platform_pose, readings_at
-from legcal.machine.equations import unmet
-from legcal.machine.home import settle
-from legcal.machine.leg import LegKind
+from legcal.geometry import Array, BoolArray, IntArray, motion_of, product
+from legcal.machine.equations import (
+    constraints_at,
+    equations_at,
+    freedoms,
+    is_constrained,
+    pose_equations,
+    unmet,
+    worst_in_words,
+)
+from legcal.machine.leg import Leg, LegKind
+from legcal.machine.mobility import CLOSED, dimensionless, hardly_changes, leg_scale, side
 from legcal.machine.model import Mechanism
-from legcal.machine.poses import follow, follow_rows
+from legcal.machine.solver import Equations, Retraction, moved, newton, solve, walk
+
+EXACT = 1e-11  # [m, rad]: where a held platform is
+NEAR = 2e-3  # [m, rad]: no other posture of a leg is as near as what axes may be off
+RESTARTS = 60
+CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
+MET = 1e-13  # of a leg length
+SHORTEST = 1.0 / 4096.0  # of the way from known readings to the wanted ones
+FRESH, FEW_RESTARTS = 6, 2  # other angles of all legs, and of those that do not close from there
+DEPENDENT = 1e-7  # of the largest singular value: demands that say the same
+FURTHEST = 0.01  # of a leg length: how far a given pose may be from a closed one
 
 
 def forward_kinematics(
@@ -82,7 +107,7 @@ class Follower:
                     f"The pose could not be followed from its start: found {problem} there, needed "
                     "a pose that the legs allow; correct the start."
                 )
-            self.configuration = close_near(mechanism, settled, self.configuration)
+            self.configuration = close_at(mechanism, settled, self.configuration, hold=False)
 
     @property
     def pose(self) -> RigidTransform:
@@ -272,3 +297,456 @@ def pose_differences(
         return displacement, np.zeros(0)
     between = np.swapaxes(T_reference[:, :3, :3], 1, 2) @ T[:, :3, :3]
     return displacement, np.asarray(Rotation.from_matrix(between).magnitude())
+
+
+def leg_vectors(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
+    return np.asarray(T_base_platform.apply(mechanism.B_platform)) - mechanism.A_base
+
+
+def readings_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
+    lengths = np.linalg.norm(leg_vectors(mechanism, T_base_platform), axis=1)
+    return np.asarray(mechanism.sign * (lengths - mechanism.q0))
+
+
+def platform_pose(mechanism: Mechanism, configuration: Array) -> RigidTransform:
+    """Return T_base_platform at a configuration."""
+    return mechanism.chain.pose(configuration, mechanism.base, mechanism.platform)
+
+
+def slider_columns(mechanism: Mechanism, legs: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return where the sliders of some legs stand in configurations and in tangent vectors."""
+    names = [mechanism.legs[j].prismatic for j in legs]
+    joints = [name for name in names if name is not None]
+    chain = mechanism.chain
+    return [chain.q_index(j) for j in joints], [chain.v_index(j) for j in joints]
+
+
+def joint_values(mechanism: Mechanism, configuration: Array) -> Array:
+    """Return the joint value of every leg at a configuration, zero for rods, (n_legs,) [m]."""
+    values = np.zeros(mechanism.n_legs)
+    sliding = [j for j, leg in enumerate(mechanism.legs) if leg.kind is not LegKind.CONSTANT]
+    values[sliding] = configuration[slider_columns(mechanism, sliding)[0]]
+    return values
+
+
+class SolvedPoses(NamedTuple):
+    """Platform poses of R_e in R_b at which legs miss least."""
+
+    R: Array  # (k, 3, 3)
+    t: Array  # (k, 3) [m]
+    missed: Array  # (k,) the largest of what legs still miss [m]
+    size: Array  # (k,) the last step [m, rad]: not small where a pose has not come to rest
+
+
+def solve_poses(
+    legs: Sequence[Leg],
+    frame_legs: Sequence[int],
+    R: Array,
+    t: Array,
+    lengthening: Array | None = None,
+) -> SolvedPoses:
+    """Return the poses near given ones where legs meet what readings and joints demand.
+
+    Where no pose meets it (parameters far from the truth) the one with least squares is found.
+
+    Parameters
+    ----------
+    legs : sequence of Leg
+        The legs in R_b and R_e.
+    frame_legs : sequence of int
+        The legs that define R_b and R_e.
+    R, t : (k, 3, 3) and (k, 3) array
+        Poses of R_e in R_b nearby, in the right assembly mode [m].
+    lengthening : (k, n_legs) array, optional
+        s q of actuated legs [m], NaN where unknown; others are not looked at. Without it poses
+        move to the nearest at which the constraints hold.
+    """
+    fixed = np.ones(6, dtype=np.bool_)
+    fixed[list(freedoms(frame_legs))] = False
+
+    def equations(poses: Array) -> tuple[Array, Array]:
+        found = pose_equations(legs, poses[:, :, :3], poses[:, :, 3], by_local=False)
+        if lengthening is None:
+            found = found.of(~found.measured)
+            values, jacobian = found.values, found.by_pose.copy()
+        else:
+            wanted = np.where(found.measured, lengthening[:, found.leg], 0.0)
+            known = np.isfinite(wanted)
+            values = np.where(known, found.values - wanted, 0.0)
+            jacobian = found.by_pose * known[..., None]
+        jacobian[:, :, fixed] = 0.0
+        return values, jacobian
+
+    poses = np.concatenate([R, t[..., None]], axis=2)
+    found = solve(equations, moved, poses, met=1e-15, rank=DEPENDENT)
+    return SolvedPoses(found.points[:, :, :3], found.points[:, :, 3], found.worst, found.size)
+
+
+def settle(
+    mechanism: Mechanism, T: RigidTransform, furthest: float = FURTHEST
+) -> tuple[RigidTransform, str | None]:
+    """Return the nearest pose that meets every constraint, and what is in the way if none is near.
+
+    Constraints may be missed by *furthest* leg lengths at the start, T_base_platform.
+    """
+    if not is_constrained(mechanism):
+        return T, None
+    scale = leg_scale(mechanism, T)
+    first = constraints_at(mechanism, T)
+    if np.abs(first.values).max() > furthest * scale:
+        return T, worst_in_words(mechanism, first)
+
+    def equations(poses: Array) -> tuple[Array, Array]:
+        found = equations_at(mechanism, poses[:, :, :3], poses[:, :, 3])
+        held = ~found.measured
+        return found.values[:, held], found.by_pose[:, held]
+
+    unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
+    found = solve(equations, moved, T.as_matrix()[None, :3], met=MET * scale, unit=unit)
+    settled = motion_of(found.points[0, :, :3], found.points[0, :, 3])
+    if found.worst[0] <= 1e-9 * scale:
+        return settled, None
+    return settled, worst_in_words(mechanism, constraints_at(mechanism, settled))
+
+
+def close_at(
+    mechanism: Mechanism,
+    T_base_platform: RigidTransform,
+    start: Array | None = None,
+    restarts: int = RESTARTS,
+    *,
+    hold: bool = True,
+) -> Array:
+    """Return the configuration (nq,) that closes every loop to 1e-12 m with the platform at a pose.
+
+    Sliders are set from the distance of their joints, so that no leg is ever flipped; joint angles
+    are solved from ``start``, and from seeded random ones for legs that do not close from there.
+    The pose must meet what the legs demand. Without *hold* it need meet that but for rounding: the
+    platform is let go at the end and moves by what the axes of the model are off.
+
+    Raises
+    ------
+    DidNotConverge
+        If a leg does not close, naming its closure and the distance left.
+    """
+    chain, astray = mechanism.chain, EXACT if hold else NEAR
+    angles = np.zeros(chain.nv, dtype=np.bool_)
+    for joint in mechanism.urdf.joints.values():
+        if joint.type in ("revolute", "continuous"):
+            angles[chain.v_index(joint.name)] = True
+    # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
+    # weigh too little to be closed, and NEAR would be a large part of a leg.
+    metre = min(1.0, leg_scale(mechanism, T_base_platform))
+    configuration = _placed(mechanism, T_base_platform, start, astray)
+    rng = np.random.default_rng(20020701)
+    for _ in range(restarts):
+        equations, retract = _held(mechanism, T_base_platform, metre, angles)
+        found = solve(equations, retract, configuration[None], met=0.01 * CLOSED, far=True)
+        configuration = found.points[0]
+        stuck = np.abs(found.values[0]) > NEAR
+        if not stuck.any():
+            break
+        columns = np.zeros(chain.nv, dtype=np.bool_)
+        columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
+        step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
+        configuration = chain.integrate(configuration, step)
+    everything = _held(mechanism, T_base_platform, 1.0, angles)
+    left = everything[0](configuration[None])[0][0]
+    if np.abs(left).max(initial=0.0) >= CLOSED:
+        angles[slider_columns(mechanism, range(mechanism.n_legs))[1]] = True  # and sliders
+        pose = T_base_platform if hold else None
+        every = angles if hold else np.ones(chain.nv, dtype=np.bool_)
+        equations, retract = _held(mechanism, pose, 1.0, every)
+        found = solve(equations, retract, configuration[None], met=0.01 * CLOSED, far=True)
+        configuration, left = found.points[0], found.values[0]
+    off = _off(mechanism, T_base_platform, configuration)
+    if np.abs(left).max(initial=0.0) >= CLOSED:
+        problem = f"{worst_closure(mechanism, left)}, needed less than 1e-12 m"
+    elif max(off) > astray:
+        problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
+    else:
+        return configuration
+    raise _not_closed(mechanism, T_base_platform, problem)
+
+
+def worst_closure(mechanism: Mechanism, residual: Array) -> str:
+    """Return which closure is most open, in words."""
+    row = 0
+    worst = (0.0, "the platform pose")
+    for closure in mechanism.chain.closures:
+        gap = float(np.abs(residual[row : row + closure.rows]).max())
+        worst = max(worst, (gap, f"'{closure.frame_1}' and '{closure.frame_2}'"))
+        row += closure.rows
+    return f"{worst[1]} stay {worst[0]:.3g} m apart"
+
+
+def _placed(
+    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None, astray: float
+) -> Array:
+    """Return a configuration with the platform and the sliders set."""
+    chain = mechanism.chain
+    configuration = chain.neutral() if start is None else start.copy()
+    if mechanism.platform_joint is not None:
+        configuration = chain.with_platform(
+            configuration,
+            mechanism.platform_joint,
+            mechanism.base,
+            mechanism.platform,
+            T_base_platform,
+        )
+        off = _off(mechanism, T_base_platform, configuration)
+        if max(off) > astray:
+            raise _not_closed(
+                mechanism,
+                T_base_platform,
+                f"the virtual joint '{mechanism.platform_joint}' leaves it {_away(off)} away, "
+                "needed a joint that reaches it",
+            )
+    q = readings_at(mechanism, T_base_platform)
+    sliding = [j for j, leg in enumerate(mechanism.legs) if leg.prismatic is not None]
+    configuration[slider_columns(mechanism, sliding)[0]] = q[sliding]
+    return configuration
+
+
+def _held(
+    mechanism: Mechanism, T: RigidTransform | None, metre: float, free: BoolArray | IntArray
+) -> tuple[Equations, Retraction]:
+    """Return the closures by free tangent coordinates; the platform held at T where legs carry it.
+
+    Lengths are divided by ``metre``.
+    """
+    chain = mechanism.chain
+    weld = T if mechanism.platform_joint is None else None
+    weights = np.ones(chain.n_rows + 6 * (weld is not None))
+    row = 0
+    for rows in [closure.rows for closure in chain.closures] + [6]:
+        weights[row : row + 3] = 1.0 / metre
+        row += rows
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        if weld is not None:
+            held, held_jacobian = chain.welded(mechanism.base, mechanism.platform, weld)
+            residual = np.concatenate([residual, held])
+            jacobian = np.concatenate([jacobian, held_jacobian])
+        return (residual * weights)[None], (jacobian[:, free] * weights[:, None])[None]
+
+    def retract(points: Array, step: Array) -> Array:
+        full = np.zeros(chain.nv)
+        full[free] = step[0]
+        return chain.integrate(points[0], full)[None]
+
+    return equations, retract
+
+
+def _off(
+    mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array
+) -> tuple[float, float]:
+    """Return how far the platform is from where it should be [m], and how far turned [rad]."""
+    R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
+    matrix = T_base_platform.as_matrix()
+    chord = float(np.linalg.norm(R - matrix[:3, :3]))  # of small turns as good as of large ones
+    turn = 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
+    return float(np.linalg.norm(t - matrix[:3, 3])), turn
+
+
+def _away(off: tuple[float, float]) -> str:
+    """Return a distance and a turn in words, without the one that is rounding beside the other."""
+    said = f"{1e3 * off[0]:.3g} mm", f"{np.degrees(off[1]):.3g} deg"
+    return " and ".join(text for text, x in zip(said, off, strict=True) if x > 1e-6 * max(off))
+
+
+def _not_closed(
+    mechanism: Mechanism, T_base_platform: RigidTransform, problem: str
+) -> DidNotConverge:
+    """Return the error of a pose at which the chain does not close."""
+    place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
+    return DidNotConverge(
+        f"{mechanism.yaml_path}: the legs could not be closed with the platform at {place} mm: "
+        f"{problem}; check that the legs reach this pose (legcal.home)."
+    )
+
+
+def follow(
+    mechanism: Mechanism,
+    configuration: Array,
+    readings: Array,
+    which: str = "",
+    shortest: float = SHORTEST,
+    on_the_chain: bool = False,
+) -> Array:
+    """Return the closed configuration at readings (n_motors,), followed from a closed one.
+
+    It is closed to 1e-12 m, in the same assembly mode, with no leg flipped. Steps are no shorter
+    than a part *shortest* of the way. *on_the_chain* stops where the joints of the chain do: soon,
+    but in a place that depends on the spanning tree. *which* names the readings in the message.
+
+    Raises
+    ------
+    DidNotConverge
+        If the steps stop contracting or reach a singularity, even tiny ones.
+    """
+    q_columns, v_columns = slider_columns(mechanism, mechanism.motors)
+    free = np.delete(np.arange(mechanism.chain.nv), v_columns)
+    first = configuration[q_columns]
+    known = mechanism.chain.linearize(configuration)[1][:, free]
+    here: float | None = None
+
+    def attempt(part: float) -> bool:
+        nonlocal configuration, known, here
+        trial = configuration.copy()
+        trial[q_columns] = readings if part == 1.0 else first + part * (readings - first)
+        reached, jacobian = _closed_from(mechanism, trial, free)
+        if reached is None or _is_flipped(mechanism, reached):
+            return False
+        if not hardly_changes(known, jacobian):
+            if here is None:
+                here = side(mechanism, platform_pose(mechanism, configuration))
+            there = side(mechanism, platform_pose(mechanism, reached))
+            if not here == there != 0.0:  # not square: only ways on which little changes
+                return False
+        configuration, known = reached, jacobian
+        return True
+
+    done = walk(attempt, shortest)
+    if done == 1.0:
+        return configuration
+    T = platform_pose(mechanism, configuration)
+    part = 0.0
+    if not on_the_chain:
+        T, part = follow_pose(mechanism, T, configuration[q_columns], readings, shortest)
+    if part < 1.0:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: at "
+            f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
+            "legs meet no more or the mechanism is singular, needed a regular path; check the "
+            "readings and legcal.home."
+        )
+    closed = _closed_at(mechanism, T, configuration, readings, free)
+    if closed is None:
+        raise DidNotConverge(
+            f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: found a "
+            "platform pose at which the legs have the right lengths, but joints that were not "
+            "closed there, needed a closed chain; give the joints of the legs axes at right angles "
+            "(of three revolutes, and of a universal joint and its leg), which turn anywhere, or "
+            "cut spherical joints with 3d."
+        )
+    return closed
+
+
+def follow_pose(
+    mechanism: Mechanism, T: RigidTransform, first: Array, last: Array, shortest: float
+) -> tuple[RigidTransform, float]:
+    """Return the pose followed from T at first to last readings, and which part of it is done."""
+    pose, known = T.as_matrix()[None, :3], dimensionless(mechanism, T)
+    motors = list(mechanism.motors)
+
+    def attempt(part: float) -> bool:
+        nonlocal pose, known
+        readings = last if part == 1.0 else first + part * (last - first)
+        lengthening = mechanism.sign[motors] * readings
+
+        def equations(poses: Array) -> tuple[Array, Array]:
+            found = equations_at(mechanism, poses[:, :, :3], poses[:, :, 3])
+            found.values[:, found.measured] -= lengthening
+            return found.values, found.by_pose
+
+        scale = leg_scale(mechanism, motion_of(pose[0, :, :3], pose[0, :, 3]))
+        unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
+        found = newton(
+            equations, moved, pose, met=MET * scale, contraction=CONTRACTION, first=scale, unit=unit
+        )
+        there = motion_of(found.points[0, :, :3], found.points[0, :, 3])
+        if not (found.arrived[0] or found.worst[0] < MET * scale) or _is_reversed(mechanism, there):
+            return False
+        jacobian = dimensionless(mechanism, there)
+        if not hardly_changes(known, jacobian):
+            if known.shape[0] != known.shape[1]:
+                return False
+            signs = [float(np.sign(np.linalg.det(J))) for J in (known, jacobian)]
+            if not signs[0] == signs[1] != 0.0:
+                return False
+        pose, known = found.points, jacobian
+        return True
+
+    done = walk(attempt, shortest)
+    return motion_of(pose[0, :, :3], pose[0, :, 3]), done
+
+
+def follow_rows(
+    mechanism: Mechanism, readings: Array
+) -> Iterator[tuple[Array, DidNotConverge | None]]:
+    """Yield the closed configuration at each row of readings (n_rows, n_motors), and no failure.
+
+    Each row starts from the nearest one that is solved already, or from home. Where a row is not
+    reached, this start comes with the failure.
+    """
+    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
+    configurations = [mechanism.home_configuration]
+    for i, row in enumerate(readings):
+        nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
+        try:
+            configuration = follow(mechanism, nearest, row, f" of row {i + 1}")
+        except DidNotConverge as failure:
+            yield nearest, failure
+            continue
+        known.append(row)
+        configurations.append(configuration)
+        yield configuration, None
+
+
+def _closed_from(
+    mechanism: Mechanism, configuration: Array, free: IntArray
+) -> tuple[Array | None, Array]:
+    """Return the configuration closed with the motors held, None if not near, and its Jacobian."""
+    equations, retract = _held(mechanism, None, 1.0, free)
+    found = newton(
+        equations, retract, configuration[None], met=0.01 * CLOSED, contraction=CONTRACTION
+    )
+    return found.points[0] if found.worst[0] < CLOSED else None, found.jacobian[0]
+
+
+def _closed_at(
+    mechanism: Mechanism, T: RigidTransform, start: Array, readings: Array, free: IntArray
+) -> Array | None:
+    """Return the closed configuration at readings whose pose is known, None if joints forbid it.
+
+    The platform is let go only where axes that are a little off leave no other way.
+    """
+    rng = np.random.default_rng(1965)
+    angles = mechanism.chain.rotation_columns()
+    turns = np.zeros((1 + FRESH, mechanism.chain.nv))
+    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (FRESH, mechanism.chain.nv))[:, angles]
+    tries = [(turn, True) for turn in turns] + [(turns[0], False)] * is_constrained(mechanism)
+    for turn, hold in tries:
+        there = mechanism.chain.integrate(start, turn)
+        try:
+            trial = close_at(mechanism, T, there, FEW_RESTARTS, hold=hold)
+        except DidNotConverge:
+            continue
+        trial[slider_columns(mechanism, mechanism.motors)[0]] = readings
+        closed, _ = _closed_from(mechanism, trial, free)
+        if closed is not None:
+            return closed
+    return None
+
+
+def _is_flipped(mechanism: Mechanism, configuration: Array) -> bool:
+    """Say whether a leg without a motor has shrunk through its base joint."""
+    rows = [j for j, leg in enumerate(mechanism.legs) if leg.kind is LegKind.PASSIVE]
+    if not rows:
+        return False
+    q = configuration[slider_columns(mechanism, rows)[0]]
+    return bool(np.any(mechanism.sign[rows] * q + mechanism.q0[rows] <= 0.0))
+
+
+def _is_reversed(mechanism: Mechanism, T: RigidTransform) -> bool:
+    """Say whether a leg that is fixed to the platform points the wrong way."""
+    return any(
+        leg.platform_joint == ""
+        and leg.platform_axis is not None
+        and float(T.rotation.apply(leg.platform_axis) @ vector) <= 0.0
+        for leg, vector in zip(mechanism.legs, leg_vectors(mechanism, T), strict=True)
+    )

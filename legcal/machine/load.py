@@ -13,19 +13,11 @@ from legcal.geometry import Array
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.classification import CONCURRENT, PERPENDICULAR, LegChain, leg_of
-from legcal.machine.closing import (
-    CONFIGURATIONS,
-    generic_configurations,
-    leg_vectors,
-    mobility,
-    platform_pose,
-    readings_at,
-    slider_columns,
-)
 from legcal.machine.cylinders import at_visible_heights, visual_cylinders, with_cylinders
 from legcal.machine.equations import linearize
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, legs_outside
+from legcal.machine.kinematics import leg_vectors, platform_pose, readings_at, slider_columns
 from legcal.machine.leg import (
     LONGEST,
     MOST_LEGS,
@@ -34,11 +26,10 @@ from legcal.machine.leg import (
     THINNEST,
     Demand,
     LegKind,
-    geometry_of,
-    n_frame_legs,
 )
+from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility, singularity
 from legcal.machine.model import Mechanism
-from legcal.machine.poses import singularity
+from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.topology import (
     any_joint,
@@ -279,7 +270,7 @@ def check_equations(mechanism: Mechanism) -> None:
         T = platform_pose(mechanism, configuration)
         R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
         for j, leg in enumerate(mechanism.legs):
-            equations = linearize(geometry_of(leg), R, t, by_local=False)
+            equations = linearize(leg, R, t, by_local=False)
             values = equations.values[0].copy()
             if leg.kind is not LegKind.CONSTANT:
                 values[0] -= leg.sign * configuration[slider_columns(mechanism, (j,))[0][0]]

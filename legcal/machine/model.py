@@ -97,12 +97,12 @@ class Mechanism:
     @cached_property
     def A_base(self) -> Array:
         """Base joint centres in the base link, (n_legs, 3) [m]."""
-        return _fixed(np.array([leg.A_base for leg in self.legs]))
+        return _fixed(np.array([leg.A for leg in self.legs]))
 
     @cached_property
     def B_platform(self) -> Array:
         """Platform joint centres in the platform link, (n_legs, 3) [m]."""
-        return _fixed(np.array([leg.B_platform for leg in self.legs]))
+        return _fixed(np.array([leg.B for leg in self.legs]))
 
     @cached_property
     def q0(self) -> Array:

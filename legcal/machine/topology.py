@@ -31,7 +31,7 @@ from legcal.machine.classification import (
     understand,
     undirected,
 )
-from legcal.machine.leg import n_frame_legs
+from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock
 from legcal.machine.tree import reference_poses
 from legcal.machine.urdf import Urdf, UrdfJoint

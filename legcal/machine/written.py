@@ -22,7 +22,7 @@ from legcal.machine.classification import LegChain, Step
 from legcal.machine.files import FOLDER_YAML
 from legcal.machine.formats import XML_SUFFIXES
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import Leg, LegGeometry, LegKind, geometry_of
+from legcal.machine.leg import Leg, LegKind
 from legcal.machine.load import load_mechanism
 from legcal.machine.model import Mechanism
 from legcal.machine.parameters import (
@@ -168,7 +168,7 @@ class Motion:
 
 
 def moved_origins(
-    mechanism: Mechanism, legs: Sequence[LegGeometry]
+    mechanism: Mechanism, legs: Sequence[Leg]
 ) -> dict[str, tuple[RigidTransform, bool]]:
     """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
     handles = Handles(mechanism)
@@ -199,14 +199,14 @@ def moved_origins(
     return found
 
 
-def _ends(leg: Leg, wanted: LegGeometry) -> tuple[Motion, Motion]:
+def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:
     """Return how the ends of a leg move in the links of base and platform."""
     is_fixed = leg.platform_joint == ""
     return (
-        Motion(wanted.A - leg.A_base, leg.A_base, _turn(leg.base_axis, wanted.base_axis)),
+        Motion(wanted.A - leg.A, leg.A, _turn(leg.base_axis, wanted.base_axis)),
         Motion(
-            wanted.B - leg.B_platform,
-            leg.B_platform,
+            wanted.B - leg.B,
+            leg.B,
             _turn(leg.platform_axis, wanted.platform_axis, directed=is_fixed),
         ),
     )
@@ -224,13 +224,13 @@ def _turn(axis: Array | None, wanted: Array | None, *, directed: bool = False) -
     return None if angle < ROUNDING else Rotation.from_rotvec(angle / sine * normal)
 
 
-def _twisted(leg: Leg, wanted: LegGeometry, at_platform: Motion) -> float:
+def _twisted(leg: Leg, wanted: Leg, at_platform: Motion) -> float:
     """Return how far the upper half of a leg turns about it, beside what its end does [rad]."""
     if leg.twist is None or wanted.twist is None:
         return 0.0
     carried = leg.twist
     if at_platform.turn is not None:
-        carried = float(twist_after(geometry_of(leg), at_platform.turn) or 0.0)
+        carried = float(twist_after(leg, at_platform.turn) or 0.0)
     twist = wanted.twist - carried
     twist -= np.pi * np.round(twist / np.pi)
     return float(twist) if abs(twist) > ROUNDING else 0.0
@@ -337,7 +337,7 @@ _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
 CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
 
 
-def write_urdf(mechanism: Mechanism, legs: Sequence[LegGeometry], destination: Path) -> None:
+def write_urdf(mechanism: Mechanism, legs: Sequence[Leg], destination: Path) -> None:
     """Write the mechanism's URDF with other numbers of its legs, of whatever class.
 
     Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
@@ -445,7 +445,7 @@ Axes = Mapping[str, Sequence[float]]  # by leg name, in R_b or R_e
 
 
 def nominal_axes(
-    leg_names: Sequence[str], nominal: Sequence[LegGeometry]
+    leg_names: Sequence[str], nominal: Sequence[Leg]
 ) -> dict[str, dict[str, list[float]]]:
     """Return the axes that turns count from, at the base in R_b and at the platform in R_e."""
     named = list(zip(leg_names, nominal, strict=True))
@@ -459,8 +459,8 @@ def nominal_axes(
 
 def turns_between(
     parametrization: Parametrization,
-    calibrated: Sequence[LegGeometry],
-    nominal: Sequence[LegGeometry],
+    calibrated: Sequence[Leg],
+    nominal: Sequence[Leg],
 ) -> Array:
     """Return the derivative (p, p) of parameters with calibrated axes by those with nominal ones.
 

@@ -443,7 +443,7 @@ def _radius(leg: Leg, mechanism: Mechanism) -> float:
     """Return the radius of the thickest cylinder of a leg, or one that suits it [m]."""
     if leg.cylinders:
         return max(c.radius for c in leg.cylinders)
-    length = np.linalg.norm(mechanism.home.apply(leg.B_platform) - leg.A_base)
+    length = np.linalg.norm(mechanism.home.apply(leg.B) - leg.A)
     return _DEFAULT_RADIUS * float(length)
 
 

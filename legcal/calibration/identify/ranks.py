@@ -15,7 +15,6 @@ from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.machine import (
     SHOWN,
     Demand,
-    LegKind,
     describe_direction,
     freedoms,
     pose_equations,
@@ -99,20 +98,14 @@ class WhitenedDemands:
 
 def demands_of(session: Session) -> WhitenedDemands:
     """Return what readings and legs demand of the poses of a session."""
-    equations = pose_equations(session.legs, session.parametrization, session.R, session.t)
+    equations = pose_equations(session.legs, session.R, session.t)
     sigma = np.where(equations.measured, session.sigma_q, SIGMA_EXACT)[:, None]
-    demand = tuple(
-        d
-        for leg in session.legs
-        for d in leg.demands
-        if not (d is Demand.LENGTH and leg.kind is LegKind.PASSIVE)
-    )
     columns = list(freedoms(session.frame_legs))
     return WhitenedDemands(
         (equations.by_pose / sigma * pose_unit(session))[:, :, columns],
-        equations.by_parameters / sigma * session.unit,
+        equations.by_parameters(session.parametrization) / sigma * session.unit,
         equations.leg,
-        demand,
+        equations.demands,
     )
 
 

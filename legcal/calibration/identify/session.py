@@ -19,7 +19,6 @@ from legcal.machine import (
     LegKind,
     Mechanism,
     Parametrization,
-    demanded,
     freedoms,
     geometries,
     joined,
@@ -27,6 +26,7 @@ from legcal.machine import (
     main_cylinders,
     moved_legs,
     parametrization_of,
+    pose_equations,
 )
 
 _TIMES = {2: "two", 3: "three", 4: "four"}
@@ -436,7 +436,7 @@ class _Closing:
         if count < len(motors):
             size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
             rows = [
-                demanded(self.legs[j], R, t, by_local=False).by_pose[0, 0, self.columns]
+                pose_equations([self.legs[j]], R, t, by_local=False).by_pose[0, 0, self.columns]
                 for j in motors
             ]
             held = self.system(R, t, None)[1][0] / size
@@ -467,7 +467,7 @@ class _Closing:
         """Return residuals (k, m), derivatives (k, m, f); without lengths motors are free."""
         values, slopes = [np.zeros((len(t), 0))], [np.zeros((len(t), 0, 6))]
         for j, leg in enumerate(self.legs):
-            found = demanded(leg, R, t, by_local=False)
+            found = pose_equations([leg], R, t, by_local=False)
             value, slope = found.values, found.by_pose
             if leg.kind is LegKind.ACTUATED and j in self.driven and wanted is not None:
                 value[:, 0] += leg.q0 - wanted[:, j]

@@ -7,7 +7,6 @@ from .choices import Prior as Prior
 from .constraints import Start as Start
 from .constraints import cameras_from_hints as cameras_from_hints
 from .constraints import platform_poses as platform_poses
-from .constraints import pose_rows as pose_rows
 from .constraints import start_from as start_from
 from .contradictions import FOCAL_PART as FOCAL_PART
 from .cramer_rao import average_images as average_images

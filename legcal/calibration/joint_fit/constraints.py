@@ -14,62 +14,25 @@ from legcal.calibration.joint_fit.state import (
     State,
     components,
     motions,
-    turned,
 )
 from legcal.data import Measurements
 from legcal.errors import DatasetError, DidNotConverge
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray
 from legcal.machine import (
-    Demand,
     LegGeometry,
-    LegKind,
-    demanded,
+    PoseEquations,
     freedoms,
+    n_bonds,
+    pose_equations,
+    solve_poses,
     tied_twist,
     tied_twist_slope,
     turn_of,
 )
 
 _RANK = 1e-7  # of the largest singular value
-_MET = 1e-13  # [m]
-_NEARLY_MET = 1e-10  # [m], of demands that cannot all be met to rounding
-_MAX_STEPS = 20
+_AT_REST = 1e-6  # [m, rad], the last step where demands cannot all be met to rounding
 _PLATFORM_AXIS, _TWIST = slice(9, 11), 11  # among the numbers of a leg
-
-
-@dataclass(frozen=True, eq=False)
-class PoseRows:
-    """The equations of legs at poses; all rows are lengths.
-
-    Attributes
-    ----------
-    values : (n_poses, m) array
-        How far each row is from met [m]; for a row that holds by a reading |AB| - q0.
-    by_pose : (n_poses, m, 6) array
-        Derivative by rotation [rad] and displacement [m] of R_e in R_b.
-    by_local : (n_poses, m, 12) array
-        Derivative by the numbers of the row's leg.
-    leg : (m,) array of int
-        The leg of each row.
-    measured : (m,) array of bool
-        Which rows hold by a reading.
-    """
-
-    values: Array
-    by_pose: Array
-    by_local: Array
-    leg: IntArray
-    measured: BoolArray
-
-    def of(self, rows: BoolArray) -> PoseRows:
-        """Return some of the rows."""
-        return PoseRows(
-            self.values[:, rows],
-            self.by_pose[:, rows],
-            self.by_local[:, rows],
-            self.leg[rows],
-            self.measured[rows],
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,29 +49,6 @@ class Tangent:
 
     Z: Array
     Q: Array
-
-
-def pose_rows(
-    legs: Sequence[LegGeometry], R: Array, t: Array, *, by_local: bool = True
-) -> PoseRows:
-    """Return what all legs demand at poses R (k, 3, 3), t (k, 3) of R_e in R_b.
-
-    Without *by_local* these derivatives have no columns.
-    """
-    found = [demanded(leg, R, t, by_local=by_local) for leg in legs]
-    counts = [len(part.demands) for part in found]
-    measured = [
-        leg.kind is LegKind.ACTUATED and demand is Demand.LENGTH
-        for leg, part in zip(legs, found, strict=True)
-        for demand in part.demands
-    ]
-    return PoseRows(
-        np.concatenate([part.values for part in found], axis=1),
-        np.concatenate([part.by_pose for part in found], axis=1),
-        np.concatenate([part.by_local for part in found], axis=1),
-        np.repeat(np.arange(len(legs)), counts),
-        np.array(measured, dtype=np.bool_),
-    )
 
 
 def is_constrained(legs: Sequence[LegGeometry], frame_legs: Sequence[int]) -> bool:
@@ -128,19 +68,10 @@ def on_constraints(state: State, frame_legs: Sequence[int]) -> State:
     """
     if not any(map(n_bonds, state.legs)):
         return state
-    free = list(freedoms(frame_legs))
-    R, t, size = state.R_pose, state.t_pose, np.inf
-    for _ in range(_MAX_STEPS):
-        rows = _binding(state.legs, R, t, by_local=False)
-        step = np.zeros((len(t), 6))
-        inverse = np.linalg.pinv(rows.by_pose[:, :, free], rcond=_RANK)
-        step[:, free] = -np.einsum("kij,kj->ki", inverse, rows.values)
-        previous, size = size, float(np.abs(step).max(initial=0.0))
-        R, t = turned(R, step[:, :3]), t + step[:, 3:]
-        if size < _MET or (size < _NEARLY_MET and size > 0.5 * previous):
-            return replace(state, R_pose=R, t_pose=t)
-        if not size < 1e3:
-            break
+    found = solve_poses(state.legs, frame_legs, state.R_pose, state.t_pose)
+    size = float(found.size.max(initial=0.0))
+    if size < _AT_REST:
+        return replace(state, R_pose=found.R, t_pose=found.t)
     raise DidNotConverge(
         "The fit of everything could not keep the platform on what its joints allow: found a pose "
         f"that still moves by {size:.2g} m or rad, needed rest; start nearer to the truth (joints "
@@ -190,20 +121,10 @@ def following(state: State, frame_legs: Sequence[int], leg: int, column: int) ->
     return motion
 
 
-def n_bonds(leg: LegGeometry) -> int:
-    """Return how many equations of a leg hold without a reading."""
-    return len(leg.demands) - (leg.kind is not LegKind.CONSTANT)
-
-
-def _binding(legs: Sequence[LegGeometry], R: Array, t: Array, *, by_local: bool = True) -> PoseRows:
+def _binding(legs: Sequence[LegGeometry], R: Array, t: Array) -> PoseEquations:
     """Return the rows that hold without a reading."""
-    rows = pose_rows(legs, R, t, by_local=by_local)
+    rows = pose_equations(legs, R, t)
     return rows.of(~rows.measured)
-
-
-_MAX_ITERATIONS = 60
-_STEP = 1e-12  # [m, rad]
-_LARGEST_TURN = 0.3  # [rad] in one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,37 +279,6 @@ def platform_poses(
     tuple of RigidTransform
         T_Rb_Re.
     """
-    free = list(freedoms(frame_legs))
-    reading = lengths - np.array([leg.q0 for leg in geometry])
-    R, t = components(T_Rb_Re)
-    damping = np.full(len(R), 1e-6)
-    error, J = _misses(geometry, reading, R, t)
-    cost = np.sum(error**2, axis=1)
-    for _ in range(_MAX_ITERATIONS):
-        J_free = J[:, :, free]
-        N = np.swapaxes(J_free, -1, -2) @ J_free + damping[:, None, None] * np.eye(len(free))
-        step = np.zeros((len(t), 6))
-        gradient = np.einsum("kli,kl->ki", J_free, error)
-        step[:, free] = -np.linalg.solve(N, gradient[..., None])[..., 0]
-        turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
-        step *= np.minimum(1.0, _LARGEST_TURN / np.maximum(turn, 1e-300))
-        R_next, t_next = turned(R, step[:, :3]), t + step[:, 3:]
-        error_next, J_next = _misses(geometry, reading, R_next, t_next)
-        cost_next = np.sum(error_next**2, axis=1)
-        better = cost_next <= cost
-        damping = np.where(better, np.maximum(damping * 0.1, 1e-14), damping * 10.0)
-        R[better], t[better], cost[better] = R_next[better], t_next[better], cost_next[better]
-        error[better], J[better] = error_next[better], J_next[better]
-        if np.abs(step).max() < _STEP:
-            break
-    return motions(R, t)
-
-
-def _misses(
-    geometry: Sequence[LegGeometry], reading: Array, R: Array, t: Array
-) -> tuple[Array, Array]:
-    """Return how far all rows are from met (n_poses, m) [m] and their derivatives by the pose."""
-    rows = pose_rows(geometry, R, t)
-    wanted = np.where(rows.measured, reading[:, rows.leg], 0.0)
-    known = np.isfinite(wanted)
-    return np.where(known, rows.values - wanted, 0.0), rows.by_pose * known[..., None]
+    lengthening = lengths - np.array([leg.q0 for leg in geometry])
+    found = solve_poses(geometry, frame_legs, *components(T_Rb_Re), lengthening)
+    return motions(found.R, found.t)

@@ -15,7 +15,7 @@ import numpy as np
 
 from legcal.calibration.joint_fit.biases import SharedShifts
 from legcal.calibration.joint_fit.choices import Choices
-from legcal.calibration.joint_fit.constraints import Start, n_bonds, with_values
+from legcal.calibration.joint_fit.constraints import Start, with_values
 from legcal.calibration.joint_fit.observations import (
     ObservedAxes,
     ObservedBoard,
@@ -38,7 +38,7 @@ from legcal.calibration.joint_fit.residuals import (
 from legcal.calibration.joint_fit.state import FittedLegs, Layout, State, components, intrinsic_of
 from legcal.data import Measurements
 from legcal.geometry import Array, IntArray
-from legcal.machine import LegGeometry, freedoms, tied_twist, tied_twist_slope, turn_slope
+from legcal.machine import LegGeometry, freedoms, n_bonds, tied_twist, tied_twist_slope, turn_slope
 from legcal.vision import (
     Camera,
     intrinsic_names,

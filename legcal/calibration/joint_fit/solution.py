@@ -74,7 +74,7 @@ class Solution:
     kinematic_covariance : (p, p) array
         Covariance of steps of all kinematic parameters from the fitted legs, as
         :func:`legcal.machine.parameters.moved_legs` and
-        :func:`legcal.machine.sensitivity.pose_sensitivity` have them (axes turn about the
+        :func:`legcal.machine.pose_sensitivity` have them (axes turn about the
         vectors of where they are); zero where they are fixed, and along what is held.
     held_covariance : (p, p) array
         How far these may be off along what is held, if the nominal model is as wrong there as the

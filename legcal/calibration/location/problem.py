@@ -99,8 +99,7 @@ def motions_by_readings(
         Standard deviation of a reading [m].
     """
     R, t = _joint_frames(mechanism, poses)
-    known = parametrization_of(mechanism)
-    equations = pose_equations(geometries(mechanism), known, R, t)
+    equations = pose_equations(geometries(mechanism), R, t)
     columns = list(freedoms(mechanism.frame_legs))
     inverse = np.linalg.pinv(equations.by_pose[:, :, columns])[:, :, equations.measured]
     moved = np.zeros((len(poses), 6, inverse.shape[2]))

@@ -496,13 +496,14 @@ def _rows_of_poses(design: OutlineDesign, sigma_q: float) -> list[Array]:
     """Return what the images and readings of each pose say of cameras, parameters and radii."""
     n_cameras, n_parameters = 6 * len(design.T_Rb_camera), len(design.parametrization)
     by_pose, by_shared = _outline_rows(design)
-    demands = pose_equations(design.legs, design.parametrization, design.R, design.t)
+    demands = pose_equations(design.legs, design.R, design.t)
+    by_parameters = demands.by_parameters(design.parametrization)
     held, read = ~demands.measured, demands.measured
     columns, pose = list(freedoms(design.frame_legs)), design.pose[design.outlines.row]
     parameters = slice(n_cameras, n_cameras + n_parameters)
     found = []
     for k in range(len(design.t)):
-        F, G = demands.by_pose[k][:, columns], demands.by_parameters[k]
+        F, G = demands.by_pose[k][:, columns], by_parameters[k]
         of_readings = np.zeros((int(read.sum()), by_shared.shape[-1]))
         of_readings[:, parameters] = G[read] / sigma_q
         seen = pose == k

@@ -38,15 +38,13 @@ from legcal.data import (
 from legcal.errors import DidNotConverge, LegcalError
 from legcal.geometry import Array
 from legcal.machine import (
-    Demand,
     KinematicParameters,
     LegGeometry,
-    LegKind,
-    demanded,
     free_coordinates,
-    freedoms,
-    parameter_names,
+    parametrize,
     point_like_legs,
+    pose_equations,
+    solve_poses,
     to_vector,
 )
 from legcal.paper import NominalMechanism, point_like_mechanism, run_steps
@@ -59,8 +57,8 @@ from legcal.simulation.machine import (
     leg_vectors,
     length_jacobian,
     perturb,
+    poses_with_lengths,
     random_poses,
-    solve_poses,
 )
 from legcal.simulation.observe import OutlineNoise, observe_outlines, outline_table
 from legcal.simulation.studies.runner import Record, failure_of, is_failure
@@ -116,7 +114,7 @@ def poses_of_readings(
     """Return the poses that other parameters compute from the readings of true poses."""
     lengths = np.linalg.norm(leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
     changed = lengths - machine.parameters.offsets + parameters.offsets
-    return solve_poses(parameters, changed, T_Rb_Re)
+    return poses_with_lengths(parameters, changed, T_Rb_Re)
 
 
 def expected_errors(machine: Machine, covariance: Array, T_Rb_Re: RigidTransform) -> PlatformErrors:
@@ -278,32 +276,22 @@ def closed_poses(
     legs: Sequence[LegGeometry], frame_legs: Sequence[int], R: Array, t: Array
 ) -> tuple[Array, Array]:
     """Return the nearest poses at which everything holds that legs demand without a reading."""
-    columns = list(freedoms(frame_legs))
-    if len(columns) < 6:
+    if len(frame_legs) < 3:
         R, t = _in_plane(legs, R, t)
-    for _ in range(_STEPS):
-        values, by_pose = unmeasured(legs, R, t)
-        if np.abs(values).max(initial=0.0) < _CLOSED:
-            return R, t
-        step = np.zeros((len(t), 6))
-        step[:, columns] = -(np.linalg.pinv(by_pose[:, :, columns]) @ values[..., None])[..., 0]
-        R, t = moved_poses(R, t, step)
+    found = solve_poses(legs, frame_legs, R, t)
+    if found.missed.max(initial=0.0) < _CLOSED:
+        return found.R, found.t
     raise DidNotConverge(
-        f"Simulated poses could not be closed: found legs {1e3 * np.abs(values).max():.2g} mm off "
+        f"Simulated poses could not be closed: found legs {1e3 * found.missed.max():.2g} mm off "
         "what they demand, needed poses that they allow; check the model's home."
     )
 
 
 def unmeasured(legs: Sequence[LegGeometry], R: Array, t: Array) -> tuple[Array, Array]:
     """Return the equations that hold without a reading, (k, m) [m], and how poses change them."""
-    values, by_pose = [np.zeros((len(t), 0))], [np.zeros((len(t), 0, 6))]
-    for leg in legs:
-        found = demanded(leg, R, t)
-        measured = [d is Demand.LENGTH and leg.kind is LegKind.ACTUATED for d in found.demands]
-        rows = np.flatnonzero(~np.array(measured, dtype=np.bool_))
-        values.append(found.values[:, rows])
-        by_pose.append(found.by_pose[:, rows])
-    return np.concatenate(values, axis=1), np.concatenate(by_pose, axis=1)
+    found = pose_equations(legs, R, t, by_local=False)
+    held = found.of(~found.measured)
+    return held.values, held.by_pose
 
 
 def moved_poses(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
@@ -530,7 +518,7 @@ class _Sums:
 def means_of(records: Iterable[Record], machines: Mapping[str, Machine]) -> PaperMeans:
     """Return the means over records, which are read once."""
     first = next(iter(machines.values()))
-    names = parameter_names(first.leg_names, first.frame_legs)
+    names = parametrize(first.leg_names, point_like_legs(first.parameters), first.frame_legs).names
     sums: dict[tuple[str, str], _Sums] = {}
     for record in records:
         for machine, found in record.items():

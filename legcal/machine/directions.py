@@ -1,0 +1,146 @@
+"""Directions of the parameter space: what they do to the platform, a sparse basis, and words."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import qr
+
+from legcal.geometry import Array
+
+SHOWN = 0.02  # of the largest component
+
+
+def split_by_motion(
+    motion: Array | None, basis: Array, length: float, harmless: float
+) -> tuple[Array, Array]:
+    """Return a space of directions as that which moves the platform and that which does not.
+
+    Parameters
+    ----------
+    motion : (k, 6, p) array or None
+        Rotation [rad] and displacement [m] of the platform at k poses by each parameter, all
+        in metres; None where the motors do not determine the pose, and everything counts.
+    basis : (w, p) array
+        Orthonormal basis of the space.
+    length : float
+        Mean leg length, by which rotations become displacements [m].
+    harmless : float
+        Motion of the platform, as a part of the change of the parameters, that counts as none.
+
+    Returns
+    -------
+    moving, still : (a, p) and (b, p) array
+        Orthonormal bases, a + b = w.
+    """
+    if motion is None or len(basis) == 0:
+        return basis, basis[:0]
+    moved = motion @ basis.T
+    moved[:, :3] *= length
+    flat = moved.reshape(-1, len(basis)) / np.sqrt(len(moved))
+    singular, turn = np.linalg.eigh(flat.T @ flat)
+    still = singular < harmless**2
+    return turn.T[~still] @ basis, turn.T[still] @ basis
+
+
+def sparse_basis(basis: Array) -> Array:
+    """Return a basis of the same space in which each direction has a parameter for itself."""
+    if len(basis) == 0:
+        return basis
+    _, upper, order = qr(basis, mode="economic", pivoting=True)
+    w = len(basis)
+    sparse = np.zeros_like(basis)
+    sparse[:, order] = np.linalg.solve(upper[:, :w], upper)
+    sparse[np.abs(sparse) < 1e-9] = 0.0
+    first = np.argmax(np.abs(sparse) > SHOWN * np.abs(sparse).max(axis=1, keepdims=True), axis=1)
+    return np.asarray(sparse[np.argsort(first, kind="stable")])
+
+
+_MOST_GROUPS = 4  # of joints in one direction
+_NOUN = {
+    "base": ("base joint", "base joints"),
+    "platform": ("platform joint", "platform joints"),
+    "offset": ("offset of leg", "offsets of legs"),
+    "length": ("length of leg", "lengths of legs"),
+    "base_axis": ("base axis of leg", "base axes of legs"),
+    "platform_axis": ("platform axis of leg", "platform axes of legs"),
+    "twist": ("twist of leg", "twists of legs"),
+    "radius": ("radius of leg", "radii of legs"),
+    "": ("camera", "cameras"),
+}
+
+
+def joined(words: Sequence[str]) -> str:
+    """Return words as a list in a sentence."""
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
+    """Return what to call each leg after the word leg: its number where its name is one."""
+    numbers = [re.fullmatch(r"[Ll]eg[_-]?(\d+)", name) for name in leg_names]
+    labels = {
+        name: match.group(1) if match else name
+        for name, match in zip(leg_names, numbers, strict=True)
+    }
+    return labels if len(set(labels.values())) == len(labels) else {name: name for name in labels}
+
+
+def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
+    """Return a combination of parameters in words.
+
+    Parameters
+    ----------
+    parameters : sequence of str
+        Names of the parameters that change.
+    leg_names : sequence of str
+        All legs.
+
+    Returns
+    -------
+    str
+        ``z of platform joints 2 and 4 together``, ``offset of leg 3``, ``fx of camera c1``.
+    """
+    coordinates: dict[tuple[str, str], list[str]] = {}
+    for name in parameters:
+        owner, kind, which = _split(name, leg_names)
+        coordinates.setdefault((kind, owner), []).append(which)
+    groups: dict[tuple[str, str], list[str]] = {}
+    for (kind, owner), found in coordinates.items():
+        axes = joined(sorted(found))
+        if kind == "radius":  # a tube and a rod of one leg
+            axes = ""
+        elif kind.endswith("_axis"):
+            axes = f"angle{'s' * (len(found) > 1)} {axes}"
+        groups.setdefault((kind, axes), []).append(owner)
+    phrases = []
+    for (kind, axes), owners in groups.items():
+        noun = _NOUN[kind][len(owners) > 1]
+        ordered = _labelled(owners, leg_names)
+        phrases.append(f"{axes + ' of ' if axes else ''}{noun} {joined(ordered)}")
+    if len(phrases) > _MOST_GROUPS:
+        more = len(phrases) - _MOST_GROUPS + 1
+        phrases = [*phrases[: _MOST_GROUPS - 1], f"{more} more such changes"]
+    together = " together" if len(coordinates) > 1 else ""
+    return f"{joined(phrases)}{together}"
+
+
+def _labelled(owners: Sequence[str], leg_names: Sequence[str]) -> list[str]:
+    """Return what to call legs, in their order, or cameras."""
+    labels = leg_labels(leg_names)
+    legs = [labels[name] for name in leg_names if name in owners]
+    return [*legs, *(owner for owner in owners if owner not in leg_names)]
+
+
+def _split(name: str, leg_names: Sequence[str]) -> tuple[str, str, str]:
+    """Return leg, kind and coordinate of a parameter, or view, nothing and coordinate.
+
+    Names of legs may contain dots.
+    """
+    leg = max((n for n in leg_names if name.startswith(f"{n}.")), key=len, default="")
+    kind, _, which = name[len(leg) + 1 :].partition(".")
+    if leg and kind in _NOUN:
+        return leg, kind, which
+    view, _, which = name.rpartition(".")
+    return view, "", which

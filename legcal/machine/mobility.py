@@ -1,0 +1,178 @@
+"""How the closed machine can move: mobility, free motions of its joints, and singularities.
+
+The closures leave a null space of joint rates; the mobility is the rank of the twist that it gives
+the platform. What is left of the null space moves no platform: legs with an S joint at both ends
+spin about themselves. Dependent closures (a planar machine welded in space) do not change it.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.geometry import Array
+from legcal.machine.equations import demands_at, is_constrained
+from legcal.machine.model import Mechanism
+from legcal.machine.solver import solve
+
+CLOSED = 1e-12  # [m], and [rad] for frames
+RANK_TOLERANCE = 1e-7  # of the largest singular value, lengths and angles made comparable
+STEP = 0.05  # [rad], and of a leg length
+CONFIGURATIONS = 3
+SURE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity between J0 and J1
+
+
+def leg_scale(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
+    """Return the mean length of the legs at a pose [m]."""
+    B = T_base_platform.apply(mechanism.B_platform)
+    return float(np.linalg.norm(B - mechanism.A_base, axis=1).mean())
+
+
+def mobility(mechanism: Mechanism) -> int:
+    """Return the freedoms of the platform; the motors determine it where they are as many.
+
+    The rank is taken where the closures have their largest, at closed configurations near home too,
+    because a symmetric pose may be singular.
+    """
+    found = [freedoms_at(mechanism, c) for c in generic_configurations(mechanism, CONFIGURATIONS)]
+    return min(found)[1]
+
+
+def freedoms_at(mechanism: Mechanism, configuration: Array) -> tuple[int, int]:
+    """Return the freedoms of all joints and of the platform alone at a closed configuration."""
+    null_space = free_motions(mechanism, configuration)
+    twist = mechanism.chain.twist(mechanism.base, mechanism.platform) @ null_space
+    twist[:3] /= leg_scale(mechanism, mechanism.home)
+    values = np.linalg.svd(twist, compute_uv=False)
+    return null_space.shape[1], int(np.sum(values > RANK_TOLERANCE))
+
+
+def generic_configurations(mechanism: Mechanism, count: int) -> Iterator[Array]:
+    """Yield home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
+    chain = mechanism.chain
+    yield mechanism.home_configuration
+    rng = np.random.default_rng(1965)
+    unit = _column_units(mechanism)
+    jacobian = chain.linearize(mechanism.home_configuration)[1] * unit
+    inverse = np.linalg.pinv(jacobian, rcond=RANK_TOLERANCE)
+    for _ in range(count - 1):
+        direction = rng.normal(size=chain.nv)
+        direction -= inverse @ (jacobian @ direction)
+        size = float(np.abs(direction).max())
+        if size < RANK_TOLERANCE:
+            return  # nothing moves
+        step = STEP * unit * direction / size
+        configuration = project(mechanism, chain.integrate(mechanism.home_configuration, step))
+        if configuration is not None:
+            yield configuration
+
+
+def project(mechanism: Mechanism, configuration: Array) -> Array | None:
+    """Return the closed configuration nearest to one that is almost closed, None if none is."""
+    chain = mechanism.chain
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        return residual[None], jacobian[None]
+
+    found = solve(
+        equations,
+        lambda points, step: chain.integrate(points[0], step[0])[None],
+        configuration[None],
+        met=0.01 * CLOSED,
+        unit=_column_units(mechanism),
+        steps=15,
+    )
+    return found.points[0] if found.worst[0] < CLOSED else None
+
+
+def free_motions(mechanism: Mechanism, configuration: Array) -> Array:
+    """Return a basis (nv, k) of the tangent steps that keep all loops closed, idle spins too.
+
+    It is orthonormal with lengths in leg lengths.
+    """
+    units = _column_units(mechanism)
+    jacobian = mechanism.chain.linearize(configuration)[1] * units
+    row, scale = 0, leg_scale(mechanism, mechanism.home)
+    for closure in mechanism.chain.closures:
+        jacobian[row : row + 3] /= scale
+        row += closure.rows
+    _, values, right = np.linalg.svd(jacobian)
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0])) if len(values) else 0
+    return np.asarray(units[:, None] * right[rank:].T)
+
+
+def _column_units(mechanism: Mechanism) -> Array:
+    """Return what turns tangent steps without a unit into [m] and [rad]."""
+    units = np.full(mechanism.chain.nv, leg_scale(mechanism, mechanism.home))
+    units[mechanism.chain.rotation_columns()] = 1.0
+    return units
+
+
+def singularity(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
+    """Return the smallest singular value of the dimensionless Jacobian of the legs' equations.
+
+    Rows are the lengths of actuated and constant legs and all other demands, counted at the end
+    of their leg; columns are a rotation about the mean of the platform joints and a displacement.
+    Lengths are measured in mean leg lengths at the pose, angles in radian, so that the number has
+    no unit and does not depend on the size of the machine or on the frames of its links.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The machine.
+    T_base_platform : RigidTransform
+        A pose; its readings need not be inside the travel.
+
+    Returns
+    -------
+    float
+        Zero at a singular pose, and wherever the motors do not determine the pose; of the order
+        of the platform's size in leg lengths at a good one.
+    """
+    jacobian = dimensionless(mechanism, T_base_platform)
+    if len(jacobian) < 6:
+        return 0.0
+    return float(np.linalg.svd(jacobian, compute_uv=False)[5])
+
+
+def side(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
+    """Return the sign of the determinant of the legs' equations where they are square, else 0.
+
+    Between two poses of different sign lies a singularity.
+    """
+    rows = dimensionless(mechanism, T_base_platform)
+    return float(np.sign(np.linalg.det(rows))) if len(rows) == 6 else 0.0
+
+
+def dimensionless(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+    """Return the Jacobian of :func:`singularity`, (n_rows, 6): rotation, displacement."""
+    matrix = T_base_platform.as_matrix()
+    turned = mechanism.B_platform @ matrix[:3, :3].T
+    vectors = turned + matrix[:3, 3] - mechanism.A_base
+    lengths = np.linalg.norm(vectors, axis=1)
+    if is_constrained(mechanism):
+        jacobian = demands_at(mechanism, T_base_platform).by_pose[0]
+        gradient, moment, centre = jacobian[:, 3:], jacobian[:, :3], turned.mean(axis=0)
+        return np.hstack([(moment - np.cross(centre, gradient)) / lengths.mean(), gradient])
+    motors = list(mechanism.motors)  # lines alone; arm x u is written out, np.cross is slow
+    arms = (turned - turned.mean(axis=0))[motors] / lengths.mean()
+    u = (vectors / lengths[:, None])[motors]
+    (x, y, z), (a, b, c) = arms.T, u.T
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
+
+
+def hardly_changes(known: Array, jacobian: Array) -> bool:
+    """Say whether two Jacobians differ too little for one of smaller rank between them."""
+    difference = jacobian - known
+    if known.shape[0] == known.shape[1]:
+        try:
+            change = np.linalg.solve(known, difference)
+        except np.linalg.LinAlgError:
+            change = np.full_like(known, np.inf)
+        if float(np.abs(change).sum(axis=1).max()) < SURE:
+            return True
+    left, values, right = np.linalg.svd(known, full_matrices=False)
+    rank = int(np.sum(values > 1e-6 * values[0]))
+    change = (left[:, :rank].T @ difference @ right[:rank].T) / values[:rank, None]
+    return float(np.linalg.norm(change, 2)) < SURE

@@ -1,0 +1,190 @@
+"""Steps to where equations are met, for many points of a manifold at once.
+
+One solver for platform poses and for configurations of the closed chain: Gauss-Newton steps of
+least norm, damped where they do not lead downhill (Levenberg-Marquardt). Where a solution has to be
+the one that belongs to the start, steps are not damped but must shrink; :func:`walk` then divides
+the way.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from legcal.geometry import Array, BoolArray
+
+Equations = Callable[[Array], tuple[Array, Array]]  # points (k, ...) to (k, m) and (k, m, n)
+Retraction = Callable[[Array, Array], Array]  # points (k, ...) and steps (k, n) to points
+
+RANK = 1e-9  # of the largest singular value: what is smaller counts as dependent
+FIRST_DAMPING, UNDAMPED, HOPELESS = 1e-3, 1e-12, 1e6  # of the mean eigenvalue
+LEAST_STEP = 1e-14  # of the unit
+PATIENCE = 5  # steps that change little
+LARGEST_TURN = 0.5  # [rad] in one step of a pose
+
+
+class Solved(NamedTuple):
+    """Where steps ended."""
+
+    points: Array  # (k, ...)
+    values: Array  # (k, m) what is left
+    jacobian: Array  # (k, m, n)
+    size: Array  # (k,) the largest component of the last step, in its unit
+    arrived: BoolArray  # (k,) equations met, or at rest where they are met best
+
+    @property
+    def worst(self) -> Array:
+        """The largest of what is left, (k,)."""
+        return np.asarray(np.abs(self.values).max(axis=1, initial=0.0))
+
+
+def solve(
+    equations: Equations,
+    retract: Retraction,
+    points: Array,
+    *,
+    met: Array | float,
+    unit: Array | float = 1.0,
+    rank: float = RANK,
+    far: bool = False,
+    steps: int = 60,
+    patience: int | None = None,
+) -> Solved:
+    """Return the points (k, ...) to which damped steps lead.
+
+    *met* is what may be left of the equations; *unit* (n,) divides the components of steps before
+    their size counts. Steps are damped from the first where the start is *far*, else where one does
+    not lead downhill. With *patience* points are given up that hardly improve.
+    """
+    points = points.copy()
+    values, jacobian = equations(points)
+    cost = np.einsum("km,km->k", values, values)
+    damping = np.minimum(FIRST_DAMPING if far else 0.0, cost)
+    size = np.zeros(len(points))
+    stuck = np.zeros(len(points), dtype=np.intp)
+    moving = np.ones(len(points), dtype=np.bool_)
+    for _ in range(steps):
+        worst = np.abs(values).max(axis=1, initial=0.0)
+        moving &= worst > met
+        if not moving.any():
+            break
+        step = np.zeros((len(points), jacobian.shape[2]))
+        step[moving] = _damped(jacobian[moving] * unit, values[moving], damping[moving], rank)
+        size[moving] = np.abs(step[moving]).max(axis=1, initial=0.0)
+        trial = retract(points, step * unit)
+        ahead, slopes = equations(trial)
+        ahead_cost = np.einsum("km,km->k", ahead, ahead)
+        better = moving & (ahead_cost < cost)
+        if patience is not None:
+            stuck = np.where(better, np.where(ahead_cost > 0.9 * cost, stuck + 1, 0), stuck)
+            moving &= stuck <= patience
+        points[better], values[better], jacobian[better] = (
+            trial[better], ahead[better], slopes[better]
+        )  # fmt: skip
+        cost[better] = ahead_cost[better]
+        at_rest = (worst < 100.0 * met) | (size < LEAST_STEP) | (damping > HOPELESS)
+        moving &= better | ~at_rest
+        damping = np.where(better, 0.1 * damping, np.maximum(10.0 * damping, 1e-8))
+    return Solved(points, values, jacobian, size, ~moving)
+
+
+def newton(
+    equations: Equations,
+    retract: Retraction,
+    points: Array,
+    *,
+    met: float,
+    contraction: float,
+    first: float = 1.0,
+    unit: Array | float = 1.0,
+    steps: int = 12,
+) -> Solved:
+    """Return the points to which steps lead that shrink from one to the next.
+
+    *first* bounds the first step by the same *contraction*. What did not shrink has not arrived,
+    unless it is met already.
+    """
+    values, jacobian = equations(points)
+    previous = np.full(len(points), first)
+    arrived, moving = np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)
+    for _ in range(steps):
+        ok = np.abs(values).max(axis=1, initial=0.0) < met
+        arrived |= moving & ok
+        moving &= ~ok
+        if not moving.any():
+            break
+        step = np.zeros((len(points), jacobian.shape[2]))
+        step[moving] = -_least(jacobian[moving] * unit, values[moving], RANK)
+        size = np.abs(step).max(axis=1, initial=0.0)
+        moving &= size <= contraction * previous
+        if not moving.any():
+            break
+        step[~moving] = 0.0
+        points = retract(points, step * unit)
+        previous = np.where(moving, size, previous)
+        values, jacobian = equations(points)
+        still = moving & (size < met)
+        arrived |= still
+        moving &= ~still
+    return Solved(points, values, jacobian, previous, arrived)
+
+
+def walk(attempt: Callable[[float], bool], shortest: float) -> float:
+    """Return which part of a way is done, walked in steps that are halved where one fails.
+
+    ``attempt(part)`` tries to reach a part of the way from where the last successful one ended; no
+    step is shorter than a part *shortest* of the way.
+    """
+    done, step = 0.0, 1.0
+    while done < 1.0:
+        wanted = min(done + step, 1.0)
+        if attempt(wanted):
+            done, step = wanted, 2.0 * step
+        else:
+            step *= 0.5
+            if step < shortest:
+                break
+    return done
+
+
+def moved(poses: Array, step: Array) -> Array:
+    """Return poses (k, 3, 4), rotation beside position, after rotations and displacements (k, 6).
+
+    Steps that turn far are shortened.
+    """
+    turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+    step = step * np.minimum(1.0, LARGEST_TURN / np.maximum(turn, 1e-300))
+    R = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :, :3]
+    return np.concatenate([R, (poses[:, :, 3] + step[:, 3:])[..., None]], axis=2)
+
+
+def _damped(jacobian: Array, values: Array, damping: Array, rank: float) -> Array:
+    """Return steps (k, n), damped by parts of the mean eigenvalue."""
+    n = jacobian.shape[2]
+    step = np.zeros((len(values), n))
+    free = damping < UNDAMPED
+    if free.any():
+        step[free] = -_least(jacobian[free], values[free], rank)
+    if not free.all():
+        J = jacobian[~free]
+        normal = np.swapaxes(J, 1, 2) @ J
+        mean = np.maximum(np.trace(normal, axis1=1, axis2=2) / max(n, 1), 1e-12)
+        normal += (damping[~free] * mean)[:, None, None] * np.eye(n)
+        gradient = np.einsum("kmn,km->kn", J, values[~free])
+        step[~free] = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+    return step
+
+
+def _least(jacobian: Array, values: Array, rank: float) -> Array:
+    """Return the shortest solutions (k, n) of linear equations, or of those that are met best."""
+    if len(values) == 1 and jacobian.shape[1] == jacobian.shape[2]:
+        try:
+            change = np.linalg.solve(jacobian, values[..., None])[..., 0]
+            if np.abs(change).max(initial=0.0) < 1.0:
+                return np.asarray(change)
+        except np.linalg.LinAlgError:
+            pass
+    if len(values) == 1:
+        return np.asarray(np.linalg.lstsq(jacobian[0], values[0], rcond=rank)[0][None])
+    return np.asarray((np.linalg.pinv(jacobian, rcond=rank) @ values[..., None])[..., 0])
