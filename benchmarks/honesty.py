@@ -22,8 +22,8 @@ import numpy as np
 
 from legcal import calibrate, load_mechanism
 from legcal.calibration.joint_fit.biases import KINDS
-from legcal.calibration.joint_fit.state import components
 from legcal.calibration.verdict import Calibration
+from legcal.geometry import components
 from legcal.geometry.types import Array
 from legcal.machine import Mechanism, geometries, pose_sensitivity, vector_of
 from legcal.simulation.session import simulate

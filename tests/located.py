@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.location.model import Frames, PosePairs, ToolPoses, predicted, turned
+from legcal.calibration.location.model import Frames, PosePairs, ToolPoses, predicted
+from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array
 from legcal.machine import (
     Configurations,
@@ -73,7 +74,7 @@ def located(
     else:
         q = np.array([inverse_kinematics(mechanism, T) for T in platform])
     tools = [BASE * T * TOOL for T in platform]
-    turn = turned(noise * SIGMA_ANGLE * chance.normal(size=(len(tools), 3)))
+    turn = rotation_matrices(noise * SIGMA_ANGLE * chance.normal(size=(len(tools), 3)))
     poses = ToolPoses(
         q=q,
         position=np.array([T.translation for T in tools])
@@ -96,7 +97,7 @@ def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> 
 def pairs_at(base: RigidTransform, tool: RigidTransform, n: int = 8, seed: int = 0) -> PosePairs:
     """Return exact tool poses of a platform that goes anywhere within 0.1 m and 30 degrees."""
     chance = np.random.default_rng(seed)
-    R = turned(chance.uniform(-0.5, 0.5, (n, 3)))
+    R = rotation_matrices(chance.uniform(-0.5, 0.5, (n, 3)))
     t = chance.uniform(-0.1, 0.1, (n, 3)) + np.array([0.0, 0.0, 0.4])
     blank = PosePairs(R, t, np.tile(np.eye(3), (n, 1, 1)), t, np.ones(n, dtype=np.bool_), 0.1)
     M, p = predicted(frames_of(base, tool), blank)
@@ -108,7 +109,7 @@ def noisy(pairs: PosePairs, chance: np.random.Generator) -> PosePairs:
     return replace(
         pairs,
         p=pairs.p + SIGMA_POSITION * chance.normal(size=(n, 3)),
-        M=turned(SIGMA_ANGLE * chance.normal(size=(n, 3))) @ pairs.M,
+        M=rotation_matrices(SIGMA_ANGLE * chance.normal(size=(n, 3))) @ pairs.M,
     )
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.constraints import Start, start_from
-from legcal.calibration.joint_fit.state import FittedLegs, components, fitted_legs, motions
+from legcal.calibration.joint_fit.state import FittedLegs, fitted_legs
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
+from legcal.geometry import components, motions_of
 from legcal.geometry.types import Array
 from legcal.machine import (
     LegGeometry,
@@ -133,7 +134,7 @@ def machine_session(
         _readings(mechanism, legs, R, t),
         SIGMA_Q,
     )
-    truth = Start(legs, T_camera_Rb, motions(R, t), "truth")
+    truth = Start(legs, T_camera_Rb, motions_of(R, t), "truth")
     away = _wrong(fitted, legs, length, angle, rng)
     home = (platform_in_base(mechanism, mechanism.home),) * len(t)
     rough = tuple(_shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.motions import roll_pitch_yaw
+from legcal.geometry import roll_pitch_yaw
 from legcal.machine import (
     LegKind,
     forward_kinematics,

@@ -20,10 +20,11 @@ from legcal.calibration.joint_fit.held_out import (
     compare_held_out,
     poses_by_outlines,
 )
-from legcal.calibration.joint_fit.state import FittedLegs, motions
+from legcal.calibration.joint_fit.state import FittedLegs
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.estimation.noise import NoiseModel
+from legcal.geometry import motions_of
 from legcal.machine import LegGeometry
 from legcal.simulation.studies.outlines import Noise, StartErrors, design_of, draw_session
 
@@ -52,7 +53,7 @@ def _truth(name: str) -> Truth:
     legs = FittedLegs(design.leg_names, design.legs, design.sign, design.frame_legs, design.radii)
     problem = build_fit(legs, session.measurements, session.outlines)
     cameras = tuple(T.inv() for T in design.T_Rb_camera)
-    poses = motions(design.R, design.t)
+    poses = motions_of(design.R, design.t)
     state = problem.begin(Start(design.legs, cameras, poses, "truth"))
     possible = possible_shifts(problem.outlines, legs.names)
     nothing = np.zeros((problem.layout.n_kept, problem.layout.n_kept))

@@ -18,8 +18,9 @@ from located import (
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import locate
-from legcal.calibration.location.model import ToolPoses, turned
+from legcal.calibration.location.model import ToolPoses
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
+from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array
 
 
@@ -307,7 +308,7 @@ def test_too_many_rows_that_disagree_are_refused_and_named() -> None:
     chance = np.random.default_rng(7)
     position, rotation = made.poses.position.copy(), made.poses.rotation.copy()
     position[:4] += chance.normal(size=(4, 3)) * 5e-3
-    rotation[:4] = turned(0.02 * chance.normal(size=(4, 3))) @ rotation[:4]
+    rotation[:4] = rotation_matrices(0.02 * chance.normal(size=(4, 3))) @ rotation[:4]
     with pytest.raises(DatasetError, match=r"4 of 12 rows that disagree.*\(1, 2, 3, 4\)"):
         locate(made.mechanism, replace(made.poses, position=position, rotation=rotation))
 

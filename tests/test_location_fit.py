@@ -29,9 +29,9 @@ from legcal.calibration.location.model import (
     jacobian,
     predicted,
     residuals,
-    turned,
 )
 from legcal.calibration.location.problem import PlatformMotions, motions_by_readings
+from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array
 from legcal.machine import forward_kinematics
 
@@ -194,7 +194,9 @@ def normalised_squares(
         pairs = noisy(exact, chance)
         if motions is not None:
             moved = motions.of_tool(truth, exact) @ chance.normal(size=motions.turn.shape[2])
-            pairs = replace(pairs, p=pairs.p + moved[:, :3], M=turned(moved[:, 3:]) @ pairs.M)
+            pairs = replace(
+                pairs, p=pairs.p + moved[:, :3], M=rotation_matrices(moved[:, 3:]) @ pairs.M
+            )
         found = fit(pairs, truth.moved(1e-3 * chance.normal(size=12)), of(noise, 12), motions)
         error = frame_errors(found.frames, BASE, TOOL) / pairs.scale
         nse.append(error @ found.information @ error / 12.0)

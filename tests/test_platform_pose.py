@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotIdentifiable
+from legcal.geometry import register_groups, register_in_plane
 from legcal.geometry.types import Array, IntArray
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.platform_pose import (
@@ -19,13 +20,7 @@ from legcal.paper.platform_pose import (
     register_by_rays,
 )
 from legcal.paper.platform_problem import turned_axis, turns_of
-from legcal.paper.solver import (
-    moved,
-    register_groups,
-    register_in_plane,
-    structure_jacobian,
-    structure_residuals,
-)
+from legcal.paper.solver import moved, structure_jacobian, structure_residuals
 
 B_RE = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.1, 0.25, 0.0], [0.2, 0.1, 0.05]])
 N_POSES = 3

@@ -19,8 +19,9 @@ from legcal.calibration.joint_fit.normal import information
 from legcal.calibration.joint_fit.problem import linearize, named_values
 from legcal.calibration.joint_fit.rounds import first_minimum
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, FittedLegs, State, components
+from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, FittedLegs, State
 from legcal.estimation.noise import NoiseModel
+from legcal.geometry import components
 from legcal.geometry.types import Array
 from legcal.machine import parametrize, radius_name
 

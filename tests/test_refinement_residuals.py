@@ -18,8 +18,9 @@ from legcal.calibration.joint_fit.residuals import (
     outline_residual,
     prior_residual,
 )
-from legcal.calibration.joint_fit.state import State, cayley, turned
+from legcal.calibration.joint_fit.state import State
 from legcal.estimation.loss import cost_of, efficiency, weights, width_to_k
+from legcal.geometry import cayley, turned
 from legcal.geometry.types import Array
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis

@@ -14,6 +14,7 @@ from mechanisms import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
+from legcal.geometry import segment_distance
 from legcal.geometry.types import Array
 from legcal.machine import (
     REGULAR,
@@ -27,14 +28,7 @@ from legcal.machine import (
     singularity,
 )
 from legcal.machine.mobility import side
-from legcal.simulation.poses import (
-    JITTER,
-    Clearance,
-    are_extreme,
-    draw_poses,
-    given_poses,
-    segment_distance,
-)
+from legcal.simulation.poses import JITTER, Clearance, are_extreme, draw_poses, given_poses
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel

@@ -8,13 +8,12 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge
+from legcal.geometry import register_groups, register_points
 from legcal.paper.solver import (
     LeastSquares,
     Term,
     moved,
     moved_points,
-    register_groups,
-    register_points,
     solve_least_squares,
     structure_jacobian,
     structure_residuals,

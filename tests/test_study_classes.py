@@ -15,8 +15,8 @@ from test_cli import run
 
 from legcal.calibration.joint_fit.constraints import Start
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import components, motions
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
+from legcal.geometry import components, motions_of
 from legcal.machine import LegGeometry, load_mechanism, platform_in_base, vector_of
 from legcal.machine.files import shipped_names
 from legcal.simulation.studies import classes
@@ -121,7 +121,7 @@ def test_the_machine_that_stands_where_the_fit_holds_shows_the_same_as_the_true_
     xi, truth = (vector_of(design.parametrization, d.legs, design.legs) for d in (there, design))
     assert np.abs(xi - truth).max() > 1e-3  # far off, in what nothing shows
     cameras = tuple(T.inv() for T in there.T_Rb_camera)
-    stands = Start(there.legs, cameras, motions(there.R, there.t), "there")
+    stands = Start(there.legs, cameras, motions_of(there.R, there.t), "there")
     shown = shown_outlines(there.radii, session.measurements, stands)
     ends = design.camera.undistort(design.outlines.ends)
     assert np.abs(design.camera.line_offset(shown.h[:, None], ends)).max() < 1e-7  # [px]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
 from legcal.errors import ModelError, UsageError
-from legcal.geometry.motions import roll_pitch_yaw
+from legcal.geometry import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine import (
     Demand,

@@ -32,7 +32,6 @@ from .joint_fit.platform import poses_at_readings as poses_at_readings
 from .joint_fit.solution import Solution as Solution
 from .joint_fit.state import FittedLegs as FittedLegs
 from .joint_fit.state import RefinementSettings as RefinementSettings
-from .joint_fit.state import components as components
 from .location.document import LOCATION_FILE as LOCATION_FILE
 from .location.document import load_location as load_location
 from .location.document import location_document as location_document

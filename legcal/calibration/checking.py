@@ -23,7 +23,6 @@ from legcal.calibration.joint_fit import (
     PlatformPair,
     Prior,
     Solution,
-    components,
     in_file_order,
     known_parameters,
 )
@@ -32,7 +31,7 @@ from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.estimation import NoiseModel
 from legcal.files import Document
-from legcal.geometry import Array
+from legcal.geometry import Array, components
 from legcal.machine import (
     Mechanism,
     Parametrization,

@@ -17,7 +17,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.joint_fit import (
     Choices,
     FittedLegs,
-    components,
     fitted_legs,
     start_from,
 )
@@ -38,7 +37,7 @@ from legcal.data import (
     store_outlines,
 )
 from legcal.errors import DatasetError
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, components
 from legcal.machine import (
     LegGeometry,
     Mechanism,

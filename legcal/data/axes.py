@@ -26,7 +26,7 @@ from legcal.data.outlines import Outlines
 from legcal.data.rows import Rows
 from legcal.errors import NotVisible
 from legcal.files import Column, format_table, read_table, write_atomically
-from legcal.geometry import Array, IntArray, normal_basis
+from legcal.geometry import Array, IntArray, nearest_point_to_line, normal_basis
 from legcal.vision import (
     Camera,
     angles_of_direction,
@@ -119,7 +119,9 @@ def axes_from_outlines(
     u, M = axis_of_outlines(h[:, 0], h[:, 1], radius)
     view = measurements.view[outlines.row[pairs[:, 0]]]
     rays, h_of_offset = _end_rays_and_derivatives(outlines, pairs, view, measurements)
-    M = _nearest_point_to_ray(u, M, rays.mean(axis=(1, 2)))
+    middle = rays.mean(axis=(1, 2))
+    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+    M = nearest_point_to_line(u, M, middle, np.zeros(3))
     basis = normal_basis(u)
     derivative = axis_derivative(h, h_of_offset, u, M, basis)
     offsets = np.zeros((len(pairs), 4, 4))
@@ -258,14 +260,6 @@ def outline_derivative(
     direction = np.cross(np.broadcast_to(h[..., None, :], rays.shape), other)
     scale = -moved / np.sum(direction * rays, axis=-1)
     return rays, direction * scale[..., None]
-
-
-def _nearest_point_to_ray(u: Array, M: Array, ray: Array) -> Array:
-    """Return the point of each axis nearest to a ray through the camera centre."""
-    d = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    across = u - d * np.sum(u * d, axis=-1, keepdims=True)
-    t = -np.sum(across * M, axis=-1) / np.sum(across * across, axis=-1)
-    return np.asarray(M + t[:, None] * u)
 
 
 def axes_of_table(

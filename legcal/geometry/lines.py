@@ -53,3 +53,31 @@ def normal_basis(
     ahead, behind = [1, 2, 0], [2, 0, 1]  # np.cross is slow on single vectors
     e2[...] = u[..., ahead] * e1[..., behind] - u[..., behind] * e1[..., ahead]
     return basis
+
+
+def nearest_point_to_line(u: Array, M: Array, d: Array, P: Array) -> Array:
+    """Return the point of each line (u, M) that is nearest to a line along d through P.
+
+    All are (..., 3), u and d unit directions that are not parallel.
+    """
+    across = u - d * np.sum(u * d, axis=-1, keepdims=True)
+    t = np.sum(across * (P - M), axis=-1) / np.sum(across * across, axis=-1)
+    return np.asarray(M + t[..., None] * u)
+
+
+def segment_distance(start_1: Array, span_1: Array, start_2: Array, span_2: Array) -> Array:
+    """Return the distance of pairs of straight pieces start + s span, 0 <= s <= 1."""
+
+    def dot(one: Array, other: Array) -> Array:
+        return np.asarray(np.einsum("ni,ni->n", one, other))
+
+    between = start_1 - start_2
+    a, e, b = dot(span_1, span_1), dot(span_2, span_2), dot(span_1, span_2)
+    c, f = dot(span_1, between), dot(span_2, between)
+    square = a * e - b * b
+    lines_cross = square > 1e-12 * a * e
+    s = np.where(lines_cross, (b * f - c * e) / np.where(lines_cross, square, 1.0), 0.0)
+    s = np.clip(s, 0.0, 1.0)
+    t = np.clip((b * s + f) / e, 0.0, 1.0)
+    s = np.clip((b * t - c) / a, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(between + s[:, None] * span_1 - t[:, None] * span_2, axis=1))

@@ -1,11 +1,12 @@
-"""Rigid motions."""
+"""Rigid motions, as transforms or batched as (R, t), and the ones that lay points on points."""
+
+from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array
-
-_ONE = np.eye(3)
+from legcal.geometry.rotations import nearest_rotation, orthogonal, rotation_matrices
+from legcal.geometry.types import Array, IntArray
 
 
 def frame_on_points(
@@ -42,7 +43,7 @@ def motion_of(
     time of reading a model.
     """
     matrix = np.zeros((*R.shape[:-2], 4, 4))
-    matrix[..., :3, :3] = R @ (1.5 * _ONE - 0.5 * (np.swapaxes(R, -1, -2) @ R))
+    matrix[..., :3, :3] = orthogonal(R)
     matrix[..., :3, 3] = t
     matrix[..., 3, 3] = 1.0
     return RigidTransform(matrix, normalize=False, copy=False)
@@ -56,17 +57,91 @@ def product(*motions: RigidTransform) -> RigidTransform:
     return motion_of(matrix[..., :3, :3], matrix[..., :3, 3])
 
 
-def roll_pitch_yaw(
-    rotation: Array,  # (3, 3) rotation matrix
-) -> Array:
-    """Return the angles of a rotation about fixed x, y, z, (3,) [rad], to rounding everywhere.
+def motions_of(R: Array, t: Array) -> tuple[RigidTransform, ...]:
+    """Return rigid motions of rotation matrices (n, 3, 3) and translations (n, 3) [m]."""
+    return tuple(motion_of(R, t)) if len(R) else ()
 
-    Near a pitch of 90 degrees the yaw is badly determined: whatever it comes out as, the roll
-    makes up for it.
+
+def components(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
+    """Return rotation matrices (n, 3, 3) and translations (n, 3) of motions."""
+    T = np.array([T.as_matrix() for T in motions]).reshape(-1, 4, 4)
+    return T[:, :3, :3].copy(), T[:, :3, 3].copy()
+
+
+def register_points(P_from: Array, P_to: Array) -> RigidTransform:
+    """Return the rigid motion that lays points on points best, unweighted, in closed form.
+
+    A mirror is never returned, and coplanar points are enough.
+
+    Parameters
+    ----------
+    P_from, P_to : (n, 3) array
+        The same points in two frames [m], at least three and not collinear.
+
+    Returns
+    -------
+    RigidTransform
+        T_to_from.
     """
-    r = rotation
-    yaw = np.arctan2(r[1, 0], r[0, 0])
-    s, c = np.sin(yaw), np.cos(yaw)
-    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
-    roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
-    return np.array([roll, pitch, yaw])
+    R, t = register_groups(P_from, P_to, np.zeros(len(P_from), dtype=np.intp))
+    return RigidTransform.from_components(t[0], Rotation.from_matrix(R[0]))
+
+
+def register_groups(
+    P_from: Array, P_to: Array, group: IntArray, weight: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the motion of :func:`register_points` for each group of points.
+
+    Parameters
+    ----------
+    P_from, P_to : (n, 3) array
+        The same points in two frames [m].
+    group : (n,) array of int
+        The group of each point: 0, 1 and so on.
+    weight : (n,) array, optional
+        Weight of each point; all weigh the same without it.
+
+    Returns
+    -------
+    (n_groups, 3, 3) array, (n_groups, 3) array
+        Rotation matrix and translation [m] of T_to_from.
+    """
+    arm_from, arm_to, centre_from, centre_to, weight = _arms(P_from, P_to, group, weight)
+    moment = np.zeros((len(centre_to), 3, 3))
+    np.add.at(moment, group, weight[:, None, None] * arm_to[:, :, None] * arm_from[:, None, :])
+    R = nearest_rotation(moment)
+    return R, centre_to - np.einsum("gij,gj->gi", R, centre_from)
+
+
+def register_in_plane(
+    P_from: Array, P_to: Array, group: IntArray, weight: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the motion in the plane z = 0 that lays points on points best, for each group.
+
+    Two points are enough; heights are not looked at. Otherwise as :func:`register_groups`.
+    """
+    arm_from, arm_to, centre_from, centre_to, weight = _arms(P_from, P_to, group, weight)
+    (x, y), (i, j) = arm_from.T[:2], arm_to.T[:2]
+    sine, cosine = (
+        np.bincount(group, weights=weight * part) for part in (x * j - y * i, x * i + y * j)
+    )
+    R = rotation_matrices(np.arctan2(sine, cosine)[:, None] * [0.0, 0.0, 1.0])
+    t = centre_to - np.einsum("gij,gj->gi", R, centre_from)
+    t[:, 2] = 0.0
+    return R, t
+
+
+def _arms(
+    P_from: Array, P_to: Array, group: IntArray, weight: Array | None
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return points from the centres of their groups, these centres, and the weights."""
+    weight = np.ones(len(group)) if weight is None else weight
+    whole = np.bincount(group, weights=weight)[:, None]
+
+    def centres(points: Array) -> Array:
+        found = np.zeros((len(whole), 3))
+        np.add.at(found, group, weight[:, None] * points)
+        return found / whole
+
+    centre_from, centre_to = centres(P_from), centres(P_to)
+    return P_from - centre_from[group], P_to - centre_to[group], centre_from, centre_to, weight

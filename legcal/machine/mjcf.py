@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import ModelError, OutOfClass
 from legcal.files import closest
-from legcal.geometry import Array
+from legcal.geometry import Array, rotation_between
 from legcal.machine.schema import MechanismFile
 from legcal.machine.tree import (
     DRAWING,
@@ -143,7 +143,7 @@ class Values:
             axis = numbers[:3] / np.linalg.norm(numbers[:3])
             return Rotation.from_rotvec(self.compiler.radians(float(numbers[3])) * axis)
         if key == "zaxis":
-            return None if not numbers.any() else z_onto(numbers)
+            return None if not numbers.any() else _z_onto(numbers)
         x, y = numbers[:3], numbers[3:]
         z = np.cross(x, y)
         if not np.linalg.norm(z) > 1e-9 * np.linalg.norm(x) * np.linalg.norm(y):
@@ -216,16 +216,6 @@ def euler(sequence: str, angles: Array) -> Rotation:
         turn = Rotation.from_euler(letter.lower(), float(angle))
         rotation = rotation * turn if letter.islower() else turn * rotation
     return rotation
-
-
-def z_onto(direction: Array) -> Rotation:
-    """Return the shortest rotation that takes z onto a direction."""
-    unit = direction / np.linalg.norm(direction)
-    axis = np.cross([0.0, 0.0, 1.0], unit)
-    sine, cosine = float(np.linalg.norm(axis)), float(unit[2])
-    if sine == 0.0:
-        return Rotation.from_rotvec([0.0 if cosine > 0.0 else np.pi, 0.0, 0.0])
-    return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis / sine)
 
 
 WORLD = "world"
@@ -537,7 +527,7 @@ def _cylinder(tree: MjcfTree, element: etree._Element, place: Place) -> TextCyli
         along: Array = ends[3:] - ends[:3]
         length = float(np.linalg.norm(along))
         if length > 0.0:
-            T = RigidTransform.from_components(0.5 * (ends[3:] + ends[:3]), z_onto(along))
+            T = RigidTransform.from_components(0.5 * (ends[3:] + ends[:3]), _z_onto(along))
     else:
         T = values.pose(element, attributes)
         length = 2.0 * float(size[1]) if size is not None and len(size) > 1 else None
@@ -561,7 +551,9 @@ def _site(tree: MjcfTree, element: etree._Element, place: Place) -> None:
     attributes = values.attributes(element, place.childclass)
     ends = values.numbers(element, attributes, "fromto", (6,))
     if ends is not None and np.linalg.norm(ends[3:] - ends[:3]) > 0.0:
-        T = RigidTransform.from_components(0.5 * (ends[3:] + ends[:3]), z_onto(ends[3:] - ends[:3]))
+        T = RigidTransform.from_components(
+            0.5 * (ends[3:] + ends[:3]), _z_onto(ends[3:] - ends[:3])
+        )
     else:
         T = values.pose(element, attributes)
     tree.sites[name] = place.body, place.T_body_frame * T
@@ -766,3 +758,8 @@ def _without_loose_bodies(
         del tree.text.links[link]
     freed = [f"'{j.child}'" for j in held if j.type == "floating"]
     return parse_urdf(urdf.path, tree.text.robot(name), travel_needed=False), freed
+
+
+def _z_onto(direction: Array) -> Rotation:
+    """Return the shortest rotation that takes z onto a direction of any length."""
+    return rotation_between(np.array([0.0, 0.0, 1.0]), direction / np.linalg.norm(direction))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, OutOfClass, OutOfResources, UsageError
 from legcal.files import motion_to_xyz_quat, write_atomically
-from legcal.geometry import Array, roll_pitch_yaw
+from legcal.geometry import Array, roll_pitch_yaw, rotation_between
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
 from legcal.machine.classification import LegChain, Step
 from legcal.machine.files import FOLDER_YAML
@@ -218,10 +218,8 @@ def _turn(axis: Array | None, wanted: Array | None, *, directed: bool = False) -
         return None
     if not directed and axis @ wanted < 0.0:
         wanted = -wanted
-    normal = np.cross(axis, wanted)
-    sine = float(np.linalg.norm(normal))
-    angle = float(np.arctan2(sine, axis @ wanted))
-    return None if angle < ROUNDING else Rotation.from_rotvec(angle / sine * normal)
+    turn = rotation_between(axis, wanted)
+    return None if turn.magnitude() < ROUNDING else turn
 
 
 def _twisted(leg: Leg, wanted: Leg, at_platform: Motion) -> float:

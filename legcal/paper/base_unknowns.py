@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data import LegAxes, Measurements
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, normal_basis, register_points
 from legcal.machine import free_coordinates
 from legcal.paper.nominal import NominalMechanism
-from legcal.paper.solver import Solution, register_points
+from legcal.paper.solver import Solution
 
 
 @dataclass(frozen=True, eq=False)

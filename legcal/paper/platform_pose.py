@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, register_groups, register_in_plane
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.nominal import Criteria
 from legcal.paper.solver import (
@@ -25,8 +25,6 @@ from legcal.paper.solver import (
     Term,
     moved,
     moved_points,
-    register_groups,
-    register_in_plane,
     solve_least_squares,
     turned_points,
 )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, cross, cross_matrices, rotation_matrices
 from legcal.machine import Cylinder
 from legcal.perception.lines import EdgePairs
 from legcal.vision import visible_pieces
@@ -172,7 +172,7 @@ def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Ar
     X = X.reshape(-1, len(targets), 2, 3)
     z = np.maximum(X[..., 2:], NEAREST)
     xy = X[..., :2] / z
-    normal = _vector_product(X[:, :, 0], X[:, :, 1])
+    normal = cross(X[:, :, 0], X[:, :, 1])
     level = normal[..., 0] ** 2 + normal[..., 1] ** 2
     flat = np.sqrt(level / (level + normal[..., 2] ** 2 + 1e-24))
     width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
@@ -296,7 +296,9 @@ def _centre(pictures: Sequence[Picture], poses: Poses) -> Array:
 
 def _step_prior(centre: Array) -> Array:
     """Return the precision (n, 6, 6) of no step at all: what nothing fixes stays where it is."""
-    J = np.concatenate([-_cross(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2)
+    J = np.concatenate(
+        [-cross_matrices(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2
+    )
     distance = PLACE_PRIOR * np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
     H = J.swapaxes(1, 2) @ J / (distance**2)[:, None, None]
     H[:, :3, :3] += np.eye(3) / TURN_PRIOR**2
@@ -341,7 +343,7 @@ def _equations(
     D[:, :, 3] = 0.5 * g_along
     D = D @ picture.R  # by the ends in the frame of the poses
     X = (X - picture.t) @ picture.R
-    turning = _vector_product(X[:, :, None], D).sum(axis=3)
+    turning = cross(X[:, :, None], D).sum(axis=3)
     J = np.concatenate([turning, D.sum(axis=3)], axis=-1)
     in_base = D @ poses.R[:, None, None]
     at = place[:, None, :, None]  # (T, 1, 2, 1)
@@ -391,32 +393,9 @@ def _moved(poses: Poses, xi: Array, shift: Array, centre: Array) -> Poses:
     moved = np.linalg.norm(np.cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
     distance = np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
     xi = xi / np.maximum(np.maximum(turned, moved / (MOST_PLACE * distance)), 1.0)[:, None]
-    turn = _rotations(xi[:, :3])
+    turn = rotation_matrices(xi[:, :3])
     t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]
     return Poses(turn @ poses.R, t, shift)
-
-
-def _rotations(vectors: Array) -> Array:
-    """Return the rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    K = _cross(vectors / np.maximum(angle, 1e-12)[:, None])
-    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + s * K + (1.0 - c) * (K @ K))
-
-
-def _vector_product(x: Array, y: Array) -> Array:
-    """Return x x y (..., 3), in a third of the time of numpy's."""
-    out = np.empty(np.broadcast_shapes(x.shape, y.shape))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[..., i] = x[..., j] * y[..., k] - x[..., k] * y[..., j]
-    return out
-
-
-def _cross(vectors: Array) -> Array:
-    """Return the matrices (n, 3, 3) of vector products with vectors (n, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
 
 
 def exchanged(poses: Poses, X: Array) -> Poses:

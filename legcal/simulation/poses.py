@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.data import reading_columns, readings_in
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
 from legcal.files import read_table
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, segment_distance
 from legcal.machine import (
     INSIDE,
     REGULAR,
@@ -108,25 +108,6 @@ class Clearance:
         span = np.diff(along, axis=1) * u
         distance = segment_distance(start[one], span[one], start[two], span[two])
         return np.asarray(distance < self._needed)
-
-
-def segment_distance(start_1: Array, span_1: Array, start_2: Array, span_2: Array) -> Array:
-    """Return the distance of pairs of straight pieces start + s span, 0 <= s <= 1."""
-    between = start_1 - start_2
-    a, e, b = _dot(span_1, span_1), _dot(span_2, span_2), _dot(span_1, span_2)
-    c, f = _dot(span_1, between), _dot(span_2, between)
-    square = a * e - b * b
-    lines_cross = square > 1e-12 * a * e
-    s = np.where(lines_cross, (b * f - c * e) / np.where(lines_cross, square, 1.0), 0.0)
-    s = np.clip(s, 0.0, 1.0)
-    t = np.clip((b * s + f) / e, 0.0, 1.0)
-    s = np.clip((b * t - c) / a, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(between + s[:, None] * span_1 - t[:, None] * span_2, axis=1))
-
-
-def _dot(one: Array, two: Array) -> Array:
-    """Return the scalar products of rows."""
-    return np.asarray(np.einsum("ni,ni->n", one, two))
 
 
 ROUNDING = 1e-9  # [rad]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, motion_of
+from legcal.geometry import Array, cross_matrices, motion_of
 from legcal.vision.camera import Camera
 
 _ITERATIONS = 50
@@ -101,7 +101,7 @@ def _evaluated(
     by_point[:, :, 2] = -xy
     by_point = camera.pixels_per_unit(xy) @ by_point / P[:, 2, None, None]
     arm = P - T.translation
-    by_turn = -by_point @ _cross(arm)
+    by_turn = -by_point @ cross_matrices(arm)
     J = np.concatenate([by_point, by_turn], axis=-1) / sigma_px[:, None, None]
     weighted = J * weight[:, None, None]
     information = np.einsum("nia,nib->ab", weighted, J)
@@ -113,14 +113,6 @@ def _moved(T: RigidTransform, step: Array) -> RigidTransform:
     """Return a pose shifted [m] and turned [rad] about its own origin, in the camera frame."""
     turn = Rotation.from_rotvec(step[3:]).as_matrix()
     return motion_of(turn @ T.as_matrix()[:3, :3], T.translation + step[:3])
-
-
-def _cross(v: Array) -> Array:
-    """Return the matrices (n, 3, 3) of the cross product with vectors (n, 3)."""
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _apart(one: PlanePose, other: PlanePose) -> float:

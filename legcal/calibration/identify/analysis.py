@@ -34,12 +34,12 @@ from legcal.calibration.identify.session import (
     random_poses,
     travel_of,
 )
-from legcal.calibration.joint_fit import NO_CHOICES, Choices, components
+from legcal.calibration.joint_fit import NO_CHOICES, Choices
 from legcal.calibration.run import nominal_poses
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.files import closest
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, components
 from legcal.machine import (
     DATASET_YAML,
     NEAR,

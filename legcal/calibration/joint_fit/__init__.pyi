@@ -33,5 +33,4 @@ from .solution import Solution as Solution
 from .state import DEFAULT_SETTINGS as DEFAULT_SETTINGS
 from .state import FittedLegs as FittedLegs
 from .state import RefinementSettings as RefinementSettings
-from .state import components as components
 from .state import fitted_legs as fitted_legs

@@ -8,16 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.state import (
-    FittedLegs,
-    Layout,
-    State,
-    components,
-    motions,
-)
+from legcal.calibration.joint_fit.state import FittedLegs, Layout, State
 from legcal.data import Measurements
 from legcal.errors import DatasetError, DidNotConverge
-from legcal.geometry import Array, BoolArray
+from legcal.geometry import Array, BoolArray, components, motions_of
 from legcal.machine import (
     LegGeometry,
     PoseEquations,
@@ -281,4 +275,4 @@ def platform_poses(
     """
     lengthening = lengths - np.array([leg.q0 for leg in geometry])
     found = solve_poses(geometry, frame_legs, *components(T_Rb_Re), lengthening)
-    return motions(found.R, found.t)
+    return motions_of(found.R, found.t)

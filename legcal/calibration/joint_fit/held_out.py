@@ -24,11 +24,11 @@ from legcal.calibration.joint_fit.problem import (
     offsets_of,
     with_measurements,
 )
-from legcal.calibration.joint_fit.state import State, components, turned
+from legcal.calibration.joint_fit.state import State
 from legcal.data import Measurements, Outlines
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import NoiseModel
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, components, turned
 from legcal.machine import pose_differences
 
 

@@ -14,9 +14,8 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit.constraints import platform_poses
 from legcal.calibration.joint_fit.solution import Sensitivity
-from legcal.calibration.joint_fit.state import components
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array
+from legcal.geometry import Array, components
 from legcal.machine import (
     LegGeometry,
     LegKind,

@@ -35,9 +35,9 @@ from legcal.calibration.joint_fit.residuals import (
     places,
     prior_residual,
 )
-from legcal.calibration.joint_fit.state import FittedLegs, Layout, State, components, intrinsic_of
+from legcal.calibration.joint_fit.state import FittedLegs, Layout, State, intrinsic_of
 from legcal.data import Measurements
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, components
 from legcal.machine import LegGeometry, freedoms, n_bonds, tied_twist, tied_twist_slope, turn_slope
 from legcal.vision import (
     Camera,

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, BoolArray, IntArray, motion_of
+from legcal.geometry import Array, BoolArray, IntArray, motions_of, turned
 from legcal.machine import (
     LegGeometry,
     Mechanism,
@@ -232,17 +232,17 @@ class State:
     @property
     def T_camera_Rb(self) -> tuple[RigidTransform, ...]:
         """Camera poses, one a view."""
-        return motions(self.R_camera, self.t_camera)
+        return motions_of(self.R_camera, self.t_camera)
 
     @property
     def T_Rb_board(self) -> RigidTransform:
         """The calibration board in R_b; of no meaning where no image shows one."""
-        return motions(self.R_board, self.t_board)[0]
+        return motions_of(self.R_board, self.t_board)[0]
 
     @property
     def T_Rb_Re(self) -> tuple[RigidTransform, ...]:
         """Platform poses."""
-        return motions(self.R_pose, self.t_pose)
+        return motions_of(self.R_pose, self.t_pose)
 
     def moved(self, x: Array, layout: Layout) -> State:
         """Return the state after a change x of its unknowns [m, rad, px]."""
@@ -284,36 +284,6 @@ def _changed(
 def intrinsic_of(camera: Camera, key: str) -> float:
     """Return one number of a camera by its name."""
     return float(intrinsic_values(camera)[intrinsic_names(camera).index(key)])
-
-
-def cayley(w: Array) -> Array:
-    """Return Cayley's rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
-    g = 0.5 * w
-    K = np.zeros((*w.shape[:-1], 3, 3))
-    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -g[..., 2], g[..., 1], -g[..., 0]
-    K -= np.swapaxes(K, -1, -2)
-    scale = 2.0 / (1.0 + np.sum(g**2, axis=-1))[..., None, None]
-    return np.asarray(np.eye(3) + scale * (K + K @ K))
-
-
-def turned(R: Array, w: Array) -> Array:
-    """Return rotation matrices turned by rotation vectors, orthogonal to rounding."""
-    product = cayley(w) @ R
-    drift = np.swapaxes(product, -1, -2) @ product
-    return np.asarray(product @ (1.5 * np.eye(3) - 0.5 * drift))
-
-
-def motions(R: Array, t: Array) -> tuple[RigidTransform, ...]:
-    """Return rigid motions of rotation matrices (n, 3, 3) and translations (n, 3) [m]."""
-    if len(R) == 0:
-        return ()
-    return tuple(motion_of(R, t))
-
-
-def components(motions: Sequence[RigidTransform]) -> tuple[Array, Array]:
-    """Return rotation matrices and translations of motions."""
-    T = np.array([T.as_matrix() for T in motions]).reshape(-1, 4, 4)
-    return T[:, :3, :3].copy(), T[:, :3, 3].copy()
 
 
 @dataclass(frozen=True, eq=False)

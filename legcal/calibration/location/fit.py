@@ -21,13 +21,12 @@ from legcal.calibration.location.model import (
     Noise,
     PosePairs,
     jacobian,
-    nearest_rotation,
     residuals,
     stacked,
 )
 from legcal.calibration.location.problem import PlatformMotions
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, nearest_rotation
 
 System = Callable[[Frames], tuple[Array, Array]]
 STEPS = 60

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, rotation_matrices
 
 Frame = Literal["base", "tool"]
 Kind = Literal["position", "orientation"]
@@ -338,9 +338,9 @@ class Frames:
         world axes [rad], and the same of the tool in the platform.
         """
         return Frames(
-            turned(step[..., 3:6]) @ self.R_base,
+            rotation_matrices(step[..., 3:6]) @ self.R_base,
             self.t_base + step[..., :3],
-            turned(step[..., 9:]) @ self.R_tool,
+            rotation_matrices(step[..., 9:]) @ self.R_tool,
             self.t_tool + step[..., 6:9],
         )
 
@@ -395,28 +395,6 @@ def jacobian(frames: Frames, pairs: PosePairs) -> Array:
     J[..., 3:, 3:6] = np.eye(3) * pairs.oriented[:, None, None]
     J[..., 3:, 9:] = carried * pairs.oriented[:, None, None]
     return J
-
-
-def cross_matrices(v: Array) -> Array:
-    """Return the matrices (..., 3, 3) of w -> v x w."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def turned(rotation_vector: Array) -> Array:
-    """Return the rotation matrices (..., 3, 3) of rotation vectors [rad]."""
-    flat = Rotation.from_rotvec(rotation_vector.reshape(-1, 3)).as_matrix()
-    return np.asarray(flat.reshape(*rotation_vector.shape[:-1], 3, 3))
-
-
-def nearest_rotation(matrix: Array) -> Array:
-    """Return the rotation matrices nearest to some matrices (..., 3, 3)."""
-    U, _, Vt = np.linalg.svd(matrix)
-    flip = np.ones(U.shape[:-1])
-    flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
-    return np.asarray((U * flip[..., None, :]) @ Vt)
 
 
 SMALLEST = 1e-9  # [m, rad]; nobody measures better, and files round

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.earlier import EarlierResult, read_result
-from legcal.calibration.location.model import Frames, Noise, PosePairs, ToolPoses, cross_matrices
+from legcal.calibration.location.model import Frames, Noise, PosePairs, ToolPoses
 from legcal.calibration.result import MODEL_NAME, RESULT_NAME
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry import Array, BoolArray, IntArray
+from legcal.geometry import Array, BoolArray, IntArray, cross_matrices
 from legcal.machine import (
     Mechanism,
     forward_kinematics_many,

@@ -26,7 +26,6 @@ from legcal.calibration import (
     Solution,
     Start,
     cameras_from_hints,
-    components,
     compress,
     eliminate,
     platform_poses,
@@ -35,7 +34,7 @@ from legcal.calibration import (
 )
 from legcal.data import Measurements, Outlines, View, axes_from_outlines
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable, UsageError
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, components
 from legcal.machine import (
     LegGeometry,
     LegKind,
