@@ -15,14 +15,8 @@ from repeated_images import RepeatedImages, repeated_images
 from rich.console import Console
 
 from legcal import cli
-from legcal.calibration.noise import (
-    QUANTITIES,
-    Noise,
-    find_repeats,
-    measure_noise,
-    noise_document,
-    noise_notes,
-)
+from legcal.calibration.noise import Noise, find_repeats, measure_noise, noise_notes
+from legcal.calibration.repeatability import QUANTITIES
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.machine import load_mechanism
@@ -74,14 +68,14 @@ def test_json_is_one_document_and_the_folder_stays_as_it_was(
     before = sorted(rendered.path.rglob("*"))
     assert run(monkeypatch, rendered.path, "--json") == 0
     printed = capsys.readouterr()
-    assert json.loads(printed.out) == noise_document(found)
+    assert json.loads(printed.out) == found.document()
     assert sorted(rendered.path.rglob("*")) == before
     for stage in ("Recognising legs", "Measuring outlines", "Canny and least squares"):
         assert stage in printed.err
 
 
 def test_every_leg_has_standard_deviations_by_both_methods(found: Noise) -> None:
-    document = noise_document(found)
+    document = found.document()
     assert (document["images"], document["orientations"]) == (6, 2)
     assert document["repeats"] == {"least": 3, "most": 3}
     assert set(document["methods"]) == {"detector", "canny"}
@@ -99,7 +93,7 @@ def test_every_leg_has_standard_deviations_by_both_methods(found: Noise) -> None
 
 
 def test_a_detection_that_is_missed_is_counted_and_leaves_fewer_repeats(found: Noise) -> None:
-    for method in noise_document(found)["methods"].values():
+    for method in found.document()["methods"].values():
         for leg in method["legs"]:
             assert leg["images"] == 6
             assert leg["axes"] <= 5
@@ -111,14 +105,14 @@ def test_a_detection_that_is_missed_is_counted_and_leaves_fewer_repeats(found: N
 
 
 def test_the_upper_bound_is_the_largest_of_all_legs_and_orientations(found: Noise) -> None:
-    for method in noise_document(found)["methods"].values():
+    for method in found.document()["methods"].values():
         for name in QUANTITIES:
             values = [o[name] for leg in method["legs"] for o in leg["orientations"]]
             assert method["upper_bound"][name] == max(v for v in values if v is not None)
 
 
 def test_the_orientations_that_set_upper_bounds_are_named(found: Noise) -> None:
-    for method in noise_document(found)["methods"].values():
+    for method in found.document()["methods"].values():
         for name in (*QUANTITIES, "outline"):
             at = method["upper_bound_at"][name]
             (leg,) = [leg for leg in method["legs"] if leg["leg"] == at["leg"]]
@@ -165,14 +159,14 @@ def test_the_result_does_not_depend_on_the_order_of_rows(
     spoiled: RepeatedImages, found: Noise
 ) -> None:
     spoiled.rows.reverse()
-    assert noise_document(measure_noise(spoiled.write())) == noise_document(found)
+    assert measure_noise(spoiled.write()).document() == found.document()
 
 
 def test_rows_that_nothing_repeats_are_left_out(spoiled: RepeatedImages) -> None:
     for row, label in zip(spoiled.rows[3:], ("", "alone", "p1"), strict=True):
         row["pose"] = label
     spoiled.entry["views"]["c1"]["legs"] = ["leg1", "leg3", "leg4", "leg6"]
-    document = noise_document(measure_noise(spoiled.write()))
+    document = measure_noise(spoiled.write()).document()
     assert (document["images"], document["orientations"]) == (3, 1)
     legs = document["methods"]["canny"]["legs"]
     assert {o["pose"] for leg in legs for o in leg["orientations"]} == {"p0"}
@@ -190,7 +184,7 @@ def test_what_is_wrong_with_the_cameras_is_said(spoiled: RepeatedImages) -> None
 def test_a_leg_along_the_image_x_axis_is_said_to_have_no_M_LS(tmp_path: Path) -> None:
     made = repeated_images(tmp_path / "level", "3-rps", n_poses=1, level_leg=1)
     noise = measure_noise(made.write())
-    for method in noise_document(noise)["methods"].values():
+    for method in noise.document()["methods"].values():
         leg = method["legs"][1]
         assert leg["axes"] == 3
         assert (leg["without_M_LS"], leg["x"], leg["z"]) == (1, None, None)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from legcal.calibration.noise import (
+from legcal.calibration.repeatability import (
     QUANTITIES,
     AxisValues,
     Repeats,
@@ -84,8 +84,8 @@ def test_the_range_of_the_ratio_holds_the_truth_nineteen_times_in_twenty(factor:
     inside = 0
     for _ in range(1500):
         samples = [drawn(rng, c, n, factor) for c, n in zip(covariances, (3, 2, 8), strict=True)]
-        low, high = pooled(samples).ratio_range
-        inside += low < factor < high
+        spread = pooled(samples)
+        inside += spread.ratio_low < factor < spread.ratio_high
     assert 0.93 < inside / 1500 < 0.97
 
 

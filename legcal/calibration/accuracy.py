@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DidNotConverge, ModelError
+from legcal.files import Document
 from legcal.geometry import Array
 from legcal.machine import (
     WORKSPACE_POSES,
@@ -32,6 +33,25 @@ from legcal.machine import (
 
 _ROUNDS = 20  # of drawing again what the reference does not reach
 _HOPELESS = 10  # poses that it does not reach, if they are the first
+
+
+class ComparedParameter(Document):
+    """A parameter of the model and of the reference [m, rad]."""
+
+    name: str
+    value: float
+    reference: float
+    difference: float
+
+
+class EvaluationDocument(Document):
+    """What ``legcal evaluate --json`` prints; null where no pose is compared."""
+
+    dX_m: float | None
+    dE_rad: float | None
+    dX_max_m: float | None
+    poses: int
+    parameters: list[ComparedParameter]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,19 +80,18 @@ class Evaluation:
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``legcal evaluate --json`` prints."""
-        compared = len(self.displacement) > 0
-        return {
-            "dX_m": float(self.displacement.mean()) if compared else None,
-            "dE_rad": float(self.rotation.mean()) if compared else None,
-            "dX_max_m": float(self.displacement.max()) if compared else None,
-            "poses": len(self.displacement),
-            "parameters": [
-                {"name": name, "value": v, "reference": r, "difference": v - r}
-                for name, v, r in zip(
-                    self.names, self.values.tolist(), self.references.tolist(), strict=True
-                )
+        dX, dE = self.displacement, self.rotation
+        numbers = zip(self.names, self.values.tolist(), self.references.tolist(), strict=True)
+        return EvaluationDocument(
+            dX_m=float(dX.mean()) if len(dX) else None,
+            dE_rad=float(dE.mean()) if len(dX) else None,
+            dX_max_m=float(dX.max()) if len(dX) else None,
+            poses=len(dX),
+            parameters=[
+                ComparedParameter(name=name, value=v, reference=r, difference=v - r)
+                for name, v, r in numbers
             ],
-        }
+        ).document()
 
 
 def evaluate(

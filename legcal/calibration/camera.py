@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import f as f_distribution
 
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, NotVisible, UsageError
-from legcal.files import OwnYaml, describe
+from legcal.files import Document, OwnYaml, describe
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.progress import Report, no_progress
 from legcal.vision import (
@@ -68,6 +68,41 @@ class ImageResult:
     rms_px: float | None
     tilt: float | None
     reason: str
+
+
+class Intrinsic(Document):
+    """A number of the camera [px, or without unit]."""
+
+    name: str
+    value: float
+    sigma: float
+
+
+class BoardImage(Document):
+    """What an image gave."""
+
+    image: str
+    corners: int
+    used: int
+    rms_px: float | None
+    tilt_rad: float | None
+    reason: str | None
+
+
+class CameraDocument(Document):
+    """What ``legcal camera --json`` prints."""
+
+    legcal_camera: int
+    model: str
+    width: int
+    height: int
+    intrinsics: list[Intrinsic]
+    covariance: list[list[float]]
+    rms_px: float
+    noise_px: float
+    coverage: float
+    images: list[BoardImage]
+    warnings: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,31 +156,29 @@ class CameraCalibration:
     def document(self) -> dict[str, Any]:
         """Return what ``--json`` prints."""
         numbers = zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True)
-        return {
-            "legcal_camera": 1,
-            "model": self.camera.model,
-            "width": self.camera.width,
-            "height": self.camera.height,
-            "intrinsics": [
-                {"name": name, "value": value, "sigma": sigma} for name, value, sigma in numbers
-            ],
-            "covariance": self.covariance.tolist(),
-            "rms_px": self.rms_px,
-            "noise_px": self.noise_px,
-            "coverage": self.coverage,
-            "images": [
-                {
-                    "image": image.name,
-                    "corners": image.corners,
-                    "used": image.used,
-                    "rms_px": image.rms_px,
-                    "tilt_rad": image.tilt,
-                    "reason": image.reason or None,
-                }
+        return CameraDocument(
+            legcal_camera=1,
+            model=self.camera.model,
+            width=self.camera.width,
+            height=self.camera.height,
+            intrinsics=[Intrinsic(name=name, value=v, sigma=sigma) for name, v, sigma in numbers],
+            covariance=self.covariance.tolist(),
+            rms_px=self.rms_px,
+            noise_px=self.noise_px,
+            coverage=self.coverage,
+            images=[
+                BoardImage(
+                    image=image.name,
+                    corners=image.corners,
+                    used=image.used,
+                    rms_px=image.rms_px,
+                    tilt_rad=image.tilt,
+                    reason=image.reason or None,
+                )
                 for image in self.images
             ],
-            "warnings": list(self.warnings),
-        }
+            warnings=list(self.warnings),
+        ).document()
 
 
 CAMERA_FILE = OwnYaml(

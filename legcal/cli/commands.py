@@ -363,4 +363,4 @@ def noise(
 
     with report.progress_on_stderr() as progress:
         found = calibration.measure_noise(dataset, progress=progress, workers=image_workers())
-    show(as_json, lambda: calibration.noise_document(found), lambda: report.noise_table(found))
+    show(as_json, found.document, lambda: report.noise_table(found))

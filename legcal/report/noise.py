@@ -69,9 +69,8 @@ def _bounding(noise: Noise) -> list[str]:
         for quantity in (*QUANTITIES, OUTLINE):
             o = method.bounding(quantity)
             if o is not None:
-                leg = noise.dataset.mechanism.leg_names[o.leg]
-                place = f"{leg} in {noise.view_names[o.view]}/{noise.pose_labels[o.pose]}"
-                places.setdefault(place, []).append(quantity)
+                at = noise.place(o)
+                places.setdefault(f"{at.leg} in {at.view}/{at.pose}", []).append(quantity)
         if places:
             found = "; ".join(f"{place} ({', '.join(of)})" for place, of in places.items())
             lines.append(f"Upper bounds by {CALLED[method.name]}: {found}.")
@@ -148,12 +147,11 @@ def _outline_cells(spread: Spread | None) -> list[str]:
     """Return spread, claim, ratio with its range, the median and the largest."""
     if spread is None:
         return ["-"] * 6
-    low, high = spread.ratio_range
     return [
         f"{spread.sd:.4f}",
         f"{spread.claimed:.4f}",
         f"{spread.ratio:.2f}",
-        f"{low:.2f} to {high:.2f}",
+        f"{spread.ratio_low:.2f} to {spread.ratio_high:.2f}",
         f"{spread.median:.4f}",
         f"{spread.largest:.4f}",
     ]
