@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine.leg import N_LOCAL, Demand, Leg, LegKind
 from legcal.machine.model import Mechanism
 from legcal.machine.parameters import Parametrization
@@ -225,7 +225,7 @@ def _point_like(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> Pose
         local[..., :3], local[..., 3:6], local[..., 6] = -u, u @ R, -1.0
     return PoseEquations(
         lengths - np.array([leg.q0 for leg in legs]),
-        np.concatenate([_cross(arms, u), u], axis=2),
+        np.concatenate([cross(arms, u), u], axis=2),
         local,
         np.arange(len(legs)),
         (Demand.LENGTH,) * len(legs),
@@ -294,7 +294,7 @@ class _Row:
 
     def depends_on_leg(self, gradient: Array) -> None:
         """Add the dependence on the vector from A to B."""
-        self.by_pose[:, :3] += _cross(self.state.arm, gradient)
+        self.by_pose[:, :3] += cross(self.state.arm, gradient)
         self.by_pose[:, 3:] += gradient
         if self.state.by_local:
             self.by_local[:, :3] -= gradient
@@ -317,12 +317,12 @@ class _Row:
     def depends_on_platform_vector(self, vector: Array, gradient: Array) -> None:
         """Add the dependence on a direction that is tied to the platform and to its axis."""
         axis = _given(self.state.leg.platform_axis)
-        self.by_pose[:, :3] += _cross(self.state.turned(vector), gradient)
+        self.by_pose[:, :3] += cross(self.state.turned(vector), gradient)
         if not self.state.by_local:
             return
         inside = _back(self.state.R, gradient)
         for column, e in zip((9, 10), _basis(axis), strict=True):
-            self.by_local[:, column] += inside @ _cross(e, vector)
+            self.by_local[:, column] += inside @ cross(e, vector)
 
 
 def _length(state: _State) -> _Row:
@@ -365,28 +365,28 @@ def _twist(state: _State) -> _Row:
     """Return sin(angle - twist) of the inner axes p and w about u."""
     leg, u = state.leg, state.u
     a, tau = _given(leg.base_axis), float(leg.twist or 0.0)
-    across = _cross(a, u)
+    across = cross(a, u)
     reach = np.linalg.norm(across, axis=1)[:, None]
     p = np.broadcast_to(a, u.shape) if leg.base_joint == "R" else across / reach
     b = _given(leg.platform_axis)
     outer = _basis(b)[0] if leg.platform_joint == "" else b
-    far = _cross(state.turned(outer), u)
+    far = cross(state.turned(outer), u)
     far_reach = np.linalg.norm(far, axis=1)[:, None]
     w = far / far_reach if leg.platform_joint == "U" else state.turned(outer)
     c, s = np.cos(tau), np.sin(tau)
-    row = _Row(state, c * _dot(u, _cross(p, w)) - s * _dot(p, w))
-    by_p, by_w = c * _cross(w, u) - s * w, c * _cross(u, p) - s * p
-    row.depends_on_u(c * _cross(p, w))
+    row = _Row(state, c * _dot(u, cross(p, w)) - s * _dot(p, w))
+    by_p, by_w = c * cross(w, u) - s * w, c * cross(u, p) - s * p
+    row.depends_on_u(c * cross(p, w))
     if leg.base_joint == "U":
-        row.depends_on_u(_cross(by_p, a) / reach)
-        by_p = _cross(u, by_p) / reach
+        row.depends_on_u(cross(by_p, a) / reach)
+        by_p = cross(u, by_p) / reach
     row.depends_on_base_axis(by_p)
     if leg.platform_joint == "U":
-        row.depends_on_u(_cross(by_w, state.turned(outer)) / far_reach)
-        by_w = _cross(u, by_w) / far_reach
+        row.depends_on_u(cross(by_w, state.turned(outer)) / far_reach)
+        by_w = cross(u, by_w) / far_reach
     row.depends_on_platform_vector(outer, by_w)
     if state.by_local:
-        row.by_local[:, 11] = -(s * _dot(u, _cross(p, w)) + c * _dot(p, w))
+        row.by_local[:, 11] = -(s * _dot(u, cross(p, w)) + c * _dot(p, w))
     return row
 
 
@@ -418,16 +418,6 @@ def _basis_of(axis: bytes) -> Array:
     basis = normal_basis(np.frombuffer(axis))
     basis.flags.writeable = False
     return basis
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return vector products of rows or single vectors; np.cross is slow on few of them."""
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    i, j, k = b[..., 0], b[..., 1], b[..., 2]
-    first = y * k - z * j
-    product = np.empty((*first.shape, 3))
-    product[..., 0], product[..., 1], product[..., 2] = first, z * i - x * k, x * j - y * i
-    return product
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry import Array, BoolArray, IntArray, normal_basis
+from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine.leg import N_LOCAL, KinematicParameters, Leg, LegKind
 from legcal.machine.model import Mechanism
 
@@ -232,7 +232,7 @@ def _turn(axis: Array | None, nominal: Array | None) -> Array:
         return np.zeros(2)
     if axis @ nominal < 0.0:
         axis = -axis
-    turn = _cross(nominal, axis)
+    turn = cross(nominal, axis)
     sine = float(np.sqrt(turn @ turn))
     scale = 1.0 if sine == 0.0 else float(np.arctan2(sine, axis @ nominal)) / sine
     return np.asarray(normal_basis(nominal) @ (scale * turn))
@@ -246,8 +246,8 @@ def turn_slope(axis: Array | None, nominal: Array | None) -> Array:
     if axis is None or nominal is None:
         return np.eye(2)
     seen = -axis if axis @ nominal < 0.0 else axis
-    by_turn = _cross(normal_basis(axis), seen)
-    turn, d_turn = _cross(nominal, seen), _cross(nominal, by_turn)
+    by_turn = cross(normal_basis(axis), seen)
+    turn, d_turn = cross(nominal, seen), cross(nominal, by_turn)
     sine, cosine = float(np.sqrt(turn @ turn)), float(nominal @ seen)
     if sine == 0.0:
         return np.asarray(normal_basis(nominal) @ d_turn.T)
@@ -290,12 +290,6 @@ def _twist(leg: Leg, nominal: Leg) -> float:
     if twist is None or nominal.twist is None:
         return 0.0
     return float(twist - np.pi * np.round((twist - nominal.twist) / np.pi))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return vector products along the last axis; np.cross is slow."""
-    here, there = [1, 2, 0], [2, 0, 1]
-    return np.asarray(a[..., here] * b[..., there] - a[..., there] * b[..., here])
 
 
 def turn_between(nominal: Array | None, axis: Array | None) -> Rotation:

@@ -37,7 +37,7 @@ from legcal.calibration.joint_fit.residuals import (
 )
 from legcal.calibration.joint_fit.state import FittedLegs, Layout, State, intrinsic_of
 from legcal.data import Measurements
-from legcal.geometry import Array, IntArray, components
+from legcal.geometry import Array, IntArray, components, cross
 from legcal.machine import LegGeometry, freedoms, n_bonds, tied_twist, tied_twist_slope, turn_slope
 from legcal.vision import (
     Camera,
@@ -537,9 +537,9 @@ class _Ends:
         """Return derivatives by A, B, camera and by the pose from those by both ends."""
         by_A, by_B = slope[..., :3], slope[..., 3:6]
         a, b = by_A @ self.R_camera, by_B @ self.R_camera
-        turn = _cross(self.A_turned[:, None], by_A) + _cross(self.B_turned[:, None], by_B)
+        turn = cross(self.A_turned[:, None], by_A) + cross(self.B_turned[:, None], by_B)
         J = np.concatenate([a, b @ self.R_pose, turn, by_A + by_B], axis=-1)
-        return J, np.concatenate([_cross(self.arm[:, None], b), b], axis=-1)
+        return J, np.concatenate([cross(self.arm[:, None], b), b], axis=-1)
 
 
 def linearize(problem: FitProblem, state: State, whitening: Array) -> Linearization:
@@ -599,7 +599,7 @@ def _reading_rows(problem: FitProblem, state: State) -> Rows:
     def chain(slope: Array) -> tuple[Array, Array]:
         b = slope[..., 3:6]
         J = np.concatenate([slope[..., :3], b @ R_pose, slope[..., 6:]], axis=-1)
-        return J, np.concatenate([_cross(arm[:, None], b), b], axis=-1)
+        return J, np.concatenate([cross(arm[:, None], b), b], axis=-1)
 
     return Rows(r, slope, chain).scaled(1.0 / e.sigma)
 
@@ -631,9 +631,9 @@ def corner_rows(problem: FitProblem, state: State) -> Rows:
         in_base = in_camera @ R_camera
         J = np.concatenate(
             [
-                _cross(turned[:, None], in_camera),
+                cross(turned[:, None], in_camera),
                 in_camera,
-                _cross(grown[:, None], in_base),
+                cross(grown[:, None], in_base),
                 in_base,
                 in_base @ arm[..., None],
                 slope[..., 3:] @ by_intrinsics,
@@ -663,10 +663,3 @@ def _arms(state: State) -> Array:
 def _times(R: Array, v: Array) -> Array:
     """Return R v of rows, (n, 3)."""
     return np.asarray((R @ v[..., None])[..., 0])
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return vector products along the last axis; np.cross is slow."""
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    i, j, k = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([y * k - z * j, z * i - x * k, x * j - y * i], axis=-1)
