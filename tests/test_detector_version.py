@@ -1,39 +1,53 @@
 """What the detector measures in six fixed photographs: kept outlines depend on its version.
 
-Run this file to record the values again, once DETECTOR_VERSION is raised.
+They are measured near a placement that is two millimetres off, quickly and with all care, and
+close to the true one. Rounding on another processor moves some outlines by a few hundredths of a
+pixel, so that it is most of them that may not change. Run this file to record the values again,
+once DETECTOR_VERSION is raised.
 """
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.fitting import rough_scene
-from legcal.calibration.joint_fit.choices import Choices
-from legcal.calibration.run import start_run
-from legcal.data import Outlines, load_dataset
-from legcal.perception import Placement, measure_photographs, observe
+from legcal.data import Outlines, load_dataset, no_outlines
+from legcal.perception import Photographs, Placement, measure_photographs
 from legcal.perception.photographs import DETECTOR_VERSION
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
 FOLDER = Path(__file__).parent / "data" / "six-photographs"
 VALUES = FOLDER / "values.json"
-PX, PART = 1e-3, 1e-3  # that other versions of libraries may change: [px], of covariances
+# What rounding may change: verdicts, the median end, nine in ten [px], the median covariance.
+VERDICTS, PX, MOST_PX, PART = 3, 2e-3, 0.05, 3e-3
+RAISE = "outlines came out differently: raise DETECTOR_VERSION and record the values again"
+OFF, BLUR = 2e-3, 0.6  # of joint centres [m], and the blur that is taken to be known [px]
 
 
-def measured() -> dict[str, Any]:
-    """Return the outlines as observed at first, and as measured again near there."""
+def measured() -> dict[str, list[Any]]:
+    """Return the outlines of the six photographs, measured in three ways."""
     dataset = load_dataset(FOLDER)
-    run = start_run(dataset, in_turn, no_progress, Choices(), use_cache=False)
-    nominal, _ = rough_scene(run)
-    observed = observe(run.photographs, nominal, no_progress)
-    again = replace(observed.photographs, keep=run.photographs.keep)
-    found = observed.placement
-    near = Placement.of_fit(found.A_base, found.B_base, found.T_base_camera, observed.blur)
-    tables = {"first": observed.outlines, "again": measure_photographs(again, near, no_progress)}
+    m, rows = dataset.measurements, np.arange(6)
+    load = dataset.image_reader(rows.tolist())
+    photographs = Photographs(dataset.mechanism, m, load, in_turn, rows, no_outlines())
+    truth = json.loads((FOLDER / "truth.json").read_text(encoding="utf-8"))
+    A, B = np.array([truth["A_base"]] * 6), np.array(truth["B_base"])
+    poses = [truth["T_base_camera"][view.name] for view in m.views]
+    cameras = [
+        RigidTransform.from_components(pose["xyz"], Rotation.from_quat(pose["quat_xyzw"]))
+        for pose in poses
+    ]
+    signs = np.resize([1.0, -1.0, -1.0, 1.0, -1.0], B.shape)
+    rough = Placement(A + OFF * signs, B - OFF * signs, tuple(cameras))
+    near = Placement.of_fit(A, B, cameras, (BLUR, BLUR))
+    tables = {
+        "quickly": measure_photographs(photographs, rough, no_progress, together=False),
+        "with care": measure_photographs(photographs, rough, no_progress),
+        "near a fit": measure_photographs(photographs, near, no_progress),
+    }
     return {name: _listed(outlines) for name, outlines in tables.items()}
 
 
@@ -51,13 +65,17 @@ def _listed(outlines: Outlines) -> list[Any]:
 def test_values_change_only_with_the_version() -> None:
     stored = json.loads(VALUES.read_text(encoding="utf-8"))
     assert stored["version"] == DETECTOR_VERSION, "record the values again: run this file"
-    found = measured()
-    for name in ("first", "again"):
-        assert len(found[name]) == len(stored[name])
-        for new, old in zip(found[name], stored[name], strict=True):
-            assert new[:5] == old[:5], f"{name}: raise DETECTOR_VERSION"
-            assert np.allclose(new[5:9], old[5:9], rtol=0, atol=PX), f"{name}: raise it, {new[:5]}"
-            assert np.allclose(new[9:], old[9:], rtol=PART, atol=1e-6), f"{name}: raise it"
+    for way, found in measured().items():
+        pairs = list(zip(found, stored[way], strict=True))
+        assert all(new[:4] == old[:4] for new, old in pairs), way
+        same = [(new, old) for new, old in pairs if new[4] == old[4] and new[5] >= 0.0]
+        assert len(same) > 0.7 * len(pairs), way
+        assert sum(new[4] != old[4] for new, old in pairs) <= VERDICTS, f"{way}: {RAISE}"
+        new, old = (np.array([one[k][5:] for one in same]) for k in (0, 1))
+        moved = np.abs(new[:, :4] - old[:, :4]).max(axis=1)
+        assert np.median(moved) <= PX, f"{way}: {RAISE}"
+        assert np.quantile(moved, 0.9) <= MOST_PX, f"{way}: {RAISE}"
+        assert np.median(np.abs(new[:, 4:] / old[:, 4:] - 1.0)) <= PART, f"{way}: {RAISE}"
 
 
 if __name__ == "__main__":
