@@ -167,7 +167,7 @@ def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Ar
         at = targets.place[:, :, None]
         ends = ends + (1.0 - at) * of_leg[:, :, :1] + at * of_leg[:, :, 1:]
     n_ends = 2 * len(targets)
-    R, t = _of_camera(picture, poses)
+    R, t = picture.R @ poses.R, poses.t @ picture.R.T + picture.t
     X = ends.reshape(-1, n_ends, 3) @ R.swapaxes(1, 2) + t[:, None, :]
     X = X.reshape(-1, len(targets), 2, 3)
     z = np.maximum(X[..., 2:], NEAREST)
@@ -178,11 +178,6 @@ def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Ar
     width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
     front = (X[..., 2] > NEAREST).all(axis=-1)
     return X, xy, width, np.where(front, _shown(xy, picture.corners), 0.0)
-
-
-def _of_camera(picture: Picture, poses: Poses) -> tuple[Array, Array]:
-    """Return the poses of the picture's own camera frame: rotations and translations."""
-    return picture.R @ poses.R, poses.t @ picture.R.T + picture.t
 
 
 def _shown(xy: Array, corners: Array) -> Array:

@@ -272,25 +272,17 @@ def estimate_blur(
     best = np.argsort(-merit, kind="stable")[:BLUR_BLOCKS]
     d, grey, weight, half_width = d[best], grey[best], weight[best], half_width[best]
     blurs = np.geomspace(*BLURS)
-    misfit = _misfits(d, grey, weight, half_width, blurs)
+    n, blur = len(blurs), np.repeat(blurs, len(d)).astype(np.float32)[:, None]
+    d, grey, weight, half_width = (np.concatenate([x] * n) for x in (d, grey, weight, half_width))
+    for _ in range(BLUR_ROUNDS):
+        fit = fit_blocks(d, grey, weight, half_width, blur)
+        d = d - fit.shift[:, None].astype(np.float32)
+    misfit = np.log(fit.noise + 1e-3).reshape(n, -1).mean(axis=1)
     i = int(np.clip(np.argmin(misfit), 1, len(blurs) - 2))
     left, middle, right = misfit[i - 1 : i + 2]
     bend = left - 2.0 * middle + right
     offset = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
     return float(blurs[i] * (blurs[1] / blurs[0]) ** offset)
-
-
-def _misfits(
-    d: Samples, grey: Samples, weight: Samples, half_width: Samples, blurs: Array
-) -> Array:
-    """Return, for each of some blurs, the mean logarithm of the noise of the fitted blocks."""
-    n = len(blurs)
-    blur = np.repeat(blurs, len(d)).astype(np.float32)[:, None]
-    d, grey, weight, half_width = (np.concatenate([x] * n) for x in (d, grey, weight, half_width))
-    for _ in range(BLUR_ROUNDS):
-        fit = fit_blocks(d, grey, weight, half_width, blur)
-        d = d - fit.shift[:, None].astype(np.float32)
-    return np.asarray(np.log(fit.noise + 1e-3).reshape(n, -1).mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -219,7 +219,8 @@ def explain(
         why = f"it shows the reading given for image {measurements.image[other]}"
         tried.append((share, why, "check which image belongs to which row"))
     for w, other_view in enumerate(measurements.views):
-        if w == view or placement.T_base_camera[w] is None or not _same_size(search, view, w):
+        sizes = [(c.width, c.height) for c in (measurements.views[view].camera, other_view.camera)]
+        if w == view or placement.T_base_camera[w] is None or sizes[0] != sizes[1]:
             continue
         same = other_view.camera is measurements.views[view].camera
         seen = pairs if same else search.pairs(row, w)
@@ -266,12 +267,6 @@ def _other_readings(search: Search, row: int) -> list[int]:
         if pose != own and image and (pose not in of_pose or measurements.view[other] == view):
             of_pose[pose] = other
     return list(of_pose.values())
-
-
-def _same_size(search: Search, view: int, other: int) -> bool:
-    """Say whether the cameras of two views take images of one size."""
-    one, two = (search.measurements.views[v].camera for v in (view, other))
-    return (one.width, one.height) == (two.width, two.height)
 
 
 def _picture(

@@ -225,11 +225,17 @@ class _Pool:
         moving = np.ones(len(self.half_width), dtype=np.bool_)
         for _ in range(n):
             before = at
-            at = self._round(at, moving, log_blur, sigma)
-            step = np.maximum(
-                np.abs(at.line - before.line).max(axis=1), np.abs(at.log_blur - before.log_blur)
-            )
-            moving = step >= CONVERGED
+            self._know(at, moving)
+            if np.all(moving):
+                at = self._step(at, log_blur, sigma)
+            else:
+                at = _Round(*(values.copy() for values in before))
+                some = _Round(*(values[moving] for values in before))
+                step = self._part(moving)._step(some, log_blur, sigma)
+                for values, new in zip(at, step, strict=True):
+                    values[moving] = new
+            moved = np.abs(at.line - before.line).max(axis=1)
+            moving = np.maximum(moved, np.abs(at.log_blur - before.log_blur)) >= CONVERGED
             if not np.any(moving):
                 break
         return at
@@ -245,17 +251,6 @@ class _Pool:
             if np.any(own):
                 self.products[own] = self.pixels.products(at.line, at.log_blur, lost)
             self.at_line[lost], self.at_log_blur[lost] = at.line[lost], at.log_blur[lost]
-
-    def _round(self, at: _Round, moving: BoolArray, log_blur: float, sigma: float) -> _Round:
-        """Take one step of some edges."""
-        self._know(at, moving)
-        if np.all(moving):
-            return self._step(at, log_blur, sigma)
-        some = _Round(*(values[moving] for values in at))
-        after = _Round(*(values.copy() for values in at))
-        for values, new in zip(after, self._part(moving)._step(some, log_blur, sigma), strict=True):
-            values[moving] = new
-        return after
 
     def _part(self, edges: BoolArray) -> "_Pool":
         """Return the blocks of some edges."""

@@ -190,7 +190,11 @@ def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Picture:
     picture = np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8)
     width = max(1, round(factor * longer / PER_LINE))
     letter = factor * longer / PER_LETTER
-    curves = [[_enlarged(mark, factor) for mark in part.marks] for part in parts]
+    # Pixel (0, 0) is the centre of a pixel in both pictures.
+    curves = [
+        [Mark(mark.kind, (mark.points + 0.5) * factor - 0.5) for mark in part.marks]
+        for part in parts
+    ]
     for marks in curves:
         for mark in marks:
             _draw_curve(picture, mark, width)
@@ -199,11 +203,6 @@ def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Picture:
     for part, marks in zip(parts, curves, strict=True):
         _label(picture, places, part, marks, letter)
     return np.vstack([picture, _legend(picture.shape[1], letter, width, caption)])
-
-
-def _enlarged(mark: Mark, factor: int) -> Mark:
-    """Return a curve of the enlarged picture; pixel (0, 0) is the centre of a pixel in both."""
-    return Mark(mark.kind, (mark.points + 0.5) * factor - 0.5)
 
 
 def _draw_curve(picture: Picture, mark: Mark, width: int) -> None:

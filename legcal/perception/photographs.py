@@ -160,8 +160,7 @@ def observe(
     ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
     ``together`` is as for :func:`legcal.perception.outline.measure`.
     """
-    exposures, pairs = _looked_at(photographs, nominal, report, joined)
-    defects = _defects(photographs.measurements, exposures)
+    defects, pairs = _looked_at(photographs, nominal, report, joined)
     usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
     search = photographs.search(nominal, pairs)
     hints = nominal.T_base_camera
@@ -200,7 +199,9 @@ def observe(
     placement, reasons = diagnose(
         search, placement, outlines, photographs.detect, defects, photographs.run
     )
-    usual = _usual_blur(photographs.measurements, blur)
+    view, known = photographs.measurements.view, ~np.isnan(blur)
+    of_views = [blur[known & (view == v)] for v in range(len(photographs.measurements.views))]
+    usual = tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
     return Observed(photographs, placement, reject_images(outlines, reasons), reasons, usual)
 
 
@@ -273,20 +274,13 @@ def _measured(
     return photographs.with_found(found), blur
 
 
-def _usual_blur(measurements: Measurements, blur: Array) -> tuple[float, ...]:
-    """Return the blur of most images of each view [px]; NaN where none was measured."""
-    known = ~np.isnan(blur)
-    of_views = [blur[known & (measurements.view == v)] for v in range(len(measurements.views))]
-    return tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
-
-
 def _looked_at(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
-) -> tuple[dict[int, Exposure], dict[int, EdgePairs]]:
-    """Return how images were exposed, and edge pairs of those recognised first, by row."""
-    rows = photographs.detect.tolist()
+) -> tuple[dict[int, str], dict[int, EdgePairs]]:
+    """Return why images show nothing, and edge pairs of those recognised first, by row."""
+    rows, measurements = photographs.detect.tolist(), photographs.measurements
     hints = nominal.T_base_camera
-    groups = group_views(photographs.measurements, photographs.detect, hints, joined)
+    groups = group_views(measurements, photographs.detect, hints, joined)
     first = {r for g in groups for r in (g.rows if g.hint is None else g.some)}
     exposures, pairs = dict[int, Exposure](), dict[int, EdgePairs]()
     count = _counted(report, "Looking at images", len(rows))
@@ -296,7 +290,10 @@ def _looked_at(
         if own is not None:
             pairs[row] = own
         count(row)
-    return exposures, pairs
+    numbers = [camera_numbers(view.camera) for view in measurements.views]
+    camera = [numbers.index(own) for own in numbers]  # the first view of the same camera
+    view = {row: int(measurements.view[row]) for row in rows}
+    return image_defects(exposures, view, {row: camera[v] for row, v in view.items()}), pairs
 
 
 def _look(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, EdgePairs | None]:
@@ -305,14 +302,6 @@ def _look(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, Ed
     view = int(search.measurements.view[row])
     pairs = replace(search, load=lambda _: image).pairs(row, view) if row in rows else None
     return expose(to_grey(image)), pairs
-
-
-def _defects(measurements: Measurements, exposures: Mapping[int, Exposure]) -> dict[int, str]:
-    """Return why images show nothing, by row."""
-    numbers = [camera_numbers(view.camera) for view in measurements.views]
-    camera = [numbers.index(own) for own in numbers]  # the first view of the same camera
-    view = {row: int(measurements.view[row]) for row in exposures}
-    return image_defects(exposures, view, {row: camera[v] for row, v in view.items()})
 
 
 def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]:

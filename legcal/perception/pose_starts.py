@@ -69,7 +69,8 @@ def pose_starts(picture: Picture, n_legs: int) -> Poses:
     X[:, 0] += place
     v, ray = _turned(w_all[f, m], cosine, sine), ray_all[f, k]
     vX, vr, Xr = _dot(v, X), _dot(v, ray), _dot(X, ray)
-    along = -(_dot(X, X) * vr - vX * Xr) / _safe(vX * vr - Xr)
+    across = vX * vr - Xr
+    along = -(_dot(X, X) * vr - vX * Xr) / np.where(np.abs(across) < 1e-12, 1e-12, across)
     depth = _dot(U_c[f, 2], X + along[:, None] * v)
     flat = np.linalg.norm(planes[k][:, :2], axis=1)
     expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
@@ -178,7 +179,3 @@ def _turned(x: Array, cosine: Array, sine: Array) -> Array:
 
 def _dot(x: Array, y: Array) -> Array:
     return np.asarray(np.einsum("ni,ni->n", x, y))
-
-
-def _safe(x: Array) -> Array:
-    return np.where(np.abs(x) < 1e-12, 1e-12, x)

@@ -343,7 +343,9 @@ def _normal_equations(
 ) -> _Normal:
     """Return the normal equations without the images' own parts, by sigmas of joints and images."""
     joint_sigma, image_sigma = sigmas
-    M, b = _by_item(lines, *equations)
+    residual, J = equations
+    Jt = J.swapaxes(1, 2)
+    M, b = lines.summed(Jt @ J), -lines.summed((Jt @ residual[..., None])[..., 0])
     M[:, 12:, 12:] += np.eye(3) / image_sigma**2
     b[:, 12:] -= state.own / image_sigma**2
     solved = np.linalg.solve(M[:, 12:, 12:], np.concatenate([M[:, 12:, :12], b[:, 12:, None]], -1))
@@ -367,12 +369,6 @@ def _normal_equations(
     H[joints, joints] += joint_sigma**-2
     g[6:] -= state.shift.ravel() / joint_sigma**2
     return _Normal(H, g, back, start)
-
-
-def _by_item(lines: Lines, residual: Array, J: Array) -> tuple[Array, Array]:
-    """Return J^T J (n_items, 15, 15) and -J^T r (n_items, 15)."""
-    Jt = J.swapaxes(1, 2)
-    return lines.summed(Jt @ J), -lines.summed((Jt @ residual[..., None])[..., 0])
 
 
 def _moved(state: _State, normal: _Normal, lines: Lines, middle: Array) -> _State:
