@@ -16,7 +16,6 @@ from .directions import joined as joined
 from .directions import leg_labels as leg_labels
 from .directions import sparse_basis as sparse_basis
 from .directions import split_by_motion as split_by_motion
-from .document import describe as describe
 from .equations import PoseEquations as PoseEquations
 from .equations import freedoms as freedoms
 from .equations import linearize as linearize
@@ -60,6 +59,7 @@ from .load import singular_note as singular_note
 from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
 from .model import Mechanism as Mechanism
+from .model import describe as describe
 from .parameters import Parametrization as Parametrization
 from .parameters import footed as footed
 from .parameters import free_coordinates as free_coordinates

@@ -21,47 +21,24 @@ ConnectionType = Literal["revolute", "prismatic", "sphere"]
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """A joint of the mechanism between two bodies.
-
-    Attributes
-    ----------
-    type : {"revolute", "prismatic", "sphere"}
-        What moves.
-    bodies : tuple of str
-        The bodies on both sides, named by one of their links; parent and child for a joint of
-        the tree.
-    T_body_joint : tuple of RigidTransform
-        The joint frame in either body. The second one is the first one moved by the joint.
-    joint : str or None
-        The URDF joint; None for a closure.
-    closure : int or None
-        The index of the closure; None for a joint of the tree.
-    """
+    """A joint of the mechanism between two bodies: one of the tree, or a ``3d`` closure."""
 
     type: ConnectionType
-    bodies: tuple[str, str]
-    T_body_joint: tuple[RigidTransform, RigidTransform]
-    joint: str | None
-    closure: int | None
+    bodies: tuple[str, str]  # each named by one of its links; of the tree's joints parent, child
+    T_body_joint: tuple[
+        RigidTransform, RigidTransform
+    ]  # the second is the first moved by the joint
+    joint: str | None  # the URDF joint; None for a closure
+    closure: int | None  # the index of the closure; None for a joint of the tree
 
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """The bodies and connections of a mechanism.
+    """The bodies and connections of a mechanism."""
 
-    Attributes
-    ----------
-    body_of : dict of str to str
-        The body of every link.
-    T_body_link : dict of str to RigidTransform
-        The pose of every link in its body.
-    connections : tuple of Connection
-        The joints between bodies, without the virtual platform joint.
-    """
-
-    body_of: dict[str, str]
+    body_of: dict[str, str]  # of every link
     T_body_link: dict[str, RigidTransform]
-    connections: tuple[Connection, ...]
+    connections: tuple[Connection, ...]  # without the virtual platform joint
 
 
 def rigid_bodies(urdf: Urdf, closures: Sequence[Closure], platform_joint: str | None) -> Bodies:

@@ -100,19 +100,9 @@ class ClosedChain:
         return np.concatenate(pieces) if pieces else np.zeros(0)
 
     def linearize(self, configuration: Array) -> tuple[Array, Array]:
-        """Return the residual of the closures and its exact Jacobian.
+        """Return the residual (n_rows,) of the closures and its exact Jacobian (n_rows, nv).
 
-        Parameters
-        ----------
-        configuration : (nq,) array
-            Any configuration.
-
-        Returns
-        -------
-        residual : (n_rows,) array
-            Three rows [m] for a point, six [m, rad] for a frame, in the order of the closures.
-        jacobian : (n_rows, nv) array
-            Its derivative with respect to a tangent step.
+        Three rows [m] for a point, six [m, rad] for a frame, in the order of the closures.
         """
         model, data = self._model, self._data
         pin.computeJointJacobians(model, data, configuration)
@@ -156,14 +146,9 @@ class ClosedChain:
         return motion_of(M.rotation, M.translation)
 
     def welded(self, base: str, frame: str, T_base_frame: RigidTransform) -> tuple[Array, Array]:
-        """Return residual and Jacobian of holding a frame at a pose, at the last linearisation.
+        """Return residual (6,) [m, rad] and Jacobian (6, nv) of holding a frame at a pose.
 
-        Returns
-        -------
-        residual : (6,) array
-            Logarithm of the remaining motion [m, rad].
-        jacobian : (6, nv) array
-            Its derivative.
+        They are those at the last linearisation; the residual is the logarithm of what is left.
         """
         M = self._placement(base).actInv(self._placement(frame))
         matrix = T_base_frame.as_matrix()
@@ -172,12 +157,9 @@ class ClosedChain:
         return np.array(pin.log6(error).vector), np.asarray(jacobian)
 
     def twist(self, base: str, frame: str) -> Array:
-        """Return how a tangent step moves one frame in another, at the last linearisation.
+        """Return how a tangent step moves one frame in another, (6, nv): displacement and rotation.
 
-        Returns
-        -------
-        (6, nv) array
-            Displacement and rotation of ``frame`` relative to ``base``, in ``frame``.
+        It is that at the last linearisation, in ``frame``.
         """
         M = self._placement(base).actInv(self._placement(frame))
         J_frame, J_base = (

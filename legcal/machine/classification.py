@@ -1,8 +1,13 @@
-"""A leg in the links of base and platform, from its chain: centres, length law, axes and twist."""
+"""A leg from its joints: what the joints at its ends are, A, B, length law, axes and twist.
+
+A leg is taken apart with all its joints at zero, in the frame of the base body. The revolutes and
+spheres before and after its slider, or on both sides of the best split of a rod, make one R, U or S
+each; revolutes along the leg only turn it.
+"""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import cast
@@ -21,22 +26,12 @@ PERPENDICULAR = 1e-3  # [rad]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A connection as a leg passes it from base to platform.
-
-    Attributes
-    ----------
-    connection : Connection
-        The joint.
-    near, far : int
-        Which of its two bodies lies towards the base, and which towards the platform.
-    axis : (3,) array
-        Unit axis in the joint frame.
-    """
+    """A connection as a leg passes it from base to platform."""
 
     connection: Connection
-    near: int
-    far: int
-    axis: Array
+    near: int  # which of its two bodies lies towards the base,
+    far: int  # and which towards the platform
+    axis: Array  # (3,) unit axis in the joint frame
 
     @property
     def name(self) -> str:
@@ -48,29 +43,14 @@ class Step:
         matrix = self.connection.T_body_joint[side].as_matrix()
         return matrix[:3, 3], matrix[:3, :3] @ self.axis
 
-    def point(self, side: int, along: float) -> Array:
-        """Return the point of the axis at a distance from the joint frame's origin [m]."""
-        origin, direction = self.line(side)
-        return origin + along * direction
-
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """The axis of a revolute, or the centre of a sphere.
-
-    Attributes
-    ----------
-    name : str
-        The joint.
-    point : (3,) array
-        A point of the axis: the joint's origin [m].
-    direction : (3,) array or None
-        Unit direction; None for a sphere.
-    """
+    """The axis of a revolute, or the centre of a sphere, which has no direction."""
 
     name: str
-    point: Array
-    direction: Array | None
+    point: Array  # (3,) the joint's origin [m]
+    direction: Array | None  # (3,) unit vector
 
     @property
     def along(self) -> Array:
@@ -92,43 +72,203 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """What the revolutes and spheres at one end of a leg make together.
+    """What the revolutes and spheres at one end of a leg make together."""
 
-    Attributes
-    ----------
-    letter : {"R", "U", "S", ""}
-        The joint; empty where nothing turns but the leg about itself.
-    centre : (3,) array or None
-        Its centre [m]; None for R, which has an axis of possible ones.
-    axes : tuple of Axis
-        The axis of R; the outer one, fixed in base or platform, and the inner one of U.
-    spins : tuple of Axis
-        Revolutes along the leg that are not part of it.
-    spare : int
-        Freedoms that it has beyond those of its letter.
+    letter: PlatformLetter  # empty where nothing turns but the leg about itself
+    centre: Array | None  # (3,) [m]; None for R, which has an axis of possible ones
+    axes: tuple[Axis, ...]  # that of R; of U the one fixed in base or platform, then the inner one
+    spins: tuple[Axis, ...] = ()  # revolutes along the leg that are not part of it
+    spare: int = 0  # freedoms that it has beyond those of its letter
+
+    @property
+    def outer(self) -> Array | None:
+        """The direction fixed in base or platform of R or U."""
+        return self.axes[0].along if self.axes else None
+
+    @property
+    def inner(self) -> Array | None:
+        """The direction fixed in the leg of R or U."""
+        return self.axes[-1].along if self.axes else None
+
+
+@dataclass(frozen=True, eq=False)
+class LegChain:
+    """The joints of one leg, and its geometry with all of them at zero in the base body's frame."""
+
+    steps: tuple[Step, ...]  # from base to platform
+    poses: tuple[RigidTransform, ...]  # of the base body, the bodies of the leg, the platform's
+    n_lower: int  # joints on the base side of the slider, or of the rod
+    slider: Step | None  # None for a leg of constant length
+    base: Pivot
+    platform: Pivot
+    A: Array  # (3,) [m]
+    B: Array  # (3,) [m]
+    u: Array  # (3,) in which a slider moves the platform end; else from A to B
+    idle_spins: int  # freedoms that turn nothing but the leg about itself
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The bodies of the leg, without base and platform."""
+        return tuple(step.connection.bodies[step.far] for step in self.steps[:-1])
+
+    @property
+    def n_upper(self) -> int:
+        """The index of the body behind the slider, or of the one of the rod."""
+        return self.n_lower + (self.slider is not None)
+
+    @property
+    def motor(self) -> str | None:
+        """The slider's joint, None for a rod."""
+        return None if self.slider is None else self.slider.connection.joint
+
+    @property
+    def reach(self) -> float:
+        """Position of B past A along u at joint value zero [m]."""
+        return float((self.B - self.A) @ self.u)
+
+    @property
+    def twists(self) -> bool:
+        """Whether an S joint lets the leg twist about itself."""
+        return "S" in (self.base.letter, self.platform.letter)
+
+    def line_in(self, body: int, point: Array) -> tuple[Array, Array]:
+        """Return a point and the direction u in one of the bodies, 0 the base's, -1 the last."""
+        matrix = self.poses[body].inv().as_matrix()
+        return matrix[:3, :3] @ point + matrix[:3, 3], matrix[:3, :3] @ self.u
+
+
+def understand(steps: Sequence[Step], platform_origin: Array, path: Path) -> LegChain:
+    """Return a leg from its joints; the origin of the platform link is one in the platform's body.
+
+    Raises
+    ------
+    OutOfClass
+        If it is not a joint, at most one slider, and a joint, with axes as the method needs them.
     """
+    poses, axes = [RigidTransform.identity()], list[Axis]()
+    for step in steps:
+        T_near, T_far = (step.connection.T_body_joint[side] for side in (step.near, step.far))
+        T = product(poses[-1], T_near)
+        turns = step.connection.type != "sphere"
+        direction = T.as_matrix()[:3, :3] @ step.axis if turns else None
+        axes.append(Axis(step.name, T.as_matrix()[:3, 3], direction))
+        poses.append(product(T, T_far.inv()))
+    sliders = [i for i, s in enumerate(steps) if s.connection.type == "prismatic"]
+    leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
+    try:
+        if len(sliders) > 1 or 0 in sliders:
+            found = (
+                f"{len(sliders)} sliders"
+                if len(sliders) > 1
+                else f"the slider '{axes[0].name}' on the base itself, so that the joint at A moves"
+            )
+            raise OutOfClass(
+                f"the leg of joint '{leg}' is outside the method: found {found}, needed a joint "
+                "whose centre is fixed in the base, at most one slider, and a joint whose centre "
+                "is fixed in the platform; this machine cannot be calibrated this way."
+            )
+        if sliders:
+            origin = np.asarray(poses[-1].apply(platform_origin))
+            n_lower, slider = sliders[0], steps[sliders[0]]
+            ends = _telescope(axes, n_lower, -1.0 if slider.near else 1.0, origin, leg)
+        else:
+            slider, (n_lower, ends) = None, _rod(axes, leg)
+    except OutOfClass as error:
+        raise OutOfClass([f"{path}: {problem}" for problem in error.problems]) from error
+    return LegChain(tuple(steps), tuple(poses), n_lower, slider, *ends)
 
-    letter: PlatformLetter
-    centre: Array | None
-    axes: tuple[Axis, ...]
-    spins: tuple[Axis, ...] = ()
-    spare: int = 0
+
+def leg_of(
+    name: str,
+    chain: LegChain,
+    T_body_link: tuple[RigidTransform, RigidTransform],
+    *,
+    travel: tuple[float, float],
+    actuated: bool,
+    spatial: bool,
+    home: RigidTransform | None,
+) -> Leg:
+    """Return a leg in the links of base and platform, which stand at T_body_link in their bodies.
+
+    In a plane axes and twist say nothing. *home* is T_base_platform of a pose that tells the sign
+    of the length law.
+    """
+    T_base, T_platform = T_body_link
+    A = np.asarray(T_base.inv().apply(chain.A))
+    B_last, u_last = chain.line_in(-1, chain.B)
+    B = np.asarray(T_platform.inv().apply(B_last))
+    sign, kind = 1, LegKind.CONSTANT
+    if chain.slider is not None:
+        length = None if home is None else float(np.linalg.norm(home.apply(B) - A))
+        sign = _sign(chain.reach, travel, length)
+        kind = LegKind.ACTUATED if actuated else LegKind.PASSIVE
+    T_zero_platform = product(chain.poses[-1], T_platform)
+    base_axis = _axis(chain, chain.base, T_base)
+    platform_axis = _axis(chain, chain.platform, T_zero_platform)
+    if chain.platform.letter == "":
+        platform_axis = sign * np.asarray(T_platform.rotation.inv().apply(u_last))
+    return Leg(
+        base_joint=cast("JointLetter", chain.base.letter),
+        platform_joint=chain.platform.letter,
+        kind=kind,
+        A=A,
+        B=B,
+        q0=sign * chain.reach,
+        base_axis=base_axis if spatial else None,
+        platform_axis=platform_axis if spatial else None,
+        twist=_twist(chain, sign, platform_axis, T_zero_platform) if spatial else None,
+        name=name,
+        prismatic=chain.motor,
+        sign=sign,
+        travel=travel,
+    )
 
 
-def pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
+def _sign(reach: float, travel: tuple[float, float], length: float | None) -> int:
+    """Return whether a leg grows (+1) or shrinks (-1) with its joint value.
+
+    B stands at reach + q along the slider. Its length at home tells on which side of A, where
+    only one of the two is within the travel; else the middle of the travel does.
+    """
+    if length is not None:
+        inside = [travel[0] <= s * length - reach <= travel[1] for s in (1, -1)]
+        if inside[0] != inside[1]:
+            return 1 if inside[0] else -1
+    return 1 if reach + 0.5 * (travel[0] + travel[1]) > 0.0 else -1
+
+
+def _axis(chain: LegChain, pivot: Pivot, T_zero_link: RigidTransform) -> Array | None:
+    """Return the axis of a joint in its link, where it is a parameter."""
+    if pivot.outer is None or (pivot.letter == "U" and chain.twists):
+        return None
+    return undirected(np.asarray(T_zero_link.rotation.inv().apply(pivot.outer)))
+
+
+def _twist(
+    chain: LegChain, sign: int, platform_axis: Array | None, T_zero_platform: RigidTransform
+) -> float | None:
+    """Return the angle about u between the inner axes of a leg without an S joint [rad]."""
+    if chain.twists:
+        return None
+    p, w = chain.base.inner, chain.platform.inner
+    if w is None and platform_axis is not None:
+        w = np.asarray(T_zero_platform.rotation.apply(normal_basis(platform_axis)[0]))
+    if p is None or w is None:
+        raise ValueError("a leg without an S joint has an axis at both ends")
+    angle = math.atan2(float(sign * chain.u @ np.cross(p, w)), float(p @ w))
+    # modulo pi; just above -pi/2 is rounding, and means pi/2
+    return angle - math.pi * math.ceil(angle / math.pi - 0.5 - 1e-10)
+
+
+Ends = tuple[Pivot, Pivot, Array, Array, Array, int]  # base, platform, A, B, u, idle spins
+
+
+def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
     """Return the joint that consecutive spheres and revolutes make, from their geometry.
 
     Three or more revolutes whose axes meet in one point are an S, two that meet at right angles a
-    U. A revolute along the leg turns nothing but the leg itself.
-
-    Parameters
-    ----------
-    axes : sequence of Axis
-        From the one fixed in base or platform to the one fixed in the leg.
-    along : (3,) array or None
-        The direction of the leg; None while it is not known.
-    leg : str
-        A joint that names the leg.
+    U. A revolute along the leg, whose direction may not be known yet, turns nothing but the leg.
+    *axes* come from the one fixed in base or platform to the one fixed in the leg.
 
     Raises
     ------
@@ -137,7 +277,7 @@ def pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
     """
     spheres = [axis for axis in axes if axis.direction is None]
     if spheres:
-        return _about(spheres[0], [axis for axis in axes if axis is not spheres[0]], leg)
+        return _about_sphere(spheres[0], [axis for axis in axes if axis is not spheres[0]], leg)
     lines = _distinct(axes)
     spare = len(axes) - len(lines)
     spins: tuple[Axis, ...] = ()
@@ -159,7 +299,7 @@ def pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
     return Pivot("U", centre, tuple(lines), (), spare)
 
 
-def _about(sphere: Axis, others: Sequence[Axis], leg: str) -> Pivot:
+def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str) -> Pivot:
     """Return an S joint made of a sphere and revolutes through its centre."""
     for axis in others:
         miss = axis.distance(sphere.point)
@@ -241,37 +381,7 @@ def _names(axes: Sequence[Axis]) -> str:
     return " and ".join(f"'{axis.name}'" for axis in axes)
 
 
-@dataclass(frozen=True, eq=False)
-class Ends:
-    """Both ends of a leg with all joints at zero: their joints, A, B, and the leg's direction."""
-
-    base: Pivot
-    platform: Pivot
-    A: Array
-    B: Array
-    u: Array
-    idle_spins: int
-
-
-class LegAtZero:
-    """The joints of a leg at zero, in the frame of the base body."""
-
-    def __init__(self, steps: Sequence[Step], platform_origin: Array) -> None:
-        self.steps = tuple(steps)
-        self.poses = [RigidTransform.identity()]
-        self.axes: list[Axis] = []
-        for step in steps:
-            T_near, T_far = (step.connection.T_body_joint[side] for side in (step.near, step.far))
-            T = product(self.poses[-1], T_near)
-            turns = step.connection.type != "sphere"
-            direction = T.as_matrix()[:3, :3] @ step.axis if turns else None
-            self.axes.append(Axis(step.name, T.as_matrix()[:3, 3], direction))
-            self.poses.append(product(T, T_far.inv()))
-        self.platform_origin = np.asarray(self.poses[-1].apply(platform_origin))
-        self.leg = next((s.connection.joint for s in steps if s.connection.joint), "") or ""
-
-
-def with_spins(base: Pivot, platform: Pivot, u: Array, leg: str) -> tuple[Pivot, Pivot, int]:
+def _with_spins(base: Pivot, platform: Pivot, u: Array, leg: str) -> tuple[Pivot, Pivot, int]:
     """Return both joints with the revolutes along the leg made part of them, and the idle ones.
 
     A universal joint and a revolute along the leg are an S, on whichever end it stands: the leg
@@ -287,7 +397,7 @@ def with_spins(base: Pivot, platform: Pivot, u: Array, leg: str) -> tuple[Pivot,
     for i in (0, 1):
         if ends[i].letter == "U" and spare[1 - i] and ends[1 - i].letter != "S":
             spare[1 - i] -= 1
-            ends[i] = Pivot("S", ends[i].centre, (), ends[i].spins, ends[i].spare)
+            ends[i] = replace(ends[i], letter="S", axes=())
     left = sum(spare)
     letters = [end.letter for end in ends]
     if letters[0] == "":
@@ -307,12 +417,12 @@ def with_spins(base: Pivot, platform: Pivot, u: Array, leg: str) -> tuple[Pivot,
     return ends[0], ends[1], idle
 
 
-def check_axes(ends: Ends, leg: str) -> None:
+def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
     """Refuse revolute axes, and inner axes of legs without S, that are not square to the leg."""
-    without_s = "S" not in (ends.base.letter, ends.platform.letter)
-    for end in (ends.base, ends.platform):
+    without_s = "S" not in (base.letter, platform.letter)
+    for end in (base, platform):
         if end.letter == "R" or (end.letter == "U" and without_s):
-            tilt = off_square(end.axes[-1].along, ends.u)
+            tilt = off_square(end.axes[-1].along, u)
             if tilt > PERPENDICULAR:
                 what = "a revolute axis" if end.letter == "R" else "an inner axis of a U joint"
                 raise OutOfClass(
@@ -322,7 +432,7 @@ def check_axes(ends: Ends, leg: str) -> None:
                 )
 
 
-def rod_ends(zero: LegAtZero) -> tuple[int, Ends]:
+def _rod(axes: Sequence[Axis], leg: str) -> tuple[int, Ends]:
     """Return how many joints of a leg without slider are at the base, and its ends.
 
     A revolute along the rod passes through both centres, and may belong to either joint: the one
@@ -335,20 +445,20 @@ def rod_ends(zero: LegAtZero) -> tuple[int, Ends]:
     """
     found: list[tuple[float, int, Ends]] = []
     problems: dict[int, OutOfClass] = {}
-    for n_lower in range(1, len(zero.steps)):
+    for n_lower in range(1, len(axes)):
         try:
-            ends = _split_rod(zero, n_lower)
+            ends = _split_rod(axes, n_lower, leg)
         except OutOfClass as error:
             problems[n_lower] = error
             continue
-        lower, upper = zero.axes[:n_lower], zero.axes[n_lower:]
-        away = [np.linalg.norm(axis.point - ends.A) for axis in lower]
-        away += [np.linalg.norm(axis.point - ends.B) for axis in upper]
+        lower, upper = axes[:n_lower], axes[n_lower:]
+        away = [np.linalg.norm(axis.point - ends[2]) for axis in lower]
+        away += [np.linalg.norm(axis.point - ends[3]) for axis in upper]
         found.append((float(sum(away)), n_lower, ends))
     if found:
         _, n_lower, ends = min(found, key=lambda split: split[:2])
         return n_lower, ends
-    places = _places(zero.axes)
+    places = _places(axes)
     if len(places) == 2:
         raise problems[len(places[0])]
     what = (
@@ -358,33 +468,32 @@ def rod_ends(zero: LegAtZero) -> tuple[int, Ends]:
         else "no slider and all joints in one place"
     )
     raise OutOfClass(
-        f"the leg of joint '{zero.leg}' is outside the method: found {what}, needed a joint whose "
+        f"the leg of joint '{leg}' is outside the method: found {what}, needed a joint whose "
         "centre is fixed in the base, then a slider or a rod of constant length, and a joint whose "
         "centre is fixed in the platform; this machine cannot be calibrated this way."
     )
 
 
-def _split_rod(zero: LegAtZero, n_lower: int) -> Ends:
+def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str) -> Ends:
     """Return the ends of a rod whose first joints are at the base."""
-    lower, upper = zero.axes[:n_lower], zero.axes[: n_lower - 1 : -1]
-    A, B = _on_rod(pivot(lower, None, zero.leg), pivot(upper, None, zero.leg))
+    lower, upper = axes[:n_lower], axes[: n_lower - 1 : -1]
+    A, B = _on_rod(_pivot(lower, None, leg), _pivot(upper, None, leg))
     length = float(np.linalg.norm(B - A))
     if length < CONCURRENT:
         raise OutOfClass(
-            f"the leg of joint '{zero.leg}' is outside the method: found both its joints in one "
+            f"the leg of joint '{leg}' is outside the method: found both its joints in one "
             "point, needed a distance between them; correct their origins."
         )
     u = (B - A) / length
-    base, platform = pivot(lower, u, zero.leg), pivot(upper, u, zero.leg)
-    base, platform, idle_spins = with_spins(base, platform, u, zero.leg)
-    ends = Ends(base, platform, A, B, u, idle_spins)
+    base, platform = _pivot(lower, u, leg), _pivot(upper, u, leg)
+    base, platform, idle_spins = _with_spins(base, platform, u, leg)
     if platform.letter == "":
         raise OutOfClass(
-            f"the leg of joint '{zero.leg}' is outside the method: found a rod that only turns "
+            f"the leg of joint '{leg}' is outside the method: found a rod that only turns "
             "about itself at the platform, needed a joint there; correct its axes."
         )
-    check_axes(ends, zero.leg)
-    return ends
+    _check_axes(base, platform, u, leg)
+    return base, platform, A, B, u, idle_spins
 
 
 def _on_rod(base: Pivot, platform: Pivot) -> tuple[Array, Array]:
@@ -429,8 +538,10 @@ def _places(axes: Sequence[Axis]) -> list[list[Axis]]:
 _END = {"R": "platform axis", "U": "platform joint", "S": "platform joint", "": "slider"}
 
 
-def telescope_ends(zero: LegAtZero, slider: int) -> Ends:
-    """Return the ends of a leg whose slider is one of its joints, given by its index.
+def _telescope(
+    axes: Sequence[Axis], slider: int, towards: float, platform_origin: Array, leg: str
+) -> Ends:
+    """Return the ends of a leg whose slider, one of its joints, moves *towards* along its axis.
 
     Between joints with a centre the leg's axis is the line through one of them along the slider.
     Between two R it is the line along the slider that meets both axes; where these are parallel,
@@ -441,12 +552,11 @@ def telescope_ends(zero: LegAtZero, slider: int) -> Ends:
     OutOfClass
         If that line misses a joint by more than 10 um, or an axis is not square to it.
     """
-    step = zero.steps[slider]
-    u = zero.axes[slider].along * (1.0 if step.near == 0 else -1.0)  # a joint moves its child
-    base = pivot(zero.axes[:slider], u, zero.leg)
-    platform = pivot(zero.axes[:slider:-1], u, zero.leg)
-    base, platform, idle_spins = with_spins(base, platform, u, zero.leg)
-    origin = zero.axes[slider].point
+    u = towards * axes[slider].along  # a joint moves its child
+    base = _pivot(axes[:slider], u, leg)
+    platform = _pivot(axes[:slider:-1], u, leg)
+    base, platform, idle_spins = _with_spins(base, platform, u, leg)
+    origin = axes[slider].point
     A, B, miss = _on_slider(base, platform, u, origin)
     what = f"its axis through the {_END[platform.letter]} misses the base joint"
     for spin in (*base.spins, *platform.spins):
@@ -454,15 +564,14 @@ def telescope_ends(zero: LegAtZero, slider: int) -> Ends:
             miss, what = spin.distance(A), f"the axis of '{spin.name}' misses that of the leg"
     if miss > CONCURRENT:
         raise OutOfClass(
-            f"the leg of slider '{step.name}' is outside the method: {what} "
+            f"the leg of slider '{axes[slider].name}' is outside the method: {what} "
             f"{'axis' if base.letter == 'R' else 'centre'} by {1e3 * miss:.4g} mm, needed at most "
             "0.01 mm; correct the origins along the leg."
         )
     if platform.letter == "":
-        B = A + ((zero.platform_origin - A) @ u) * u
-    ends = Ends(base, platform, A, B, u, idle_spins)
-    check_axes(ends, zero.leg)
-    return ends
+        B = A + ((platform_origin - A) @ u) * u
+    _check_axes(base, platform, u, leg)
+    return base, platform, A, B, u, idle_spins
 
 
 def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[Array, Array, float]:
@@ -492,260 +601,3 @@ def _crossing(axis: Axis, u: Array, point: Array) -> Array:
     """Return the point of an axis that is nearest to a line."""
     on_axis, _ = nearest(axis, Axis("", point, u))
     return axis.foot(point) if on_axis is None else on_axis
-
-
-@dataclass(frozen=True, eq=False)
-class JointGroup:
-    """A joint of the leg at base or platform, with its centre in the bodies that it joins.
-
-    Attributes
-    ----------
-    letter : {"R", "U", "S", ""}
-        Its type; empty where the leg is fixed to the platform.
-    centre_near, centre_far : (3,) array
-        The centre in the body towards the base, and in the one towards the platform [m].
-    outer : (3,) array or None
-        The axis of R, or the one of U that is fixed in base or platform, in that body.
-    inner : (3,) array or None
-        The axis of R, or the one of U that is fixed in the leg, with all joints of the leg at
-        zero in the body of the base.
-    """
-
-    letter: PlatformLetter
-    centre_near: Array
-    centre_far: Array
-    outer: Array | None
-    inner: Array | None
-
-
-@dataclass(frozen=True, eq=False)
-class LegChain:
-    """The chain of one leg, and its geometry.
-
-    Attributes
-    ----------
-    steps : tuple of Step
-        Its joints from base to platform.
-    bodies : tuple of str
-        The body after every joint but the last: all of the leg, without base and platform.
-    n_lower : int
-        Number of joints on the base side of the slider, or of the rod.
-    base, platform : JointGroup
-        The joints at both ends.
-    slider : Step or None
-        The prismatic joint; None for a leg of constant length.
-    u_lower, u_upper : (3,) array
-        For a slider, the direction in which its value moves the platform end, in the bodies on
-        its base and platform side; else the direction from A to B.
-    reach : float
-        Position of B past A along that direction at joint value zero [m].
-    u_zero : (3,) array
-        That direction with all joints at zero, in the body of the base.
-    T_zero : RigidTransform
-        The body of the platform in that of the base, with all joints of the leg at zero.
-    idle_spins : int
-        Freedoms of the joints that turn nothing but the leg about itself.
-    """
-
-    steps: tuple[Step, ...]
-    bodies: tuple[str, ...]
-    n_lower: int
-    base: JointGroup
-    platform: JointGroup
-    slider: Step | None
-    u_lower: Array
-    u_upper: Array
-    reach: float
-    u_zero: Array
-    T_zero: RigidTransform
-    idle_spins: int
-
-    @property
-    def motor(self) -> str | None:
-        """The slider's joint, None for a rod."""
-        return None if self.slider is None else self.slider.connection.joint
-
-    @property
-    def u_platform(self) -> Array:
-        """The direction ``u_zero`` in the body of the platform, for a leg that is fixed to it."""
-        return np.asarray(self.T_zero.rotation.inv().apply(self.u_zero))
-
-    @property
-    def twists(self) -> bool:
-        """Whether an S joint lets the leg twist about itself."""
-        return "S" in (self.base.letter, self.platform.letter)
-
-
-def understand(steps: Sequence[Step], platform_origin: Array, path: Path) -> LegChain:
-    """Return the geometry of a leg from its joints.
-
-    Parameters
-    ----------
-    steps : sequence of Step
-        Its joints from base to platform.
-    platform_origin : (3,) array
-        Origin of the platform link in the body of the platform [m].
-    path : Path
-        The file, for messages.
-
-    Raises
-    ------
-    OutOfClass
-        If it is not a joint, at most one slider, and a joint, with axes as the method needs them.
-    """
-    zero = LegAtZero(steps, platform_origin)
-    sliders = [i for i, s in enumerate(steps) if s.connection.type == "prismatic"]
-    try:
-        if not sliders:
-            n_lower, ends = rod_ends(zero)
-            return _chain(zero, n_lower, None, ends)
-        if len(sliders) > 1 or sliders[0] == 0:
-            raise OutOfClass(_misplaced(zero, sliders))
-        return _chain(zero, sliders[0], steps[sliders[0]], telescope_ends(zero, sliders[0]))
-    except OutOfClass as error:
-        raise OutOfClass([f"{path}: {problem}" for problem in error.problems]) from error
-
-
-def _misplaced(zero: LegAtZero, sliders: Sequence[int]) -> str:
-    """Return why the sliders of a leg are not where a leg has one."""
-    found = (
-        f"{len(sliders)} sliders"
-        if len(sliders) > 1
-        else f"the slider '{zero.axes[0].name}' on the base itself, so that the joint at A moves"
-    )
-    return (
-        f"the leg of joint '{zero.leg}' is outside the method: found {found}, needed a joint whose "
-        "centre is fixed in the base, at most one slider, and a joint whose centre is fixed in the "
-        "platform; this machine cannot be calibrated this way."
-    )
-
-
-def _chain(zero: LegAtZero, n_lower: int, slider: Step | None, ends: Ends) -> LegChain:
-    """Return a leg, every number in the body that it is fixed in."""
-    lower, upper = zero.poses[n_lower], zero.poses[n_lower + (slider is not None)]
-    last = zero.poses[-1]
-    groups = []
-    for end, centre, near, far, own in (
-        (ends.base, ends.A, zero.poses[0], lower, zero.poses[0]),
-        (ends.platform, ends.B, upper, last, last),
-    ):
-        outer, inner = (end.axes[0].along, end.axes[-1].along) if end.axes else (None, None)
-        groups.append(
-            JointGroup(
-                end.letter,
-                np.asarray(near.inv().apply(centre)),
-                np.asarray(far.inv().apply(centre)),
-                None if outer is None else outer @ own.as_matrix()[:3, :3],
-                inner,
-            )
-        )
-    return LegChain(
-        steps=zero.steps,
-        bodies=tuple(s.connection.bodies[s.far] for s in zero.steps[:-1]),
-        n_lower=n_lower,
-        base=groups[0],
-        platform=groups[1],
-        slider=slider,
-        u_lower=ends.u @ lower.as_matrix()[:3, :3],
-        u_upper=ends.u @ upper.as_matrix()[:3, :3],
-        reach=float((ends.B - ends.A) @ ends.u),
-        u_zero=ends.u,
-        T_zero=last,
-        idle_spins=ends.idle_spins,
-    )
-
-
-def leg_of(
-    name: str,
-    chain: LegChain,
-    T_body_link: tuple[RigidTransform, RigidTransform],
-    *,
-    travel: tuple[float, float],
-    actuated: bool,
-    spatial: bool,
-    home: RigidTransform | None,
-) -> Leg:
-    """Return a leg in the links of base and platform.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    chain : LegChain
-        Its joints.
-    T_body_link : tuple of RigidTransform
-        The links of base and platform in their bodies.
-    travel : tuple of float
-        Limits of the slider [m].
-    actuated : bool
-        Whether its slider has a motor.
-    spatial : bool
-        Whether the mechanism moves in space; in a plane axes and twist say nothing.
-    home : RigidTransform or None
-        T_base_platform of a pose that tells the sign of the length law.
-    """
-    T_base, T_platform = T_body_link
-    A_base = np.asarray(T_base.inv().apply(chain.base.centre_near))
-    B_platform = np.asarray(T_platform.inv().apply(chain.platform.centre_far))
-    sign, kind = 1, LegKind.CONSTANT
-    if chain.slider is not None:
-        length = None if home is None else float(np.linalg.norm(home.apply(B_platform) - A_base))
-        sign = _sign(chain.reach, travel, length)
-        kind = LegKind.ACTUATED if actuated else LegKind.PASSIVE
-    base_axis = _axis(chain, chain.base, T_base)
-    platform_axis = _axis(chain, chain.platform, T_platform)
-    if chain.platform.letter == "":
-        platform_axis = sign * np.asarray(T_platform.rotation.inv().apply(chain.u_platform))
-    return Leg(
-        name=name,
-        base_joint=cast("JointLetter", chain.base.letter),
-        platform_joint=chain.platform.letter,
-        kind=kind,
-        prismatic=chain.motor,
-        A=A_base,
-        B=B_platform,
-        q0=sign * chain.reach,
-        sign=sign,
-        travel=travel,
-        cylinders=(),
-        base_axis=base_axis if spatial else None,
-        platform_axis=platform_axis if spatial else None,
-        twist=_twist(chain, sign, platform_axis, T_platform) if spatial else None,
-    )
-
-
-def _sign(reach: float, travel: tuple[float, float], length: float | None) -> int:
-    """Return whether a leg grows (+1) or shrinks (-1) with its joint value.
-
-    B stands at reach + q along the slider. Its length at home tells on which side of A, where
-    only one of the two is within the travel; else the middle of the travel does.
-    """
-    if length is not None:
-        inside = [travel[0] <= s * length - reach <= travel[1] for s in (1, -1)]
-        if inside[0] != inside[1]:
-            return 1 if inside[0] else -1
-    return 1 if reach + 0.5 * (travel[0] + travel[1]) > 0.0 else -1
-
-
-def _axis(chain: LegChain, group: JointGroup, T_body_link: RigidTransform) -> Array | None:
-    """Return the axis of a joint in its link, where it is a parameter."""
-    if group.outer is None or (group.letter == "U" and chain.twists):
-        return None
-    return undirected(np.asarray(T_body_link.rotation.inv().apply(group.outer)))
-
-
-def _twist(
-    chain: LegChain, sign: int, platform_axis: Array | None, T_platform: RigidTransform
-) -> float | None:
-    """Return the angle about u between the inner axes of a leg without an S joint [rad]."""
-    if chain.twists:
-        return None
-    p, w = chain.base.inner, chain.platform.inner
-    if w is None and platform_axis is not None:
-        T_zero_link = chain.T_zero.rotation * T_platform.rotation
-        w = np.asarray(T_zero_link.apply(normal_basis(platform_axis)[0]))
-    if p is None or w is None:
-        raise ValueError("a leg without an S joint has an axis at both ends")
-    angle = math.atan2(float(sign * chain.u_zero @ np.cross(p, w)), float(p @ w))
-    # modulo pi; just above -pi/2 is rounding, and means pi/2
-    return angle - math.pi * math.ceil(angle / math.pi - 0.5 - 1e-10)

@@ -1,4 +1,4 @@
-"""At which height the legs of a planar mechanism lie: where their visible cylinders are.
+"""The visible cylinders of a file, which of them lie along legs, and the heights of planar legs.
 
 In a plane the kinematics say nothing of heights, and joint origins may stand anywhere along their
 axes. A camera sees the legs where their cylinders are.
@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, product
 from legcal.machine.bodies import Bodies
-from legcal.machine.classification import JointGroup, LegChain, Step
+from legcal.machine.classification import LegChain, Step
 from legcal.machine.leg import Cylinder, Leg
 from legcal.machine.urdf import Urdf, parse_robot
 
@@ -40,33 +40,26 @@ def with_cylinders(
     bodies: Bodies,
     chains: Sequence[LegChain],
 ) -> tuple[Leg, ...]:
-    """Return the legs with the visual cylinders that are coaxial with them.
+    """Return the legs with the visual cylinders that are coaxial with them, in the file's order.
 
-    A cylinder counts on every link that moves rigidly with the base or the platform half of
-    the leg, or only turns about the leg's axis.
-
-    Parameters
-    ----------
-    legs : sequence of Leg
-        The legs, with their sign.
-    shown : sequence of VisualCylinder
-        The cylinders of the file.
-    bodies : Bodies
-        The rigid bodies.
-    chains : sequence of LegChain
-        The joints of the legs.
+    A cylinder counts on every link that moves rigidly with the base or the platform half of the
+    leg, or only turns about the leg's axis.
     """
     return tuple(
-        replace(leg, cylinders=_of_leg(leg, chain, bodies, shown))
+        replace(leg, cylinders=_along(leg, chain, shown, bodies))
         for leg, chain in zip(legs, chains, strict=True)
     )
 
 
-def ends_in_body(cylinder: VisualCylinder, bodies: Bodies) -> Array:
-    """Return both ends of a cylinder's axis in the body that it is on, (2, 3) [m]."""
-    T = product(bodies.T_body_link[cylinder.link], cylinder.T_link_cylinder)
-    half = np.array([0.0, 0.0, 0.5 * cylinder.length])
-    return np.asarray(T.apply(np.stack([-half, half])))
+def at_visible_heights(
+    chains: Sequence[LegChain], shown: Sequence[VisualCylinder], bodies: Bodies
+) -> list[LegChain]:
+    """Return the legs of a planar mechanism at the height of their longest cylinder.
+
+    A leg without a cylinder over its axis stays where its slider, or its joint at the base, has its
+    origin.
+    """
+    return [_raised(chain, shown, bodies) for chain in chains]
 
 
 def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
@@ -113,20 +106,17 @@ def _attributes(element: etree._Element, *names: str) -> dict[str, str]:
     return {name: value for name in names if (value := element.get(name)) is not None}
 
 
-def _of_leg(
-    leg: Leg,
-    chain: LegChain,
-    bodies: Bodies,
-    shown: Sequence[VisualCylinder],
+def _along(
+    leg: Leg, chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies
 ) -> tuple[Cylinder, ...]:
-    """Return the cylinders of one leg, in the order of the file."""
+    """Return the cylinders along one leg."""
     halves = _halves(leg, chain)
     found = []
     for cylinder in shown:
         if bodies.body_of[cylinder.link] not in halves:
             continue
         side, origin, u = halves[bodies.body_of[cylinder.link]]
-        ends = ends_in_body(cylinder, bodies) - origin
+        ends = _ends(cylinder, bodies) - origin
         along = ends @ u
         if np.linalg.norm(ends - along[:, None] * u, axis=1).max() < COAXIAL:
             start, end = sorted(float(x) for x in along)
@@ -137,106 +127,52 @@ def _of_leg(
 def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
     """Return the bodies that hold the leg's axis: their side, A or B, and u from A to B."""
     halves: dict[str, Half] = {}
-    A, u = chain.base.centre_far, leg.sign * chain.u_lower
-    lower = list(zip(chain.steps, chain.bodies, strict=False))[: chain.n_lower]
-    for step, body in reversed(lower):
-        halves[body] = "base", A, u
-        if not _turns_about(step, step.far, u):
+
+    def turns(body: int, side: Literal["base", "platform"], point: Array, step: Step) -> bool:
+        """Take a body, and say whether the joint behind it is a revolute about the leg."""
+        at, u = chain.line_in(body, point)
+        halves[chain.bodies[body - 1]] = side, at, leg.sign * u
+        axis = step.line(step.far if side == "base" else step.near)[1]
+        return step.connection.type == "revolute" and bool(
+            np.linalg.norm(np.cross(axis, u)) < PARALLEL
+        )
+
+    for k in reversed(range(chain.n_lower)):
+        if not turns(k + 1, "base", chain.A, chain.steps[k]):
             break
-        A, u = _across(step, step.far, step.near, A, u)
     if chain.slider is None:
         return halves
-    B, u = chain.platform.centre_near, leg.sign * chain.u_upper
     if leg.platform_joint == "":
-        last = chain.steps[-1]
-        on_platform = chain.platform.centre_far, leg.sign * chain.u_platform
-        halves[last.connection.bodies[last.far]] = "platform", *on_platform
-    for step, body in zip(
-        chain.steps[chain.n_lower + 1 :], chain.bodies[chain.n_lower :], strict=True
-    ):
-        halves[body] = "platform", B, u
-        if not _turns_about(step, step.near, u):
+        last, (B, u) = chain.steps[-1], chain.line_in(-1, chain.B)
+        halves[last.connection.bodies[last.far]] = "platform", B, leg.sign * u
+    for k in range(chain.n_upper, len(chain.steps)):
+        if not turns(k, "platform", chain.B, chain.steps[k]):
             break
-        B, u = _across(step, step.near, step.far, B, u)
     return halves
 
 
-def _turns_about(step: Step, side: int, u: Array) -> bool:
-    """Say whether a joint is a revolute about the leg's axis, which passes through its centre."""
-    parallel = np.linalg.norm(np.cross(step.line(side)[1], u)) < PARALLEL
-    return step.connection.type == "revolute" and bool(parallel)
-
-
-def _across(step: Step, here: int, there: int, point: Array, u: Array) -> tuple[Array, Array]:
-    """Return a point and a direction of a revolute's axis in the body on its other side."""
-    origin, axis = step.line(here)
-    along = float((point - origin) @ axis)
-    return step.point(there, along), np.sign(axis @ u) * step.line(there)[1]
-
-
-def at_visible_heights(
-    chains: Sequence[LegChain], shown: Sequence[VisualCylinder], bodies: Bodies
-) -> list[LegChain]:
-    """Return the legs of a planar mechanism at the height of their longest cylinder.
-
-    A leg without a cylinder over its axis stays where its slider, or its joint at the base, has its
-    origin.
-
-    Parameters
-    ----------
-    chains : sequence of LegChain
-        Legs with an R joint at either end, all axes parallel.
-    shown : sequence of VisualCylinder
-        The cylinders of the file.
-    bodies : Bodies
-        The rigid bodies.
-    """
-    return [_raised(chain, shown, bodies) for chain in chains]
-
-
 def _raised(chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies) -> LegChain:
-    """Return one leg with both centres at the height of its cylinder."""
-    first, last = chain.steps[0], chain.steps[-1]
+    """Return one leg with both centres at the height of its cylinder along the joints' axes."""
     if chain.platform.letter != "R" or len(chain.steps) != 2 + (chain.slider is not None):
         return chain
-    on_base, on_lower = (first.line(side)[1] for side in (first.near, first.far))
-    on_upper = on_lower
-    if chain.slider is not None:
-        T_lower, T_upper = (
-            chain.slider.connection.T_body_joint[side]
-            for side in (chain.slider.near, chain.slider.far)
-        )
-        on_upper = np.asarray((T_upper.rotation * T_lower.rotation.inv()).apply(on_lower))
-    up = float(np.sign(on_upper @ last.line(last.near)[1]))
-    on_platform = up * last.line(last.far)[1]
-    halves = {
-        chain.bodies[-1]: (chain.platform.centre_near, chain.u_upper, on_upper),
-        chain.bodies[0]: (chain.base.centre_far, chain.u_lower, on_lower),
-    }
-    found = [
-        (cylinder.length, height)
-        for cylinder in shown
-        if (body := bodies.body_of[cylinder.link]) in halves
-        if (height := _height(ends_in_body(cylinder, bodies), *halves[body])) is not None
-    ]
+    normal = chain.base.axes[-1].along
+    found = []
+    for k, centre in ((len(chain.bodies), chain.B), (1, chain.A)):
+        for cylinder in shown:
+            if bodies.body_of[cylinder.link] == chain.bodies[k - 1]:
+                offset = chain.poses[k].apply(_ends(cylinder, bodies)) - centre
+                height = float((offset @ normal).mean())
+                beside = offset - (offset @ chain.u)[:, None] * chain.u - height * normal
+                if np.linalg.norm(beside, axis=1).max() < COAXIAL:
+                    found.append((cylinder.length, height))
     if not found:
         return chain
-    height = max(found)[1]
-    return replace(
-        chain,
-        base=_moved(chain.base, height * on_base, height * on_lower),
-        platform=_moved(chain.platform, height * on_upper, height * on_platform),
-    )
+    shift = max(found)[1] * normal
+    return replace(chain, A=chain.A + shift, B=chain.B + shift)
 
 
-def _height(ends: Array, centre: Array, u: Array, normal: Array) -> float | None:
-    """Return how far over a leg's axis a cylinder lies along it [m], None if it does not."""
-    offset = ends - centre
-    heights = offset @ normal
-    beside = offset - (offset @ u)[:, None] * u - heights.mean() * normal
-    return float(heights.mean()) if np.linalg.norm(beside, axis=1).max() < COAXIAL else None
-
-
-def _moved(group: JointGroup, near: Array, far: Array) -> JointGroup:
-    """Return a joint with its centre moved in the bodies on both sides [m]."""
-    return replace(group, centre_near=group.centre_near + near, centre_far=group.centre_far + far)
+def _ends(cylinder: VisualCylinder, bodies: Bodies) -> Array:
+    """Return both ends of a cylinder's axis in the body that it is on, (2, 3) [m]."""
+    T = product(bodies.T_body_link[cylinder.link], cylinder.T_link_cylinder)
+    half = np.array([0.0, 0.0, 0.5 * cylinder.length])
+    return np.asarray(T.apply(np.stack([-half, half])))

@@ -46,199 +46,7 @@ from legcal.machine.topology import (
 from legcal.machine.tree import Source
 from legcal.machine.urdf import Urdf
 
-
-def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
-    """Check that the URDF has every link and joint that the YAML names.
-
-    Raises
-    ------
-    ModelError
-        With one sentence for each unknown name.
-    """
-    block = file.legcal
-    links, joints = set(urdf.links), set(urdf.joints)
-    named: list[tuple[str, str, str, set[str]]] = [
-        *((f"name_mot.{i}", joint, "joint", joints) for i, joint in enumerate(file.name_mot)),
-        *(
-            (f"closed_loop.{i}.{k}", frame, "frame (link or joint)", links | joints)
-            for i, pair in enumerate(file.closed_loop)
-            for k, frame in enumerate(pair)
-        ),
-    ]
-    if block is not None:
-        named += [
-            ("legcal.base", block.base, "link", links),
-            ("legcal.platform", block.platform, "link", links),
-            *((f"legcal.legs.{leg}", joint, "joint", joints) for leg, joint in block.legs.items()),
-        ]
-        if block.platform_joint is not None:
-            named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
-    problems = [
-        _unknown(path, place, name, what, urdf, known)
-        for place, name, what, known in named
-        if name not in known
-    ]
-    problems += [
-        f"{path}: closed_loop.{i} could not be used: found '{one}' twice, needed two frames; "
-        "correct one of them."
-        for i, (one, two) in enumerate(file.closed_loop)
-        if one == two
-    ]
-    if block is not None and block.base == block.platform:
-        problems.append(
-            f"{path}: legcal.platform could not be used: found the link '{block.base}' as base and "
-            "as platform, needed two links; correct one of them."
-        )
-    if problems:
-        raise ModelError(problems)
-
-
-def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
-    """Check that there are as many legs as define a frame, not far more, no fixed one in a plane.
-
-    Raises
-    ------
-    OutOfClass
-        If there are fewer, or more than MOST_LEGS, or a leg of a planar mechanism is fixed to
-        the platform.
-    """
-    n_d = n_frame_legs(spatial=spatial)
-    if len(chains) < n_d:
-        where = "in space" if spatial else "in a plane"
-        raise OutOfClass(
-            f"{path}: this mechanism is outside the method: found {len(chains)} "
-            f"{'leg' if len(chains) == 1 else 'legs'} {where}, needed at least {n_d}, whose joints "
-            "define the frames of base and platform; this machine cannot be calibrated this way."
-        )
-    if len(chains) > MOST_LEGS:
-        raise OutOfClass(
-            f"{path}: this mechanism is outside the method: found {len(chains)} legs, needed at "
-            f"most {MOST_LEGS}, since the work grows with their cube; leave out passive legs."
-        )
-    fixed = [chain for chain in chains if chain.platform.letter == ""]
-    if fixed and not spatial:
-        raise OutOfClass(
-            f"{path}: the leg of joint '{any_joint(fixed[0])}' is outside the method: found it "
-            "fixed to the platform of a planar mechanism, needed a revolute joint there; this "
-            "machine cannot be calibrated this way."
-        )
-
-
-def legs_in_order(
-    chains: Sequence[LegChain], bodies: Bodies, urdf: Urdf, block: LegcalBlock, path: Path
-) -> list[LegChain]:
-    """Return the leg chains in the order of the YAML.
-
-    Raises
-    ------
-    ModelError
-        If a name means no leg, or two mean the same, or a leg has none.
-    """
-    problems, ordered = [], list[LegChain]()
-    owner: dict[int, str] = {}
-    for name, joint in block.legs.items():
-        found = [c for c in chains if _is_on(joint, c, bodies, urdf)]
-        if not found:
-            problems.append(
-                f"{path}: legcal.legs.{name} could not be used: found the joint '{joint}', which "
-                "is on no leg between base and platform, needed one that moves with the leg; name "
-                "its prismatic joint."
-            )
-        elif id(found[0]) in owner:
-            problems.append(
-                f"{path}: legcal.legs.{name} could not be used: found '{joint}' on the leg that "
-                f"is already named '{owner[id(found[0])]}', needed a leg of its own; correct it."
-            )
-        else:
-            owner[id(found[0])] = name
-            ordered.append(found[0])
-    problems += [
-        f"{path}: legcal.legs is incomplete: found no name for the leg with joint "
-        f"'{any_joint(chain)}', needed every leg; add a line for it."
-        for chain in chains
-        if id(chain) not in owner and not problems
-    ]
-    if problems:
-        raise ModelError(problems)
-    return ordered
-
-
-def check_frames(mechanism: Mechanism) -> None:
-    """Check that the joint centres of the frame legs span a frame on base and platform.
-
-    Raises
-    ------
-    ModelError
-        If they are too few or too many, coincide, or are collinear.
-    """
-    path, n_d = mechanism.yaml_path, n_frame_legs(spatial=mechanism.spatial)
-    chosen = [mechanism.leg_names[j] for j in mechanism.frame_legs]
-    if len(chosen) != n_d:
-        where = "in space" if mechanism.spatial else "in a plane"
-        raise ModelError(
-            f"{path}: legcal.base_frame could not be used: found {len(chosen)} legs, needed {n_d} "
-            f"for a mechanism {where}; name {n_d} legs."
-        )
-    problems = []
-    for side in ("base", "platform"):
-        try:
-            _ = mechanism.T_base_Rb if side == "base" else mechanism.T_platform_Re
-        except ValueError:
-            needed = "three that span a plane" if n_d == 3 else "two that lie apart in the plane"
-            problems.append(
-                f"{path}: legcal.base_frame could not be used: found {side} joints of "
-                f"{', '.join(chosen)} in one point or on one line, needed {needed}; choose other "
-                "legs."
-            )
-    if problems:
-        raise ModelError(problems)
-
-
-def check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
-    """Check that every motor is the slider of a leg.
-
-    Raises
-    ------
-    OutOfClass
-        With one sentence for each motor that is not.
-    """
-    sliders = {c.slider.connection.joint for c in chains if c.slider is not None}
-    problems = []
-    for motor in file.name_mot:
-        kind = urdf.joints[motor].type
-        if kind != "prismatic":
-            problems.append(
-                f"{path}: the motor '{motor}' is outside the method: found a {kind} joint in "
-                "name_mot, needed prismatic joints, whose readings are leg lengths; this machine "
-                "cannot be calibrated this way."
-            )
-        elif motor not in sliders:
-            problems.append(
-                f"{path}: the motor '{motor}' is outside the method: found it on no leg, needed "
-                "the slider of a leg; remove it from name_mot."
-            )
-    if problems:
-        raise OutOfClass(problems)
-
-
-def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
-    """Say whether a joint belongs to a leg."""
-    if any(step.connection.joint == joint for step in chain.steps):
-        return True
-    entry = urdf.joints[joint]
-    return not entry.moves and bodies.body_of[entry.child] in chain.bodies
-
-
-def _unknown(path: Path, place: str, name: str, what: str, urdf: Urdf, known: set[str]) -> str:
-    """Return that a name is not in the URDF."""
-    return (
-        f"{path}: {place} could not be used: found the {what} '{name}', which is not in "
-        f"{urdf.path.name}; {closest(name, sorted(known))}"
-    )
-
-
 FARTHEST = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
-
 _FOUND = {
     Demand.BASE_AXIS: "its revolute axis at the base {0:.3g} deg from perpendicular to the leg",
     Demand.PLATFORM_AXIS: "its revolute axis at the platform {0:.3g} deg from perpendicular to it",
@@ -246,270 +54,7 @@ _FOUND = {
     Demand.ALONG_2: "it turned {0:.3g} deg in the platform to which it is fixed",
     Demand.TWIST: "it twisted by {0:.3g} deg although it has no S joint",
 }
-
-
-def check_equations(mechanism: Mechanism) -> None:
-    """Check the equations of all legs against Pinocchio at home and at poses near it.
-
-    The closed configurations come from the URDF alone, the equations from the geometry that was
-    found: both must describe one machine. Origins and axes of a file are rounded, so the same
-    tolerances hold as for joints.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The mechanism, with its chain closed at home.
-
-    Raises
-    ------
-    OutOfClass
-        If a length is more than 10 um off, or an axis, a direction or a twist more than 1 mrad.
-    """
-    problems: dict[str, str] = {}
-    for configuration in generic_configurations(mechanism, CONFIGURATIONS):
-        T = platform_pose(mechanism, configuration)
-        R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
-        for j, leg in enumerate(mechanism.legs):
-            equations = linearize(leg, R, t, by_local=False)
-            values = equations.values[0].copy()
-            if leg.kind is not LegKind.CONSTANT:
-                values[0] -= leg.sign * configuration[slider_columns(mechanism, (j,))[0][0]]
-            for demand, value in zip(equations.demands, np.abs(values), strict=True):
-                problem = _problem(demand, float(value))
-                if problem is not None:
-                    problems.setdefault(
-                        leg.name,
-                        f"{mechanism.yaml_path}: leg '{leg.name}' is outside the method: found "
-                        f"{problem} at a closed pose; check the origins and axes along the leg.",
-                    )
-    if problems:
-        raise OutOfClass(list(problems.values()))
-
-
-def check_across(mechanism: Mechanism) -> None:
-    """Check that the closures of a planar mechanism hold across its plane too.
-
-    Raises
-    ------
-    OutOfClass
-        If one is more than 10 um open, or turned by more than 1 mrad.
-    """
-    row, residual = 0, mechanism.chain.residual(mechanism.home_configuration)
-    problems = []
-    for closure in mechanism.chain.closures:
-        gap = float(np.linalg.norm(residual[row : row + 3]))
-        tilt = float(np.linalg.norm(residual[row + 3 : row + closure.rows]))
-        row += closure.rows
-        if gap > CONCURRENT or tilt > PERPENDICULAR:
-            problems.append(
-                f"{mechanism.yaml_path}: the loops could not be closed: found "
-                f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
-                f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move, needed "
-                f"at most 0.01 mm and {np.degrees(PERPENDICULAR):.2g} deg; correct the origins and "
-                "axes along this leg."
-            )
-    if problems:
-        raise OutOfClass(problems)
-
-
-def check_origins(urdf: Urdf) -> None:
-    """Check that no joint is so far out that rounding hides how joints lie to each other.
-
-    Raises
-    ------
-    ModelError
-        If an origin is more than 10 km away from the parent link.
-    """
-    for joint in urdf.joints.values():
-        away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        if away > FARTHEST:
-            raise ModelError(
-                f"{urdf.path}: the lengths could not be used: found the origin of joint "
-                f"'{joint.name}' {away:.4g} m away from its parent link, needed at most "
-                f"{FARTHEST:g} m; write all lengths in metres (are they millimetres?)."
-            )
-
-
-def check_spread(mechanism: Mechanism) -> None:
-    """Check that the joints are as near each other as metres put them, before home is looked for.
-
-    Raises
-    ------
-    ModelError
-        If the joints of base or platform lie more than 20 m apart.
-    """
-    sizes = {
-        "the joints on the base": float(np.linalg.norm(np.ptp(mechanism.A_base, axis=0))),
-        "the joints on the platform": float(np.linalg.norm(np.ptp(mechanism.B_platform, axis=0))),
-    }
-    for name, size in sizes.items():
-        if size > LONGEST:
-            raise ModelError(
-                f"{mechanism.urdf_path}: the lengths could not be used: found {name} {size:.4g} m "
-                f"apart, needed at most {LONGEST:g} m; write all lengths in metres (are they "
-                "millimetres?)."
-            )
-
-
-def check_unit(mechanism: Mechanism) -> None:
-    """Check that the legs are as long at home, and move as far, as those written in metres.
-
-    Raises
-    ------
-    ModelError
-        If one is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or a
-        cylinder along it is thicker than half of it or thinner than 2e-4 of it.
-    """
-    lengths = np.linalg.norm(leg_vectors(mechanism, mechanism.home), axis=1)
-    fixed = np.array([leg.platform_joint == "" for leg in mechanism.legs])
-    odd = np.flatnonzero(~fixed & ((lengths < SHORTEST) | (lengths > LONGEST)))
-    if len(odd):
-        raise ModelError(
-            f"{mechanism.urdf_path}: the lengths could not be used: found leg "
-            f"'{mechanism.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home, needed 1 mm to "
-            "20 m; write all lengths in metres (are they millimetres?)."
-        )
-    for leg in mechanism.legs:
-        reach = leg.travel[1] - leg.travel[0]
-        if leg.kind is LegKind.ACTUATED and reach > LONGEST:
-            raise ModelError(
-                f"{mechanism.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
-                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
-                "limits of its slider in metres (are they millimetres?)."
-            )
-    _check_radii(mechanism, np.where(fixed, lengths.max(), lengths))
-
-
-def _check_radii(mechanism: Mechanism, lengths: Array) -> None:
-    """Check that what a camera sees of each leg is no thicker and no thinner than a leg is."""
-    for leg, length in zip(mechanism.legs, lengths, strict=True):
-        for cylinder in leg.cylinders:
-            if not THINNEST < cylinder.radius / length < THICKEST:
-                raise ModelError(
-                    f"{mechanism.urdf_path}: the <visual> cylinder of link '{cylinder.link}' "
-                    f"could not be used: found a radius of {1e3 * cylinder.radius:.4g} mm along "
-                    f"leg '{leg.name}', which is {1e3 * length:.4g} mm long at home, needed "
-                    f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
-                )
-
-
-def _problem(demand: Demand, value: float) -> str | None:
-    """Return how an equation is broken, None if it is kept."""
-    if demand is Demand.LENGTH:
-        if value <= CONCURRENT:
-            return None
-        return f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most 0.01 mm,"
-    if value <= PERPENDICULAR:
-        return None
-    angle = np.degrees(np.arcsin(min(value, 1.0)))
-    return f"{_FOUND[demand].format(angle)}, needed at most {np.degrees(PERPENDICULAR):.2g} deg,"
-
-
 REGULAR = 1e-4  # singularity measure: less than that is the rounding of a file
-
-
-def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
-    """Return what deserves attention in a mechanism, one sentence each."""
-    notes = []
-    if not home_is_given:
-        xyz = ", ".join(f"{x:.6g}" for x in mechanism.home.translation)
-        quat = ", ".join(f"{x:.6g}" for x in mechanism.home.rotation.as_quat(canonical=True))
-        notes.append(
-            "legcal.home is not given: a pose with all legs at mid-travel was taken, xyz "
-            f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
-        )
-    q = readings_at(mechanism, mechanism.home)
-    outside = legs_outside(mechanism)
-    for j, leg in enumerate(mechanism.legs):
-        lower, upper = leg.travel
-        if j in outside:
-            notes.append(
-                f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
-                f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
-            )
-    return (*notes, *_unseen_notes(mechanism), *_motor_notes(mechanism), *_spin_notes(mechanism))
-
-
-def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[str, ...]:
-    """Return what of the block ``legcal`` was proposed because the file does not have it."""
-    frame = ", ".join(mechanism.leg_names[j] for j in mechanism.frame_legs)
-    if written is None:
-        return (
-            f"the file has no block legcal: base '{mechanism.base}', platform "
-            f"'{mechanism.platform}', legs {', '.join(mechanism.leg_names)} and base_frame "
-            f"[{frame}] were taken from its bodies; write them down to choose others.",
-        )
-    if written.base_frame is None:
-        return (
-            f"legcal.base_frame is not given: [{frame}] was taken, whose joints span most; write "
-            "it down to choose others.",
-        )
-    return ()
-
-
-def singular_note(mechanism: Mechanism) -> str | None:
-    """Return that the motors do not hold the platform at home, None where they do."""
-    if not 0 < mechanism.mobility <= len(mechanism.motors):
-        return None
-    measure = singularity(mechanism, mechanism.home)
-    if measure > REGULAR:
-        return None
-    return (
-        "the mechanism is singular at home: the platform moves there although all motors stand "
-        f"(singularity measure {measure:.1g}, needed above {REGULAR:g}); correct legcal.home, or "
-        "the joints if they make similar figures on base and platform."
-    )
-
-
-def _unseen_notes(mechanism: Mechanism) -> list[str]:
-    """Return which legs show no cylinder."""
-    unseen = [leg.name for leg in mechanism.legs if not leg.cylinders]
-    if not unseen:
-        return []
-    if len(unseen) == 1:
-        who, add = f"leg '{unseen[0]}' has no <visual> cylinder along its axis: it", "add one"
-    else:
-        who = f"legs {', '.join(unseen)} have no <visual> cylinder along their axes: they"
-        add = "add one to each"
-    return [f"{who} cannot be seen in images; {add} with its radius."]
-
-
-def _motor_notes(mechanism: Mechanism) -> list[str]:
-    """Return where forward kinematics has too few motors, or too many, or a singular start."""
-    notes = []
-    if mechanism.mobility == 0:
-        return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
-    if not mechanism.is_determined:
-        n_motors = len(mechanism.motors)
-        found = "the motors do not determine the pose"
-        if n_motors > mechanism.mobility:
-            found = "there are more motors than the pose needs"
-        notes.append(
-            f"{found}: mobility {mechanism.mobility}, motors {n_motors}; forward kinematics is "
-            "refused."
-        )
-    singular = singular_note(mechanism)
-    return notes if singular is None else [*notes, singular]
-
-
-def _spin_notes(mechanism: Mechanism) -> list[str]:
-    """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
-    notes = []
-    chains = mechanism.leg_chains
-    both = sum(leg.base_joint == leg.platform_joint == "S" for leg in mechanism.legs)
-    if both:
-        legs, spin = "1 leg has", "spins about itself"
-        if both > 1:
-            legs, spin = f"{both} legs have", "spin about themselves"
-        notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
-    others = sum(chain.idle_spins for chain in chains) - both
-    if others:
-        joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
-        notes.append(
-            f"{joints} what an S joint of the leg does, or another revolute; this is not counted "
-            "as mobility."
-        )
-    return notes
 
 
 def load_mechanism(model: str | Path) -> Mechanism:
@@ -637,3 +182,449 @@ def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
     """Return the limits of a leg's slider [m], zero for a rod."""
     limits = None if chain.motor is None else urdf.joints[chain.motor].limits
     return (0.0, 0.0) if limits is None else limits
+
+
+def legs_in_order(
+    chains: Sequence[LegChain], bodies: Bodies, urdf: Urdf, block: LegcalBlock, path: Path
+) -> list[LegChain]:
+    """Return the leg chains in the order of the YAML.
+
+    Raises
+    ------
+    ModelError
+        If a name means no leg, or two mean the same, or a leg has none.
+    """
+    problems, ordered = [], list[LegChain]()
+    owner: dict[int, str] = {}
+    for name, joint in block.legs.items():
+        found = [c for c in chains if _is_on(joint, c, bodies, urdf)]
+        if not found:
+            problems.append(
+                f"{path}: legcal.legs.{name} could not be used: found the joint '{joint}', which "
+                "is on no leg between base and platform, needed one that moves with the leg; name "
+                "its prismatic joint."
+            )
+        elif id(found[0]) in owner:
+            problems.append(
+                f"{path}: legcal.legs.{name} could not be used: found '{joint}' on the leg that "
+                f"is already named '{owner[id(found[0])]}', needed a leg of its own; correct it."
+            )
+        else:
+            owner[id(found[0])] = name
+            ordered.append(found[0])
+    problems += [
+        f"{path}: legcal.legs is incomplete: found no name for the leg with joint "
+        f"'{any_joint(chain)}', needed every leg; add a line for it."
+        for chain in chains
+        if id(chain) not in owner and not problems
+    ]
+    if problems:
+        raise ModelError(problems)
+    return ordered
+
+
+def _is_on(joint: str, chain: LegChain, bodies: Bodies, urdf: Urdf) -> bool:
+    """Say whether a joint belongs to a leg."""
+    if any(step.connection.joint == joint for step in chain.steps):
+        return True
+    entry = urdf.joints[joint]
+    return not entry.moves and bodies.body_of[entry.child] in chain.bodies
+
+
+def check_names(file: MechanismFile, urdf: Urdf, path: Path) -> None:
+    """Check that the URDF has every link and joint that the YAML names.
+
+    Raises
+    ------
+    ModelError
+        With one sentence for each unknown name.
+    """
+    block = file.legcal
+    links, joints = set(urdf.links), set(urdf.joints)
+    named: list[tuple[str, str, str, set[str]]] = [
+        *((f"name_mot.{i}", joint, "joint", joints) for i, joint in enumerate(file.name_mot)),
+        *(
+            (f"closed_loop.{i}.{k}", frame, "frame (link or joint)", links | joints)
+            for i, pair in enumerate(file.closed_loop)
+            for k, frame in enumerate(pair)
+        ),
+    ]
+    if block is not None:
+        named += [
+            ("legcal.base", block.base, "link", links),
+            ("legcal.platform", block.platform, "link", links),
+            *((f"legcal.legs.{leg}", joint, "joint", joints) for leg, joint in block.legs.items()),
+        ]
+        if block.platform_joint is not None:
+            named.append(("legcal.platform_joint", block.platform_joint, "joint", joints))
+    problems = [
+        _unknown(path, place, name, what, urdf, known)
+        for place, name, what, known in named
+        if name not in known
+    ]
+    problems += [
+        f"{path}: closed_loop.{i} could not be used: found '{one}' twice, needed two frames; "
+        "correct one of them."
+        for i, (one, two) in enumerate(file.closed_loop)
+        if one == two
+    ]
+    if block is not None and block.base == block.platform:
+        problems.append(
+            f"{path}: legcal.platform could not be used: found the link '{block.base}' as base and "
+            "as platform, needed two links; correct one of them."
+        )
+    if problems:
+        raise ModelError(problems)
+
+
+def _unknown(path: Path, place: str, name: str, what: str, urdf: Urdf, known: set[str]) -> str:
+    """Return that a name is not in the URDF."""
+    return (
+        f"{path}: {place} could not be used: found the {what} '{name}', which is not in "
+        f"{urdf.path.name}; {closest(name, sorted(known))}"
+    )
+
+
+def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> None:
+    """Check that there are as many legs as define a frame, not far more, no fixed one in a plane.
+
+    Raises
+    ------
+    OutOfClass
+        If there are fewer, or more than MOST_LEGS, or a leg of a planar mechanism is fixed to
+        the platform.
+    """
+    n_d = n_frame_legs(spatial=spatial)
+    if len(chains) < n_d:
+        where = "in space" if spatial else "in a plane"
+        raise OutOfClass(
+            f"{path}: this mechanism is outside the method: found {len(chains)} "
+            f"{'leg' if len(chains) == 1 else 'legs'} {where}, needed at least {n_d}, whose joints "
+            "define the frames of base and platform; this machine cannot be calibrated this way."
+        )
+    if len(chains) > MOST_LEGS:
+        raise OutOfClass(
+            f"{path}: this mechanism is outside the method: found {len(chains)} legs, needed at "
+            f"most {MOST_LEGS}, since the work grows with their cube; leave out passive legs."
+        )
+    fixed = [chain for chain in chains if chain.platform.letter == ""]
+    if fixed and not spatial:
+        raise OutOfClass(
+            f"{path}: the leg of joint '{any_joint(fixed[0])}' is outside the method: found it "
+            "fixed to the platform of a planar mechanism, needed a revolute joint there; this "
+            "machine cannot be calibrated this way."
+        )
+
+
+def check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, path: Path) -> None:
+    """Check that every motor is the slider of a leg.
+
+    Raises
+    ------
+    OutOfClass
+        With one sentence for each motor that is not.
+    """
+    sliders = {c.slider.connection.joint for c in chains if c.slider is not None}
+    problems = []
+    for motor in file.name_mot:
+        kind = urdf.joints[motor].type
+        if kind != "prismatic":
+            problems.append(
+                f"{path}: the motor '{motor}' is outside the method: found a {kind} joint in "
+                "name_mot, needed prismatic joints, whose readings are leg lengths; this machine "
+                "cannot be calibrated this way."
+            )
+        elif motor not in sliders:
+            problems.append(
+                f"{path}: the motor '{motor}' is outside the method: found it on no leg, needed "
+                "the slider of a leg; remove it from name_mot."
+            )
+    if problems:
+        raise OutOfClass(problems)
+
+
+def check_frames(mechanism: Mechanism) -> None:
+    """Check that the joint centres of the frame legs span a frame on base and platform.
+
+    Raises
+    ------
+    ModelError
+        If they are too few or too many, coincide, or are collinear.
+    """
+    path, n_d = mechanism.yaml_path, n_frame_legs(spatial=mechanism.spatial)
+    chosen = [mechanism.leg_names[j] for j in mechanism.frame_legs]
+    if len(chosen) != n_d:
+        where = "in space" if mechanism.spatial else "in a plane"
+        raise ModelError(
+            f"{path}: legcal.base_frame could not be used: found {len(chosen)} legs, needed {n_d} "
+            f"for a mechanism {where}; name {n_d} legs."
+        )
+    problems = []
+    for side in ("base", "platform"):
+        try:
+            _ = mechanism.T_base_Rb if side == "base" else mechanism.T_platform_Re
+        except ValueError:
+            needed = "three that span a plane" if n_d == 3 else "two that lie apart in the plane"
+            problems.append(
+                f"{path}: legcal.base_frame could not be used: found {side} joints of "
+                f"{', '.join(chosen)} in one point or on one line, needed {needed}; choose other "
+                "legs."
+            )
+    if problems:
+        raise ModelError(problems)
+
+
+def check_origins(urdf: Urdf) -> None:
+    """Check that no joint is so far out that rounding hides how joints lie to each other.
+
+    Raises
+    ------
+    ModelError
+        If an origin is more than 10 km away from the parent link.
+    """
+    for joint in urdf.joints.values():
+        away = float(np.linalg.norm(joint.T_parent_origin.translation))
+        if away > FARTHEST:
+            raise ModelError(
+                f"{urdf.path}: the lengths could not be used: found the origin of joint "
+                f"'{joint.name}' {away:.4g} m away from its parent link, needed at most "
+                f"{FARTHEST:g} m; write all lengths in metres (are they millimetres?)."
+            )
+
+
+def check_spread(mechanism: Mechanism) -> None:
+    """Check that the joints are as near each other as metres put them, before home is looked for.
+
+    Raises
+    ------
+    ModelError
+        If the joints of base or platform lie more than 20 m apart.
+    """
+    sizes = {
+        "the joints on the base": float(np.linalg.norm(np.ptp(mechanism.A_base, axis=0))),
+        "the joints on the platform": float(np.linalg.norm(np.ptp(mechanism.B_platform, axis=0))),
+    }
+    for name, size in sizes.items():
+        if size > LONGEST:
+            raise ModelError(
+                f"{mechanism.urdf_path}: the lengths could not be used: found {name} {size:.4g} m "
+                f"apart, needed at most {LONGEST:g} m; write all lengths in metres (are they "
+                "millimetres?)."
+            )
+
+
+def check_unit(mechanism: Mechanism) -> None:
+    """Check that the legs are as long at home, and move as far, as those written in metres.
+
+    Raises
+    ------
+    ModelError
+        If one is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or a
+        cylinder along it is thicker than half of it or thinner than 2e-4 of it.
+    """
+    lengths = np.linalg.norm(leg_vectors(mechanism, mechanism.home), axis=1)
+    fixed = np.array([leg.platform_joint == "" for leg in mechanism.legs])
+    odd = np.flatnonzero(~fixed & ((lengths < SHORTEST) | (lengths > LONGEST)))
+    if len(odd):
+        raise ModelError(
+            f"{mechanism.urdf_path}: the lengths could not be used: found leg "
+            f"'{mechanism.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home, needed 1 mm to "
+            "20 m; write all lengths in metres (are they millimetres?)."
+        )
+    for leg in mechanism.legs:
+        reach = leg.travel[1] - leg.travel[0]
+        if leg.kind is LegKind.ACTUATED and reach > LONGEST:
+            raise ModelError(
+                f"{mechanism.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
+                f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
+                "limits of its slider in metres (are they millimetres?)."
+            )
+    _check_radii(mechanism, np.where(fixed, lengths.max(), lengths))
+
+
+def _check_radii(mechanism: Mechanism, lengths: Array) -> None:
+    """Check that what a camera sees of each leg is no thicker and no thinner than a leg is."""
+    for leg, length in zip(mechanism.legs, lengths, strict=True):
+        for cylinder in leg.cylinders:
+            if not THINNEST < cylinder.radius / length < THICKEST:
+                raise ModelError(
+                    f"{mechanism.urdf_path}: the <visual> cylinder of link '{cylinder.link}' "
+                    f"could not be used: found a radius of {1e3 * cylinder.radius:.4g} mm along "
+                    f"leg '{leg.name}', which is {1e3 * length:.4g} mm long at home, needed "
+                    f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
+                )
+
+
+def check_across(mechanism: Mechanism) -> None:
+    """Check that the closures of a planar mechanism hold across its plane too.
+
+    Raises
+    ------
+    OutOfClass
+        If one is more than 10 um open, or turned by more than 1 mrad.
+    """
+    row, residual = 0, mechanism.chain.residual(mechanism.home_configuration)
+    problems = []
+    for closure in mechanism.chain.closures:
+        gap = float(np.linalg.norm(residual[row : row + 3]))
+        tilt = float(np.linalg.norm(residual[row + 3 : row + closure.rows]))
+        row += closure.rows
+        if gap > CONCURRENT or tilt > PERPENDICULAR:
+            problems.append(
+                f"{mechanism.yaml_path}: the loops could not be closed: found "
+                f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
+                f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move, needed "
+                f"at most 0.01 mm and {np.degrees(PERPENDICULAR):.2g} deg; correct the origins and "
+                "axes along this leg."
+            )
+    if problems:
+        raise OutOfClass(problems)
+
+
+def check_equations(mechanism: Mechanism) -> None:
+    """Check the equations of all legs against Pinocchio at home and at poses near it.
+
+    The closed configurations come from the URDF alone, the equations from the geometry that was
+    found: both must describe one machine. Origins and axes of a file are rounded, so the same
+    tolerances hold as for joints.
+
+    Raises
+    ------
+    OutOfClass
+        If a length is more than 10 um off, or an axis, a direction or a twist more than 1 mrad.
+    """
+    problems: dict[str, str] = {}
+    for configuration in generic_configurations(mechanism, CONFIGURATIONS):
+        T = platform_pose(mechanism, configuration)
+        R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
+        for j, leg in enumerate(mechanism.legs):
+            equations = linearize(leg, R, t, by_local=False)
+            values = equations.values[0].copy()
+            if leg.kind is not LegKind.CONSTANT:
+                values[0] -= leg.sign * configuration[slider_columns(mechanism, (j,))[0][0]]
+            for demand, value in zip(equations.demands, np.abs(values), strict=True):
+                problem = _problem(demand, float(value))
+                if problem is not None:
+                    problems.setdefault(
+                        leg.name,
+                        f"{mechanism.yaml_path}: leg '{leg.name}' is outside the method: found "
+                        f"{problem} at a closed pose; check the origins and axes along the leg.",
+                    )
+    if problems:
+        raise OutOfClass(list(problems.values()))
+
+
+def _problem(demand: Demand, value: float) -> str | None:
+    """Return how an equation is broken, None if it is kept."""
+    if demand is Demand.LENGTH:
+        if value <= CONCURRENT:
+            return None
+        return f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most 0.01 mm,"
+    if value <= PERPENDICULAR:
+        return None
+    angle = np.degrees(np.arcsin(min(value, 1.0)))
+    return f"{_FOUND[demand].format(angle)}, needed at most {np.degrees(PERPENDICULAR):.2g} deg,"
+
+
+def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
+    """Return what deserves attention in a mechanism, one sentence each."""
+    notes = []
+    if not home_is_given:
+        xyz = ", ".join(f"{x:.6g}" for x in mechanism.home.translation)
+        quat = ", ".join(f"{x:.6g}" for x in mechanism.home.rotation.as_quat(canonical=True))
+        notes.append(
+            "legcal.home is not given: a pose with all legs at mid-travel was taken, xyz "
+            f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
+        )
+    q = readings_at(mechanism, mechanism.home)
+    outside = legs_outside(mechanism)
+    for j, leg in enumerate(mechanism.legs):
+        lower, upper = leg.travel
+        if j in outside:
+            notes.append(
+                f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
+                f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
+            )
+    return (*notes, *_unseen_notes(mechanism), *_motor_notes(mechanism), *_spin_notes(mechanism))
+
+
+def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[str, ...]:
+    """Return what of the block ``legcal`` was proposed because the file does not have it."""
+    frame = ", ".join(mechanism.leg_names[j] for j in mechanism.frame_legs)
+    if written is None:
+        return (
+            f"the file has no block legcal: base '{mechanism.base}', platform "
+            f"'{mechanism.platform}', legs {', '.join(mechanism.leg_names)} and base_frame "
+            f"[{frame}] were taken from its bodies; write them down to choose others.",
+        )
+    if written.base_frame is None:
+        return (
+            f"legcal.base_frame is not given: [{frame}] was taken, whose joints span most; write "
+            "it down to choose others.",
+        )
+    return ()
+
+
+def singular_note(mechanism: Mechanism) -> str | None:
+    """Return that the motors do not hold the platform at home, None where they do."""
+    if not 0 < mechanism.mobility <= len(mechanism.motors):
+        return None
+    measure = singularity(mechanism, mechanism.home)
+    if measure > REGULAR:
+        return None
+    return (
+        "the mechanism is singular at home: the platform moves there although all motors stand "
+        f"(singularity measure {measure:.1g}, needed above {REGULAR:g}); correct legcal.home, or "
+        "the joints if they make similar figures on base and platform."
+    )
+
+
+def _unseen_notes(mechanism: Mechanism) -> list[str]:
+    """Return which legs show no cylinder."""
+    unseen = [leg.name for leg in mechanism.legs if not leg.cylinders]
+    if not unseen:
+        return []
+    if len(unseen) == 1:
+        who, add = f"leg '{unseen[0]}' has no <visual> cylinder along its axis: it", "add one"
+    else:
+        who = f"legs {', '.join(unseen)} have no <visual> cylinder along their axes: they"
+        add = "add one to each"
+    return [f"{who} cannot be seen in images; {add} with its radius."]
+
+
+def _motor_notes(mechanism: Mechanism) -> list[str]:
+    """Return where forward kinematics has too few motors, or too many, or a singular start."""
+    notes = []
+    if mechanism.mobility == 0:
+        return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
+    if not mechanism.is_determined:
+        n_motors = len(mechanism.motors)
+        found = "the motors do not determine the pose"
+        if n_motors > mechanism.mobility:
+            found = "there are more motors than the pose needs"
+        notes.append(
+            f"{found}: mobility {mechanism.mobility}, motors {n_motors}; forward kinematics is "
+            "refused."
+        )
+    singular = singular_note(mechanism)
+    return notes if singular is None else [*notes, singular]
+
+
+def _spin_notes(mechanism: Mechanism) -> list[str]:
+    """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
+    notes = []
+    chains = mechanism.leg_chains
+    both = sum(leg.base_joint == leg.platform_joint == "S" for leg in mechanism.legs)
+    if both:
+        legs, spin = "1 leg has", "spins about itself"
+        if both > 1:
+            legs, spin = f"{both} legs have", "spin about themselves"
+        notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
+    others = sum(chain.idle_spins for chain in chains) - both
+    if others:
+        joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
+        notes.append(
+            f"{joints} what an S joint of the leg does, or another revolute; this is not counted "
+            "as mobility."
+        )
+    return notes

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -18,61 +19,26 @@ from legcal.machine.urdf import Urdf
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A platform on legs, read from a YAML and its URDF.
-
-    Attributes
-    ----------
-    name : str
-        The robot's name.
-    yaml_path, urdf_path : Path
-        Its files.
-    base, platform : str
-        Links.
-    platform_joint : str or None
-        The virtual joint that carries the platform.
-    legs : tuple of Leg
-        In the order of the YAML.
-    frame_legs : tuple of int
-        The legs whose joint centres define R_b and R_e: origin, x axis, xy plane.
-    spatial : bool
-        Whether the platform moves in space and not in a plane.
-    home : RigidTransform
-        T_base_platform of a pose in the assembly mode.
-    home_configuration : (nq,) array
-        The closed chain there.
-    chain : ClosedChain
-        The tree and its closures in Pinocchio.
-    urdf : Urdf
-        The tree as written.
-    leg_chains : tuple of LegChain
-        The joints of every leg.
-    mobility : int
-        Freedoms of the platform; the motors determine its pose where it equals their number.
-    diagnostics : tuple of str
-        What the reader should know, one sentence each.
-    base_normal, platform_normal : (3,) array or None
-        The normal of the plane of motion in the links of base and platform, the same way up;
-        None in space.
-    """
+    """A platform on legs, read from a YAML and its URDF."""
 
     name: str
     yaml_path: Path
     urdf_path: Path
-    base: str
-    platform: str
-    platform_joint: str | None
-    legs: tuple[Leg, ...]
-    frame_legs: tuple[int, ...]
-    spatial: bool
-    home: RigidTransform
-    home_configuration: Array
-    chain: ClosedChain
-    urdf: Urdf
-    leg_chains: tuple[LegChain, ...]
-    mobility: int = 0
-    diagnostics: tuple[str, ...] = ()
-    base_normal: Array | None = None
-    platform_normal: Array | None = None
+    base: str  # link
+    platform: str  # link
+    platform_joint: str | None  # the virtual joint that carries the platform
+    legs: tuple[Leg, ...]  # in the order of the YAML, in the links of base and platform
+    frame_legs: tuple[int, ...]  # whose joints define R_b and R_e: origin, x axis, xy plane
+    spatial: bool  # whether the platform moves in space and not in a plane
+    home: RigidTransform  # T_base_platform of a pose in the assembly mode
+    home_configuration: Array  # (nq,) the closed chain there
+    chain: ClosedChain  # the tree and its closures in Pinocchio
+    urdf: Urdf  # the tree as written
+    leg_chains: tuple[LegChain, ...]  # the joints of every leg
+    mobility: int = 0  # freedoms of the platform
+    diagnostics: tuple[str, ...] = ()  # what the reader should know, one sentence each
+    base_normal: Array | None = None  # (3,) of the plane of motion in the links of base and
+    platform_normal: Array | None = None  # platform, the same way up; None in space
 
     @property
     def n_legs(self) -> int:
@@ -145,12 +111,7 @@ class Mechanism:
         return replace(self, legs=legs)
 
     def with_leg_order(self, names: Sequence[str]) -> "Mechanism":
-        """Return the same mechanism with its legs in another order.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Every leg once.
+        """Return the same mechanism with its legs, each named once, in another order.
 
         Raises
         ------
@@ -175,3 +136,46 @@ def _fixed(array: Array) -> Array:
     """Return an array that nobody can change."""
     array.flags.writeable = False
     return array
+
+
+def describe(mechanism: Mechanism) -> dict[str, Any]:
+    """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
+
+    A is in the base link and B in the platform link [m], twist in [rad]; ``n_d`` is the number of
+    legs that define the frames, ``r`` that of R joints on the base, ``n_ac`` that of legs that are
+    actuated or of constant length, ``idle_spins`` the freedoms that only turn a leg about itself.
+    """
+    kinds = [leg.kind for leg in mechanism.legs]
+    return {
+        "name": mechanism.name,
+        "spatial": mechanism.spatial,
+        "mobility": mechanism.mobility,
+        "motors": len(mechanism.motors),
+        "n": mechanism.n_legs,
+        "n_d": len(mechanism.frame_legs),
+        "r": sum(leg.base_joint == "R" for leg in mechanism.legs),
+        "n_ac": len(kinds) - kinds.count(LegKind.PASSIVE),
+        "idle_spins": sum(chain.idle_spins for chain in mechanism.leg_chains),
+        "legs": [_leg(leg) for leg in mechanism.legs],
+        "diagnostics": list(mechanism.diagnostics),
+    }
+
+
+def _leg(leg: Leg) -> dict[str, Any]:
+    """Return one leg of the document."""
+    return {
+        "name": leg.name,
+        "type": leg.type,
+        "actuated": leg.kind.value == "actuated",
+        "kind": leg.kind.value,
+        "A": [float(x) for x in leg.A],
+        "B": [float(x) for x in leg.B],
+        "q0": float(leg.q0),
+        "sign": leg.sign,
+        "base_axis": None if leg.base_axis is None else [float(x) for x in leg.base_axis],
+        "platform_axis": (
+            None if leg.platform_axis is None else [float(x) for x in leg.platform_axis]
+        ),
+        "twist": leg.twist,
+        "cylinders": [{"link": c.link, "radius": c.radius} for c in leg.cylinders],
+    }

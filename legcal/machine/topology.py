@@ -1,10 +1,10 @@
-"""Base, platform and legs of a mechanism whose file does not name them, from its bodies alone.
+"""The legs of a machine as a graph: chains of joints between bodies, their plane, and proposals.
 
-The base is the body of the URDF's root, the platform the body where most chains end. Legs come in
-the order of ``name_mot``, those without a motor after them in the order of the URDF; they are
-named by what their joints' names have in front of the first underscore, where that tells them
-apart. The frames stand on the legs whose joints span the largest triangle, or lie farthest apart
-in a plane.
+A file that does not name base, platform and legs means these: the base is the body of the URDF's
+root, the platform the body where most chains end. Legs come in the order of ``name_mot``, those
+without a motor after them in the order of the URDF; they are named by what their joints' names have
+in front of the first underscore, where that tells them apart. The frames stand on the legs whose
+joints span the largest triangle, or lie farthest apart in a plane.
 """
 
 from collections.abc import Sequence
@@ -36,18 +36,13 @@ from legcal.machine.schema import LegcalBlock
 from legcal.machine.tree import reference_poses
 from legcal.machine.urdf import Urdf, UrdfJoint
 
+Normals = tuple[Array, Array]
+VIRTUAL = ("floating", "planar")
+TIE = 1e-6  # of the largest triangle
+
 
 def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[LegChain]:
     """Return the legs between two links, each understood as joint, slider, joint.
-
-    Parameters
-    ----------
-    bodies : Bodies
-        The bodies of the mechanism.
-    urdf : Urdf
-        The tree, for axes.
-    base, platform : str
-        Links.
 
     Raises
     ------
@@ -95,6 +90,198 @@ def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[St
             "from base to platform, needed every joint on a leg; fix it or remove it."
         )
     return paths
+
+
+def propose_block(
+    urdf: Urdf, closures: Sequence[Closure], motors: Sequence[str], path: Path
+) -> LegcalBlock:
+    """Return the block ``legcal`` that a file without one means.
+
+    Raises
+    ------
+    OutOfClass
+        If no body is the platform of separate legs of the class.
+    """
+    virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
+    bodies = rigid_bodies(urdf, closures, None)
+    base = bodies.body_of[urdf.root]
+    real = replace(bodies, connections=_without_virtual(bodies, urdf))
+    carried = [bodies.body_of[j.child] for j in virtual]
+    platform = _platform_body(real, base, carried, urdf, path)
+    carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
+        base, platform}]  # fmt: skip
+    joint = carrier[0].name if carrier else None
+    link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
+    bodies = rigid_bodies(urdf, closures, joint)
+    chains = in_order(find_chains(bodies, urdf, urdf.root, link), motors, urdf)
+    joints = [any_joint(chain) for chain in chains]
+    names = _leg_names(joints)
+    block = LegcalBlock(
+        version=1,
+        base=urdf.root,
+        platform=link,
+        platform_joint=joint,
+        legs=dict(zip(names, joints, strict=True)),
+    )
+    return block.model_copy(update={"base_frame": propose_frame(names, chains)})
+
+
+def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]:
+    """Return the legs to define frames with: those whose joints span most on base and platform."""
+    normals = plane_of_motion(chains)
+    count = n_frame_legs(spatial=normals is None)
+    if len(names) <= count:
+        return list(names)
+    ends = (
+        np.array([chain.A for chain in chains]),
+        np.array([chain.line_in(-1, chain.B)[0] for chain in chains]),
+    )
+    if normals is not None:
+        ends = _flat(ends[0], normals[0]), _flat(ends[1], normals[1])
+    chosen = list(combinations(range(len(names)), count))
+    spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
+    first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
+    return [names[j] for j in chosen[first]]
+
+
+def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> list[LegChain]:
+    """Return legs in the order of their motors, then those without one in the order of the URDF."""
+    rank = {name: i for i, name in enumerate([*urdf.joints, *motors])}
+    rank |= {name: i - len(motors) for i, name in enumerate(motors)}
+    return sorted(chains, key=lambda chain: rank[any_joint(chain)])
+
+
+def any_joint(chain: LegChain) -> str:
+    """Return a joint that names a leg: its slider, or the first one that it has."""
+    named = [s.connection.joint for s in chain.steps if s.connection.joint]
+    return chain.motor or (named[0] if named else "")
+
+
+def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
+    """Return the normal of the plane in which a mechanism moves, None if it moves in space.
+
+    All joints must be revolutes, all of their axes parallel; the sliders are perpendicular to
+    them in every leg of the class.
+    """
+    normals = [_normals(chain) for chain in chains]
+    first = normals[0]
+    if first is None:
+        return None
+    for other in normals:
+        if other is None or not all(parallel(a, b) for a, b in zip(first, other, strict=True)):
+            return None
+    return first
+
+
+def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform]) -> Normals:
+    """Return the normals in the links of base and platform.
+
+    The last component that is not zero is positive in the base.
+    """
+    base, platform = (
+        np.asarray(T.rotation.inv().apply(normal))
+        for normal, T in zip(normals, T_body_link, strict=True)
+    )
+    return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
+
+
+def normals_of_closures(
+    in_links: Normals | None, closures: Sequence[Closure], block: LegcalBlock, urdf: Urdf
+) -> list[Array | None]:
+    """Return for which closures it is enough to hold in the plane, with its normal there.
+
+    Closures of a planar mechanism repeat that it is planar, and contradict each other by what
+    its axes are rounded. All are held in the plane alone; but where a floating joint carries the
+    platform, one more is needed to hold that in the plane.
+    """
+    if in_links is None:
+        return [None] * len(closures)
+    poses, parents = reference_poses(urdf), {j.child: j for j in urdf.joints.values()}
+    virtual = None if block.platform_joint is None else urdf.joints[block.platform_joint]
+    floats = virtual is not None and virtual.type == "floating"
+    normals: list[Array | None] = []
+    for closure in closures:
+        link = above = frame_link(urdf, closure.frame_1)
+        while above in parents and parents[above] is not virtual:
+            above = parents[above].parent
+        root, normal = (block.base, in_links[0])
+        if above in parents and floats:
+            root, normal = (block.platform, in_links[1])
+        turn = poses[link].rotation.inv() * poses[root].rotation
+        normals.append(np.asarray(turn.apply(normal)) if closure.kind == "6d" else None)
+    return [None, *normals[1:]] if floats else normals
+
+
+def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
+    """Check that the virtual joint, if there is one, has a type that is covered.
+
+    Raises
+    ------
+    OutOfClass
+        If it is neither floating nor planar, or planar about another axis than its z.
+    """
+    if block.platform_joint is None:
+        return
+    joint = urdf.joints[block.platform_joint]
+    if joint.type not in ("floating", "planar"):
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a {joint.type} "
+            "joint, needed a floating or planar one, which only says where the platform is; "
+            "correct it, or write null if a leg carries the platform."
+        )
+    if joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
+        axis = ", ".join(f"{x:g}" for x in joint.axis)
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
+            f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
+            "plane of its frame; turn its origin rpy instead."
+        )
+
+
+def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> None:
+    """Check that the virtual joint carries the platform from the base.
+
+    Raises
+    ------
+    OutOfClass
+        If its links belong to other bodies.
+    """
+    if block.platform_joint is None:
+        return
+    joint = urdf.joints[block.platform_joint]
+    found = bodies.body_of[joint.parent], bodies.body_of[joint.child]
+    if found != (bodies.body_of[block.base], bodies.body_of[block.platform]):
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found it between the "
+            f"parent '{joint.parent}' and the child '{joint.child}', needed '{block.base}' and "
+            f"'{block.platform}'; name the joint that carries the platform, or write null."
+        )
+
+
+def check_plane(joint: UrdfJoint, normal: Array | None, path: Path) -> None:
+    """Check that a planar virtual joint lets the platform move as its legs do.
+
+    Raises
+    ------
+    OutOfClass
+        If the mechanism moves in space or in another plane.
+    """
+    if joint.type != "planar":
+        return
+    if normal is None:
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint, "
+            "needed a floating one, because the axes of the legs do not let the platform move in "
+            "one plane; correct its type."
+        )
+    z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
+    if not parallel(z, normal):
+        tilt = 90.0 - np.degrees(off_square(z, normal))
+        raise OutOfClass(
+            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found its plane "
+            f"{tilt:.4g} deg from the plane in which the legs move, needed the same plane within "
+            "0.057 deg; correct its origin rpy."
+        )
 
 
 def _refuse_second_mechanism(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> None:
@@ -201,116 +388,6 @@ def _name(connection: Connection) -> str:
     return f"the 3d closure number {(connection.closure or 0) + 1}"
 
 
-def check_type(block: LegcalBlock, urdf: Urdf, path: Path) -> None:
-    """Check that the virtual joint, if there is one, has a type that is covered.
-
-    Raises
-    ------
-    OutOfClass
-        If it is neither floating nor planar, or planar about another axis than its z.
-    """
-    if block.platform_joint is None:
-        return
-    joint = urdf.joints[block.platform_joint]
-    if joint.type not in ("floating", "planar"):
-        raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a {joint.type} "
-            "joint, needed a floating or planar one, which only says where the platform is; "
-            "correct it, or write null if a leg carries the platform."
-        )
-    if joint.type == "planar" and not np.array_equal(joint.axis, [0.0, 0.0, 1.0]):
-        axis = ", ".join(f"{x:g}" for x in joint.axis)
-        raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint "
-            f'with the axis ({axis}), needed <axis xyz="0 0 1"/>, because its plane is the xy '
-            "plane of its frame; turn its origin rpy instead."
-        )
-
-
-def check_bodies(block: LegcalBlock, bodies: Bodies, urdf: Urdf, path: Path) -> None:
-    """Check that the virtual joint carries the platform from the base.
-
-    Raises
-    ------
-    OutOfClass
-        If its links belong to other bodies.
-    """
-    if block.platform_joint is None:
-        return
-    joint = urdf.joints[block.platform_joint]
-    found = bodies.body_of[joint.parent], bodies.body_of[joint.child]
-    if found != (bodies.body_of[block.base], bodies.body_of[block.platform]):
-        raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found it between the "
-            f"parent '{joint.parent}' and the child '{joint.child}', needed '{block.base}' and "
-            f"'{block.platform}'; name the joint that carries the platform, or write null."
-        )
-
-
-def check_plane(joint: UrdfJoint, normal: Array | None, path: Path) -> None:
-    """Check that a planar virtual joint lets the platform move as its legs do.
-
-    Parameters
-    ----------
-    joint : UrdfJoint
-        The virtual joint.
-    normal : (3,) array or None
-        The normal of the plane of motion in the parent link; None for a mechanism in space.
-    path : Path
-        The file that names it.
-
-    Raises
-    ------
-    OutOfClass
-        If the mechanism moves in space or in another plane.
-    """
-    if joint.type != "planar":
-        return
-    if normal is None:
-        raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found a planar joint, "
-            "needed a floating one, because the axes of the legs do not let the platform move in "
-            "one plane; correct its type."
-        )
-    z = joint.T_parent_origin.rotation.apply([0.0, 0.0, 1.0])
-    if not parallel(z, normal):
-        tilt = 90.0 - np.degrees(off_square(z, normal))
-        raise OutOfClass(
-            f"{path}: legcal.platform_joint '{joint.name}' is not covered: found its plane "
-            f"{tilt:.4g} deg from the plane in which the legs move, needed the same plane within "
-            "0.057 deg; correct its origin rpy."
-        )
-
-
-Normals = tuple[Array, Array]
-
-
-def plane_of_motion(chains: Sequence[LegChain]) -> Normals | None:
-    """Return the normal of the plane in which a mechanism moves, None if it moves in space.
-
-    All joints must be revolutes, all of their axes parallel; the sliders are perpendicular to
-    them in every leg of the class.
-
-    Parameters
-    ----------
-    chains : sequence of LegChain
-        The legs.
-
-    Returns
-    -------
-    tuple of (3,) array or None
-        The unit normal in the bodies of base and platform, the same way up in both.
-    """
-    normals = [_normals(chain) for chain in chains]
-    first = normals[0]
-    if first is None:
-        return None
-    for other in normals:
-        if other is None or not all(parallel(a, b) for a, b in zip(first, other, strict=True)):
-            return None
-    return first
-
-
 def _normals(chain: LegChain) -> Normals | None:
     """Return the direction of all axes of a leg in base and platform, None if they differ."""
     if chain.base.letter != "R" or chain.platform.letter not in ("R", ""):
@@ -318,161 +395,7 @@ def _normals(chain: LegChain) -> Normals | None:
     v, w = chain.base.inner, chain.platform.inner
     if v is None or (w is not None and not parallel(v, w)):
         return None
-    return v, np.asarray(chain.T_zero.rotation.inv().apply(v))
-
-
-def in_links(normals: Normals, T_body_link: tuple[RigidTransform, RigidTransform]) -> Normals:
-    """Return the normals in the links of base and platform.
-
-    The last component that is not zero is positive in the base.
-    """
-    base, platform = (
-        np.asarray(T.rotation.inv().apply(normal))
-        for normal, T in zip(normals, T_body_link, strict=True)
-    )
-    return (base, platform) if np.all(undirected(base) == base) else (-base, -platform)
-
-
-def normals_of_closures(
-    in_links: Normals | None, closures: Sequence[Closure], block: LegcalBlock, urdf: Urdf
-) -> list[Array | None]:
-    """Return for which closures it is enough to hold in the plane, with its normal there.
-
-    Closures of a planar mechanism repeat that it is planar, and contradict each other by what
-    its axes are rounded. All are held in the plane alone; but where a floating joint carries the
-    platform, one more is needed to hold that in the plane.
-
-    Parameters
-    ----------
-    in_links : tuple of (3,) array or None
-        The normals in the links of base and platform; None in space.
-    closures : sequence of Closure
-        What coincides.
-    block : LegcalBlock
-        The links of base and platform, and the virtual joint.
-    urdf : Urdf
-        The tree.
-
-    Returns
-    -------
-    list of (3,) array or None
-        The normal in the first frame of each closure, None where everything is to hold.
-    """
-    if in_links is None:
-        return [None] * len(closures)
-    poses, parents = reference_poses(urdf), {j.child: j for j in urdf.joints.values()}
-    virtual = None if block.platform_joint is None else urdf.joints[block.platform_joint]
-    floats = virtual is not None and virtual.type == "floating"
-    normals: list[Array | None] = []
-    for closure in closures:
-        link = above = frame_link(urdf, closure.frame_1)
-        while above in parents and parents[above] is not virtual:
-            above = parents[above].parent
-        root, normal = (block.base, in_links[0])
-        if above in parents and floats:
-            root, normal = (block.platform, in_links[1])
-        turn = poses[link].rotation.inv() * poses[root].rotation
-        normals.append(np.asarray(turn.apply(normal)) if closure.kind == "6d" else None)
-    return [None, *normals[1:]] if floats else normals
-
-
-VIRTUAL = ("floating", "planar")
-TIE = 1e-6  # of the largest triangle
-
-
-def propose_block(
-    urdf: Urdf, closures: Sequence[Closure], motors: Sequence[str], path: Path
-) -> LegcalBlock:
-    """Return the block ``legcal`` that a file without one means.
-
-    Parameters
-    ----------
-    urdf : Urdf
-        The tree.
-    closures : sequence of Closure
-        What coincides.
-    motors : sequence of str
-        The joints of ``name_mot``.
-    path : Path
-        The file, for messages.
-
-    Returns
-    -------
-    LegcalBlock
-        Without ``home``.
-
-    Raises
-    ------
-    OutOfClass
-        If no body is the platform of separate legs of the class.
-    """
-    virtual = [joint for joint in urdf.joints.values() if joint.type in VIRTUAL]
-    bodies = rigid_bodies(urdf, closures, None)
-    base = bodies.body_of[urdf.root]
-    real = replace(bodies, connections=_without_virtual(bodies, urdf))
-    carried = [bodies.body_of[j.child] for j in virtual]
-    platform = _platform_body(real, base, carried, urdf, path)
-    carrier = [j for j in virtual if {bodies.body_of[j.parent], bodies.body_of[j.child]} == {
-        base, platform}]  # fmt: skip
-    joint = carrier[0].name if carrier else None
-    link = carrier[0].child if carrier else _main_link(urdf, closures, bodies, platform)
-    bodies = rigid_bodies(urdf, closures, joint)
-    chains = in_order(find_chains(bodies, urdf, urdf.root, link), motors, urdf)
-    joints = [any_joint(chain) for chain in chains]
-    names = _leg_names(joints)
-    block = LegcalBlock(
-        version=1,
-        base=urdf.root,
-        platform=link,
-        platform_joint=joint,
-        legs=dict(zip(names, joints, strict=True)),
-    )
-    return block.model_copy(update={"base_frame": propose_frame(names, chains)})
-
-
-def propose_frame(names: Sequence[str], chains: Sequence[LegChain]) -> list[str]:
-    """Return the legs to define frames with: those whose joints span most on base and platform.
-
-    Parameters
-    ----------
-    names : sequence of str
-        The legs.
-    chains : sequence of LegChain
-        Their joints.
-
-    Returns
-    -------
-    list of str
-        Three legs, or two of a planar mechanism, or all where there are fewer; the first ones
-        where several span the same.
-    """
-    normals = plane_of_motion(chains)
-    count = n_frame_legs(spatial=normals is None)
-    if len(names) <= count:
-        return list(names)
-    ends = (
-        np.array([chain.base.centre_near for chain in chains]),
-        np.array([chain.platform.centre_far for chain in chains]),
-    )
-    if normals is not None:
-        ends = _flat(ends[0], normals[0]), _flat(ends[1], normals[1])
-    chosen = list(combinations(range(len(names)), count))
-    spans = np.array([_span(ends[0][list(c)]) * _span(ends[1][list(c)]) for c in chosen])
-    first = int(np.argmax(spans >= spans.max() * (1.0 - TIE)))
-    return [names[j] for j in chosen[first]]
-
-
-def in_order(chains: Sequence[LegChain], motors: Sequence[str], urdf: Urdf) -> list[LegChain]:
-    """Return legs in the order of their motors, then those without one in the order of the URDF."""
-    rank = {name: i for i, name in enumerate([*urdf.joints, *motors])}
-    rank |= {name: i - len(motors) for i, name in enumerate(motors)}
-    return sorted(chains, key=lambda chain: rank[any_joint(chain)])
-
-
-def any_joint(chain: LegChain) -> str:
-    """Return a joint that names a leg: its slider, or the first one that it has."""
-    named = [s.connection.joint for s in chain.steps if s.connection.joint]
-    return chain.motor or (named[0] if named else "")
+    return v, np.asarray(chain.poses[-1].rotation.inv().apply(v))
 
 
 def _without_virtual(bodies: Bodies, urdf: Urdf) -> tuple[Connection, ...]:

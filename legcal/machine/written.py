@@ -250,9 +250,9 @@ def _at_slider(
         raise ValueError("a rod has no slider")
     body = slider.connection.bodies[0]  # that of the joint's parent
     if slider.near == 0:
-        along, point = chain.u_lower, chain.base.centre_far
+        point, along = chain.line_in(chain.n_lower, chain.A)
     else:
-        along, point = chain.u_upper, chain.platform.centre_near
+        point, along = chain.line_in(chain.n_upper, chain.B)
     handle = handles.of(slider, 0, body, leg.name)._replace(is_inverse=slider.near != 0)
     return handle, _screw(leg.sign * along, point, grown), body
 
@@ -268,7 +268,8 @@ def _in_rod(
     except OutOfClass:
         handle = handles.of(below, below.far, handles.link(above, above.near), leg.name)
         handle = handle._replace(is_inverse=not handle.is_inverse)
-    return handle, _screw(chain.u_lower, chain.base.centre_far, grown), body
+    point, along = chain.line_in(chain.n_lower, chain.A)
+    return handle, _screw(along, point, grown), body
 
 
 def mechanism_text(mechanism: Mechanism, urdf: str) -> str:
