@@ -13,15 +13,14 @@ from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session, planned_session
 from legcal.geometry.types import Array
 from legcal.machine import Mechanism, load_mechanism
-from legcal.paper import joints_in_base as rigid_parts
-from legcal.paper import joints_in_base as scalar_products
-from legcal.paper import offsets
+from legcal.paper import joints_in_base, offsets
 from legcal.paper.joints_in_base import JointsInBase, register_views
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
+from legcal.paper.least_squares import LeastSquares, Solution
 from legcal.paper.leg_directions import directions_through_joints
-from legcal.paper.platform_joints import build_mean_distances
-from legcal.paper.platform_problem import build_rigid, platform_unknowns, rigid_problem
-from legcal.paper.solver import LeastSquares, Solution, structure_jacobian
+from legcal.paper.platform import RigidProblem, build_rigid
+from legcal.paper.platform_printed import build_mean_distances
+from legcal.paper.platform_unknowns import PlatformUnknowns
 from legcal.simulation.machine import Machine
 from legcal.simulation.studies.paper import nominal_of
 
@@ -42,7 +41,7 @@ def hexapod() -> Mechanism:
 
 def rank_of_first(problem: LeastSquares, wanted: int, known: slice = slice(0, 0)) -> int:
     """Return how many of the first unknowns a problem determines, others being free or known."""
-    J = np.asarray(structure_jacobian(problem.structure)(problem.start, problem.observed).full())
+    J = problem.jacobian(problem.start).toarray()
     J[:, known] = 0.0
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     return _rank(J) - _rank(J[:, wanted:])
@@ -77,9 +76,10 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
     base = base_as_drawn(machine, joints)
     directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
     q0 = machine.parameters.offsets
-    step2 = rigid_parts.build_rigid(nominal_of(machine), joints, base.T_Rb_camera)
+    step2 = joints_in_base.build_rigid(nominal_of(machine), joints, base.T_Rb_camera)
     step3 = offsets.build_constant_distances(nominal_of(machine), directions, q0, m.sigma_q)
-    rigid = rigid_problem(nominal_of(machine), joints, base, directions, m.sigma_q)
+    unknowns = PlatformUnknowns.of(nominal_of(machine))
+    rigid = RigidProblem.of(nominal_of(machine), unknowns, joints, base, directions, m.sigma_q)
     step4 = build_rigid(rigid)
     built = [
         3 * int(joints.located.sum()),
@@ -108,11 +108,11 @@ def test_printed_ranks_are_those_of_the_problems_that_the_steps_solve(coplanar: 
     base = base_as_drawn(machine, joints)
     directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
     built = [
-        rank_of_first(scalar_products.build_scalar_products(nominal_of(machine), joints), 12),
+        rank_of_first(joints_in_base.build_scalar_products(nominal_of(machine), joints), 12),
         rank_of_first(offsets.build_consecutive(nominal_of(machine), directions), 6),
         rank_of_first(
             build_mean_distances(
-                nominal_of(machine), platform_unknowns(nominal_of(machine)), directions
+                nominal_of(machine), PlatformUnknowns.of(nominal_of(machine)), directions
             ),
             12,
         ),

@@ -11,16 +11,15 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.machine import Demand, LegGeometry, LegKind, linearize
-from legcal.paper.platform_joints import fixed_direction, locate_passive_end, revolute_axis
-from legcal.paper.platform_pose import (
+from legcal.paper.leg_demands import (
     closure_of_leg,
     fixed_on_platform,
     length_of_leg,
     revolute_on_platform,
     twist_of_leg,
 )
-from legcal.paper.platform_problem import turned_axis
-from legcal.paper.solver import moved_points
+from legcal.paper.motions import axis_frames, moved_points, turned_axis
+from legcal.paper.platform_printed import fixed_direction, locate_passive_end, revolute_axis
 
 KINDS = [("U", "U"), ("U", ""), ("R", "U"), ("U", "R"), ("R", "R")]
 
@@ -121,6 +120,10 @@ def a_leg(base: str, platform: str, rng: np.random.Generator) -> LegGeometry:
     )
 
 
+def frame_of(v: Array) -> Array:
+    return np.asarray(axis_frames(v[None])[0])
+
+
 def known_of(leg: LegGeometry, R: Array, t: Array) -> tuple[Array, Array, Array, Array]:
     return np.array([0.0, 0.0, leg.B[2]]), R, t, leg.A
 
@@ -144,23 +147,23 @@ def test_demands_are_those_of_the_mechanism_at_poses_after_a_step(joints: tuple[
     )
     local = np.concatenate([leg.B[:2], [0.0], step])
     known = known_of(leg, R, t)
-    a, b = ((v, normal_basis(v)) for v in (leg.base_axis, leg.platform_axis) if v is not None)
+    a, b = (frame_of(v) for v in (leg.base_axis, leg.platform_axis) if v is not None)
     length = length_of_leg()(np.append(local, leg.q0), *known, 0.0, 1.0)
     assert float(length) == pytest.approx(expected[Demand.LENGTH], abs=1e-12)
     none = np.zeros(2)
     x = np.concatenate([local, none, none, [0.0]])
-    twist = twist_of_leg(*joints)(x, *known, *a, *b, 0.4, 1.0)
+    twist = twist_of_leg(*joints)(x, *known, a, b, 0.4, 1.0)
     assert float(twist) == pytest.approx(expected[Demand.TWIST], abs=1e-12)
     with_turns = np.concatenate([local, none])
     if joints[1] == "R":
-        value = revolute_on_platform()(with_turns, *known, *b, 1.0)
+        value = revolute_on_platform()(with_turns, *known, b, 1.0)
         assert float(value) == pytest.approx(expected[Demand.PLATFORM_AXIS], abs=1e-12)
     if joints[1] == "":
-        both = fixed_on_platform()(with_turns, *known, *b, 1.0).full().ravel()
+        both = fixed_on_platform()(with_turns, *known, b, 1.0).full().ravel()
         wanted = [expected[d] for d in (Demand.ALONG_1, Demand.ALONG_2)]
         assert both == pytest.approx(wanted, abs=1e-12)
     u = unit(R_moved @ leg.B + t_moved - leg.A)
-    closure = closure_of_leg(*joints)(np.zeros(5), u, R_moved, *a, *b, 0.4, 0.5)
+    closure = closure_of_leg(*joints)(np.zeros(5), u, R_moved, a, b, 0.4, 0.5)
     assert float(closure) == pytest.approx(2.0 * expected[Demand.TWIST], abs=1e-12)
 
 
@@ -173,10 +176,8 @@ def test_the_twist_follows_all_its_unknowns_as_by_differences(joints: tuple[str,
     assert leg.platform_axis is not None
     given_ = (
         *known_of(leg, R, t),
-        leg.base_axis,
-        normal_basis(leg.base_axis),
-        leg.platform_axis,
-        normal_basis(leg.platform_axis),
+        frame_of(leg.base_axis),
+        frame_of(leg.platform_axis),
         0.4,
         1.0,
     )
@@ -198,7 +199,6 @@ def test_turned_axes_inside_problems_are_those_of_results() -> None:
     leg = LegGeometry("S", "R", LegKind.ACTUATED, np.zeros(3), np.array([0.0, 0.0, 0.4]), 0.0)
     local = np.concatenate([leg.B, np.zeros(6), turns])
     known = (np.zeros(3), np.eye(3), np.zeros(3), leg.A)
-    value = float(revolute_on_platform()(local, *known, v, normal_basis(v), 1.0))
+    value = float(revolute_on_platform()(local, *known, frame_of(v), 1.0))
     axis = turned_axis(v, turns)
-    assert axis is not None
     assert value == pytest.approx(float(axis[2]), abs=1e-12)

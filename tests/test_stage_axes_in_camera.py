@@ -9,8 +9,7 @@ from staged_machines import shipped
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.paper import joints_in_camera as meeting_axes
-from legcal.paper import joints_in_camera as meeting_points
+from legcal.paper import joints_in_camera
 from legcal.paper.joints_in_base import locate_joints_in_base
 from legcal.paper.joints_in_camera import (
     derivative_of_miss,
@@ -99,8 +98,8 @@ def test_weights_are_computed_again_until_joints_and_axes_stay(
     observed = shipped("3-rps", n_poses=10, noise=3.0, seed=1)
     inputs = observed.nominal, observed.axes, observed.measurements
     found = locate_joints_in_cameras(*inputs)
-    monkeypatch.setattr(meeting_axes, "MOST_REWEIGHTINGS", 1000)
-    monkeypatch.setattr(meeting_points, "_SETTLED", 1e-9)
+    monkeypatch.setattr(joints_in_camera, "MOST_REWEIGHTINGS", 1000)
+    monkeypatch.setattr(joints_in_camera, "_CONVERGED", 1e-9)
     longer = locate_joints_in_cameras(*inputs)
     assert np.array_equal(found.axis_located, longer.axis_located)
     sigma = np.sqrt(np.einsum("vlii->vli", found.covariance))[found.axis_located]

@@ -11,10 +11,10 @@ from legcal.machine import KinematicParameters
 from legcal.paper.four_steps import run_steps
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.paper.leg_directions import LegDirections, directions_through_joints, select_axes
+from legcal.paper.leg_directions import LegDirections, directions_through_joints
 from legcal.paper.nominal import Criteria, NominalMechanism
 from legcal.paper.offsets import Offsets, identify_offsets
-from legcal.paper.platform_joints import PlatformJoints, locate_platform_joints
+from legcal.paper.platform import PlatformJoints, locate_platform_joints
 from legcal.simulation.cameras import cameras_around
 from legcal.simulation.machine import Machine, hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
@@ -97,7 +97,7 @@ def test_poses_that_show_two_legs_or_one_take_part() -> None:
     axes = session.axes
     two = (axes.row % 8 == 0) & ~np.isin(axes.leg, (0, 3, 4))
     one = (axes.row % 8 == 1) & ~np.isin(axes.leg, (0, 3))
-    some = replace(session, axes=select_axes(axes, ~two & ~one))
+    some = replace(session, axes=axes.choose(np.flatnonzero(~two & ~one)))
     counts = np.bincount(some.axes.row)
     assert set(counts.tolist()) >= {2, 4}
     nominal = five_millimetres_away(session.machine)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from machine_session import SHIPPED
-from scipy.sparse import csc_array
 from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, five_millimetres_away
 from staged_machines import Observed, planned, shipped, three_steps
@@ -22,18 +21,12 @@ from legcal.machine import (
     parametrize,
     vector_of,
 )
-from legcal.paper import platform_joints
+from legcal.paper import platform
 from legcal.paper.four_steps import StagedResult, run_steps
-from legcal.paper.nominal import Criteria
-from legcal.paper.platform_pose import Transformation
-from legcal.paper.platform_problem import build_rigid, rigid_problem
-from legcal.paper.solver import (
-    LeastSquares,
-    Solution,
-    solve_least_squares,
-    structure_jacobian,
-    structure_residuals,
-)
+from legcal.paper.least_squares import LeastSquares, Solution, solve_least_squares
+from legcal.paper.nominal import Criteria, Transformation
+from legcal.paper.platform import RigidProblem, build_rigid
+from legcal.paper.platform_unknowns import PlatformUnknowns
 from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
 from legcal.simulation.machine import hexapod, perturb
 from legcal.simulation.observe import OutlineNoise
@@ -189,7 +182,7 @@ def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
 
 
 @pytest.mark.parametrize("name", ["3-rpr", "3-spr", "3-upu", "3-upu-tilted", "tricept"])
-def test_the_rigid_criterion_has_the_rank_that_is_foretold(name: str) -> None:
+def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
     mechanism = load_mechanism(name)
     session = planned_session(mechanism, [tuple(range(mechanism.n_legs))], 8)
     (rank,) = [
@@ -200,13 +193,12 @@ def test_the_rigid_criterion_has_the_rank_that_is_foretold(name: str) -> None:
     observed = planned(session, mechanism.sign)
     observed = replace(observed, nominal=replace(observed.nominal, legs=session.legs))
     steps = three_steps(observed)
-    rigid = rigid_problem(
-        observed.nominal, steps.joints, steps.base, steps.directions, session.sigma_q
+    unknowns = PlatformUnknowns.of(observed.nominal)
+    rigid = RigidProblem.of(
+        observed.nominal, unknowns, steps.joints, steps.base, steps.directions, session.sigma_q
     )
     problem = build_rigid(rigid)
-    given = problem.start, problem.observed
-    J = csc_array(structure_jacobian(problem.structure)(*given).full())
-    residuals = np.asarray(structure_residuals(problem.structure)(*given).full()).ravel()
+    J, residuals = problem.jacobian(problem.start), problem.residuals(problem.start)
     n = len(rigid.unknowns)
     found = Solution(problem.start, residuals, J, n, 0, "").information()
     kept = [i for i, name in enumerate(rigid.unknowns.names) if "offset" not in name]
@@ -290,9 +282,9 @@ def test_axes_stay_near_nominal_where_step_4_does_not_converge_without_that(
         return solve_least_squares(problem)
 
     observed = shipped("3-upu-tilted")
-    monkeypatch.setattr(platform_joints, "solve_least_squares", fails_once)
+    monkeypatch.setattr(platform, "solve_least_squares", fails_once)
     found = run(observed)
-    assert found.diagnostics == (platform_joints.KEPT_NEAR,)
+    assert found.diagnostics == (platform.KEPT_NEAR,)
     assert calls == [calls[0], calls[0] - 1, calls[0]]
     is_angle = np.array([unit == "rad" for unit in parameters_of(observed).units])
     error, before = off(observed, found.legs), off(observed, observed.nominal.legs)

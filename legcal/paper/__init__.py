@@ -1,4 +1,21 @@
-"""paper."""
+"""The paper's method as its section 3 has it: four steps from leg axes to parameters.
+
+In go a :class:`NominalMechanism` (where the steps start), the leg axes that the images give
+(section 3.1, rooms vision and data) and the readings; out come the identified legs and the cameras.
+
+=====================  =======  ==================================================================
+``conditions``         3.2-3.5  counts of equations and unknowns as printed, (10)-(12), (15), (17)
+``joints_in_camera``   3.2      step 1: base joints and revolute axes in each camera, (6), (7)
+``joints_in_base``     3.3      step 2: the same in R_b, and where the cameras stood, (8), (9)
+``offsets``            3.4      step 3: offsets of the legs, (13), (14)
+``platform``           3.5      step 4: joints and axes on the platform, passive legs, (16)-(19)
+``four_steps``         3        the steps in a row
+=====================  =======  ==================================================================
+
+Each step has the criterion as printed (``literal``) and a weighted one. All are problems of
+``least_squares``, built with CasADi and solved with IPOPT. Errors of the platform (20) are those of
+the machine room's ``pose_differences``.
+"""
 
 import lazy_loader
 

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data import LegAxes, Measurements
-from legcal.geometry import BoolArray
 from legcal.machine import KinematicParameters, LegGeometry
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
@@ -16,23 +15,15 @@ from legcal.paper.leg_directions import (
     directions_through_joints,
     find_misses,
     observed_directions,
-    select_axes,
 )
-from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.nominal import Criteria, NominalMechanism, Transformation
 from legcal.paper.offsets import Offsets, identify_offsets
-from legcal.paper.platform_joints import PlatformJoints, locate_platform_joints
-from legcal.paper.platform_pose import Transformation
+from legcal.paper.platform import PlatformJoints, locate_platform_joints
 
 
 @dataclass(frozen=True, eq=False)
 class BaseSteps:
-    """What steps 1 and 2 give: the base as the cameras see it, and where they stood.
-
-    Attributes
-    ----------
-    joints_in_camera, joints_in_base
-        The results of steps 1 and 2.
-    """
+    """What steps 1 and 2 give: the base as the cameras see it, and where they stood."""
 
     joints_in_camera: JointsInCamera
     joints_in_base: JointsInBase
@@ -45,27 +36,15 @@ class BaseSteps:
 
 @dataclass(frozen=True, eq=False)
 class StagedResult:
-    """What the four steps give.
+    """What the four steps give."""
 
-    Attributes
-    ----------
-    legs : tuple of LegGeometry
-        The identified legs in R_b and R_e: joint centres, offsets, axes and twists.
-    T_Rb_camera : tuple of RigidTransform or None, length n_views
-        Where each camera stood; None for a view that locates fewer than three base joints.
-    joints_in_camera, joints_in_base, offsets, platform_joints
-        The results of steps 1 to 4.
-    diagnostics : tuple of str
-        What was left out or left at nominal, and why.
-    """
-
-    legs: tuple[LegGeometry, ...]
-    T_Rb_camera: tuple[RigidTransform | None, ...]
+    legs: tuple[LegGeometry, ...]  # identified, in R_b and R_e
+    T_Rb_camera: tuple[RigidTransform | None, ...]  # as of :class:`BaseSteps`
     joints_in_camera: JointsInCamera
     joints_in_base: JointsInBase
     offsets: Offsets
     platform_joints: PlatformJoints
-    diagnostics: tuple[str, ...]
+    diagnostics: tuple[str, ...]  # what was left out or left at nominal, and why
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -86,38 +65,17 @@ def run_steps(
 ) -> StagedResult:
     """Identify all parameters from leg axes and readings by the four steps (3.2 to 3.5).
 
-    Parameters
-    ----------
-    mechanism : NominalMechanism
-        The nominal mechanism: its parameters are the start.
-    axes : LegAxes
-        Leg axes in the camera frames.
-    measurements : Measurements
-        Views, poses and readings of the images.
-    criteria : {"default", "literal"}
-        ``literal`` takes (6), (7), (9), (14) and (16) to (19) as printed, unweighted.
-    transformation : {"points", "cross_product"}, optional
-        How (18) is solved: by point equality, as by default, or as printed, as in the
-        ``literal`` steps.
-    free_twists : bool
-        Look for the twists of legs without an S joint too; they are nominal otherwise.
-
-    Returns
-    -------
-    StagedResult
-
-    Raises
-    ------
-    NotIdentifiable
-        If the observations do not determine the parameters.
-    DidNotConverge
-        If a step does not converge.
+    ``literal`` criteria are (6), (7), (9), (14) and (16) to (19) as printed, unweighted; (18) is
+    then solved as printed too, by point equality otherwise, unless ``transformation`` says how.
+    Twists of legs without an S joint are nominal unless they are freed. Raises NotIdentifiable if
+    the observations do not determine the parameters, DidNotConverge if a step does not converge.
     """
+    base = run_base_steps(mechanism, axes, measurements, criteria=criteria)
     return run_platform_steps(
         mechanism,
         axes,
         measurements,
-        run_base_steps(mechanism, axes, measurements, criteria=criteria),
+        base,
         criteria=criteria,
         transformation=transformation,
         free_twists=free_twists,
@@ -131,10 +89,7 @@ def run_base_steps(
     *,
     criteria: Criteria = "default",
 ) -> BaseSteps:
-    """Locate base joints and cameras by steps 1 and 2 (3.2 and 3.3).
-
-    Parameters and errors are those of :func:`run_steps`.
-    """
+    """Locate base joints and cameras by steps 1 and 2 (3.2 and 3.3), as :func:`run_steps`."""
     joints = locate_joints_in_cameras(mechanism, axes, measurements, criteria=criteria)
     return BaseSteps(joints, locate_joints_in_base(mechanism, joints, criteria=criteria))
 
@@ -149,22 +104,20 @@ def run_platform_steps(
     transformation: Transformation | None = None,
     free_twists: bool = False,
 ) -> StagedResult:
-    """Identify the rest by steps 3 and 4 (3.4 and 3.5).
-
-    Parameters and errors are those of :func:`run_steps`; ``base_steps`` is what
-    :func:`run_base_steps` found by the same axes and criteria.
-    """
+    """Identify the rest by steps 3 and 4 (3.4 and 3.5), as :func:`run_steps`."""
     joints, base = base_steps.joints_in_camera, base_steps.joints_in_base
     diagnostics = joints.diagnostics
-    if criteria == "default":
+    if criteria == "literal":
+        directions = observed_directions(mechanism, axes, measurements, joints)
+    else:
         wrong = find_misses(axes, measurements, joints, base)
-        diagnostics += _describe_misses(mechanism, axes, measurements, wrong)
-        axes = select_axes(axes, ~wrong)
-    directions = (
-        observed_directions(mechanism, axes, measurements, joints)
-        if criteria == "literal"
-        else directions_through_joints(mechanism, axes, measurements, joints, base)
-    )
+        diagnostics += tuple(
+            f"Leg {mechanism.leg_names[leg]} in image {measurements.image[row] or row + 1} was "
+            "left out of steps 3 and 4: its axis misses its base joint by far; check its outlines."
+            for leg, row in zip(axes.leg[wrong].tolist(), axes.row[wrong].tolist(), strict=True)
+        )
+        axes = axes.choose(np.flatnonzero(~wrong))
+        directions = directions_through_joints(mechanism, axes, measurements, joints, base)
     offsets = identify_offsets(mechanism, directions, measurements.sigma_q, criteria=criteria)
     platform = locate_platform_joints(
         mechanism,
@@ -185,16 +138,4 @@ def run_platform_steps(
         offsets=offsets,
         platform_joints=platform,
         diagnostics=diagnostics + platform.diagnostics,
-    )
-
-
-def _describe_misses(
-    mechanism: NominalMechanism, axes: LegAxes, measurements: Measurements, wrong: BoolArray
-) -> tuple[str, ...]:
-    """Return a sentence for each axis that was left out of steps 3 and 4."""
-    return tuple(
-        f"Leg {mechanism.leg_names[int(axes.leg[i])]} in image "
-        f"{measurements.image[int(axes.row[i])] or int(axes.row[i]) + 1} was left out of steps "
-        "3 and 4: its axis misses its base joint by far; check its outlines."
-        for i in np.flatnonzero(wrong)
     )

@@ -1,4 +1,4 @@
-"""What the four steps know of a mechanism: its legs as drawn, in R_b and R_e."""
+"""What the four steps know of a mechanism: its nominal legs, in R_b and R_e."""
 
 from __future__ import annotations
 
@@ -21,29 +21,17 @@ from legcal.machine import (
 )
 
 Criteria = Literal["default", "literal"]
+Transformation = Literal["points", "cross_product"]  # how (18) is solved
 
 
 @dataclass(frozen=True, eq=False)
 class NominalMechanism:
-    """The nominal legs of a mechanism: where the steps start, and which unknowns they have.
-
-    Attributes
-    ----------
-    leg_names : tuple of str
-        Names of the legs, for messages.
-    legs : tuple of LegGeometry
-        Joint centres, axes and lengths; what belongs to the base in R_b, what belongs to the
-        platform in R_e.
-    sign : (n_legs,) array
-        Sign of q in the leg length: L = sign q + q0.
-    frame_legs : tuple of int
-        The legs whose joint centres define R_b and R_e: three in space, two in a plane.
-    """
+    """The nominal legs of a mechanism: where the steps start, and which unknowns they have."""
 
     leg_names: tuple[str, ...]
-    legs: tuple[LegGeometry, ...]
-    sign: NDArray[Any]
-    frame_legs: tuple[int, ...]
+    legs: tuple[LegGeometry, ...]  # what belongs to the base in R_b, to the platform in R_e
+    sign: NDArray[Any]  # (n_legs,), of q in the leg length L = sign q + q0
+    frame_legs: tuple[int, ...]  # their joints define R_b and R_e: three in space, two in a plane
 
     @property
     def n_legs(self) -> int:
@@ -90,6 +78,11 @@ class NominalMechanism:
         for j in np.flatnonzero(self.revolute):
             axes[j] = self.legs[j].base_axis
         return axes
+
+    @cached_property
+    def base_normals(self) -> Array:
+        """:attr:`base_axes`; in a planar mechanism z for all, where it is no parameter."""
+        return self.base_axes if self.spatial else np.tile([0.0, 0.0, 1.0], (self.n_legs, 1))
 
 
 def nominal_mechanism(mechanism: Mechanism) -> NominalMechanism:

@@ -1,0 +1,81 @@
+"""Unknown motions and axes inside the steps, in CasADi and for numbers.
+
+Unknown rotations are Gibbs vectors w = tan(angle / 2) along the axis, counted from a start: they
+have no branches and no square root. An unknown axis is turned about its normal basis e1, e2 by
+two turns [rad], w = (turn_1 e1 + turn_2 e2) / 2.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.geometry import Array, normal_basis
+
+# Unknown motions
+
+
+def moved_points(step: ca.SX, R: ca.SX, t: ca.SX, points: ca.SX) -> ca.SX:
+    """Return points (3, n) after R, t and a step (6,): translation [m], then Gibbs vector."""
+    return turned_points(step[3:], R @ points) + ca.repmat(t + step[:3], 1, points.shape[1])
+
+
+def turned_points(w: ca.SX, points: ca.SX) -> ca.SX:
+    """Return points (3, n) turned by the rotation that has the Gibbs vector w (3,)."""
+    cross = ca.skew(w)
+    turn = ca.SX.eye(3) + 2.0 / (1.0 + ca.dot(w, w)) * (cross + ca.mtimes(cross, cross))
+    return turn @ points
+
+
+def moved(step: Array, start: RigidTransform) -> RigidTransform:
+    """Return the motion of :func:`moved_points` for numbers."""
+    w = step[3:]
+    size = float(np.linalg.norm(w))
+    turn = Rotation.from_rotvec(w * (2.0 * np.arctan(size) / size if size > 0.0 else 2.0))
+    return RigidTransform.from_components(start.translation + step[:3], turn * start.rotation)
+
+
+# Unknown axes
+
+
+def axis_frames(v: Array) -> Array:
+    """Return axes (n, 3) and their normal bases as columns, (n, 3, 3)."""
+    return np.concatenate([v[:, :, None], np.swapaxes(normal_basis(v), 1, 2)], axis=2)
+
+
+def turned_frame(turns: ca.SX, frame: ca.SX) -> ca.SX:
+    """Return an axis and its normal basis, columns (3, 3), after two turns of the axis."""
+    return turned_points(0.5 * frame[:, 1:] @ turns, frame)
+
+
+def turned_axis(nominal: Array, turns: Array) -> Array:
+    """Return the first column of :func:`turned_frame` for numbers."""
+    if not turns.any():
+        return nominal
+    square = 0.25 * float(turns @ turns)
+    coordinates = np.array([1.0 - square, turns[1], -turns[0]]) / (1.0 + square)
+    axis = coordinates @ np.vstack([nominal, normal_basis(nominal)])
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
+def turned_axis_slope(nominal: Array, turns: Array) -> Array:
+    """Return the derivative (3, 2) of :func:`turned_axis` by the turns."""
+    by_turns = np.array([-0.5 * turns, [0.0, 1.0], [-1.0, 0.0]])
+    axis = turned_axis(nominal, turns)
+    frame = np.vstack([nominal, normal_basis(nominal)])
+    return np.asarray(
+        (frame.T @ by_turns - 0.5 * np.outer(axis, turns)) / (1.0 + 0.25 * float(turns @ turns))
+    )
+
+
+def turns_of(axis: Array, nominal: Array) -> Array:
+    """Return the turns (2,) that take a nominal axis to an axis, both as lines."""
+    axis = axis if axis @ nominal > 0.0 else -axis
+    gibbs = np.cross(nominal, axis) / (1.0 + float(nominal @ axis))
+    return np.asarray(2.0 * normal_basis(nominal) @ gibbs)
+
+
+def whitener(covariance: Array) -> Array:
+    """Return W with W covariance W' = 1, for symmetric positive covariances (..., n, n)."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

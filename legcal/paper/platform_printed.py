@@ -1,0 +1,351 @@
+"""Section 3.5 as printed: joints and axes on the platform by eqs (16) to (19), one by one.
+
+With the offsets known, the leg ends B of every pose are points of one rigid body. Mean distances
+of a view equal those in the platform frame R_e (16):
+
+    C_3 = sum over views and pairs of legs (mean |B_j B_g| in R_c - |B_j B_g| in R_e)^2
+
+Where the platform is (18) gives revolute axes on the platform by v . u = 0 (7), the ends of passive
+legs by u x A B = 0 (19), universal axes and twists by the closure of legs without an S joint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from legcal.errors import NotIdentifiable
+from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
+from legcal.machine import LegGeometry, LegKind, tied_twist, twist_after
+from legcal.paper.joints_in_base import JointsInBase, distance_of_joints
+from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
+from legcal.paper.leg_demands import closure_of_leg, twisting_legs
+from legcal.paper.leg_directions import LegDirections
+from legcal.paper.motions import axis_frames
+from legcal.paper.nominal import NominalMechanism, Transformation
+from legcal.paper.offsets import leg_ends, pairs_of_legs
+from legcal.paper.platform_pose import (
+    PlatformPoses,
+    check_located,
+    locate_platform,
+    register_by_rays,
+)
+from legcal.paper.platform_unknowns import (
+    BASE_TURNS,
+    OF_B,
+    PLATFORM_TURNS,
+    TWIST,
+    PlatformUnknowns,
+    held_at_nominal,
+    near_nominal,
+    turned,
+)
+
+_APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
+_SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
+_CLOSED = 1e-4  # unit of the closures together, rms: what changes them by less is not shown
+
+
+def platform_as_printed(
+    known: NominalMechanism,
+    unknowns: PlatformUnknowns,
+    base: JointsInBase,
+    directions: LegDirections,
+    transformation: Transformation,
+) -> tuple[tuple[LegGeometry, ...], Solution, tuple[str, ...]]:
+    """Identify joints and axes on the platform by (16) to (19).
+
+    ``known`` has what steps 2 and 3 found; directions are in the frames of the cameras. Returns
+    the legs, the solution of (16), and what was left at nominal, in words.
+    """
+    solution = solve_least_squares(build_mean_distances(known, unknowns, directions))
+    x = unknowns.vector(known.legs)
+    x[: len(solution.x)] = solution.x
+    legs = unknowns.legs(x, known.legs)
+    asked = [
+        name
+        for name, leg in zip(known.leg_names, legs, strict=True)
+        if leg.kind is LegKind.PASSIVE or leg.platform_axis is not None or leg.twist is not None
+    ]
+    if not asked:
+        return legs, solution, ()
+    directions, centre, in_base = _in_base_frame(known, base, directions, transformation)
+    poses = locate_platform(
+        directions,
+        leg_ends(directions, known.parameters.offsets),
+        np.array([leg.B for leg in legs]),
+        centre=centre,
+        transformation=transformation,
+        spatial=known.spatial,
+    )
+    check_located(poses, "Axes and passive ends", f"leg {', '.join(asked)}", spatial=known.spatial)
+    legs = tuple(
+        _with_axis_and_end(known, unknowns, j, leg, directions, poses) for j, leg in enumerate(legs)
+    )
+    legs, said = _close_legs(known, unknowns, legs, directions, poses, in_base)
+    return _in_own_frame(known, legs), solution, said
+
+
+def build_mean_distances(
+    known: NominalMechanism, unknowns: PlatformUnknowns, directions: LegDirections
+) -> LeastSquares:
+    """Build the criterion C_3 of (16): mean distances of a view equal those in R_e.
+
+    Two legs that end in one place have none. In a plane the heights of R_e are nominal.
+    """
+    q0 = known.parameters.offsets
+    ends = leg_ends(directions, q0)
+    pairs = pairs_of_legs(directions, q0)
+    B = known.parameters.platform_joints[directions.leg[pairs]]
+    apart = _APART * float(np.mean(q0[np.isfinite(q0)]))
+    pairs = pairs[np.linalg.norm(B[:, 1] - B[:, 0], axis=1) > apart]
+    distance = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
+    key = np.column_stack([directions.view[pairs[:, 0]], directions.leg[pairs]])
+    distinct, which = np.unique(key, axis=0, return_inverse=True)
+    which = which.ravel()
+    mean = np.bincount(which, weights=distance) / np.bincount(which)
+    legs = distinct[:, 1:]
+    place = unknowns.place[:, OF_B]
+    observed = (np.swapaxes(unknowns.held[legs], 1, 2), mean, np.ones(len(mean)))
+    return LeastSquares(
+        "The platform joints (eq 16)",
+        (Term(distance_of_joints(), place[legs].reshape(-1, 6), observed),),
+        unknowns.vector(known.legs)[: int(place.max()) + 1],
+        exact_hessian=True,
+    )
+
+
+def _in_base_frame(
+    known: NominalMechanism,
+    base: JointsInBase,
+    directions: LegDirections,
+    transformation: Transformation,
+) -> tuple[LegDirections, Array, BoolArray]:
+    """Return directions in R_b where their camera is located, camera centres, and which these are.
+
+    As printed the camera is where each A lies on the ray that shows it, as the platform is.
+    """
+    A, u, basis = directions.A.copy(), directions.u.copy(), directions.basis.copy()
+    centre, in_base = np.zeros_like(A), np.zeros(len(A), dtype=np.bool_)
+    for v, T in enumerate(base.T_Rb_camera):
+        here = np.flatnonzero(directions.view == v)
+        if T is None or not len(here):
+            continue
+        if transformation == "cross_product" and known.spatial:
+            legs, first = np.unique(directions.leg[here], return_index=True)
+            T = register_by_rays(base.A_Rb[legs], directions.A[here[first]], T.inv()).inv()
+        A[here], u[here] = T.apply(A[here]), T.rotation.apply(u[here])
+        basis[here] = T.rotation.apply(basis[here].reshape(-1, 3)).reshape(-1, 2, 3)
+        centre[here], in_base[here] = T.translation, True
+    return replace(directions, A=A, u=u, basis=basis), centre, in_base
+
+
+# Axes on the platform and passive ends
+
+
+def _with_axis_and_end(
+    known: NominalMechanism,
+    unknowns: PlatformUnknowns,
+    j: int,
+    leg: LegGeometry,
+    directions: LegDirections,
+    poses: PlatformPoses,
+) -> LegGeometry:
+    """Return leg *j* with its axis on the platform, (7), and its end if it is passive, (19)."""
+    name, nominal = known.leg_names[j], leg.platform_axis
+    here = np.flatnonzero((directions.leg == j) & (poses.pose >= 0))
+    u, R, t = directions.u[here], poses.R[poses.pose[here]], poses.t[poses.pose[here]]
+    u_Re = np.einsum("nij,ni->nj", R, u)
+    if nominal is not None and leg.platform_joint == "R":
+        leg = replace(leg, platform_axis=revolute_axis(name, u_Re, nominal))
+    elif nominal is not None and leg.platform_joint == "":
+        fixed = replace(leg, platform_axis=fixed_direction(name, u_Re))
+        twist = None if leg.twist is None else tied_twist(fixed, leg, leg.twist)
+        leg = replace(fixed, twist=twist)
+    if leg.kind is LegKind.PASSIVE:
+        free = np.flatnonzero(unknowns.place[j, OF_B] >= 0)
+        if j in known.frame_legs and leg.platform_joint != "":
+            free = np.arange(3 if known.spatial else 2)
+        B = locate_passive_end(name, u, directions.A[here], (R, t), leg.B, free)
+        leg = replace(leg, B=B)
+    return leg
+
+
+def revolute_axis(name: str, u: Array, nominal: Array) -> Array:
+    """Return a revolute axis in R_e (3,) from v . u = 0 (7), u (n, 3) in R_e, on the nominal side.
+
+    Raises NotIdentifiable if the leg has fewer than two directions in the platform.
+    """
+    value, vector = np.linalg.eigh(u.T @ u)
+    axis = vector[:, 0]
+    if value[1] <= _SAME_DIRECTION * len(u):
+        found = f"one direction in {len(u)} pose{'s' * (len(u) != 1)}"
+        raise NotIdentifiable(
+            f"The revolute axis of leg {name} on the platform could not be identified: found "
+            f"{found if len(u) else 'no pose that shows its direction'} in the frame of the "
+            "platform, needed two different ones; add poses between which the leg turns about it."
+        )
+    return axis if axis @ nominal > 0.0 else -axis
+
+
+def fixed_direction(name: str, u: Array) -> Array:
+    """Return the direction in R_e of a leg that is fixed to the platform: the mean of u (n, 3).
+
+    Raises NotIdentifiable if no pose shows it.
+    """
+    if not len(u):
+        raise NotIdentifiable(
+            f"The direction of leg {name} in the platform could not be identified: found no pose "
+            "that shows it together with three legs of known length, needed one; add images that "
+            "show several legs at once."
+        )
+    total = u.sum(axis=0)
+    return np.asarray(total / np.linalg.norm(total))
+
+
+def locate_passive_end(
+    name: str,
+    u: Array,
+    A: Array,
+    pose: tuple[Array, Array],
+    B_nominal: Array,
+    free: IntArray,
+) -> Array:
+    """Return the platform joint centre (3,) of a passive leg: u x A B = 0 in all poses, eq (19).
+
+    u and A (n, 3) are in the frames of groups, as is the pose, R (n, 3, 3) and t (n, 3). Only the
+    ``free`` coordinates of B are looked for: three; two in a plane, and on a leg that is fixed to
+    the platform, along which B may lie anywhere. Raises NotIdentifiable if the leg has too few
+    directions in the platform.
+    """
+    R, t = pose
+    across = np.eye(3) - u[:, :, None] * u[:, None, :]  # its square is itself
+    inside = np.swapaxes(R, 1, 2) @ across
+    normal = (inside @ R).sum(axis=0)
+    right = np.einsum("nij,nj->i", inside, A - t) - normal @ B_nominal
+    B = B_nominal.copy()
+    normal = normal[np.ix_(free, free)]
+    if len(u) == 0 or np.linalg.eigvalsh(normal)[0] <= _SAME_DIRECTION * len(u):
+        raise NotIdentifiable(
+            f"The end of leg {name} on the platform could not be located: found "
+            f"{len(u)} pose{'s' * (len(u) != 1)} of the platform that show{'s' * (len(u) == 1)} "
+            "it, with axes that do not meet in one point there; needed two different directions in "
+            "the platform, each seen together with three legs of known length (eq 19); add images "
+            "at poses that differ more."
+        )
+    B[free] += np.linalg.solve(normal, right[free])
+    return B
+
+
+# Universal axes and twists
+
+
+def _close_legs(
+    known: NominalMechanism,
+    unknowns: PlatformUnknowns,
+    legs: tuple[LegGeometry, ...],
+    directions: LegDirections,
+    poses: PlatformPoses,
+    in_base: BoolArray,
+) -> tuple[tuple[LegGeometry, ...], tuple[str, ...]]:
+    """Identify universal axes and twists by the closure, what the poses leave open at nominal.
+
+    ``legs`` have all else as it was found. Returns them, and what was left at nominal, in words.
+    """
+    wanted = unknowns.of_closure
+    of_others = [
+        unknowns.place[j, PLATFORM_TURNS]
+        for j, leg in enumerate(unknowns.nominal)
+        if leg.platform_joint != "U"
+    ]
+    wanted = np.setdiff1d(wanted, np.array(of_others).ravel())
+    if not len(wanted):
+        return legs, ()
+    numbers = np.unique(poses.pose[in_base & (poses.pose >= 0)])
+    seen = poses.R[numbers], poses.t[numbers]
+    problem = _build_closure(unknowns, wanted, legs, directions, poses, in_base)
+    x, information = problem.start, np.zeros((0, len(wanted)))
+    near = near_nominal(np.arange(len(wanted)))
+    if problem.terms:
+        solution = solve_least_squares(replace(problem, terms=(*problem.terms, *near)))
+        x, information = solution.x, solution.without_last(len(wanted)).information()
+    found = _closed(unknowns, legs, wanted, x)
+    held, said = held_at_nominal(
+        known, unknowns, information, found, seen, np.zeros(len(wanted)), wanted
+    )
+    if problem.terms:
+        problem = replace(problem, terms=(*problem.terms, *held), start=x)
+        found = _closed(unknowns, legs, wanted, solve_least_squares(problem).x)
+    return found, said
+
+
+def _build_closure(
+    unknowns: PlatformUnknowns,
+    wanted: IntArray,
+    legs: tuple[LegGeometry, ...],
+    directions: LegDirections,
+    poses: PlatformPoses,
+    in_base: BoolArray,
+) -> LeastSquares:
+    """Build the closure of all legs without an S joint: sin(angle - twist) = 0, unweighted."""
+    renumbered = np.full(len(unknowns) + 1, -1, dtype=np.intp)
+    renumbered[wanted] = np.arange(len(wanted))
+    place = renumbered[unknowns.place]
+    shown = in_base & (poses.pose >= 0)
+    kinds = twisting_legs(legs)
+    n_rows = sum(int(np.sum(shown & of_kind[directions.leg])) for of_kind in kinds.values())
+    terms = []
+    for joints, of_kind in kinds.items():
+        rows = np.flatnonzero(shown & of_kind[directions.leg])
+        if not len(rows):
+            continue
+        leg = directions.leg[rows]
+        observed = (
+            directions.u[rows],
+            poses.R[poses.pose[rows]],
+            axis_frames(np.array([legs[j].base_axis for j in leg], dtype=np.float64)),
+            axis_frames(np.array([legs[j].platform_axis for j in leg], dtype=np.float64)),
+            np.array([float(legs[j].twist or 0.0) for j in leg]),
+            np.full(len(rows), _CLOSED / np.sqrt(n_rows)),
+        )
+        columns = (place[leg, PLATFORM_TURNS], place[leg, BASE_TURNS], place[leg, TWIST, None])
+        terms.append(Term(closure_of_leg(*joints), np.hstack(columns), observed))
+    return LeastSquares("The universal axes (step 4)", tuple(terms), np.zeros(len(wanted)))
+
+
+def _closed(
+    unknowns: PlatformUnknowns, legs: tuple[LegGeometry, ...], wanted: IntArray, x: Array
+) -> tuple[LegGeometry, ...]:
+    """Return legs with universal axes turned from the nominal ones, and twists changed."""
+    values = np.zeros(len(unknowns) + 1)
+    values[wanted] = x
+    return tuple(
+        leg
+        if leg.twist is None
+        else replace(
+            leg,
+            base_axis=turned(leg.base_axis, values[place[BASE_TURNS]]),
+            platform_axis=turned(leg.platform_axis, values[place[PLATFORM_TURNS]]),
+            twist=leg.twist + float(values[place[TWIST]]),
+        )
+        for leg, place in zip(legs, unknowns.place, strict=True)
+    )
+
+
+def _in_own_frame(
+    known: NominalMechanism, legs: tuple[LegGeometry, ...]
+) -> tuple[LegGeometry, ...]:
+    """Return legs with the platform in R_e, where passive legs among the frame legs were moved."""
+    frame = list(known.frame_legs)
+    if all(legs[j].kind is not LegKind.PASSIVE for j in frame):
+        return legs
+    T = frame_on_points(np.array([legs[j].B for j in frame])).inv()
+    found = []
+    for j, leg in enumerate(legs):
+        B, axis = T.apply(leg.B), leg.platform_axis
+        if j in frame:  # coordinates that are zero by the choice of the frame
+            B[frame.index(j) : len(frame)] = 0.0
+        axis = None if axis is None else np.asarray(T.rotation.apply(axis))
+        found.append(replace(leg, B=B, platform_axis=axis, twist=twist_after(leg, T.rotation)))
+    return tuple(found)
