@@ -17,7 +17,6 @@ from legcal.calibration.joint_fit import Choices
 from legcal.calibration.run import CalibrationRun, start_run
 from legcal.data import (
     Dataset,
-    Outlines,
     few_views,
     inverse,
     load_dataset,
@@ -26,7 +25,6 @@ from legcal.data import (
 from legcal.errors import DatasetError
 from legcal.files import output_path
 from legcal.geometry import IntArray
-from legcal.machine import Cylinder
 from legcal.perception import (
     BEFORE_FIT,
     DETECTION,
@@ -113,59 +111,30 @@ def _rows_with_image(dataset: Dataset) -> IntArray:
 
 def _detected(run: CalibrationRun, images: IntArray) -> Detection:
     """Recognise and measure, and return what was found in the order of the files."""
-    photographs = run.photographs
+    dataset, order, photographs = run.dataset, run.order, run.photographs
     scene, board = rough_scene(run)
-    if len(photographs.detect) == 0:
-        return _in_file_order(
-            run, images, given_outlines(photographs), scene, photographs.cylinders, {}, ()
+    outlines, cylinders = given_outlines(photographs), photographs.cylinders
+    unplaced, notes = dict[str, str](), list[str]()
+    if len(photographs.detect):
+        T_board_camera = None if board is None else board.T_board_camera
+        seen = observe(photographs, scene, run.progress, T_board_camera)
+        cameras, cylinders = seen.placement.T_base_camera, seen.photographs.cylinders
+        placed = np.array([T is not None for T in cameras])
+        row = seen.outlines.row
+        kept = placed[run.measurements.view[row]] | ~np.isin(row, photographs.detect)
+        outlines, unplaced = seen.outlines.choose(kept), seen.placement.unplaced
+        notes = _notes(run, seen.placement)
+        # Legs of a view that could not be placed are drawn where its rough pose has them.
+        drawn = tuple(
+            T if T is not None else rough
+            for T, rough in zip(cameras, scene.T_base_camera, strict=True)
         )
-    T_board_camera = None if board is None else board.T_board_camera
-    seen = observe(photographs, scene, run.progress, T_board_camera)
-    placement, cameras = seen.placement, seen.placement.T_base_camera
-    # Legs of a view that could not be placed are drawn where its rough pose has them.
-    drawn = tuple(
-        T if T is not None else rough for T, rough in zip(cameras, scene.T_base_camera, strict=True)
-    )
-    placed = np.array([T is not None for T in cameras])
-    row = seen.outlines.row
-    kept = placed[run.measurements.view[row]] | ~np.isin(row, photographs.detect)
-    views = run.measurements.views
-    hints = hint_notes(
-        [view.name for view in views], [view.T_base_camera for view in views], cameras, BEFORE_FIT
-    )
-    untold = [view.name for view in views if not view.camera.gamma_is_told]
-    gamma = (
-        f"The gamma of {few_views(untold)} is not told and was taken as 1: outlines of a camera "
-        "that encodes light lie off by up to half of the blur; write gamma of the views in "
-        "dataset.yaml, or let legcal calibrate estimate it.",
-    )
-    return _in_file_order(
-        run,
-        images,
-        seen.outlines.choose(kept),
-        replace(placement, T_base_camera=drawn),
-        seen.photographs.cylinders,
-        placement.unplaced,
-        (*hints, *placement.notes, *(gamma if untold else ())),
-    )
-
-
-def _in_file_order(
-    run: CalibrationRun,
-    images: IntArray,
-    outlines: Outlines,
-    scene: Placement,
-    cylinders: tuple[tuple[Cylinder, ...], ...],
-    unplaced: dict[str, str],
-    notes: tuple[str, ...],
-) -> Detection:
-    """Return what was found in the order of the files."""
-    dataset, order = run.dataset, run.order
+        scene = replace(seen.placement, T_base_camera=drawn)
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
-    restored = order.restore(outlines)
+    names = dataset.mechanism.leg_names
     return Detection(
         dataset=dataset,
-        outlines=reject_unused_legs(restored, dataset.measurements, dataset.mechanism.leg_names),
+        outlines=reject_unused_legs(order.restore(outlines), dataset.measurements, names),
         A_base=scene.A_base[rows][:, legs],
         B_base=scene.B_base[rows][:, legs],
         cylinders=tuple(cylinders[leg] for leg in legs.tolist()),
@@ -174,3 +143,17 @@ def _in_file_order(
         unplaced=unplaced,
         notes=(*dataset.notes, *notes, *run.unreached_notes()),
     )
+
+
+def _notes(run: CalibrationRun, placement: Placement) -> list[str]:
+    """Return what is to be said of the cameras and the images."""
+    views = run.measurements.views
+    hints = [view.T_base_camera for view in views]
+    notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
+    untold = [view.name for view in views if not view.camera.gamma_is_told]
+    gamma = (
+        f"The gamma of {few_views(untold)} is not told and was taken as 1: outlines of a camera "
+        "that encodes light lie off by up to half of the blur; write gamma of the views in "
+        "dataset.yaml, or let legcal calibrate estimate it."
+    )
+    return [*notes, *placement.notes, *([gamma] if untold else [])]

@@ -24,24 +24,12 @@ TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its sta
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What the four steps give by themselves.
+    """What the four steps give by themselves."""
 
-    Attributes
-    ----------
-    legs : tuple of LegGeometry or None
-        The legs in R_b and R_e; None if the steps could not be run to the end.
-    T_Rb_camera : tuple of RigidTransform or None
-        The cameras that step 2 places; None as a whole if the steps failed.
-    failure : str
-        Why they failed; "" if they did not.
-    diagnostics : tuple of str
-        What they left out or at nominal, and why.
-    """
-
-    legs: tuple[LegGeometry, ...] | None
-    T_Rb_camera: tuple[RigidTransform | None, ...] | None
-    failure: str
-    diagnostics: tuple[str, ...] = ()
+    legs: tuple[LegGeometry, ...] | None  # in R_b and R_e; None if they did not reach the end
+    T_Rb_camera: tuple[RigidTransform | None, ...] | None  # of step 2; None if that failed
+    failure: str  # why they failed; "" if they did not
+    diagnostics: tuple[str, ...] = ()  # what they left out or at nominal, and why
 
     def in_file_order(self, order: Order) -> Steps:
         """Return the same with legs and views in the order of the files."""
@@ -57,18 +45,10 @@ class Steps:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the calibrated model should replace the nominal one.
+    """Whether the calibrated model should replace the nominal one."""
 
-    Attributes
-    ----------
-    trustworthy : bool
-        The predicted improvement exceeds two of its standard deviations.
-    sentence : str
-        The same, for people.
-    """
-
-    trustworthy: bool
-    sentence: str
+    trustworthy: bool  # the predicted improvement exceeds two of its standard deviations
+    sentence: str  # the same, for people
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +60,7 @@ class Calibration:
     dataset : Dataset
         What it was computed from; its ``mechanism`` is the nominal model.
     solution : Solution
-        The fit of everything: parameters, covariance, cameras, platform poses, radii.
+        The joint fit: parameters, covariance, cameras, platform poses, radii.
     steps : Steps
         What the four steps gave.
     platform : PlatformAccuracy or None

@@ -1,4 +1,4 @@
-"""The command line."""
+"""The command line: parses, calls a job, prints its document or its report, returns a code."""
 
 from legcal.cli.app import main
 

@@ -21,7 +21,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import (
     OBSERVATIONS_NAME,
-    QUALITY,
     Dataset,
     ImageReader,
     Outlines,
@@ -30,7 +29,7 @@ from legcal.data import (
     write_observations,
 )
 from legcal.errors import OutOfResources, UsageError
-from legcal.files import OutputKind, check_destination, path_problem, result_folder
+from legcal.files import Document, OutputKind, check_destination, path_problem, result_folder
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Cylinder
 from legcal.perception.outline import HIDDEN, OUTSIDE
@@ -129,8 +128,45 @@ def reason_class(reason: str) -> str:
     return HIDDEN_LEG if reason.startswith(HIDDEN) else short_reason(reason) or "no reason given"
 
 
-def view_figures(detection: Detection) -> dict[str, dict[str, Any]]:
-    """Return the figures of every view that has images or outlines, as JSON has them.
+class ViewFigures(Document):
+    """What was found in the images of a view."""
+
+    images: int
+    legs_visible: int
+    legs_found: int
+    outlines: int
+    used: int
+    edited: int
+    contrast: float | None  # medians of the used outlines
+    length: float | None
+    residual: float | None
+    rejected: dict[str, int]  # by reason, the most first
+    problem: str | None  # why its camera could not be placed
+
+
+class Overlay(Document):
+    """The picture of an image."""
+
+    view: str
+    image: str
+    file: str
+
+
+class DetectionDocument(Document):
+    """What ``legcal detect --json`` prints."""
+
+    legcal_detection: int
+    mechanism: str
+    views: dict[str, ViewFigures]
+    images: int
+    outlines: int
+    used: int
+    overlays: list[Overlay]
+    notes: list[str]
+
+
+def view_figures(detection: Detection) -> dict[str, ViewFigures]:
+    """Return the figures of every view that has images or outlines.
 
     Legs are counted in each image that should show them: neither outside nor hidden. They are found
     where one of their outlines is used.
@@ -146,17 +182,19 @@ def view_figures(detection: Detection) -> dict[str, dict[str, Any]]:
         rejected = Counter(
             reason_class(why) for why, ok in zip(reasons, used, strict=True) if not ok
         )
-        found[name] = {
-            "images": int(np.count_nonzero(measurements.view[detection.rows] == v)),
-            "legs_visible": _count_legs(outlines, ~np.array(hidden, dtype=np.bool_) | used),
-            "legs_found": _count_legs(outlines, used),
-            "outlines": len(outlines),
-            "used": int(np.count_nonzero(used)),
-            "edited": int(np.count_nonzero(is_edited(outlines))),
-            **{name: _median(outlines, name) for name in QUALITY},
-            "rejected": dict(rejected.most_common()),
-            "problem": detection.unplaced.get(name) or None,
-        }
+        found[name] = ViewFigures(
+            images=int(np.count_nonzero(measurements.view[detection.rows] == v)),
+            legs_visible=_count_legs(outlines, ~np.array(hidden, dtype=np.bool_) | used),
+            legs_found=_count_legs(outlines, used),
+            outlines=len(outlines),
+            used=int(np.count_nonzero(used)),
+            edited=int(np.count_nonzero(is_edited(outlines))),
+            contrast=_median(outlines, "contrast"),
+            length=_median(outlines, "length"),
+            residual=_median(outlines, "residual"),
+            rejected=dict(rejected.most_common()),
+            problem=detection.unplaced.get(name) or None,
+        )
     return found
 
 
@@ -304,19 +342,19 @@ def detection_document(detection: Detection, pictures: Mapping[int, str]) -> dic
     """Return what ``--json`` prints; *pictures* are the files of rows, relative to the folder."""
     outlines = detection.outlines
     names = row_names(detection.dataset.measurements)
-    return {
-        "legcal_detection": 1,
-        "mechanism": detection.dataset.mechanism.name,
-        "views": view_figures(detection),
-        "images": len(detection.rows),
-        "outlines": len(outlines),
-        "used": int(np.count_nonzero(outlines.used)),
-        "overlays": [
-            {"view": detection.view_of(row), "image": names[row], "file": file}
+    return DetectionDocument(
+        legcal_detection=1,
+        mechanism=detection.dataset.mechanism.name,
+        views=view_figures(detection),
+        images=len(detection.rows),
+        outlines=len(outlines),
+        used=int(np.count_nonzero(outlines.used)),
+        overlays=[
+            Overlay(view=detection.view_of(row), image=names[row], file=file)
             for row, file in pictures.items()
         ],
-        "notes": list(detection.notes),
-    }
+        notes=list(detection.notes),
+    ).document()
 
 
 def picture_names(detection: Detection) -> dict[int, str]:

@@ -1,4 +1,7 @@
-"""report."""
+"""What people read: results of the jobs as text, by one renderer of tables (``render``).
+
+In go the results of :mod:`legcal.calibration` or their documents, out come rich renderables.
+"""
 
 import lazy_loader
 
