@@ -39,7 +39,6 @@ class OtherRadii:
     """What pictures say of radii, by leg and radius in the model."""
 
     factor: dict[Part, float]  # by how much they differ from the model; others are left out
-    sigma: dict[Part, float]  # standard error of the logarithms of these
     common: float = 0.0  # the factor of all parts, if they differ alike; 0 otherwise
 
     def corrected(self, cylinders: Sequence[Sequence[Cylinder]]) -> list[tuple[Cylinder, ...]]:
@@ -65,14 +64,14 @@ class OtherRadii:
         }
         if self.common and len(mine) >= MOST_PARTS * len(self.factor):
             return self
-        return OtherRadii(mine, self.sigma)
+        return OtherRadii(mine)
 
     def of_the_same(self, step: "OtherRadii") -> "OtherRadii":
         """Return what a step says of the parts whose radii this one has corrected."""
         if self.common:
             return step if step.common else NO_OTHER_RADII
         mine = {(leg, r * factor) for (leg, r), factor in self.factor.items()}
-        return OtherRadii({part: f for part, f in step.factor.items() if part in mine}, step.sigma)
+        return OtherRadii({part: f for part, f in step.factor.items() if part in mine})
 
     def then(self, step: "OtherRadii") -> "OtherRadii":
         """Return both corrections, the second one of radii that the first had corrected."""
@@ -81,11 +80,7 @@ class OtherRadii:
         factor = {
             (leg, r): f * step.of(leg, r * self.of(leg, r)) for (leg, r), f in self.factor.items()
         }
-        sigma = {
-            (leg, r): step.sigma.get((leg, r * self.of(leg, r)), s)
-            for (leg, r), s in self.sigma.items()
-        }
-        return OtherRadii(factor, sigma, self.common * (step.common or 1.0))
+        return OtherRadii(factor, self.common * (step.common or 1.0))
 
 
 def _alike(one: float, other: float) -> bool:
@@ -93,7 +88,7 @@ def _alike(one: float, other: float) -> bool:
     return abs(one - other) <= EQUAL_RADII * other
 
 
-NO_OTHER_RADII = OtherRadii({}, {})
+NO_OTHER_RADII = OtherRadii({})
 
 
 def other_radii(
@@ -118,20 +113,19 @@ def other_radii(
     known = {part: found for part, found in agreed.items() if found is not None}
     if not known:
         return NO_OTHER_RADII
-    sigma = {part: found[1] for part, found in known.items()}
     common = float(np.median([value for value, _ in known.values()]))
     alike = np.mean([abs(value - common) < CONSISTENT for value, _ in known.values()])
     of_several = alike >= MOST_PARTS and len({leg for leg, _ in known}) > 1
     if not alone and abs(common) > different and of_several:
         factor = float(np.exp(common))
-        return OtherRadii(dict.fromkeys(samples, factor), sigma, factor)
+        return OtherRadii(dict.fromkeys(samples, factor), factor)
     bias = common if of_several else 0.0  # of pairs, whatever the leg
     differing = {
         part: float(np.exp(value - bias))
-        for part, (value, sigma_value) in known.items()
-        if abs(value - bias) > max(different, SURE * sigma_value)
+        for part, (value, sigma) in known.items()
+        if abs(value - bias) > max(different, SURE * sigma)
     }
-    return OtherRadii(differing, {part: sigma[part] for part in differing})
+    return OtherRadii(differing)
 
 
 def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
