@@ -10,10 +10,8 @@ from machines import MACHINES, of_types, ring
 
 import legcal
 from legcal.calibration.identify.session import (
-    _Closing,
     default_cameras,
     planned_session,
-    random_poses,
 )
 from legcal.errors import DidNotConverge
 from legcal.machine import (
@@ -24,7 +22,10 @@ from legcal.machine import (
     forward_kinematics_many,
     geometries,
     linearize,
+    pose_equations,
+    random_poses,
 )
+from legcal.machine.configurations import _Drive
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 
@@ -89,13 +90,11 @@ def test_the_motors_that_draw_their_lengths_stand_far_from_each_other() -> None:
     angles = [15.0 * j for j in range(24)]
     A, B = ring(angles, 0.3), ring([a + 30.0 * (-1) ** j for j, a in enumerate(angles)], 0.15)
     legs = [LegGeometry("S", "S", LegKind.ACTUATED, a, b, 0.0) for a, b in zip(A, B, strict=True)]
-    closing = _Closing(legs, (0, 8, 16))
     R, t = np.eye(3)[None], np.array([[0.0, 0.0, 0.4]])
-    lengths = closing.lengths(R, t)
-    all_of_them = np.linalg.cond(closing.system(R, t, lengths)[1][0])
-    closing.drive(R, t)
-    assert len(closing.driven) == 6
-    assert np.linalg.cond(closing.system(R, t, lengths)[1][0]) < 2.0 * all_of_them
+    all_of_them = np.linalg.cond(pose_equations(legs, R, t).by_pose[0])
+    drive = _Drive(legs, (0, 8, 16), R, t)
+    assert len(drive.driven) == 6
+    assert np.linalg.cond(drive.slopes(R, t)[0]) < 2.0 * all_of_them
 
 
 def test_a_machine_that_cannot_reach_its_travel_is_refused() -> None:
@@ -134,8 +133,8 @@ def test_machines_that_reach_few_drawn_poses_get_all_in_the_end(
 ) -> None:
     chance = np.random.default_rng(1)
     monkeypatch.setattr(
-        "legcal.calibration.identify.session._Closing.is_regular",
-        lambda _self, _R, t, _R0, _t0: chance.random(len(t)) < 0.75,  # in each of five steps
+        "legcal.machine.configurations._Drive.is_regular",
+        lambda _self, _R, t: chance.random(len(t)) < 0.75,  # in each of five steps
     )
     mechanism = legcal.load_mechanism("hexapod")
     assert len(planned_session(mechanism, [range(6)], 60).t) == 60

@@ -7,6 +7,7 @@ from .configurations import WORKSPACE_SEED as WORKSPACE_SEED
 from .configurations import Configurations as Configurations
 from .configurations import beyond_travel as beyond_travel
 from .configurations import random_configurations as random_configurations
+from .configurations import random_poses as random_poses
 from .configurations import strolled as strolled
 from .configurations import workspace as workspace
 from .cylinders import COAXIAL as COAXIAL

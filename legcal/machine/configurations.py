@@ -6,17 +6,27 @@ nearer to home after two draws in vain. Where motors do not determine the pose, 
 manifold of closed configurations.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray
-from legcal.machine.kinematics import follow, joint_values, platform_pose, slider_columns
+from legcal.machine.equations import PoseEquations, freedoms, pose_equations
+from legcal.machine.kinematics import (
+    follow,
+    joint_values,
+    platform_pose,
+    slider_columns,
+    solve_poses,
+)
+from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import free_motions, project, singularity
 from legcal.machine.model import Mechanism
+from legcal.machine.solver import RANK, moved
 
 TRIES = 40  # draws for each configuration
 NEARER = 1.3 * 0.8 ** np.arange(TRIES)  # how far from home draws go, at most all of the way
@@ -29,6 +39,19 @@ STRIDE = 0.15  # [rad], and of a leg length
 INSIDE = 1e-12  # [m]
 WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are told
 WORKSPACE_SEED = 20020721
+
+# Poses of any legs, many at once and without a chain
+PARTS = 5  # of the way from home to a pose, so that no pose jumps to another assembly mode
+STEPS, LAST_STEPS = 3, 9  # of the solver, a part of the way and at its end
+CLOSED = 1e-9  # of the mean leg length
+NEARLY_CLOSED = 1e-5  # where more is demanded than freedoms are left, and joints give way
+DEPENDENT = 1e-4  # singular values of equations below this are those of the others
+SINGULAR = 0.05  # smallest singular value, of its value at home
+FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
+ATTEMPTS = 12
+SHRINKING = 0.6  # each attempt with that part of the travel of the one before, but
+LEAST_SHARE = 0.078  # of the travel at least
+LOOSE = 0.01  # of a hold by motors and joints, without unit
 
 
 class Configurations(NamedTuple):
@@ -173,3 +196,150 @@ def beyond_travel(mechanism: Mechanism, configuration: Array) -> BoolArray:
     lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
     outside = (values < lower - INSIDE) | (values > upper + INSIDE)
     return np.asarray(outside | (mechanism.sign * values + mechanism.q0 <= 0.0))
+
+
+def random_poses(
+    legs: Sequence[Leg],
+    frame_legs: Sequence[int],
+    home: RigidTransform,
+    travel: Array,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Return random poses (count, 3, 3) and (count, 3) [m] of R_e in R_b inside the travel.
+
+    They are those of legs in R_b and R_e that no file describes: many at once, without a chain.
+    *home* is T_Rb_Re near a closed pose of the wanted assembly mode, *travel* (n_legs, 2) the
+    shortest and longest length of each leg [m], equal for legs of constant length.
+
+    Raises
+    ------
+    DidNotConverge
+        If the machine cannot move inside its travel.
+    """
+    start = solve_poses(legs, frame_legs, home.rotation.as_matrix()[None], home.translation[None])
+    drive = _Drive(legs, frame_legs, start.R, start.t)
+    home_lengths = drive.lengths(start.R, start.t)[0]
+    slack = 1e-6 + 0.05 * (travel[:, 1] - travel[:, 0])
+    low = np.minimum(travel[:, 0], home_lengths) - slack  # home counts as inside
+    high = np.maximum(travel[:, 1], home_lengths) + slack
+    found_R, found_t = np.zeros((0, 3, 3)), np.zeros((0, 3))
+    share, tried, near_singular = 1.0, 0, 0
+    for _ in range(ATTEMPTS):
+        n = 2 * (count - len(found_t)) + 10
+        wanted = rng.uniform(travel[:, 0], travel[:, 1], (n, len(legs)))
+        wanted = home_lengths + share * (wanted - home_lengths)
+        R, t = drive.wandered(n, share, rng)
+        first, good = drive.lengths(R, t), np.ones(n, dtype=np.bool_)
+        for part in np.linspace(0.0, 1.0, PARTS + 1)[1:]:
+            R, t = drive.closed(R, t, first + part * (wanted - first), STEPS)
+            good &= drive.is_regular(R, t)
+        tried, near_singular = tried + n, near_singular + int(np.sum(~good))
+        R, t = drive.closed(R, t, wanted, LAST_STEPS)
+        lengths = drive.lengths(R, t)
+        good &= drive.is_closed(R, t, wanted) & np.all((lengths >= low) & (lengths <= high), axis=1)
+        found_R, found_t = np.concatenate([found_R, R[good]]), np.concatenate([found_t, t[good]])
+        if len(found_t) >= count:
+            return found_R[:count], found_t[:count]
+        share = max(SHRINKING * share, LEAST_SHARE)
+    found = f"found {len(found_t)} of {count} random poses inside the travel"
+    if 2 * near_singular > tried and drive.hold() < LOOSE:
+        raise DidNotConverge(
+            f"The observations could not be predicted: {found}, needed all; most ways there come "
+            "near a singular pose, in which motors and joints do not hold the platform: choose a "
+            "home further from it, or joints that do not make the same figure on base and platform."
+        )
+    raise DidNotConverge(
+        f"The observations could not be predicted: {found}, needed all; check the travel (limit "
+        "lower, upper) and the home pose of the model."
+    )
+
+
+class _Drive:
+    """Legs whose motors draw their lengths at many poses; of redundant motors as many as needed.
+
+    Those are taken that say most beside each other, of what the other demands leave open.
+    """
+
+    def __init__(self, legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array) -> None:
+        self.legs, self.frame_legs, self.R, self.t = tuple(legs), frame_legs, R, t
+        self.columns = list(freedoms(frame_legs))
+        self.q0 = np.array([leg.q0 for leg in legs])
+        motors = [j for j, leg in enumerate(legs) if leg.kind is LegKind.ACTUATED]
+        self.driven = np.array([], dtype=np.intp)
+        held = self.slopes(R, t)[0]
+        self.driven = np.array(motors, dtype=np.intp)
+        every = self.slopes(R, t)[0]
+        rank_every, rank_held = (
+            int(np.linalg.matrix_rank(J, tol=DEPENDENT)) if J.size else 0 for J in (every, held)
+        )
+        count = rank_every - rank_held
+        if count < len(motors):
+            size = np.where(np.array(self.columns) < 3, self.lengths(R, t).mean(), 1.0)
+            found = pose_equations(legs, R, t, by_local=False)
+            rows = found.by_pose[0][found.measured][:, self.columns] / size
+            left = np.eye(len(size)) - np.linalg.pinv(held / size, rcond=RANK) @ (held / size)
+            order = qr((rows @ left).T, mode="r", pivoting=True)[1]
+            self.driven = np.array([motors[k] for k in order[:count]], dtype=np.intp)
+
+    def lengths(self, R: Array, t: Array) -> Array:
+        """Return the leg lengths, (k, n_legs) [m]."""
+        A, B = np.array([leg.A for leg in self.legs]), np.array([leg.B for leg in self.legs])
+        return np.asarray(np.linalg.norm(B @ np.swapaxes(R, 1, 2) + t[:, None] - A, axis=2))
+
+    def equations(self, R: Array, t: Array) -> PoseEquations:
+        """Return what is held: the constraints, and the lengths of driven motors."""
+        found = pose_equations(self.legs, R, t, by_local=False)
+        return found.of(~found.measured | np.isin(found.leg, self.driven))
+
+    def slopes(self, R: Array, t: Array) -> Array:
+        """Return their derivatives (k, m, f) by the possible motions."""
+        return self.equations(R, t).by_pose[:, :, self.columns]
+
+    def hold(self) -> float:
+        """Return how well motors and joints hold the platform at home: 0 where singular."""
+        scale = np.where(np.array(self.columns) < 3, 1.0 / self.lengths(self.R, self.t).mean(), 1.0)
+        slopes = self.slopes(self.R, self.t)[0] * scale
+        return float(np.linalg.svd(slopes, compute_uv=False)[-1]) if slopes.size else 0.0
+
+    def closed(self, R: Array, t: Array, wanted: Array, steps: int) -> tuple[Array, Array]:
+        """Return poses nearer to wanted lengths (k, n_legs) of driven motors."""
+        lengthening = np.full_like(wanted, np.nan)
+        lengthening[:, self.driven] = (wanted - self.q0)[:, self.driven]
+        found = solve_poses(self.legs, self.frame_legs, R, t, lengthening, steps)
+        return found.R, found.t
+
+    def wandered(self, n: int, share: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Return n poses that differ from home as far as no motor holds the platform."""
+        J = self.slopes(self.R, self.t)[0]
+        left = np.eye(len(self.columns))
+        if len(J):
+            left -= np.linalg.pinv(J, rcond=1e-6) @ J
+        scale = np.where(np.array(self.columns) < 3, 1.0, self.lengths(self.R, self.t).mean())
+        step = np.zeros((n, 6))
+        step[:, self.columns] = scale * (
+            rng.normal(size=(n, len(self.columns))) * share * FREE @ left.T
+        )
+        pose = np.concatenate([self.R, self.t[..., None]], axis=2)
+        poses = moved(np.repeat(pose, n, axis=0), step)
+        return poses[:, :, :3], poses[:, :, 3]
+
+    def is_closed(self, R: Array, t: Array, wanted: Array) -> BoolArray:
+        """Return which poses meet what legs and lengths demand."""
+        found = self.equations(R, t)
+        goal = np.where(found.measured, (wanted - self.q0)[:, found.leg], 0.0)
+        redundant = len(found.leg) > len(self.columns)
+        limit = (NEARLY_CLOSED if redundant else CLOSED) * self.lengths(R, t).mean(axis=1)
+        return np.asarray(np.abs(found.values - goal).max(axis=1, initial=0.0) <= limit)
+
+    def is_regular(self, R: Array, t: Array) -> BoolArray:
+        """Return which poses are as far from singular as a share of home is, on the same side."""
+        J, J0 = self.slopes(R, t), self.slopes(self.R, self.t)
+        if J.shape[1] == 0:
+            return np.ones(len(t), dtype=np.bool_)
+        s, s0 = np.linalg.svd(J, compute_uv=False), np.linalg.svd(J0, compute_uv=False)[0]
+        last = int(np.sum(s0 > 1e-6 * s0[0])) - 1
+        good = s[:, last] > SINGULAR * s0[last]
+        if J.shape[1] == J.shape[2]:
+            good &= np.linalg.det(J) * np.linalg.det(J0) >= 0.0
+        return np.asarray(good)

@@ -346,6 +346,7 @@ def solve_poses(
     R: Array,
     t: Array,
     lengthening: Array | None = None,
+    steps: int = 60,
 ) -> SolvedPoses:
     """Return the poses near given ones where legs meet what readings and joints demand.
 
@@ -362,6 +363,8 @@ def solve_poses(
     lengthening : (k, n_legs) array, optional
         s q of actuated legs [m], NaN where unknown; others are not looked at. Without it poses
         move to the nearest at which the constraints hold.
+    steps : int
+        At most; where they are few poses come nearer.
     """
     fixed = np.ones(6, dtype=np.bool_)
     fixed[list(freedoms(frame_legs))] = False
@@ -380,7 +383,7 @@ def solve_poses(
         return values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
-    found = solve(equations, moved, poses, met=1e-15, rank=DEPENDENT)
+    found = solve(equations, moved, poses, met=1e-15, rank=DEPENDENT, steps=steps)
     return SolvedPoses(found.points[:, :, :3], found.points[:, :, 3], found.worst, found.size)
 
 

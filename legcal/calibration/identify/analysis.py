@@ -31,7 +31,6 @@ from legcal.calibration.identify.session import (
     machine_near,
     planned_session,
     radii,
-    random_poses,
     travel_of,
 )
 from legcal.calibration.joint_fit import NO_CHOICES, Choices
@@ -48,6 +47,7 @@ from legcal.machine import (
     legs_outside,
     load_mechanism,
     parametrization_of,
+    random_poses,
     singular_note,
 )
 from legcal.paper import Condition, count_conditions, three_legs_at_once, two_directions
