@@ -35,7 +35,7 @@ def told(dataset: Dataset, gamma: float | None) -> Dataset:
     views = tuple(
         replace(
             view,
-            camera=replace(view.camera, gamma=gamma or 1.0, gamma_is_told=gamma is not None),
+            camera=replace(view.camera, gamma=gamma or 1.0, gamma_is_given=gamma is not None),
         )
         for view in dataset.measurements.views
     )

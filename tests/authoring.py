@@ -7,9 +7,9 @@ import numpy as np
 import yaml
 
 from legcal.machine import LegKind, Mechanism, main_cylinders
-from legcal.machine.assembly import create_model
 from legcal.machine.description import Description
 from legcal.machine.description_table import read_description
+from legcal.machine.new_model import create_model
 
 ROOT = Path(__file__).parents[1]
 TABLES = sorted((ROOT / "models" / "tables").glob("*.yaml"))

@@ -7,7 +7,7 @@ import numpy as np
 from legcal import load_mechanism
 from legcal.calibration.joint_fit.choices import Choices
 from legcal.calibration.joint_fit.parameters import KnownParameters, known_parameters, resolve
-from legcal.data.dataset import wishes_of_call
+from legcal.data.dataset import overrides_of_call
 from legcal.data.measurements import View
 from legcal.vision.camera import Camera
 
@@ -34,4 +34,4 @@ def choose(
     free: Sequence[str] = (),
     parameters: KnownParameters = HEXAPOD,
 ) -> Choices:
-    return resolve(wishes_of_call(priors, fixed, free), parameters)
+    return resolve(overrides_of_call(priors, fixed, free), parameters)

@@ -8,14 +8,9 @@ import pytest
 from authoring import check_same
 
 from legcal.machine import Mechanism, singularity
-from legcal.machine.assembly import (
-    Family,
-    assemble,
-    create_model,
-    describe_family,
-    urdf_text,
-    yaml_text,
-)
+from legcal.machine.assembly import assemble
+from legcal.machine.family import Family, describe_family
+from legcal.machine.new_model import create_model, urdf_text, yaml_text
 
 GOUGH = Family("6-UPS", "mm", 300.0, 150.0, 400.0)
 

@@ -20,9 +20,10 @@ from legcal.machine import (
     load_mechanism,
     singularity,
 )
-from legcal.machine.assembly import assemble, create_model, urdf_text, yaml_text
+from legcal.machine.assembly import assemble
 from legcal.machine.description_table import read_description
 from legcal.machine.files import shipped_names
+from legcal.machine.new_model import create_model, urdf_text, yaml_text
 
 REAL = ROOT / "tests" / "data" / "nategh-agheli-real"
 NUMBER = re.compile(r"(?<![\w.-])-?\d+\.\d+(?:e[-+]\d+)?")

@@ -7,10 +7,12 @@ import pytest
 from authoring import described, made, write_table
 
 from legcal.errors import LegcalError, ModelError, OutOfClass, OutOfResources, UsageError
-from legcal.machine import assembly as create
-from legcal.machine.assembly import Family, assemble, create_model, describe_family
-from legcal.machine.assembly import described as asked
+from legcal.machine import new_model as create
+from legcal.machine.assembly import assemble
 from legcal.machine.description_table import read_description
+from legcal.machine.family import Family, describe_family
+from legcal.machine.family import described as asked
+from legcal.machine.new_model import create_model
 
 SPS = {"type": "SPS"}
 ROD = {"type": None, "types": ["SPU", "SPU", "SS"]}

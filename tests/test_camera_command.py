@@ -16,7 +16,7 @@ from legcal import calibrate_camera, cli
 from legcal.calibration.camera import CameraCalibration
 from legcal.calibration.joint_fit.choices import Prior
 from legcal.calibration.joint_fit.parameters import known_parameters, resolve
-from legcal.data.dataset import wishes_of_call
+from legcal.data.dataset import overrides_of_call
 from legcal.data.measurements import View
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array, IntArray
@@ -101,7 +101,7 @@ def test_its_sigmas_are_the_priors_of_intrinsics_that_are_freed(
 ) -> None:
     view = View("c1", read_camera(folder / "camera.yaml"))
     known = known_parameters(load_mechanism("hexapod"), [view])
-    choices = resolve(wishes_of_call(free=["c1.f?", "c1.cx"], priors=["c1.cx=310+-2"]), known)
+    choices = resolve(overrides_of_call(free=["c1.f?", "c1.cx"], priors=["c1.cx=310+-2"]), known)
     assert choices.free == frozenset()
     assert set(choices.priors) == {"c1.fx", "c1.fy", "c1.cx"}
     assert choices.priors["c1.fx"].mean == found.values[0]
@@ -109,7 +109,7 @@ def test_its_sigmas_are_the_priors_of_intrinsics_that_are_freed(
     assert choices.priors["c1.cx"] == Prior(310.0, 2.0)
     unknown = replace(view, camera=replace(view.camera, sigma={}))
     known = known_parameters(load_mechanism("hexapod"), [unknown])
-    assert resolve(wishes_of_call(free=["c1.fx"]), known).free == {"c1.fx"}
+    assert resolve(overrides_of_call(free=["c1.fx"]), known).free == {"c1.fx"}
 
 
 def test_sigmas_of_other_names_are_refused(folder: Path, tmp_path: Path) -> None:

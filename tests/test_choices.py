@@ -1,4 +1,4 @@
-"""Parameters fixed, freed and given priors by name: what wishes come to."""
+"""Parameters fixed, freed and given priors by name: what overrides come to."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from chosen import HEXAPOD, choose, known
 from legcal import load_mechanism
 from legcal.calibration.joint_fit.choices import NO_CHOICES, Prior
 from legcal.calibration.joint_fit.parameters import resolve
-from legcal.data.dataset import wishes_of_call
+from legcal.data.dataset import overrides_of_call
 from legcal.machine import parametrization_of
 
 
@@ -119,10 +119,10 @@ def test_who_holds_what() -> None:
 
 def test_what_a_run_asks_for_wins_over_the_dataset() -> None:
     in_file = [
-        replace(wish, in_file=True)
-        for wish in wishes_of_call({"leg1.offset": (0.35, 1e-4)}, ["leg2.offset"], ["c1.fx"])
+        replace(override, in_file=True)
+        for override in overrides_of_call({"leg1.offset": (0.35, 1e-4)}, ["leg2.offset"], ["c1.fx"])
     ]
-    asked = wishes_of_call(["leg2.offset=0.35±0.001"], ["leg1.offset"], ["c1.fx"])
+    asked = overrides_of_call(["leg2.offset=0.35±0.001"], ["leg1.offset"], ["c1.fx"])
     found = resolve([*in_file, *asked], HEXAPOD)
     assert found.fixed == {"leg1.offset"}
     assert found.free == {"c1.fx"}

@@ -11,7 +11,7 @@ from dataset_folder import Folder, folder
 from legcal import calibrate, cli
 from legcal.calibration.joint_fit.choices import Choices, Prior
 from legcal.calibration.joint_fit.parameters import known_parameters, resolve
-from legcal.data.dataset import load_dataset, wishes_of_call
+from legcal.data.dataset import load_dataset, overrides_of_call
 from legcal.errors import DatasetError, UsageError
 
 __all__ = ["folder"]
@@ -21,11 +21,11 @@ def chosen(folder: Folder, block: dict[str, Any], **call: Any) -> Choices:
     folder.entry["parameters"] = block
     dataset = load_dataset(folder.write())
     known = known_parameters(dataset.mechanism, dataset.measurements.views)
-    return resolve([*dataset.wishes, *wishes_of_call(**call)], known)
+    return resolve([*dataset.overrides, *overrides_of_call(**call)], known)
 
 
 def test_a_dataset_without_the_block_chooses_nothing(folder: Folder) -> None:
-    assert load_dataset(folder.path).wishes == ()
+    assert load_dataset(folder.path).overrides == ()
     assert chosen(folder, {}) == Choices()
 
 

@@ -6,7 +6,7 @@ import pytest
 from chosen import HEXAPOD, choose, known
 
 from legcal.calibration.joint_fit.parameters import resolve
-from legcal.data.dataset import wishes_of_call
+from legcal.data.dataset import overrides_of_call
 from legcal.errors import DatasetError, UsageError
 
 
@@ -143,6 +143,8 @@ def test_a_machine_of_which_all_is_fixed_is_refused(model: str) -> None:
 
 
 def test_problems_of_the_dataset_alone_are_its_own() -> None:
-    wishes = [replace(wish, in_file=True) for wish in wishes_of_call(fixed=["leg9.offset"])]
+    overrides = [
+        replace(override, in_file=True) for override in overrides_of_call(fixed=["leg9.offset"])
+    ]
     with pytest.raises(DatasetError, match="unknown name"):
-        resolve(wishes, HEXAPOD)
+        resolve(overrides, HEXAPOD)

@@ -49,7 +49,7 @@ def session() -> Session:
 
 def untold(measurements: Measurements) -> Measurements:
     """Return measurements of views of one camera whose gamma is not told."""
-    camera = dataclasses.replace(PINHOLE, gamma_is_told=False)
+    camera = dataclasses.replace(PINHOLE, gamma_is_given=False)
     views = tuple(dataclasses.replace(view, camera=camera) for view in measurements.views)
     return dataclasses.replace(measurements, views=views)
 
@@ -90,7 +90,7 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: Session) -> None:
     assert found.rms_px < 0.7 * as_linear.rms_px
 
 
-def test_view_whose_gamma_is_told_keeps_it(session: Session) -> None:
+def test_view_whose_gamma_is_given_keeps_it(session: Session) -> None:
     views = untold(session.measurements).views
     told = dataclasses.replace(views[0], camera=PINHOLE)
     measurements = dataclasses.replace(session.measurements, views=(told, *views[1:]))
@@ -141,7 +141,9 @@ def test_table_that_knows_nothing_of_gamma_is_fitted_as_before(session: Session)
 
 def test_each_camera_has_its_own_gamma(session: Session) -> None:
     cameras = [
-        dataclasses.replace(PINHOLE, K=PINHOLE.K + 1e-9 * np.diag([k, k, 0.0]), gamma_is_told=k < 2)
+        dataclasses.replace(
+            PINHOLE, K=PINHOLE.K + 1e-9 * np.diag([k, k, 0.0]), gamma_is_given=k < 2
+        )
         for k in range(3)
     ]
     views = tuple(
@@ -211,11 +213,11 @@ def test_gamma_that_may_be_chance_is_not_followed() -> None:
     assert next_gammas([(EstimatedGamma(("c1",), 1.3, 0.1, 1.0),)]) != {}
 
 
-def test_dataset_says_whether_gamma_is_told(folder: Folder) -> None:
+def test_dataset_says_whether_gamma_is_given(folder: Folder) -> None:
     folder.entry["views"]["c1"]["gamma"] = 1
     cameras = {v.name: v.camera for v in load_dataset(folder.write()).measurements.views}
-    assert cameras["c1"].gamma_is_told
-    assert not any(c.gamma_is_told for name, c in cameras.items() if name != "c1")
+    assert cameras["c1"].gamma_is_given
+    assert not any(c.gamma_is_given for name, c in cameras.items() if name != "c1")
     assert all(camera.gamma == 1.0 for camera in cameras.values())
 
 

@@ -24,7 +24,8 @@ from legcal.calibration.identify.ranks import WeakDirection
 from legcal.data.dataset import load_dataset
 from legcal.errors import UsageError
 from legcal.machine import Mechanism
-from legcal.machine.assembly import Family, create_model, describe_family
+from legcal.machine.family import Family, describe_family
+from legcal.machine.new_model import create_model
 from legcal.report.identify import _hidden, _two_digits
 
 PAPER = ("leg1,leg2,leg3,leg4", "leg3,leg4,leg5,leg6", "leg1,leg2,leg5,leg6")

@@ -11,7 +11,8 @@ from mechanisms import Layout, write_hexapod
 from rich.console import Console
 
 from legcal.machine import describe, load_mechanism
-from legcal.machine.assembly import Family, create_model, describe_family
+from legcal.machine.family import Family, describe_family
+from legcal.machine.new_model import create_model
 from legcal.report import inspect_table
 
 

@@ -261,7 +261,7 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
             f"found the result of another machine, with {different}, needed one of the same; give "
             "the result that belongs to these images."
         )
-    return replace(dataset, mechanism=calibrated, wishes=())
+    return replace(dataset, mechanism=calibrated, overrides=())
 
 
 def _difference(calibrated: Mechanism, given: Mechanism) -> str:

@@ -150,7 +150,7 @@ def _notes(run: CalibrationRun, placement: Placement) -> list[str]:
     views = run.measurements.views
     hints = [view.T_base_camera for view in views]
     notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
-    untold = [view.name for view in views if not view.camera.gamma_is_told]
+    untold = [view.name for view in views if not view.camera.gamma_is_given]
     gamma = (
         f"The gamma of {few_views(untold)} is not told and was taken as 1: outlines of a camera "
         "that encodes light lie off by up to half of the blur; write gamma of the views in "

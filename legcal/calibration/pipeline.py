@@ -27,13 +27,13 @@ from legcal.calibration.run import CalibrationRun, start_run
 from legcal.calibration.verdict import Calibration, judge
 from legcal.data import (
     Dataset,
+    Override,
     Split,
-    Wish,
     dataset_at,
     load_dataset,
+    overrides_of_call,
     reject_unused_legs,
     split_images,
-    wishes_of_call,
 )
 from legcal.errors import UsageError
 from legcal.files import check_destination, output_path
@@ -112,9 +112,9 @@ def calibrate(
     """
     if output is not None:
         check_destination(output_path(output))
-    wishes = wishes_of_call(priors, fixed, free)
+    overrides = overrides_of_call(priors, fixed, free)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    choices = _choices(dataset, wishes)
+    choices = _choices(dataset, overrides)
     split = _split(dataset, holdout)
     fitted = dataset_at(dataset, split.fitted)
     left_open = check_identifiable(fitted, choices)
@@ -153,7 +153,7 @@ def calibrate(
     return calibration
 
 
-def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
+def _choices(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
     """Return what dataset and call choose of the parameters.
 
     Twists that nobody chooses anything of are estimated with a prior: no leg is built without an
@@ -165,7 +165,7 @@ def _choices(dataset: Dataset, wishes: Sequence[Wish]) -> Choices:
         axes_given=dataset.axes is not None,
         with_board=dataset.board is not None,
     )
-    choices = resolve([*dataset.wishes, *wishes], known)
+    choices = resolve([*dataset.overrides, *overrides], known)
     twists = {
         name: Prior(parameter.nominal, TWIST_SIGMA)
         for name, parameter in known.by_name.items()

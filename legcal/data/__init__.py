@@ -1,4 +1,8 @@
-"""data."""
+"""The dataset folder (section 4.1): read, checked and put into canonical order.
+
+A folder in; a :class:`Dataset` out, with its :class:`Measurements` and the tables of what images
+show (:class:`Outlines`, :class:`LegAxes`, :class:`Corners`), which are written here too.
+"""
 
 import lazy_loader
 

@@ -20,9 +20,9 @@ from .dataset import OBSERVATIONS_NAME as OBSERVATIONS_NAME
 from .dataset import Action as Action
 from .dataset import Dataset as Dataset
 from .dataset import ImageReader as ImageReader
-from .dataset import Wish as Wish
+from .dataset import Override as Override
 from .dataset import load_dataset as load_dataset
-from .dataset import wishes_of_call as wishes_of_call
+from .dataset import overrides_of_call as overrides_of_call
 from .holdout import Split as Split
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images

@@ -119,7 +119,7 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
             None if view.T_base_camera is None else view.T_base_camera.as_matrix().tolist(),
             None if view.legs is None else sorted(view.legs),
             [view.camera.model, view.camera.width, view.camera.height],
-            [view.camera.gamma, view.camera.gamma_is_told],
+            [view.camera.gamma, view.camera.gamma_is_given],
             [view.camera.K.tolist(), view.camera.distortion.tolist()],
         ]
         for view in measurements.views

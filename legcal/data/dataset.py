@@ -115,7 +115,7 @@ _WORDS: Mapping[Action, str] = {
 
 
 @dataclass(frozen=True)
-class Wish:
+class Override:
     """What somebody asks of one parameter, or of all that a pattern matches."""
 
     name: str  # or a pattern
@@ -125,11 +125,11 @@ class Wish:
     in_file: bool = False  # said in ``dataset.yaml``, which gives way to what is asked for in a run
 
 
-def wishes_of_call(
+def overrides_of_call(
     priors: Mapping[str, object] | Sequence[str] = (),
     fixed: Sequence[str] = (),
     free: Sequence[str] = (),
-) -> tuple[Wish, ...]:
+) -> tuple[Override, ...]:
     """Return what the arguments of a call or the options of a command ask for."""
     entries: list[tuple[Action, str, object]] = []
     if isinstance(priors, Mapping):
@@ -138,12 +138,12 @@ def wishes_of_call(
         entries += [("prior", text, None) for text in _listed(priors)]
     entries += [("fixed", text, None) for text in _listed(fixed)]
     entries += [("free", text, None) for text in _listed(free)]
-    found: list[Wish] = []
+    found: list[Override] = []
     problems: list[str] = []
     for action, text, value in entries:
         where = f"The {_WORDS[action]} {describe(text)}"
         try:
-            found.append(read_wish(action, text, where, value))
+            found.append(read_override(action, text, where, value))
         except ValueError as error:
             problems.append(f"{where} could not be used: {error}")
     if problems:
@@ -151,10 +151,10 @@ def wishes_of_call(
     return tuple(found)
 
 
-def read_wish(
+def read_override(
     action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
-) -> Wish:
-    """Return a wish as it was written."""
+) -> Override:
+    """Return an override as it was written."""
     name, stated = text, None
     if value is not None:
         stated = read_prior(value)
@@ -165,7 +165,7 @@ def read_wish(
         raise ValueError(
             f"found no value, needed one and its sigma; write them behind the name: {EXAMPLE}."
         )
-    return Wish(name, action, where, stated, in_file)
+    return Override(name, action, where, stated, in_file)
 
 
 def _listed(texts: Iterable[str]) -> list[str]:
@@ -189,7 +189,7 @@ class Dataset:
     observations: Outlines | None  # the rows of ``observations.csv`` if there is one
     notes: tuple[str, ...] = ()  # what is odd but allowed
     axes: LegAxes | None = None  # the rows of ``axes.csv`` if there is one
-    wishes: tuple[Wish, ...] = ()  # what the block ``parameters`` asks of parameters by name
+    overrides: tuple[Override, ...] = ()  # what the block ``parameters`` asks of parameters by name
     board: Board | None = None  # the calibration board that is fixed to the base
     T_base_board: RigidTransform | None = None  # its pose in the base link, where it is known
     corners: Corners | None = None  # the rows of ``corners.csv`` if there is one
@@ -299,7 +299,7 @@ class ViewEntry(FileSchema):
 
 def _can_be_fixed(text: str) -> str:
     """Refuse a value that a parameter cannot be fixed at."""
-    read_wish("fixed", text, "")
+    read_override("fixed", text, "")
     return text
 
 
@@ -310,20 +310,20 @@ class ParametersEntry(FileSchema):
     fixed: list[Annotated[Name, AfterValidator(_can_be_fixed)]] = Field(default_factory=list)
     free: list[Name] = Field(default_factory=list)
 
-    def wishes(self, path: Path) -> tuple[Wish, ...]:
+    def overrides(self, path: Path) -> tuple[Override, ...]:
         """Return what the block asks for; ``path`` is that of the file, for messages."""
         block = f"{path}: parameters"
         return (
             *(
-                read_wish("prior", name, f"{block}.priors.{name}", stated, in_file=True)
+                read_override("prior", name, f"{block}.priors.{name}", stated, in_file=True)
                 for name, stated in self.priors.items()
             ),
             *(
-                read_wish("fixed", text, f"{block}.fixed '{text}'", in_file=True)
+                read_override("fixed", text, f"{block}.fixed '{text}'", in_file=True)
                 for text in self.fixed
             ),
             *(
-                read_wish("free", text, f"{block}.free '{text}'", in_file=True)
+                read_override("free", text, f"{block}.free '{text}'", in_file=True)
                 for text in self.free
             ),
         )
@@ -462,7 +462,7 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         observations=_read_outlines(folder, mechanism, measurements),
         notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
-        wishes=entry.parameters.wishes(yaml_path),
+        overrides=entry.parameters.overrides(yaml_path),
         board=board,
         T_base_board=T_base_board,
         corners=read_given_corners(folder / CORNERS_NAME, board, measurements),
@@ -552,7 +552,7 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
     """Return a view of the measurements."""
     return View(
         name=name,
-        camera=replace(camera, gamma=entry.gamma or 1.0, gamma_is_told=entry.gamma is not None),
+        camera=replace(camera, gamma=entry.gamma or 1.0, gamma_is_given=entry.gamma is not None),
         T_base_camera=entry.T_base_camera.motion() if entry.T_base_camera else None,
         legs=tuple(entry.legs) if entry.legs else None,
     )

@@ -1,4 +1,7 @@
-"""geometry."""
+"""Rotations, rigid motions and lines, batched along the leading axes; numpy alone.
+
+The one place of the sign of eq (1): the moment of a line is u x M. No robot and no camera.
+"""
 
 import lazy_loader
 

@@ -1,5 +1,3 @@
-from .assembly import create_model as create_model
-from .assembly import described as described
 from .configurations import INSIDE as INSIDE
 from .configurations import REGULAR as REGULAR
 from .configurations import WORKSPACE_POSES as WORKSPACE_POSES
@@ -23,6 +21,7 @@ from .equations import linearize as linearize
 from .equations import n_bonds as n_bonds
 from .equations import pose_equations as pose_equations
 from .equations import pose_sensitivity as pose_sensitivity
+from .family import described as described
 from .files import DATASET_YAML as DATASET_YAML
 from .files import shipped_folders as shipped_folders
 from .files import shipped_names as shipped_names
@@ -61,6 +60,7 @@ from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
 from .model import Mechanism as Mechanism
 from .model import describe as describe
+from .new_model import create_model as create_model
 from .parameters import Parametrization as Parametrization
 from .parameters import footed as footed
 from .parameters import free_coordinates as free_coordinates

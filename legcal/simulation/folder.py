@@ -103,7 +103,7 @@ def write_session(
         entry: dict[str, Any] = {"camera": camera}
         if groups:
             entry["hand_held"] = True
-        if view.camera.gamma_is_told:
+        if view.camera.gamma_is_given:
             entry["gamma"] = view.camera.gamma
         if view.T_base_camera is not None:
             entry["T_base_camera"] = _rounded(view.T_base_camera)

@@ -263,6 +263,6 @@ def _cameras(
 def _encoding(views: tuple[Viewpoint, ...], gamma: float, is_told: bool) -> tuple[Viewpoint, ...]:
     """Return views whose cameras encode light in their grey levels, as their makers say or not."""
     cameras = {
-        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_told=is_told) for view in views
+        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_given=is_told) for view in views
     }
     return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)

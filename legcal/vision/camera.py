@@ -31,7 +31,7 @@ class Camera:
     distortion: Array = field(default_factory=lambda: np.zeros(0))  # (n,)
     model: DistortionModel = "plumb_bob"  # meaning of the coefficients
     gamma: float = 1.0  # grey levels are light to the power 1 / gamma
-    gamma_is_told: bool = True  # false if nobody said so
+    gamma_is_given: bool = True  # false if nobody said so
     sigma: Mapping[str, float] = field(default_factory=dict)  # standard deviations of its numbers
 
     @property

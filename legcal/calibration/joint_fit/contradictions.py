@@ -188,8 +188,8 @@ def refuse_contradicted_values(
         for name, (mean, sigma) in asked.items()
     }
     wide = {name: one.wide for name, one in stated.items()}
-    wishes = replace(choices, fixed=choices.fixed - wide.keys(), priors={**choices.priors, **wide})
-    wider = with_choices(problem, wishes, settings)
+    widened = replace(choices, fixed=choices.fixed - wide.keys(), priors={**choices.priors, **wide})
+    wider = with_choices(problem, widened, settings)
     doubts: list[_Doubt] = []
     for begin in (wider.begin(start), state):
         try:

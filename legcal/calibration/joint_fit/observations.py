@@ -27,7 +27,7 @@ def cameras_of(measurements: Measurements) -> tuple[str, ...]:
     A view whose gamma is told stands for itself: nothing is to be found of its camera's.
     """
     views = measurements.views
-    unknown = [view for view in views if not view.camera.gamma_is_told]
+    unknown = [view for view in views if not view.camera.gamma_is_given]
     shared = shared_cameras([view.name for view in unknown], [view.camera for view in unknown])
     stands_for = dict(zip((view.name for view in unknown), shared, strict=True))
     return tuple(stands_for.get(view.name, view.name) for view in views)
@@ -38,7 +38,7 @@ def movements_by_gamma(outlines: Outlines, measurements: Measurements) -> Array:
 
     (n,)
     """
-    told = np.array([view.camera.gamma_is_told for view in measurements.views], dtype=np.bool_)
+    told = np.array([view.camera.gamma_is_given for view in measurements.views], dtype=np.bool_)
     unknown = ~told[measurements.view[outlines.row]] & np.isfinite(outlines.by_gamma)
     return np.where(unknown, outlines.by_gamma, 0.0)
 

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from legcal.calibration.joint_fit.choices import Choices, Prior
-from legcal.data import Action, View, Wish
+from legcal.data import Action, Override, View
 from legcal.errors import DatasetError, UsageError
 from legcal.files import closest
 from legcal.machine import (
@@ -209,12 +209,12 @@ def _other_lengths(leg: Leg) -> dict[str, str]:
 _DONE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed": "fixed"}
 
 
-def resolve(wishes: Sequence[Wish], known: KnownParameters) -> Choices:
-    """Return the choices that wishes come to.
+def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
+    """Return the choices that overrides come to.
 
     Parameters
     ----------
-    wishes : sequence of Wish
+    overrides : sequence of Override
         Of the dataset and of this run; the latter win.
     known : KnownParameters
         The parameters that there are.
@@ -227,10 +227,10 @@ def resolve(wishes: Sequence[Wish], known: KnownParameters) -> Choices:
     ------
     UsageError, DatasetError
         With one sentence for each name that is no parameter's, value that cannot be meant, and
-        pair of wishes that contradict each other.
+        pair of overrides that contradict each other.
     """
-    in_file, its_problems = _decisions([w for w in wishes if w.in_file], known)
-    asked, problems = _decisions([w for w in wishes if not w.in_file], known)
+    in_file, its_problems = _decisions([w for w in overrides if w.in_file], known)
+    asked, problems = _decisions([w for w in overrides if not w.in_file], known)
     if problems:
         raise UsageError([*problems, *its_problems])
     if its_problems:
@@ -272,89 +272,92 @@ def _choices(decisions: Mapping[str, _Decision], given_way: Sequence[str]) -> Ch
 
 
 def _decisions(
-    wishes: Sequence[Wish], known: KnownParameters
+    overrides: Sequence[Override], known: KnownParameters
 ) -> tuple[dict[str, _Decision], list[str]]:
-    """Return what wishes of one source come to for each parameter, and what is wrong with them."""
-    found: dict[str, list[tuple[Wish, _Decision]]] = {}
+    """Return what overrides of one source mean for each parameter, and what is wrong with them."""
+    found: dict[str, list[tuple[Override, _Decision]]] = {}
     problems: list[str] = []
-    for wish in wishes:
-        names = _matches(wish, known)
+    for override in overrides:
+        names = _matches(override, known)
         if not names:
-            problems.append(_no_match(wish, known))
+            problems.append(_no_match(override, known))
         for name in names:
             parameter = known.by_name[name]
-            problem = _misstated(wish, name, parameter)
+            problem = _misstated(override, name, parameter)
             if problem:
                 problems.append(problem)
             else:
-                found.setdefault(name, []).append((wish, _decision(wish, name, parameter)))
+                found.setdefault(name, []).append((override, _decision(override, name, parameter)))
     problems += [
         p for name, several in found.items() if (p := _contradiction(name, several, known))
     ]
     return {name: _strongest([d for _, d in several]) for name, several in found.items()}, problems
 
 
-def _matches(wish: Wish, known: KnownParameters) -> tuple[str, ...]:
-    """Return the parameters that a wish is about, by the names that count."""
-    if wish.name in known.names:
-        return (known.counted(wish.name),)
-    names = [known.counted(name) for name in known.names if fnmatchcase(name, wish.name)]
+def _matches(override: Override, known: KnownParameters) -> tuple[str, ...]:
+    """Return the parameters that an override is about, by the names that count."""
+    if override.name in known.names:
+        return (known.counted(override.name),)
+    names = [known.counted(name) for name in known.names if fnmatchcase(name, override.name)]
     return tuple(dict.fromkeys(names))
 
 
-def _no_match(wish: Wish, known: KnownParameters) -> str:
+def _no_match(override: Override, known: KnownParameters) -> str:
     """Return the sentence about a name that is no parameter's."""
-    others = [name for name in known.others if name == wish.name or fnmatchcase(name, wish.name)]
+    others = [
+        name for name in known.others if name == override.name or fnmatchcase(name, override.name)
+    ]
     if others:
         return (
-            f"{wish.where} could not be used: found {others[0]}, {known.others[others[0]]}, needed "
-            "a parameter; leave it out."
+            f"{override.where} could not be used: found {others[0]}, {known.others[others[0]]}, "
+            "needed a parameter; leave it out."
         )
-    is_pattern = not set(wish.name).isdisjoint("*?[")
+    is_pattern = not set(override.name).isdisjoint("*?[")
     found = "a pattern that no name matches" if is_pattern else "an unknown name"
     return (
-        f"{wish.where} could not be used: found {found}, needed a parameter of this machine or of "
-        f"its cameras; {closest(wish.name, known.names)}"
+        f"{override.where} could not be used: found {found}, needed a parameter of this machine or "
+        f"of its cameras; {closest(override.name, known.names)}"
     )
 
 
-def _misstated(wish: Wish, name: str, parameter: KnownParameter) -> str:
-    """Return what is wrong with the value that a wish states for a parameter, if anything."""
-    stated = wish.stated
+def _misstated(override: Override, name: str, parameter: KnownParameter) -> str:
+    """Return what is wrong with the value that an override states for a parameter, if anything."""
+    stated = override.stated
     if stated is None:
         return ""
     if stated.dimension not in ("", parameter.unit):
         needed = f"a number in {parameter.unit}" if parameter.unit else "a number without unit"
         return (
-            f"{wish.where} could not be used: found a number in {stated.dimension} for {name}, "
+            f"{override.where} could not be used: found a number in {stated.dimension} for {name}, "
             f"needed {needed}; correct the unit."
         )
     if parameter.least <= stated.value <= parameter.most:
         return ""
     return (
-        f"{wish.where} could not be used: found {_with_unit(stated.value, parameter)} for {name}, "
-        f"needed one between {parameter.least:.4g} and {parameter.most:.4g}, not so far from the "
-        f"nominal {_with_unit(parameter.nominal, parameter)}; check the number and its unit."
+        f"{override.where} could not be used: found {_with_unit(stated.value, parameter)} for "
+        f"{name}, needed one between {parameter.least:.4g} and {parameter.most:.4g}, not so far "
+        f"from the nominal {_with_unit(parameter.nominal, parameter)}; check the number and its "
+        "unit."
     )
 
 
-def _decision(wish: Wish, name: str, parameter: KnownParameter) -> _Decision:
-    """Return what a wish comes to for one parameter."""
-    if wish.stated is None:
-        return _Decision(wish.action)
-    value = wish.stated.value
+def _decision(override: Override, name: str, parameter: KnownParameter) -> _Decision:
+    """Return what an override comes to for one parameter."""
+    if override.stated is None:
+        return _Decision(override.action)
+    value = override.stated.value
     if name.endswith(".twist"):  # an angle between lines
         value -= float(np.pi * np.round((value - parameter.nominal) / np.pi))
-    return _Decision(wish.action, value, wish.stated.sigma)
+    return _Decision(override.action, value, override.stated.sigma)
 
 
 def _contradiction(
-    name: str, several: Sequence[tuple[Wish, _Decision]], known: KnownParameters
+    name: str, several: Sequence[tuple[Override, _Decision]], known: KnownParameters
 ) -> str:
     """Return what is wrong with all that is asked of one parameter, if anything."""
-    fixed = [wish for wish, decision in several if decision.action == "fixed"]
-    others = [wish for wish, decision in several if decision.action != "fixed"]
-    stated = {(d.value, d.sigma): wish for wish, d in several if d.value is not None}
+    fixed = [override for override, decision in several if decision.action == "fixed"]
+    others = [override for override, decision in several if decision.action != "fixed"]
+    stated = {(d.value, d.sigma): override for override, d in several if d.value is not None}
     if fixed and others:
         done, pair = f"both fixed and {_DONE[others[0].action]}", (fixed[0], others[0])
     elif len(stated) > 1:
@@ -386,9 +389,11 @@ def _refuse_all_fixed(choices: Choices, known: KnownParameters) -> None:
         )
 
 
-def _quoted(wish: Wish) -> str:
-    """Return where a wish was said, as part of a sentence."""
-    return wish.where[:1].lower() + wish.where[1:] if not wish.in_file else wish.where
+def _quoted(override: Override) -> str:
+    """Return where an override was said, as part of a sentence."""
+    return (
+        override.where[:1].lower() + override.where[1:] if not override.in_file else override.where
+    )
 
 
 def _with_unit(value: float, parameter: KnownParameter) -> str:

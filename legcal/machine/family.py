@@ -1,0 +1,259 @@
+"""Machines of a family: legs of one type on circles or in pairs, with a few dimensions."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import UsageError
+from legcal.files import plain_name
+from legcal.geometry import Array
+from legcal.machine.assembly import across_leg
+from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
+from legcal.machine.description_table import in_metres, read_description
+from legcal.machine.leg import MOST_LEGS, LegKind
+
+_FAMILY = re.compile(r"([0-9]{1,2})-([A-Z]+)")
+SPREAD = 30.0  # [deg] between the two joints of a pair
+TURN_IN_PLANE = 30.0  # [deg]; without, the legs of a planar platform meet in one point
+SHORTEST, STROKE, RADIUS = 0.8, 0.4, 0.02  # parts of the length at home
+
+
+@dataclass(frozen=True)
+class Family:
+    """The dimensions of a machine, lengths in ``unit`` and angles in degrees."""
+
+    family: str  # number and type of the legs, ``6-UPS``
+    unit: str | None = None  # unit of the lengths; it must be stated
+    base_radius: float | None = None  # radii of the circles on which the joint centres lie
+    platform_radius: float | None = None  # radii of the circles on which the joint centres lie
+    height: float | None = None  # height of the platform over the base at home
+    base_spread: float | None = None  # angle between the two joints of a pair, for 6 legs
+    platform_spread: float | None = None  # angle between the two joints of a pair, for 6 legs
+    turn: float | None = None  # turn of the platform about z at home
+    offset: float | None = None  # leg length at reading zero; by default 0.8 of the length at home
+    travel: tuple[float, float] | None = None  # lowest and highest reading
+    leg_radius: float | None = None  # radius of tube and rod; by default 0.02 of the length at home
+    tilt: float = 0.0
+    name: str | None = None  # name of the model; the family in small letters by default
+
+
+def describe_family(asked: Family) -> Description:
+    """Return the machine of a family."""
+    match = _FAMILY.fullmatch(asked.family)
+    letters = None if match is None else leg_type(match[2])
+    if match is None or letters is None or not 2 <= int(match[1]) <= MOST_LEGS:
+        raise UsageError(
+            f"The family could not be understood: found '{asked.family}', needed a number of legs "
+            f"from 2 to {MOST_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
+        )
+    in_plane = (letters.base, letters.platform) == ("R", "R")
+    problems = _problems(asked, in_plane) + _pointless(asked, int(match[1]), letters, in_plane)
+    if problems:
+        raise UsageError(problems)
+    unit = str(asked.unit)
+
+    def metres(value: float | None) -> float:
+        return 0.0 if value is None else in_metres(value, unit)
+
+    count = int(match[1])
+    base_angles, platform_angles = _angles(count, asked)
+    A = metres(asked.base_radius) * _ring(base_angles)
+    B = metres(asked.platform_radius) * _ring(platform_angles)
+    turn = asked.turn if asked.turn is not None else TURN_IN_PLANE * in_plane
+    z_turn = Rotation.from_euler("z", turn, degrees=True)
+    T = RigidTransform.from_components([0.0, 0.0, metres(asked.height)], z_turn)
+    tilt = float(np.radians(asked.tilt))
+    legs = []
+    for j in range(count):
+        vector = T.apply(B[j]) - A[j]
+        axes = _tilted_axes(letters, vector, A[j], tilt)
+        length = float(np.linalg.norm(vector))
+        legs.append(
+            _leg(asked, f"leg{j + 1}", letters, (A[j], B[j]), length, axes, T)
+        )  # fmt: skip
+    home = Home((0.0, 0.0, metres(asked.height)), _quaternion(z_turn))
+    name = asked.name or asked.family.lower()
+    return Description(name, f"--family {asked.family}", unit, tuple(legs), home, None)
+
+
+def _problems(asked: Family, in_plane: bool) -> list[str]:
+    """Return what is missing or impossible among the dimensions."""
+    where = f"The family {asked.family} could not be built"
+    needed = {
+        "--base-radius": asked.base_radius,
+        "--platform-radius": asked.platform_radius,
+        **({} if in_plane else {"--height": asked.height}),
+        "--unit": asked.unit,
+    }
+    missing = [option for option, value in needed.items() if value is None]
+    problems = []
+    if missing:
+        problems.append(
+            f"{where}: found no {' and no '.join(missing)}, needed "
+            f"{', '.join(needed)}; for example --base-radius 300 --platform-radius 150"
+            f"{'' if in_plane else ' --height 400'} --unit mm."
+        )
+    if asked.unit not in (None, "m", "mm"):
+        problems.append(f"{where}: found the unit '{asked.unit}', needed m or mm; correct --unit.")
+    for option, value in (*needed.items(), ("--leg-radius", asked.leg_radius)):
+        if isinstance(value, float | int) and not 0.0 < value < 1e9:
+            problems.append(f"{where}: found {option} {value:g}, needed a positive length; fix it.")
+    for option, angle in (
+        ("--base-spread", asked.base_spread),
+        ("--platform-spread", asked.platform_spread),
+    ):
+        if angle is not None and not 0.0 < angle < 120.0:
+            problems.append(
+                f"{where}: found {option} {angle:g} deg, needed an angle between 0 and 120 deg; "
+                "mend it."
+            )
+    if not abs(asked.tilt) <= 80.0:
+        problems.append(
+            f"{where}: found --tilt {asked.tilt:g} deg, needed at most 80 deg either way; mend it."
+        )
+    if asked.turn is not None and not abs(asked.turn) <= 180.0:
+        problems.append(
+            f"{where}: found --turn {asked.turn:g} deg, needed at most 180 deg either way; mend it."
+        )
+    if asked.travel is not None and not -1e9 < asked.travel[0] < asked.travel[1] < 1e9:
+        problems.append(
+            f"{where}: found --travel {asked.travel[0]:g} {asked.travel[1]:g}, needed the lower "
+            "reading first; swap them."
+        )
+    if asked.offset is not None and not abs(asked.offset) < 1e9:
+        problems.append(f"{where}: found --offset {asked.offset:g}, needed a length; mend it.")
+    if asked.name is not None:
+        try:
+            plain_name(asked.name)
+        except ValueError as error:
+            problems.append(f"{where}: the name could not be used: {error}")
+    return problems
+
+
+def _pointless(asked: Family, count: int, letters: LegType, in_plane: bool) -> list[str]:
+    """Return which given dimensions a machine of this family does not have."""
+    no_axes = not {letters.base, letters.platform} & {"R", "U"}
+    found = {
+        "--height": in_plane and bool(asked.height) and "a planar machine",
+        "--tilt": (in_plane or no_axes) and bool(asked.tilt) and "axes that cannot tilt",
+        "--base-spread": count != 6 and asked.base_spread is not None and f"{count} legs",
+        "--platform-spread": count != 6 and asked.platform_spread is not None and f"{count} legs",
+        "--offset": not letters.has_slider and asked.offset is not None and "legs without P",
+        "--travel": not letters.has_slider and asked.travel is not None and "legs without P",
+    }
+    return [
+        f"The family {asked.family} could not be built: found {option} for {what}, needed none; "
+        "leave it out."
+        for option, what in found.items()
+        if what
+    ]
+
+
+def _angles(count: int, asked: Family) -> tuple[Array, Array]:
+    """Return the angles of the joints on base and platform [rad]."""
+    if count != 6:
+        even = 2.0 * np.pi * np.arange(count) / count
+        return even, even
+    half = np.array([0.5, -0.5])
+    spreads = (SPREAD if s is None else s for s in (asked.base_spread, asked.platform_spread))
+    on_base, on_platform = (spread * np.tile(half, 3) for spread in spreads)
+    base = np.array([0.0, 120.0, 120.0, 240.0, 240.0, 360.0]) + on_base
+    platform = np.repeat([60.0, 180.0, 300.0], 2) - on_platform
+    return np.radians(base), np.radians(platform)
+
+
+def _ring(angles: Array) -> Array:
+    """Return points of the unit circle in the plane z = 0."""
+    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
+    return np.where(np.abs(ring) < 1e-15, 0.0, ring)
+
+
+def _tilted_axes(
+    letters: LegType, vector: Array, A: Array, tilt: float
+) -> tuple[Array | None, ...]:
+    """Return the tilted axes at base and platform, in the base; None for the default ones."""
+    if tilt == 0.0:
+        return None, None
+    u = vector / np.linalg.norm(vector)
+    across = across_leg(u, A)
+    axes = list[Array | None]()
+    for letter, sense in ((letters.base, 1.0), (letters.platform, -1.0)):
+        up = np.cross(u, across) if letter == "R" else np.array([0.0, 0.0, 1.0])
+        tilted = np.cos(tilt) * across + sense * np.sin(tilt) * up
+        axes.append(tilted if letter in ("R", "U") else None)
+    return tuple(axes)
+
+
+def _leg(
+    asked: Family,
+    name: str,
+    letters: LegType,
+    joints: tuple[Array, Array],
+    length: float,
+    axes: tuple[Array | None, ...],
+    T: RigidTransform,
+) -> LegEntry:
+    """Return a leg of a length at home [m]."""
+    unit = str(asked.unit)
+    kind = LegKind.ACTUATED if letters.has_slider else LegKind.CONSTANT
+    radius = _default(RADIUS * length)
+    if asked.leg_radius is not None:
+        radius = in_metres(asked.leg_radius, unit)
+    offset: float | None = None
+    travel: tuple[float, float] | None = None
+    if letters.has_slider:
+        offset, travel = _default(SHORTEST * length), (0.0, _default(STROKE * length))
+        if asked.offset is not None:
+            offset = in_metres(asked.offset, unit)
+        if asked.travel is not None:
+            travel = in_metres(asked.travel[0], unit), in_metres(asked.travel[1], unit)
+    at_platform = None if axes[1] is None else np.asarray(T.rotation.inv().apply(axes[1]))
+    return LegEntry(
+        name, letters, kind, *joints, offset, travel, radius, radius, axes[0], at_platform
+    )
+
+
+def _default(length: float) -> float:
+    """Return a length that nobody chose, in tenths of a millimetre [m]."""
+    return max(round(length, 4), 1e-4)
+
+
+def _quaternion(turn: Rotation) -> tuple[float, ...]:
+    """Return a rotation as files write it."""
+    return tuple(float(x) for x in turn.as_quat(canonical=True))
+
+
+def described(
+    table: Path | None,
+    *,
+    family: str | None,
+    unit: str | None,
+    name: str | None,
+    dimensions: Mapping[str, Any],
+) -> Description:
+    """Return the machine that a table or a family describes."""
+    given = {key: value for key, value in dimensions.items() if value is not None}
+    if (table is None) == (family is None):
+        found = "neither" if table is None else "both"
+        raise UsageError(
+            f"The model could not be written: found {found} of a table and --family, needed one; "
+            "give a YAML or CSV table, or --family 6-UPS with its dimensions."
+        )
+    if unit not in (None, "m", "mm"):
+        raise UsageError(
+            f"The unit could not be used: found '{unit}', needed mm or m; correct --unit."
+        )
+    if table is None:
+        return describe_family(Family(family=str(family), unit=unit, name=name, **given))
+    if given:
+        options = ", ".join(f"--{key.replace('_', '-')}" for key in given)
+        raise UsageError(
+            f"The model could not be written: found {options} beside a table, needed them with "
+            "--family only; write them in the table."
+        )
+    return read_description(table, unit, name)

@@ -1,0 +1,270 @@
+"""A new model of a described machine: its YAML and its URDF, written and loaded."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from legcal.errors import LegcalError, OutOfResources, UsageError
+from legcal.files import temporary_folder
+from legcal.geometry import Array
+from legcal.machine.assembly import Assembled, AssembledLeg, assemble
+from legcal.machine.description import Description
+from legcal.machine.leg import LegKind
+from legcal.machine.load import load_mechanism
+from legcal.machine.model import Mechanism
+from legcal.machine.schema import mechanism_yaml
+from legcal.machine.tree import TreeText, along, limit, place, visual
+
+TURN = (-3.15, 3.15)  # [rad]
+VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
+_AXES = {letter: along(axis) for letter, axis in zip("xyz", np.eye(3), strict=True)}
+
+
+def urdf_text(machine: Assembled) -> str:
+    """Return the URDF of a machine: all its geometry."""
+    tree = TreeText()
+    tree.link("base")
+    tree.link("platform")
+    if machine.planar:
+        height = np.array([0.0, 0.0, machine.T_base_platform.translation[2]])
+        _joint(tree, "platform_free", "planar", ("base", "platform"), height, moving=_AXES["z"])
+    else:
+        _joint(tree, "platform_free", "floating", ("base", "platform"))
+    for leg in machine.legs:
+        _Branch(tree, machine, leg).write()
+    return tree.robot(machine.name).decode()
+
+
+def yaml_text(machine: Assembled) -> str:
+    """Return the mechanism YAML of a machine: closures, motors, legs and home."""
+    return mechanism_yaml(
+        [
+            (f"{leg.name}_end", f"{leg.name}_seat", "3d" if leg.type.has_sphere else "6d")
+            for leg in machine.legs
+        ],
+        [f"{leg.name}_prismatic" for leg in machine.legs if leg.kind is LegKind.ACTUATED],
+        {
+            "urdf": f"../urdf/{machine.name}.urdf",
+            "base": "base",
+            "platform": "platform",
+            "platform_joint": "platform_free",
+            "base_frame": list(machine.base_frame),
+            "home": {"xyz": list(machine.home.xyz), "quat_xyzw": list(machine.home.quat_xyzw)},
+            "legs": {leg.name: _joint_of(leg) for leg in machine.legs},
+        },
+    )
+
+
+def _hangs_from_base(leg: AssembledLeg) -> bool:
+    """Say whether a leg hangs from the base, and not from the platform with its S at the base."""
+    return leg.type.base != "S" or leg.type.platform == "S"
+
+
+def _joint_of(leg: AssembledLeg) -> str:
+    """Return the joint that names a leg in the YAML."""
+    if leg.kind is LegKind.CONSTANT:
+        return f"{leg.name}_a1" if _hangs_from_base(leg) else f"{leg.name}_b1"
+    return f"{leg.name}_prismatic"
+
+
+def _joint(
+    tree: TreeText,
+    name: str,
+    kind: str,
+    links: tuple[str, str],
+    xyz: Array | None = None,
+    rotation: Array | None = None,
+    moving: str = "",
+) -> None:
+    """Connect two links; without numbers their frames coincide."""
+    at = place(np.zeros(3) if xyz is None else xyz, np.eye(3) if rotation is None else rotation)
+    tree.connect(name, kind, links, at + moving)
+
+
+class _Branch:
+    """One leg, from the link that it hangs from to the frames that close its loop."""
+
+    def __init__(self, tree: TreeText, machine: Assembled, leg: AssembledLeg) -> None:
+        self._tree, self._leg = tree, leg
+        self._from_base = _hangs_from_base(leg)
+        self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
+        self._T = machine.T_base_platform
+        self._link = "base" if self._from_base else "platform"
+        self._along = np.zeros(3)  # where the next joint stands in the link before it
+
+    def write(self) -> None:
+        """Add the leg to the tree."""
+        leg = self._leg
+        if self._from_base:
+            R = self._near("a", leg.type.base, leg.u, leg.base_axis, leg.A_base)
+        else:
+            inverse = self._R_base_platform.T
+            axis = inverse @ leg.platform_axis
+            R = self._near("b", leg.type.platform, -inverse @ leg.u, axis, leg.B_platform)
+        self._half(near=True)
+        if leg.kind is LegKind.CONSTANT:
+            self._along = np.array([0.0, 0.0, leg.q0])
+        else:
+            far = f"{leg.name}_{'rod' if self._from_base else 'tube'}"
+            offset = np.array([0.0, 0.0, leg.q0])
+            self._to(f"{leg.name}_prismatic", "prismatic", far, offset, None, "z", leg.travel)
+            self._half(near=False)
+        if self._from_base and not leg.type.has_sphere:
+            R = self._far(R)
+        self._close(R)
+
+    def _near(self, side: str, letter: str, u: Array, axis: Array, at: Array) -> Array:
+        """Add the joint that a leg hangs from, and return the frame of the leg there."""
+        y = _unit(np.cross(u, axis))
+        along = np.column_stack([np.cross(y, u), y, u])
+        first = np.column_stack([axis, y, np.cross(axis, y)]) if letter == "U" else along
+        self._turn(f"{side}1", at, first, "x")
+        if letter == "U":
+            self._turn(f"{side}2", None, first.T @ along, "y")
+        if letter == "S":
+            self._turn(f"{side}2", None, None, "y")
+            self._turn(f"{side}3", None, None, "z")
+        return along
+
+    def _far(self, R: Array) -> Array:
+        """Add the joint at the platform of a leg without S, and return the frame after it."""
+        leg = self._leg
+        if leg.type.platform == "":
+            return R
+        y = _unit(np.cross(leg.u, leg.platform_axis))
+        along = np.column_stack([np.cross(y, leg.u), y, leg.u])
+        if leg.type.platform == "R":
+            self._turn("b1", self._along, R.T @ along, "x")
+            return along
+        last = np.column_stack([leg.platform_axis, y, np.cross(leg.platform_axis, y)])
+        self._turn("b2", self._along, R.T @ along, "y")
+        self._turn("b1", None, along.T @ last, "x")
+        return last
+
+    def _close(self, R: Array) -> None:
+        """Add the frames that coincide where the loop closes."""
+        leg, tree = self._leg, self._tree
+        end, seat = f"{leg.name}_end", f"{leg.name}_seat"
+        tree.link(end)
+        tree.link(seat)
+        _joint(tree, f"{end}_frame", "fixed", (self._link, end), self._along)
+        carrier, at = ("platform", leg.B_platform) if self._from_base else ("base", leg.A_base)
+        turned = None if leg.type.has_sphere else self._R_base_platform.T @ R
+        _joint(tree, f"{seat}_frame", "fixed", (carrier, seat), at, turned)
+
+    def _turn(self, joint: str, at: Array | None, rotation: Array | None, axis: str) -> None:
+        """Add a revolute."""
+        name = f"{self._leg.name}_{joint}"
+        self._to(name, "revolute", f"{name}_link", at, rotation, axis, TURN)
+
+    def _to(
+        self,
+        joint: str,
+        kind: str,
+        child: str,
+        at: Array | None,
+        rotation: Array | None,
+        axis: str,
+        limits: tuple[float, float],
+    ) -> None:
+        """Add a joint and go on from its child."""
+        self._tree.link(child)
+        moving = _AXES[axis] + limit(limits)
+        _joint(self._tree, joint, kind, (self._link, child), at, rotation, moving)
+        self._link, self._along = child, np.zeros(3)
+
+    def _half(self, *, near: bool) -> None:
+        """Show the half of the leg that the present link carries."""
+        leg = self._leg
+        radius = leg.tube if near == self._from_base else leg.rod
+        if radius is None:
+            return
+        if leg.kind is LegKind.CONSTANT:
+            length = end = leg.q0
+        else:
+            length = VISIBLE * leg.shortest_shown
+            end = length if near else -length
+        at = f'<origin xyz="0 0 {0.5 * end!r}" rpy="0 0 0"/>'
+        self._tree.show(self._link, visual(at, radius, length))
+
+
+def _unit(vector: Array) -> Array:
+    """Return a vector of length one."""
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+@dataclass(frozen=True, eq=False)
+class Created:
+    """A model that was written."""
+
+    mechanism: Mechanism  # the model as legcal understands it
+    yaml_path: Path
+    urdf_path: Path
+
+
+def create_model(described: Description, output: Path, *, force: bool = False) -> Created:
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine, and load them."""
+    machine = assemble(described)
+    paths = model_paths(machine.name, output)
+    folders = [str(path) for path in paths if path.is_dir()]
+    if folders:
+        raise UsageError(
+            f"{described.source}: the model '{machine.name}' could not be written: found the "
+            f"folder {folders[0]}, needed a place for a file; give another --name or --output."
+        )
+    there = [str(path) for path in paths if os.path.lexists(path)]
+    if there and not force:
+        raise UsageError(
+            f"{described.source}: the model '{machine.name}' could not be written: found "
+            f"{' and '.join(there)} already there, needed new files; give another --name or "
+            "--output, or --force to replace them."
+        )
+    try:
+        return _write(machine, described.source, output)
+    except OSError as error:
+        raise OutOfResources(
+            f"{output}: the model could not be written: found '{error.strerror}', needed a folder "
+            "that takes it; free space, correct permissions, or choose another --output."
+        ) from error
+
+
+def model_paths(name: str, output: Path) -> tuple[Path, Path]:
+    """Return where the YAML and the URDF of a model go."""
+    return output / "models" / f"{name}.yaml", output / "urdf" / f"{name}.urdf"
+
+
+def _write(machine: Assembled, source: str, output: Path) -> Created:
+    """Write and load the files aside, then move them to their places."""
+    made = [path for path in (output, *output.parents) if not path.exists()]
+    output.mkdir(parents=True, exist_ok=True)
+    try:
+        with temporary_folder(output, machine.name) as aside:
+            written = model_paths(machine.name, aside)
+            for path, text in zip(written, (yaml_text(machine), urdf_text(machine)), strict=True):
+                path.parent.mkdir()
+                path.write_bytes(text.encode())
+            _load(written[0], aside, source)
+            places = model_paths(machine.name, output)
+            for path in places:
+                if not path.parent.is_dir():
+                    path.parent.mkdir()
+                    made.insert(0, path.parent)
+            for path, place in zip(reversed(written), reversed(places), strict=True):
+                os.replace(path, place)  # the YAML last: a URDF alone is no model
+    except BaseException:
+        for folder in made:
+            if folder.is_dir() and not os.listdir(folder):
+                folder.rmdir()
+        raise
+    return Created(load_mechanism(places[0]), *places)
+
+
+def _load(path: Path, aside: Path, source: str) -> None:
+    """Load the files where they were written aside; problems name the source instead."""
+    try:
+        load_mechanism(path)
+    except LegcalError as error:
+        told = [p.replace(f"{aside}{os.sep}", f"{source}: ") for p in error.problems]
+        raise type(error)(told) from error
