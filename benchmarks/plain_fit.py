@@ -44,7 +44,7 @@ class PlainFit:
     def sizes(self) -> Array:
         """Numbers of base and platform coordinates, offsets, radii, and of cameras and poses."""
         legs, n = self.problem.legs.n_legs, self.n_free
-        views, poses = len(self.start.R_camera), len(self.start.R_pose)
+        views, poses = len(self.start.camera_pose.R), len(self.start.platform_pose.R)
         return np.array([n, n, legs, len(self.start.radii), 6 * views, 6 * poses])
 
     def residuals(self, x: Array) -> Array:
@@ -140,8 +140,8 @@ class PlainFit:
             B,
             self.start.lengths + offsets,
             self.start.radii + radii,
-            _moved(self.start.R_camera, self.start.t_camera, cameras),
-            _moved(self.start.R_pose, self.start.t_pose, poses),
+            _moved(*self.start.camera_pose, cameras),
+            _moved(*self.start.platform_pose, poses),
         )
 
 

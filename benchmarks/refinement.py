@@ -26,10 +26,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from hexapod_session import disturbed_start, noisy_outlines, noisy_readings, simulate
 from plain_fit import PlainFit
 
-from legcal.calibration.joint_fit.build import build_fit
-from legcal.calibration.joint_fit.fit import solve_fit
-from legcal.calibration.joint_fit.solver import minimise
-from legcal.estimation.noise import NoiseModel
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.estimation import NoiseModel, minimise
 
 SIZES = (45, 450, 4500)
 REPEATS = 5
@@ -54,12 +53,11 @@ def measure(n_images: int, with_scipy: bool) -> None:
     start = disturbed_start(session)
     building = shortest_ms(lambda: build_fit(session.legs, measurements, outlines))
     problem = build_fit(session.legs, measurements, outlines)
-    whitening = NoiseModel().whitening(problem.outlines.covariance)
     begin = problem.begin(start)
-    found = minimise(problem, begin, whitening, np.inf)
-    solving = shortest_ms(lambda: minimise(problem, begin, whitening, np.inf))
+    found = minimise(problem, begin)
+    solving = shortest_ms(lambda: minimise(problem, begin))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    whole = shortest_ms(lambda: solve_fit(problem, outlines, start), 2)
+    whole = shortest_ms(lambda: refine(session.legs, measurements, outlines, start), 2)
     print(
         f"{n_images:6d} {problem.n_unknowns:9d} {problem.n_equations:10d} {building:9.1f} "
         f"{solving:9.1f} {found.iterations:6d} {solving / n_images:13.3f} {whole:10.0f} "
@@ -68,7 +66,7 @@ def measure(n_images: int, with_scipy: bool) -> None:
     )
     if not with_scipy:
         return
-    plain = PlainFit(problem, begin, whitening)
+    plain = PlainFit(problem, begin, NoiseModel().whitening(problem.outlines.covariance))
     ours = np.concatenate([found.state.A.ravel(), found.state.B.ravel(), found.state.lengths])
     kinds = {"2-point, sparse": True} | ({"2-point": False} if n_images < 100 else {})
     for kind, sparse in kinds.items():

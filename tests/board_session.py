@@ -8,8 +8,8 @@ import numpy as np
 from machine_session import MachineSession
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.joint_fit.constraints import Start
 from legcal.calibration.joint_fit.observations import SeenBoard
+from legcal.calibration.joint_fit.state import Start
 from legcal.data.corners import Corners, found_corners
 from legcal.geometry.types import Array
 from legcal.vision.board import Board

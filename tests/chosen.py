@@ -5,8 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from legcal import load_mechanism
-from legcal.calibration.joint_fit.choices import Choices
-from legcal.calibration.joint_fit.parameters import KnownParameters, known_parameters, resolve
+from legcal.calibration.joint_fit.parameters import (
+    Choices,
+    KnownParameters,
+    known_parameters,
+    resolve,
+)
 from legcal.data.dataset import overrides_of_call
 from legcal.data.measurements import View
 from legcal.vision.camera import Camera

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.joint_fit.constraints import Start
-from legcal.calibration.joint_fit.state import FittedLegs
+from legcal.calibration.joint_fit.state import FittedLegs, Start
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray

@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.joint_fit.constraints import Start, start_from
-from legcal.calibration.joint_fit.state import FittedLegs, fitted_legs
+from legcal.calibration.joint_fit.poses import start_from
+from legcal.calibration.joint_fit.state import FittedLegs, Start, fitted_legs
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry import components, motions_of

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from legcal import calibrate_camera, cli
 from legcal.calibration.camera import CameraCalibration
-from legcal.calibration.joint_fit.choices import Prior
-from legcal.calibration.joint_fit.parameters import known_parameters, resolve
+from legcal.calibration.joint_fit.parameters import Prior, known_parameters, resolve
 from legcal.data.dataset import overrides_of_call
 from legcal.data.measurements import View
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError

@@ -15,7 +15,7 @@ from spoiled import Picture, Spoiled, spoiled
 from legcal import calibrate, detect, load_dataset
 from legcal.calibration.disagreement import disagreeing_images
 from legcal.calibration.fitting import rough_scene
-from legcal.calibration.joint_fit.choices import Choices
+from legcal.calibration.joint_fit.parameters import Choices
 from legcal.calibration.joint_fit.rounds import DISAGREES
 from legcal.calibration.run import CalibrationRun, start_run
 from legcal.errors import NotIdentifiable

@@ -10,9 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.calibration.joint_fit import held_out as pose_by_outlines
-from legcal.calibration.joint_fit.biases import N_KINDS, possible_shifts
-from legcal.calibration.joint_fit.build import build_fit
-from legcal.calibration.joint_fit.constraints import Start
+from legcal.calibration.joint_fit.edge_biases import N_KINDS, possible_shifts
 from legcal.calibration.joint_fit.held_out import (
     HeldOut,
     Posterior,
@@ -20,7 +18,8 @@ from legcal.calibration.joint_fit.held_out import (
     compare_held_out,
     poses_by_outlines,
 )
-from legcal.calibration.joint_fit.state import FittedLegs
+from legcal.calibration.joint_fit.problem import build_fit
+from legcal.calibration.joint_fit.state import FittedLegs, Start
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.estimation.noise import NoiseModel
@@ -56,7 +55,7 @@ def _truth(name: str) -> Truth:
     poses = motions_of(design.R, design.t)
     state = problem.begin(Start(design.legs, cameras, poses, "truth"))
     possible = possible_shifts(problem.outlines, legs.names)
-    nothing = np.zeros((problem.layout.n_kept, problem.layout.n_kept))
+    nothing = np.zeros((problem.n_kept, problem.n_kept))
     shifts = possible.of_sizes(np.zeros(N_KINDS))
     posterior = Posterior(problem, state, shifts, NoiseModel(), nothing)
     return Truth(session.measurements, session.outlines, posterior, poses)
@@ -122,9 +121,8 @@ def test_poses_that_still_move_are_not_known(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def _shown(truth: Truth, outlines: Outlines, poses: Sequence[RigidTransform]) -> ShownPoses:
-    foretold = truth.posterior.of_images(truth.measurements, outlines, poses)
-    whitening = NoiseModel().whitening(foretold.problem.outlines.covariance)
-    return poses_by_outlines(foretold, whitening, 4.5)
+    predicted = truth.posterior.of_images(truth.measurements, outlines, poses)
+    return poses_by_outlines(predicted, 4.5)
 
 
 def test_a_wrong_outline_is_counted_and_left_out() -> None:

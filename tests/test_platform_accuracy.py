@@ -10,7 +10,7 @@ from thinned import thinned
 
 from legcal import evaluate
 from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_accuracy
-from legcal.calibration.joint_fit.solution import Sensitivity
+from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.geometry.types import Array
 from legcal.machine import (
     Mechanism,

@@ -8,16 +8,15 @@ from axes_session import AxesSession, axes_session
 from hexapod_session import disturbed_start, joint_errors, simulate
 from thinned import thinned
 
-from legcal.calibration.joint_fit.build import build_fit
-from legcal.calibration.joint_fit.cramer_rao import average_images, bound
-from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.observations import observed_axes
-from legcal.calibration.joint_fit.problem import FitProblem, linearize
+from legcal.calibration.joint_fit.fit import bound, refine
+from legcal.calibration.joint_fit.observations import average_images, observed_axes
+from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution, joints_of
 from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
+from legcal.estimation import linearize
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,7 @@ def test_the_residual_is_where_the_predicted_line_passes_the_measured_one(
 ) -> None:
     start, axes, m = session.start(), session.axes, session.measurements
     problem = _fit(session, m, axes)
-    r = linearize(problem, problem.begin(start), np.zeros((0, 2, 2))).axes.r
+    r = linearize(problem, problem.begin(start))["axes"].r
     whitening = observed_axes(axes, m, session.legs).whitening
     for i in range(0, len(axes), 7):
         j, T = axes.leg[i], start.T_camera_Rb[m.view[axes.row[i]]]

@@ -7,13 +7,11 @@ import pytest
 from board_session import BOARD, SIGMA_PX, corners_of, place_of_board, with_board
 from machine_session import LENS, MachineSession, machine_session
 
-from legcal.calibration.joint_fit.build import build_fit
-from legcal.calibration.joint_fit.choices import Choices, Prior
-from legcal.calibration.joint_fit.constraints import Start
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.parameters import BOARD_SCALE
-from legcal.calibration.joint_fit.problem import corner_rows
+from legcal.calibration.joint_fit.parameters import BOARD_SCALE, Choices, Prior
+from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.state import Start
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
@@ -45,24 +43,24 @@ def test_rows_of_corners_have_the_derivatives_of_finite_differences() -> None:
     problem = build_fit(
         session.legs, session.measurements, session.outlines, board=seen, choices=choices
     )
-    state, layout = problem.begin(start), problem.layout
-    rows, index = corner_rows(problem, state), problem.couplings.corners.index
-    wide = np.zeros((len(rows.J), 2, layout.size + 1))
+    state, factor = problem.begin(start), problem.factor("corners")
+    rows, index = factor.linearize(state), problem.places["corners"].index
+    wide = np.zeros((len(rows.J), 2, problem.size + 1))
     for column in range(index.shape[1]):
         here = np.arange(len(index)), slice(None), index[:, column]
         wide[here] += rows.J[:, :, column]
-    concerned = np.unique(index[index < layout.n_kept])
+    concerned = np.unique(index[index < problem.n_kept])
     assert {problem.named.index(name) for name in ("c1.fx", "c1.k1", BOARD_SCALE)} < {*concerned}
     for x in concerned.tolist():
-        step = 1e-6 * np.eye(layout.size)[x]
+        step = 1e-6 * np.eye(problem.size)[x]
         ahead, behind = (
-            corner_rows(problem, state.moved(sign * step, layout)).r for sign in (1.0, -1.0)
+            factor.linearize(problem.moved(state, sign * step)).r for sign in (1.0, -1.0)
         )
         slope = (ahead - behind) / 2e-6
         atol = 1e-5 * float(np.abs(slope).max())
         # What was measured moves with the camera at the derivative of the lens where it was.
         np.testing.assert_allclose(wide[..., x], slope, rtol=1e-3, atol=10.0 * atol)
-    assert not rows.J_pose.any()
+    assert not rows.J_own.any()
 
 
 def test_corners_are_where_the_camera_projects_them() -> None:
@@ -70,7 +68,7 @@ def test_corners_are_where_the_camera_projects_them() -> None:
     seen, start = with_board(session, corners_of(session))
     problem = build_fit(session.legs, session.measurements, session.outlines, board=seen)
     state = problem.begin(start)
-    board, rows = problem.board, corner_rows(problem, state)
+    board, rows = problem.board, problem.factor("corners").linearize(state)
     assert len(board) == BOARD.n_corners * 3  # one for all images of a view
     in_base = start.T_Rb_board.apply(board.point)
     for v, T in enumerate(start.T_camera_Rb):

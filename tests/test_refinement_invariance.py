@@ -8,10 +8,9 @@ from machine_session import MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform
 from thinned import thinned
 
-from legcal.calibration.joint_fit.constraints import Start
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import FittedLegs
+from legcal.calibration.joint_fit.state import FittedLegs, Start
 from legcal.machine import LegGeometry, moved_legs
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")

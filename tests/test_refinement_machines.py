@@ -9,26 +9,22 @@ from machine_session import SHIPPED, MachineSession, machine_session
 
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session
-from legcal.calibration.joint_fit.build import build_fit
-from legcal.calibration.joint_fit.choices import Choices, Prior
-from legcal.calibration.joint_fit.constraints import with_values
-from legcal.calibration.joint_fit.cramer_rao import bound
 from legcal.calibration.joint_fit.determinacy import open_directions
-from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.normal import information
-from legcal.calibration.joint_fit.problem import linearize, named_values
+from legcal.calibration.joint_fit.fit import bound, refine
+from legcal.calibration.joint_fit.parameters import Choices, Prior
+from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, FittedLegs, State
+from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, FittedLegs, State, with_values
+from legcal.estimation import Frames, information, linearize
 from legcal.estimation.noise import NoiseModel
-from legcal.geometry import components
 from legcal.geometry.types import Array
 from legcal.machine import parametrize, radius_name
 
 
 def session_as_identify_sees_it(session: MachineSession, legs: FittedLegs) -> Session:
     """Return what was measured as the analysis of identifiability takes it."""
-    R, t = components(session.truth.T_Rb_Re)
+    R, t = Frames.of(session.truth.T_Rb_Re)
     cameras = session.truth.T_camera_Rb
     radius = [max(r for (j, _), r in legs.radii.items() if j == k) for k in range(len(legs.names))]
     return Session(
@@ -140,8 +136,8 @@ def test_all_that_identify_calls_determined_is_estimated(name: str) -> None:
     everything = session.legs, session.measurements, session.outlines
     problem = build_fit(*everything, choices=Choices(fixed=known))
     state = problem.begin(session.truth)
-    linear = linearize(problem, state, NoiseModel().whitening(problem.outlines.covariance))
-    held = open_directions(problem, state, information(problem, state, linear, 0.0))
+    linear = linearize(problem, state)
+    held = open_directions(problem, state, information(problem, state, linear))
     assert len(held.directions) == ranks.of - ranks.rank
     assert set(held.names) == open_to_identify
 
@@ -154,7 +150,7 @@ def test_of_a_3_upu_that_only_translates_all_is_found_that_images_and_readings_s
     found = fit_of_everything(session, known_radii=known_radii)
     assert len(found.held) == (6 if known_radii else 7)  # turns of both axes; without radii, size
     legs, true_legs = found.legs, session.truth.legs
-    R, true_R = (components(poses)[0] for poses in (found.T_Rb_Re, session.truth.T_Rb_Re))
+    R, true_R = (Frames.of(poses)[0] for poses in (found.T_Rb_Re, session.truth.T_Rb_Re))
     size = np.linalg.norm(legs[1].A) / np.linalg.norm(true_legs[1].A)
     assert abs(size - 1.0) < 1e-8 if known_radii else abs(size - 1.0) > 1e-3
     turned = []
@@ -181,12 +177,10 @@ def test_a_first_fit_stays_near_the_nominal_model_where_nothing_is_known(seed: i
         for leg, nominal in zip(first.state.legs, session.legs.nominal, strict=True)
     ]
     assert max(turned) < np.deg2rad(3.0)
-    held = open_directions(
-        problem, first.state, information(problem, first.state, first.linear, 0.0)
-    )
+    held = open_directions(problem, first.state, information(problem, first.state, first.linear))
     assert len(held.directions) == 7
     # The knowledge that keeps it there is no measurement, and is not counted.
-    assert len(first.linear.prior_r) == len(problem.priors) < len(problem.named)
+    assert len(first.linear.prior_r) == len(problem.priors.mean) < len(problem.named)
 
 
 def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array, Array]:
@@ -197,7 +191,7 @@ def fisher_covariance(session: MachineSession, choices: Choices) -> tuple[Array,
     steps = allowed(problem, state).T
 
     def at(moved: State) -> Array:
-        values = named_values(moved, problem.layout, problem.legs)
+        values = problem.coordinates(moved)
         return np.concatenate([values, residuals(problem, moved, whitening)])
 
     by = by_differences(problem, state, at, steps, kept_move)

@@ -17,8 +17,8 @@ from hexapod_session import (
     simulate,
 )
 
-from legcal.calibration.joint_fit.constraints import cameras_from_hints, platform_poses, start_from
 from legcal.calibration.joint_fit.fit import refine, refine_from_best
+from legcal.calibration.joint_fit.poses import cameras_from_hints, platform_poses, start_from
 from legcal.calibration.joint_fit.state import fitted_legs
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines

@@ -13,7 +13,7 @@ from hexapod_session import (
 )
 from thinned import thinned
 
-from legcal.calibration.joint_fit.biases import possible_shifts
+from legcal.calibration.joint_fit.edge_biases import possible_shifts
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.observations import observed_outlines
 from legcal.calibration.joint_fit.rounds import NO_CHANGES, Changes, unsettled

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dense_fit import jacobian, residuals
 from hexapod_session import (
     PINHOLE,
     Session,
@@ -15,13 +16,20 @@ from hexapod_session import (
     simulate,
 )
 
-from legcal.calibration.joint_fit.biases import KINDS, N_KINDS, estimated_shifts, possible_shifts
-from legcal.calibration.joint_fit.build import build_fit
+from legcal.calibration.joint_fit.edge_biases import (
+    KINDS,
+    N_KINDS,
+    SharedShifts,
+    estimated_shifts,
+    possible_shifts,
+)
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.influence import scores_of_shifts, with_shifts
 from legcal.calibration.joint_fit.observations import ObservedOutlines, observed_outlines
-from legcal.calibration.joint_fit.problem import linearize, with_biases
+from legcal.calibration.joint_fit.problem import FitProblem, build_fit
+from legcal.calibration.joint_fit.rounds import with_shifts
+from legcal.calibration.joint_fit.state import State
 from legcal.data.outlines import Outlines
+from legcal.estimation import linearize, scores_of_block
 from legcal.estimation.noise import NoiseModel
 from legcal.estimation.variances import Effects, estimate_variances
 from legcal.geometry.types import Array
@@ -88,6 +96,12 @@ def observed_in(session: Session) -> ObservedOutlines:
     return observed_outlines(session.outlines, session.measurements, session.legs)
 
 
+def scores_of(problem: FitProblem, state: State, possible: SharedShifts) -> tuple[Array, Array]:
+    """Return the scores of all biases that outlines may share, and their covariance."""
+    asked, there = with_shifts(problem, state, possible)
+    return scores_of_block(asked, there, "biases")
+
+
 def test_scores_are_those_of_the_residuals_that_a_fit_leaves(session: Session) -> None:
     rng = np.random.default_rng(4)
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
@@ -95,25 +109,10 @@ def test_scores_are_those_of_the_residuals_that_a_fit_leaves(session: Session) -
     state = problem.begin(disturbed_start(session, joints=1e-5, camera=1e-5, angle=1e-5))
     whitening = NoiseModel().whitening(problem.outlines.covariance)
     possible = possible_shifts(problem.outlines, session.legs.names)
-    z, K = scores_of_shifts(problem, state, whitening, possible, with_biases(problem, possible))
-    linear = linearize(problem, state, whitening)
+    z, K = scores_of(problem, state, possible)
+    linear = linearize(problem, state)
     # All at once: outlines, readings and priors, without elimination.
-    layout, rows = problem.layout, list[tuple[Array, Array]]()
-    for where, part in (
-        (problem.couplings.outlines, linear.outlines),
-        (problem.couplings.readings, linear.readings),
-    ):
-        J = np.zeros((*part.r.shape, layout.size + 1))
-        place = np.where(where.index < layout.n_kept, where.index, layout.size)
-        for i in range(len(J)):
-            J[i][:, place[i]] = part.J[i]
-            first = layout.n_kept + 6 * where.pose[i]
-            J[i, :, first : first + 6] = part.J_pose[i]
-        rows.append((J[..., :-1].reshape(-1, layout.size), part.r.ravel()))
-    prior = np.zeros((len(linear.prior_r), layout.size))
-    prior[:, : layout.n_kept] = linear.prior_J
-    J_all = np.concatenate([rows[0][0], rows[1][0], prior])
-    r_all = np.concatenate([rows[0][1], rows[1][1], linear.prior_r])
+    J_all, r_all = jacobian(problem, linear), residuals(problem, state, whitening)
     B = np.zeros((len(problem.outlines), 2, len(possible)))
     shift = np.einsum("nij,ncj->nci", whitening, possible.shift)
     for c in range(shift.shape[1]):
@@ -132,15 +131,14 @@ def test_scores_do_not_depend_on_the_shifts_that_are_fitted(session: Session) ->
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
     problem = build_fit(session.legs, measurements, outlines)
     state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
-    whitening = NoiseModel().whitening(problem.outlines.covariance)
     possible = possible_shifts(problem.outlines, session.legs.names)
-    bare = scores_of_shifts(problem, state, whitening, possible, with_biases(problem, possible))
+    bare = scores_of(problem, state, possible)
     some = possible.of_sizes(np.array([0.0, 0.1, 0.2, 0.0, 0.1, 0.0]))
     with_some, there = with_shifts(problem, state, some)
     there = replace(there, biases=0.1 * rng.standard_normal(len(some)))
     for one, other in zip(
         bare,
-        scores_of_shifts(with_some, there, whitening, possible, with_biases(problem, possible)),
+        scores_of(with_some, there, possible),
         strict=True,
     ):
         np.testing.assert_allclose(other, one, atol=1e-7 * np.abs(one).max())
@@ -199,8 +197,8 @@ def test_residuals_of_known_shifts_give_their_sizes(session: Session) -> None:
     sigma, found = np.array([0.0, 0.0, 0.06, 0.04, 0.03, 0.0]), []
     problem = build_fit(session.legs, session.measurements, session.outlines)
     state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
-    whitening = NoiseModel().whitening(observed.covariance)
-    K = scores_of_shifts(problem, state, whitening, possible, with_biases(problem, possible))[1]
+    NoiseModel().whitening(observed.covariance)
+    K = scores_of(problem, state, possible)[1]
     rng, value, vector = np.random.default_rng(0), *np.linalg.eigh(K)
     root = vector * np.sqrt(np.maximum(value, 0.0))
     for _ in range(40):

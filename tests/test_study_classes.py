@@ -13,8 +13,8 @@ from machine_session import machine_session, shown_outlines
 from rich.console import Console
 from test_cli import run
 
-from legcal.calibration.joint_fit.constraints import Start
 from legcal.calibration.joint_fit.solution import Solution
+from legcal.calibration.joint_fit.state import Start
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import components, motions_of
 from legcal.machine import LegGeometry, load_mechanism, platform_in_base, vector_of

@@ -29,9 +29,9 @@ from legcal.calibration.joint_fit import (
 from legcal.calibration.run import start_run
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.estimation import NoiseModel
+from legcal.estimation import Frames, NoiseModel
 from legcal.files import Document
-from legcal.geometry import Array, components
+from legcal.geometry import Array
 from legcal.machine import (
     Mechanism,
     Parametrization,
@@ -348,7 +348,7 @@ def _compare(
         mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
     )
     movement = judge_movement(found, dof, changes, significance)
-    poses = components(solution.T_Rb_Re)
+    poses = Frames.of(solution.T_Rb_Re)
     J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *poses)[:, :, columns]
     # Priors pull what was found to the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / prior.plausible**2

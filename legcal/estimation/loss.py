@@ -1,42 +1,109 @@
-"""The robust loss.
+"""Robust losses of whitened residuals, by their squared norms s.
 
-With s the squared norm of a whitened residual the cost is s / (1 + sqrt(1 + k s)), the
-pseudo-Huber loss of width k^-1/2: s / 2 for small s, linear in the distance far out, convex, and
-plain least squares for k = 0. No residual, however wrong, pulls with more than that width.
+The pseudo-Huber loss of width k^-1/2 costs s / (1 + sqrt(1 + k s)): s / 2 for small s, linear in
+the distance far out, convex, and plain least squares for k = 0. Huber's turns all at once. With
+either no residual, however wrong, pulls with more than the width.
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
 from functools import cache
 from math import gamma
+from typing import Protocol
 
 import numpy as np
 
 from legcal.geometry import Array
 
 
-def width_to_k(width: float) -> float:
-    """Return k of a loss that turns linear at a whitened distance; 0 for an infinite one."""
-    return 1.0 / (width * width)
+class Loss(Protocol):
+    """What a whitened residual of squared norm s costs."""
+
+    @property
+    def width(self) -> float:
+        """Norm at which it turns from quadratic to linear."""
+
+    def cost(self, s: Array) -> float:
+        """Return the loss of all measurements."""
+
+    def softened(self, r: Array, slope: Array) -> tuple[Array, Array]:
+        """Return r (n, q), slope (n, q, l) whose squares have its gradient and curvature."""
+
+    def efficiency(self, m: int) -> float:
+        """Return the information that it keeps of m Gaussian residuals."""
 
 
-def weights(s: Array, k: float) -> Array:
-    """Return the weights of iterated least squares at squared whitened norms."""
-    return np.asarray(1.0 / np.sqrt(1.0 + k * s))
+@dataclass(frozen=True)
+class PseudoHuber:
+    """The pseudo-Huber loss; plain least squares without a width."""
+
+    width: float = np.inf
+
+    @property
+    def k(self) -> float:
+        """1 / width^2."""
+        return 1.0 / (self.width * self.width)
+
+    def weights(self, s: Array) -> Array:
+        """Return the weights of iteratively reweighted least squares."""
+        return np.asarray(1.0 / np.sqrt(1.0 + self.k * s))
+
+    def cost(self, s: Array) -> float:
+        """Return the loss of all measurements."""
+        return float(np.sum(s / (1.0 + np.sqrt(1.0 + self.k * s))))
+
+    def softened(self, r: Array, slope: Array) -> tuple[Array, Array]:
+        """Return rows with gradient w r and curvature w (1 - k w^2 r r^T), w = (1 + k s)^-1/2.
+
+        Both are positive, so that the square root of the curvature is a factor of the rows.
+        """
+        if self.k == 0.0:
+            return r, slope
+        s = np.einsum("nq,nq->n", r, r)
+        root = np.sqrt(1.0 + self.k * s)
+        along = (1.0 - 1.0 / root) / np.maximum(s, 1e-300)
+        part = along[:, None] * np.einsum("nq,nqm->nm", r, slope)
+        softened = slope - r[..., None] * part[:, None]
+        softened /= np.sqrt(root)[:, None, None]
+        return np.sqrt(root)[:, None] * r, softened
+
+    def efficiency(self, m: int) -> float:
+        """Return E[psi']^2 / E[psi^2], the asymptotic efficiency of the M-estimator."""
+        return _efficiency(self.k, m)
 
 
-def cost_of(s: Array, k: float) -> float:
-    """Return the loss of all measurements at squared whitened norms."""
-    return float(np.sum(s / (1.0 + np.sqrt(1.0 + k * s))))
+@dataclass(frozen=True)
+class Huber:
+    """Huber's loss, with the curvature of iteratively reweighted least squares."""
+
+    width: float
+
+    def cost(self, s: Array) -> float:
+        """Return the loss of all measurements."""
+        size = np.sqrt(s)
+        far = self.width * (size - 0.5 * self.width)
+        return float(np.where(size > self.width, far, 0.5 * s).sum())
+
+    def softened(self, r: Array, slope: Array) -> tuple[Array, Array]:
+        """Return rows weighted with the root of width / |r| where that is below one."""
+        size = np.sqrt(np.einsum("nq,nq->n", r, r))
+        root = np.sqrt(np.minimum(1.0, self.width / np.maximum(size, 1e-12)))
+        return root[:, None] * r, root[:, None, None] * slope
+
+    def efficiency(self, m: int) -> float:
+        """Return one: its weights are in the rows already."""
+        return 1.0
+
+
+LEAST_SQUARES = PseudoHuber()
 
 
 @cache
-def efficiency(k: float, m: int = 2) -> float:
-    """Return the information that the loss keeps of m Gaussian residuals, 1 for k = 0.
-
-    E[psi']^2 / E[psi^2], the factor of the asymptotic covariance of an M-estimator.
-    """
+def _efficiency(k: float, m: int) -> float:
     node, weight = np.polynomial.laguerre.laggauss(60)
     weight = weight * node ** (0.5 * m - 1.0) / gamma(0.5 * m)
     s = 2.0 * node  # the squared norm of m unit Gaussians has the density s^(m/2-1) exp(-s/2)
-    w = weights(s, k)
+    w = 1.0 / np.sqrt(1.0 + k * s)
     slope = w - k * s * w**3 / m
     return float((weight @ slope) ** 2 / (weight @ (w**2 * s / m)))

@@ -3,7 +3,7 @@
 The covariance that enters the fit is ``scale^2 C + bias^2 [[1, 1], [1, 1]] + tilt^2 [[1, -1],
 [-1, 1]]``: C is what detection claims, the bias is an error that both ends of an outline share
 (shading, blur), the tilt one that has opposite signs there. What outlines share with others
-is not among these (:mod:`legcal.calibration.joint_fit.biases`).
+is not among these (they are blocks of variables).
 """
 
 from __future__ import annotations

@@ -37,8 +37,9 @@ from legcal.calibration.joint_fit import NO_CHOICES, Choices
 from legcal.calibration.run import nominal_poses
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
+from legcal.estimation import Frames
 from legcal.files import closest
-from legcal.geometry import Array, BoolArray, components
+from legcal.geometry import Array, BoolArray
 from legcal.machine import (
     DATASET_YAML,
     NEAR,
@@ -77,7 +78,7 @@ def recorded_session(dataset: Dataset, *, twists: bool = False) -> Session:
     home = to_Rb * mechanism.home * from_Re
     legs, length, rng = machine_near(mechanism, home)
     if mechanism.is_determined:
-        R, t = components(nominal_poses(mechanism, m)[0])
+        R, t = Frames.of(nominal_poses(mechanism, m)[0])
     else:
         travel = travel_of(mechanism)
         R, t = random_poses(legs, mechanism.frame_legs, home, travel, m.n_poses, rng)

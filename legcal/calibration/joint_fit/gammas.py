@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from legcal.calibration.joint_fit.biases import GAMMA_SUFFIX
+from legcal.calibration.joint_fit.edge_biases import GAMMA_SUFFIX
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.state import State
 from legcal.data import Outlines, few_views
@@ -28,23 +28,12 @@ _VAGUE = 0.25  # the same from where on outlines hardly tell a gamma
 
 @dataclass(frozen=True)
 class EstimatedGamma:
-    """The gamma of a camera.
+    """The gamma of a camera."""
 
-    Attributes
-    ----------
-    views : tuple of str
-        The views of the camera.
-    gamma : float
-    fitted_sigma : float
-        Standard deviation of its logarithm, by the fit.
-    measured_with : float
-        The gamma with which the outlines were measured.
-    """
-
-    views: tuple[str, ...]
+    views: tuple[str, ...]  # of the camera
     gamma: float
-    fitted_sigma: float
-    measured_with: float
+    fitted_sigma: float  # standard deviation of its logarithm, by the fit
+    measured_with: float  # the gamma with which the outlines were measured
 
     @property
     def sigma(self) -> float:
@@ -66,21 +55,10 @@ class EstimatedGamma:
 def estimated_gammas(
     problem: FitProblem, state: State, covariance: Array, outlines: Outlines
 ) -> tuple[EstimatedGamma, ...]:
-    """Return the gammas that a fit has found.
-
-    Parameters
-    ----------
-    problem : FitProblem
-    state : State
-        Where the fit ended.
-    covariance : (n_kept, n_kept) array
-        Of all unknowns but poses.
-    outlines : Outlines
-        The table that the fit was built with.
-    """
+    """Return the gammas that a fit has found; *covariance* is that of all unknowns but poses."""
     o = problem.outlines
     found = []
-    for k, position in enumerate(problem.layout.bias.tolist()):
+    for k, position in enumerate(problem.where("biases").tolist()):
         camera = problem.named[position].removesuffix(GAMMA_SUFFIX)
         if camera == problem.named[position]:
             continue
@@ -105,10 +83,7 @@ RANGE = (1.0, 3.0)  # of gammas that are tried: photographs are linear, or encod
 def next_gammas(found: Sequence[Sequence[EstimatedGamma]]) -> dict[str, float]:
     """Return the gammas to read photographs with, by view; nothing where fits see none but theirs.
 
-    Parameters
-    ----------
-    found : sequence of sequence of EstimatedGamma
-        What successive fits have found, to outlines that were measured anew for each.
+    *found* has what successive fits have found, to outlines that were measured anew for each.
     """
     gammas: dict[str, float] = {}
     for one in found[-1]:

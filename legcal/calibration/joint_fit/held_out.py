@@ -1,4 +1,4 @@
-"""How well a fit foretells images that it has not seen: in pixels, and at the platform.
+"""How well a fit predicts images that it has not seen: in pixels, and at the platform.
 
 In pixels: where the calibrated model, its readings and its cameras put the outlines, against where
 they are. At the platform: its pose by the readings, against its pose by what the image shows alone.
@@ -12,120 +12,80 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.biases import SharedShifts, possible_shifts
-from legcal.calibration.joint_fit.constraints import on_constraints
-from legcal.calibration.joint_fit.influence import explained_share
-from legcal.calibration.joint_fit.normal import NormalEquations, of_one_kind
+from legcal.calibration.joint_fit.edge_biases import SharedShifts, possible_shifts
 from legcal.calibration.joint_fit.observations import observed_outlines, of_parts, seen_by
-from legcal.calibration.joint_fit.problem import (
-    FitProblem,
-    Linearization,
-    linearize,
-    offsets_of,
-    with_measurements,
-)
+from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.state import State
 from legcal.data import Measurements, Outlines
 from legcal.errors import NotIdentifiable, NotVisible
-from legcal.estimation import NoiseModel
-from legcal.geometry import Array, BoolArray, IntArray, components, turned
+from legcal.estimation import (
+    Frames,
+    Linearization,
+    NoiseModel,
+    NormalEquations,
+    explained_share,
+    information,
+    linearize,
+)
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import pose_differences
 
 
 @dataclass(frozen=True, eq=False)
-class Foretold:
-    """Images that a fit has not seen, with all that it knows of them.
+class Predicted:
+    """Images that a fit has not seen, with all that it knows of them."""
 
-    Attributes
-    ----------
-    problem : FitProblem
-        Their outlines and readings; its unknowns are those of the fit, with the shifts that these
-        outlines share.
-    state : State
-        Where the fit ended, at the poses of these images.
-    covariance : (n_kept, n_kept) array
-        What the fit says of all unknowns but poses; shifts that it has not met have their prior.
-    """
-
-    problem: FitProblem
-    state: State
-    covariance: Array
+    problem: FitProblem  # their outlines and readings; the unknowns of the fit, their own biases
+    state: State  # where the fit ended, at the poses of these images
+    covariance: Array  # (n_kept, n_kept) by the fit; biases that it has not met have their prior
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Where a fit ended, with the covariance of everything that is no pose.
+    """Where a fit ended, with the covariance of everything that is no pose."""
 
-    Attributes
-    ----------
-    problem : FitProblem
-        With the shifts that outlines share.
-    state : State
-    shifts : SharedShifts
-    noise : NoiseModel
-    covariance : (n_kept, n_kept) array
-        Of parameters, radii, shifts, intrinsics and cameras, all together.
-    """
-
-    problem: FitProblem
+    problem: FitProblem  # with the biases that outlines share
     state: State
     shifts: SharedShifts
     noise: NoiseModel
-    covariance: Array
+    covariance: Array  # (n_kept, n_kept)
 
     def of_images(
         self,
         measurements: Measurements,
         outlines: Outlines,
         T_Rb_Re: Sequence[RigidTransform],
-    ) -> Foretold:
-        """Return what the fit knows of other images of the same views.
-
-        Parameters
-        ----------
-        measurements : Measurements
-            The images.
-        outlines : Outlines
-            Their outlines; the used ones enter.
-        T_Rb_Re : sequence of RigidTransform
-            Their poses.
-
-        Raises
-        ------
-        DatasetError
-            If an outline cannot be used.
-        """
-        legs, state = self.problem.legs, self.state
-        found = of_parts(observed_outlines(outlines, measurements, legs), self.problem.layout.parts)
+    ) -> Predicted:
+        """Return what the fit predicts of other images of the same views, at given poses."""
+        fitted, legs, state = self.problem, self.problem.legs, self.state
+        found = of_parts(observed_outlines(outlines, measurements, legs), fitted.outlines.parts)
         found = seen_by(found, state.cameras)
-        possible = possible_shifts(found, legs.names, self.problem.outlines)
+        possible = possible_shifts(found, legs.names, fitted.outlines)
         shifts = possible.of_sizes(self.shifts.sigma)
-        problem = with_measurements(self.problem, measurements, found, shifts)
-        known = {self.problem.named[i]: i for i in self.problem.layout.bias.tolist()}
-        values = dict(zip(known, state.biases.tolist(), strict=True))
+        problem = fitted.with_measurements(measurements, found, shifts)
+        values = dict(zip(fitted.block("biases").labels, state.biases.tolist(), strict=True))
         others = [legs.radii[part] for part in found.parts[len(state.radii) :]]
-        R, t = components(T_Rb_Re)
-        return Foretold(
+        return Predicted(
             problem,
             replace(
                 state,
                 radii=np.append(state.radii, others),
                 biases=np.array([values.get(name, 0.0) for name in shifts.names]),
-                R_pose=R,
-                t_pose=t,
+                platform_pose=Frames.of(T_Rb_Re),
             ),
             self._covariance_of(problem, shifts),
         )
 
     def _covariance_of(self, problem: FitProblem, shifts: SharedShifts) -> Array:
-        """Return the covariance of the unknowns of a problem with other shifts."""
-        old, new = self.problem, problem.layout
+        """Return the covariance of the unknowns of a problem with other biases."""
+        old = self.problem
         place = {name: i for i, name in enumerate(old.named)}
-        cameras = range(old.layout.n_named, old.layout.n_kept)
+        cameras = range(old.n_named, old.n_kept)
         where = np.array([*(place.get(name, -1) for name in problem.named), *cameras], np.intp)
         is_known = where >= 0
-        covariance = np.zeros((new.n_kept, new.n_kept))
-        covariance[new.bias, new.bias] = shifts.sigmas**2
+        covariance = np.zeros((problem.n_kept, problem.n_kept))
+        biases = problem.where("biases")
+        covariance[biases, biases] = shifts.sigmas**2
         kept = where[is_known]
         covariance[np.ix_(is_known, is_known)] = self.covariance[np.ix_(kept, kept)]
         return covariance
@@ -142,114 +102,92 @@ _RANK = 1.0  # [1/rad^2, 1/m^2]: better than a metre or radian
 
 @dataclass(frozen=True, eq=False)
 class ShownPoses:
-    """Poses by outlines alone.
+    """Poses by outlines alone."""
 
-    Attributes
-    ----------
-    T_Rb_Re : tuple of RigidTransform
-        All poses; those that are not known mean nothing.
-    known : (n_known,) array of int
-        Which poses the outlines determine.
-    covariance : (n_known, 6, 6) array
-        Of the motion between each of these by the readings and by the outlines: rotation vector in
-        R_b and displacement of R_e [rad^2, rad m, m^2].
-    """
-
-    T_Rb_Re: tuple[RigidTransform, ...]
-    known: IntArray
+    T_Rb_Re: tuple[RigidTransform, ...]  # all of them; those that are not known mean nothing
+    known: IntArray  # (n_known,) which poses the outlines determine
+    # (n_known, 6, 6) of the motion between each by the readings and by the outlines: rotation
+    # vector in R_b and displacement of R_e [rad, m].
     covariance: Array
 
 
-def poses_by_outlines(foretold: Foretold, whitening: Array, rejection: float) -> ShownPoses:
-    """Return the poses that fit the outlines best.
+def poses_by_outlines(predicted: Predicted, rejection: float) -> ShownPoses:
+    """Return the poses that fit the outlines best, from those by the readings.
 
-    Outlines count less the farther off they are, then those near enough count alike. Poses that
-    still move after that are not known.
-
-    Parameters
-    ----------
-    foretold : Foretold
-        The images at poses nearby, those by the readings.
-    whitening : (n, 2, 2) array
-        Whitens the noise of the outlines [1/px].
-    rejection : float
-        Whitened distance beyond which an outline does not count.
+    Outlines count less the farther off they are, then those nearer than *rejection* (whitened)
+    count alike. Poses that still move after that are not known.
     """
-    problem, begin = foretold.problem, foretold.state
-    linear = linearize(problem, begin, whitening)
-    length = _mean_length(begin)
-    state, known = begin, _is_known(of_one_kind(problem, begin, linear, "outlines"), length)
+    problem, begin = predicted.problem, predicted.state
+    linear = linearize(problem, begin)
+    length = begin.mean_length
+    state, known = begin, _is_known(_by_outlines(problem, begin, linear), length)
     settled = np.zeros(len(known), dtype=np.bool_)
     weight = np.ones(len(problem.outlines))
     for step in range(_ROBUST_STEPS + _MOST_STEPS):
-        s = linear.outlines.squared_norms
+        s = linear["outlines"].squared_norms
         if step < _ROBUST_STEPS:
             weight = 1.0 / (1.0 + s / _WIDTH**2)
         elif step == _ROBUST_STEPS:
             weight = np.where(s < rejection**2, 1.0, 0.0)
-        normal = of_one_kind(problem, state, _weighted(linear, weight), "outlines")
+        normal = _by_outlines(problem, state, linear, weight)
         change, squared = _step(normal)
         settled = (squared < _SETTLED) & (step >= _ROBUST_STEPS)
         moving = known & ~settled
         if not moving.any():
             break
-        state, is_near = _moved(foretold, state, np.where(moving[:, None], change, 0.0), length)
+        state, is_near = _moved(predicted, state, np.where(moving[:, None], change, 0.0), length)
         known &= is_near
-        linear = linearize(problem, state, whitening)
-    outlines = of_one_kind(problem, state, _weighted(linear, weight), "outlines")
-    readings = of_one_kind(problem, state, linear, "readings")
+        linear = linearize(problem, state)
+    outlines = _by_outlines(problem, state, linear, weight)
+    readings = information(problem, state, linear, only=("readings",))
     which = np.flatnonzero(known & settled & _is_known(outlines, length))
-    covariance = _covariance(outlines, readings, foretold.covariance)[which]
-    return ShownPoses(state.T_Rb_Re, which, covariance)
+    covariance = _covariance(outlines, readings, predicted.covariance)[which]
+    return ShownPoses(state.platform_pose.motions, which, covariance)
 
 
-def _weighted(linear: Linearization, weight: Array) -> Linearization:
-    """Return the same with weights of the squares of outlines."""
-    factor = np.sqrt(weight)[:, None, None] * np.eye(2)
-    return replace(linear, outlines=linear.outlines.whitened(factor))
+def _by_outlines(
+    problem: FitProblem, state: State, linear: Linearization, weight: Array | None = None
+) -> NormalEquations:
+    """Return the information of outlines alone, their squares weighted (n,)."""
+    if weight is not None:
+        rows = linear["outlines"].whitened(np.sqrt(weight)[:, None, None])
+        linear = replace(linear, rows={**linear.rows, "outlines": rows})
+    return information(problem, state, linear, only=("outlines",))
 
 
 def _step(normal: NormalEquations) -> tuple[Array, Array]:
     """Return Gauss-Newton's steps (n_poses, 6) and their squared lengths in sigmas (n_poses,)."""
-    y = -(normal.V_inverse @ normal.g_pose[..., None])[..., 0]
+    y = -(normal.V_inverse @ normal.g_own[..., None])[..., 0]
     squared = np.einsum("kf,kfh,kh->k", y, normal.V, y)
     return (_motions(normal) @ y[..., None])[..., 0], np.asarray(squared)
 
 
 def _moved(
-    foretold: Foretold, state: State, change: Array, length: float
+    predicted: Predicted, state: State, change: Array, length: float
 ) -> tuple[State, BoolArray]:
     """Return poses after a change [rad, m] that is not too large, and which are near the first.
 
     Those that are not are back at the first ones, and so are those that put a camera into a leg.
     """
-    begin, unit = foretold.state, np.repeat([1.0, length], 3)
+    problem, begin = predicted.problem, predicted.state
+    unit, first = np.repeat([1.0, length], 3), begin.platform_pose
     reach = np.linalg.norm(change / unit, axis=1, keepdims=True)
     change = change * np.minimum(1.0, _FURTHEST / np.maximum(reach, 1e-300))
-    R, t = turned(state.R_pose, change[:, :3]), state.t_pose + change[:, 3:]
-    cosine = 0.5 * (np.einsum("kij,kij->k", R, begin.R_pose) - 1.0)
-    shift = np.linalg.norm(t - begin.t_pose, axis=1)
+    moved = state.platform_pose.moved(change)
+    cosine = 0.5 * (np.einsum("kij,kij->k", moved.R, first.R) - 1.0)
+    shift = np.linalg.norm(moved.t - first.t, axis=1)
     is_near = (cosine > np.cos(_LOST)) & (shift < _LOST * length)
-    trial = _with_poses(state, begin, is_near, R, t)
-    trial = on_constraints(trial, foretold.problem.legs.frame_legs)
-    seen = np.isfinite(offsets_of(foretold.problem, trial)).all(axis=1)
-    is_near[foretold.problem.outlines.pose[~seen]] = False
-    return _with_poses(trial, begin, is_near, trial.R_pose, trial.t_pose), is_near
+    trial = problem.projected(_with_poses(state, first, is_near, moved))
+    seen = np.isfinite(problem.offsets(trial)).all(axis=1)
+    is_near[problem.outlines.pose[~seen]] = False
+    return _with_poses(trial, first, is_near, trial.platform_pose), is_near
 
 
-def _with_poses(state: State, begin: State, chosen: BoolArray, R: Array, t: Array) -> State:
-    """Return a state with some new poses, the others those of the beginning."""
-    return replace(
-        state,
-        R_pose=np.where(chosen[:, None, None], R, begin.R_pose),
-        t_pose=np.where(chosen[:, None], t, begin.t_pose),
-    )
-
-
-def _mean_length(state: State) -> float:
-    """Return the mean length of the legs [m]."""
-    B = state.B @ np.swapaxes(state.R_pose, 1, 2) + state.t_pose[:, None]
-    return float(np.mean(np.linalg.norm(B - state.A, axis=2)))
+def _with_poses(state: State, first: Frames, chosen: BoolArray, poses: Frames) -> State:
+    """Return a state with some new poses, the others the first ones."""
+    R = np.where(chosen[:, None, None], poses.R, first.R)
+    t = np.where(chosen[:, None], poses.t, first.t)
+    return replace(state, platform_pose=Frames(R, t))
 
 
 def _is_known(normal: NormalEquations, length: float) -> BoolArray:
@@ -269,15 +207,10 @@ def _covariance(outlines: NormalEquations, readings: NormalEquations, of_fit: Ar
 
     Each has its own noise, and both follow the errors of the fit.
     """
-    apart = _following(outlines) - _following(readings)
+    apart = outlines.follow - readings.follow
     inside = outlines.V_inverse + readings.V_inverse + apart @ of_fit @ np.swapaxes(apart, 1, 2)
     Z = _motions(outlines)
     return np.asarray(Z @ inside @ np.swapaxes(Z, 1, 2))
-
-
-def _following(normal: NormalEquations) -> Array:
-    """Return how poses follow the kept unknowns inside the constraints, (n_poses, f, n_kept)."""
-    return np.asarray(-normal.V_inverse @ np.moveaxis(normal.W, 0, 2))
 
 
 def _motions(normal: NormalEquations) -> Array:
@@ -295,35 +228,20 @@ _SINGULAR = 1e-18  # of the largest eigenvalue of what readings say of a pose
 class HeldOut:
     """What images that were kept aside say of a fit.
 
-    Attributes
-    ----------
-    n_images, n_poses : int
-        How many were kept aside.
-    outlines, wrong : int
-        Outlines in them, and how many are far from where they should be, compared with the others
-        and with their noise; they are left out of what follows.
-    rms_px, expected_px : float or None
-        Root mean square of the offsets of the outlines, without the shifts that they share with
-        fitted ones [px], and what is expected. None without outlines.
-    rms_px_of_view : dict
-        The same for each view that has some, by its name.
-    displacement, rotation : (n_known,) array
-        Distance [m] and angle [rad] between the platform by the readings and by the outlines alone,
-        for each pose that its outlines determine.
-    expected_displacement, expected_rotation : (n_known,) array
-        One standard deviation of these, by the noise of outlines and readings and the covariance
-        of all that the fit knows [m, rad].
+    Offsets are without the biases that outlines share with fitted ones. What is expected is one
+    standard deviation, by the noise of outlines and readings and the covariance of all that the fit
+    knows.
     """
 
-    n_images: int
+    n_images: int  # kept aside
     n_poses: int
-    outlines: int
-    wrong: int
-    rms_px: float | None
+    outlines: int  # in them
+    wrong: int  # far from where they should be for their noise; left out of what follows
+    rms_px: float | None  # of the offsets [px]; None without outlines
     expected_px: float | None
-    rms_px_of_view: dict[str, float]
-    displacement: Array
-    rotation: Array
+    rms_px_of_view: dict[str, float]  # the same for each view that has some, by its name
+    displacement: Array  # (n_known,) platform by readings and by outlines alone [m]
+    rotation: Array  # (n_known,) [rad]
     expected_displacement: Array
     expected_rotation: Array
 
@@ -343,19 +261,11 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class PlatformPair:
-    """Root mean squares over poses: found, and expected as one standard deviation.
+    """Root mean squares over poses: found, and expected as one standard deviation."""
 
-    Attributes
-    ----------
-    displacement, expected_displacement : float
-        [m]
-    rotation, expected_rotation : float
-        [rad]
-    """
-
-    displacement: float
+    displacement: float  # [m]
     expected_displacement: float
-    rotation: float
+    rotation: float  # [rad]
     expected_rotation: float
 
 
@@ -366,27 +276,13 @@ def compare_held_out(
     T_Rb_Re: Sequence[RigidTransform],
     rejection: float,
 ) -> HeldOut:
-    """Compare images that were kept aside with what a fit of others foretells.
+    """Compare images that were kept aside with what a fit of others predicts.
 
     Shifts that the outlines share with those of the fit are taken off. What is expected has the
     noise of the outlines, that of the readings, and the covariance of all that the fit knows.
 
-    Parameters
-    ----------
-    posterior : Posterior
-        The fit.
-    measurements : Measurements
-        The images that were kept aside.
-    outlines : Outlines
-        Their outlines; the used ones are compared.
-    T_Rb_Re : sequence of RigidTransform
-        Their poses by the fit and the readings.
-    rejection : float
-        Whitened distance beyond which the fit rejects an outline.
-
-    Returns
-    -------
-    HeldOut
+    Of *measurements*, kept aside, the used *outlines* are compared, at the poses *T_Rb_Re* by the
+    fit and the readings; *rejection* is the whitened distance beyond which the fit rejects one.
 
     Raises
     ------
@@ -395,23 +291,23 @@ def compare_held_out(
     NotVisible
         If a camera stands inside a leg.
     """
-    foretold = posterior.of_images(measurements, outlines, T_Rb_Re)
-    problem, state = foretold.problem, foretold.state
-    noise = posterior.noise.covariance(problem.outlines.covariance)
-    L = np.linalg.cholesky(noise)
-    whitening = np.linalg.inv(L)
-    linear = linearize(problem, state, whitening)
+    predicted = posterior.of_images(measurements, outlines, T_Rb_Re)
+    problem, state = predicted.problem.weighted(posterior.noise), predicted.state
+    predicted = replace(predicted, problem=problem)
+    L = np.linalg.cholesky(posterior.noise.covariance(problem.outlines.covariance))
+    linear = linearize(problem, state)
     _refuse_unseen(linear)
-    readings = of_one_kind(problem, state, linear, "readings")
+    readings = information(problem, state, linear, only=("readings",))
     _refuse_undetermined(readings)
-    places, of_fit = problem.couplings.outlines, foretold.covariance
-    expected = np.eye(2) + explained_share(places, linear.outlines, readings, of_fit)
-    offsets = (L @ linear.outlines.r[..., None])[..., 0]
-    norm = _norms(linear.outlines.r, expected)
+    expected = np.eye(2) + explained_share(
+        problem, linear, readings, "outlines", predicted.covariance
+    )
+    offsets = (L @ linear["outlines"].r[..., None])[..., 0]
+    norm = _norms(linear["outlines"].r, expected)
     limit = rejection * _usual(norm)
     right = norm < limit
     pixels = np.einsum("nij,njk,nik->ni", L, expected, L)
-    shown = poses_by_outlines(foretold, whitening, limit)
+    shown = poses_by_outlines(predicted, limit)
     known = shown.known.tolist()
     displacement, rotation = pose_differences(
         [shown.T_Rb_Re[k] for k in known], [T_Rb_Re[k] for k in known]
@@ -438,7 +334,7 @@ def _refuse_undetermined(readings: NormalEquations) -> None:
     bad = np.flatnonzero(value[:, 0] <= _SINGULAR * value[:, -1])
     if len(bad):
         raise NotIdentifiable(
-            "The images that were kept aside could not be compared with what the fit foretells: "
+            "The images that were kept aside could not be compared with what the fit predicts: "
             f"found readings that leave platform pose {bad[0] + 1} of them open, needed readings "
             "that determine every pose; leave out --holdout."
         )
@@ -446,10 +342,10 @@ def _refuse_undetermined(readings: NormalEquations) -> None:
 
 def _refuse_unseen(linear: Linearization) -> None:
     """Raise NotVisible where a camera stands inside a leg."""
-    bad = int(np.sum(~np.isfinite(linear.outlines.r).all(axis=1)))
+    bad = int(np.sum(~np.isfinite(linear["outlines"].r).all(axis=1)))
     if bad:
         raise NotVisible(
-            "The images that were kept aside could not be compared with what the fit foretells: "
+            "The images that were kept aside could not be compared with what the fit predicts: "
             f"found {bad} outlines of legs that a camera stands inside by their readings, needed "
             "cameras outside the legs; check the readings."
         )

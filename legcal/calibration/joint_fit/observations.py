@@ -1,8 +1,4 @@
-"""Corners of a calibration board, as arrays that the residual of a corner takes.
-
-Camera and board stand still over the images of a view, which therefore show each corner at one
-place: what enters the fit is its mean.
-"""
+"""What was observed, as arrays that the residuals take: outlines, readings, axes, corners."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from legcal.calibration.joint_fit.state import FittedLegs
-from legcal.data import Corners, LegAxes, Measurements, Outlines
+from legcal.data import Corners, LegAxes, Measurements, Outlines, join_axes
 from legcal.errors import DatasetError
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import LegKind
@@ -44,17 +40,7 @@ def movements_by_gamma(outlines: Outlines, measurements: Measurements) -> Array:
 
 
 def mixed_gammas(moved: Array, gamma: Array, camera: Sequence[str]) -> list[str]:
-    """Return one sentence for each camera whose outlines were measured with several gammas.
-
-    Parameters
-    ----------
-    moved : (n,) array
-        :func:`movements_by_gamma` of outlines.
-    gamma : (n,) array
-        With which they were measured.
-    camera : sequence of str
-        The name of the camera of each.
-    """
+    """Return one sentence for each camera whose outlines were measured with several gammas."""
     found: dict[str, set[float]] = {}
     for by_gamma, one, name in zip(moved.tolist(), gamma.tolist(), camera, strict=True):
         if by_gamma != 0.0:
@@ -82,57 +68,31 @@ def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, fl
 
 @dataclass(frozen=True, eq=False)
 class ObservedOutlines:
-    """The outlines that enter the fit, n of them.
+    """The outlines that enter the fit, n of them."""
 
-    Attributes
-    ----------
-    index : (n,) array of int
-        Rows of the table of outlines.
-    leg, view, pose, radius : (n,) array of int
-        Indices; ``radius`` counts in ``parts``.
-    feet : (n, 2, 2) array
-        Points of the measured outline at both ends of the used piece, on the sensor plane.
-    pixels : (n, 2, 2) array
-        The same points in the image [px].
-    constants : (n, 9) array
-        What the residual needs besides: the inverse transposed derivative of pixels at
-        these points [1/px], column by column, and epsilon of eq (5).
-    covariance : (n, 2, 2) array
-        Claimed covariance of the offsets at both ends [px^2].
-    parts : tuple of (int, str)
-        Leg index and part of each radius, sorted by leg and name.
-    views : tuple of str
-        Names of the views.
-    series : (n_views,) array of int
-        The view that stands for each: the first of those that show one image each with the same
-        camera, as one that is held in the hand does; else itself.
-    cameras : tuple of str
-        The view that stands for the camera of each view.
-    by_gamma : (n,) array
-        How far each moves towards the inside with the logarithm of the gamma of its camera [px];
-        zero where that gamma is told, or nothing is known of it.
-    bias_index : (n, c) array of int
-        The shared shifts that each outline has a part in.
-    bias_shift : (n, c, 2) array
-        How far one pixel of each shifts both ends [px].
-    """
-
-    index: IntArray
-    leg: IntArray
-    view: IntArray
-    pose: IntArray
-    radius: IntArray
+    index: IntArray  # (n,) Rows of the table of outlines
+    leg: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
+    view: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
+    pose: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
+    radius: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
+    # (n, 2, 2) Points of the measured outline at both ends of the used piece, on the sensor plane
     feet: Array
-    pixels: Array
+    pixels: Array  # (n, 2, 2) The same points in the image [px]
+    # (n, 9) What the residual needs besides: the inverse transposed derivative of pixels at these
+    # points [1/px], column by column, and epsilon of eq (5)
     constants: Array
-    covariance: Array
-    parts: tuple[tuple[int, str], ...]
-    views: tuple[str, ...]
+    covariance: Array  # (n, 2, 2) Claimed covariance of the offsets at both ends [px^2]
+    parts: tuple[tuple[int, str], ...]  # Leg index and part of each radius, sorted by leg and name
+    views: tuple[str, ...]  # Names of the views
+    # (n_views,) The view that stands for each: the first of those that show one image each with the
+    # same camera, as one that is held in the hand does; else itself
     series: IntArray
-    cameras: tuple[str, ...]
+    cameras: tuple[str, ...]  # The view that stands for the camera of each view
+    # (n,) How far each moves towards the inside with the logarithm of the gamma of its camera [px];
+    # zero where that gamma is told, or nothing is known of it
     by_gamma: Array
-    bias_index: IntArray
-    bias_shift: Array
+    bias_index: IntArray  # (n, c) The shared shifts that each outline has a part in
+    bias_shift: Array  # (n, c, 2) How far one pixel of each shifts both ends [px]
 
     @property
     def epsilon(self) -> Array:
@@ -145,22 +105,12 @@ class ObservedOutlines:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """The encoder readings that enter the fit, n of them.
+    """The encoder readings that enter the fit, n of them."""
 
-    Attributes
-    ----------
-    leg, pose : (n,) array of int
-        Indices.
-    length : (n,) array
-        sign * q: the leg length without its offset [m].
-    sigma : float
-        Standard deviation [m].
-    """
-
-    leg: IntArray
-    pose: IntArray
-    length: Array
-    sigma: float
+    leg: IntArray  # (n,) Indices
+    pose: IntArray  # (n,) Indices
+    length: Array  # (n,) sign * q: the leg length without its offset [m]
+    sigma: float  # Standard deviation [m]
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -240,28 +190,14 @@ def _series(measurements: Measurements) -> IntArray:
 
 
 def of_parts(outlines: ObservedOutlines, parts: Sequence[tuple[int, str]]) -> ObservedOutlines:
-    """Return the same outlines with their radii counted in given parts, then in those of no other.
-
-    Parameters
-    ----------
-    outlines : ObservedOutlines
-    parts : sequence of (int, str)
-        Leg index and part of each radius.
-    """
+    """Return the same outlines, radii counted in given parts, then in those of no other."""
     together = tuple(dict.fromkeys((*parts, *outlines.parts)))
     number = np.array([together.index(part) for part in outlines.parts], dtype=np.intp)
     return replace(outlines, radius=number[outlines.radius], parts=together)
 
 
 def seen_by(outlines: ObservedOutlines, cameras: Sequence[Camera]) -> ObservedOutlines:
-    """Return the same outlines in the image, on the sensor planes of other cameras.
-
-    Parameters
-    ----------
-    outlines : ObservedOutlines
-    cameras : sequence of Camera
-        One a view.
-    """
+    """Return the same outlines in the image, on the sensor planes of other cameras."""
     feet, constants = outlines.feet.copy(), outlines.constants.copy()
     for v in np.unique(outlines.view):
         of_view = outlines.view == v
@@ -272,23 +208,7 @@ def seen_by(outlines: ObservedOutlines, cameras: Sequence[Camera]) -> ObservedOu
 
 
 def feet_of_ends(camera: Camera, h: Array, ends: Array) -> tuple[Array, Array]:
-    """Return the points of measured lines nearest to their ends, and the lens there.
-
-    Parameters
-    ----------
-    camera : Camera
-    h : (n, 3) array
-        Measured outlines (a, b, c).
-    ends : (n, 2, 2) array
-        Ends of the used pieces [px].
-
-    Returns
-    -------
-    feet : (n, 2, 2) array
-        Points of the sensor plane on the lines.
-    J_inverse_transposed : (n, 2, 2, 2) array
-        Inverse transposed derivative of pixels with respect to the sensor plane there [1/px].
-    """
+    """Return the points of measured lines nearest to their ends, and the lens there."""
     xy = camera.undistort(ends)
     normal = h[:, None, :2]
     value = np.sum(normal * xy, axis=-1, keepdims=True) + h[:, None, 2:]
@@ -324,26 +244,15 @@ def _bad_covariances(
 
 @dataclass(frozen=True, eq=False)
 class ObservedAxes:
-    """The axes that enter the fit, n of them.
+    """The axes that enter the fit, n of them."""
 
-    Attributes
-    ----------
-    leg, view, pose : (n,) array of int
-        Indices.
-    M : (n, 3) array
-        A point of each axis in the camera frame [m].
-    basis : (n, 2, 3) array
-        Unit vectors e1, e2 normal to the axis; its direction is e1 x e2.
-    whitening : (n, 4, 4) array
-        Lower triangular T with T C T^T = 1, C being the claimed covariance of (alpha1, alpha2,
-        beta1, beta2) [1/rad, 1/m].
-    """
-
-    leg: IntArray
-    view: IntArray
-    pose: IntArray
-    M: Array
-    basis: Array
+    leg: IntArray  # (n,) Indices
+    view: IntArray  # (n,) Indices
+    pose: IntArray  # (n,) Indices
+    M: Array  # (n, 3) A point of each axis in the camera frame [m]
+    basis: Array  # (n, 2, 3) Unit vectors e1, e2 normal to the axis; its direction is e1 x e2
+    # (n, 4, 4) Lower triangular T with T C T^T = 1, C being the claimed covariance of (alpha1,
+    # alpha2, beta1, beta2) [1/rad, 1/m]
     whitening: Array
 
     def __len__(self) -> int:
@@ -391,34 +300,17 @@ def observed_axes(
 
 @dataclass(frozen=True, eq=False)
 class ObservedBoard:
-    """The corners of a board that enter the fit, n of them.
+    """The corners of a board that enter the fit, n of them."""
 
-    Attributes
-    ----------
-    view : (n,) array of int
-        Index of the view.
-    corner : (n,) array of int
-        Number of the corner.
-    point : (n, 3) array
-        The corners in the frame of the board [m].
-    feet : (n, 2) array
-        Where they were measured, on the sensor plane.
-    pixels : (n, 2) array
-        The same in the image [px].
-    constants : (n, 4) array
-        What the residual needs besides: the derivative of pixels at these points [px], column by
-        column.
-    sigma : (n,) array
-        Standard deviation of both coordinates [px].
-    """
-
-    view: IntArray
-    corner: IntArray
-    point: Array
-    feet: Array
-    pixels: Array
+    view: IntArray  # (n,) Index of the view
+    corner: IntArray  # (n,) Number of the corner
+    point: Array  # (n, 3) The corners in the frame of the board [m]
+    feet: Array  # (n, 2) Where they were measured, on the sensor plane
+    pixels: Array  # (n, 2) The same in the image [px]
+    # (n, 4) What the residual needs besides: the derivative of pixels at these points [px], column
+    # by column
     constants: Array
-    sigma: Array
+    sigma: Array  # (n,) Standard deviation of both coordinates [px]
 
     @property
     def pixels_per_unit(self) -> Array:
@@ -428,8 +320,8 @@ class ObservedBoard:
     def __len__(self) -> int:
         return len(self.view)
 
-    def chosen(self, which: BoolArray) -> ObservedBoard:
-        """Return some of the corners."""
+    def chosen(self, which: BoolArray, scale: float = 1.0) -> ObservedBoard:
+        """Return some of the corners, with standard deviations larger by a factor."""
         return ObservedBoard(
             self.view[which],
             self.corner[which],
@@ -437,28 +329,16 @@ class ObservedBoard:
             self.feet[which],
             self.pixels[which],
             self.constants[which],
-            self.sigma[which],
+            scale * self.sigma[which],
         )
-
-    def with_scale(self, factor: float) -> ObservedBoard:
-        """Return the same corners with standard deviations that are larger by a factor."""
-        return replace(self, sigma=factor * self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """A calibration board that stands still on the base, and what images show of it.
+    """A calibration board that stands still on the base, and what images show of it."""
 
-    Attributes
-    ----------
-    board : Board
-        Where its corners are, in its own frame.
-    corners : Corners
-        Where images show them; only the used ones count.
-    """
-
-    board: Board
-    corners: Corners
+    board: Board  # Where its corners are, in its own frame
+    corners: Corners  # Where images show them; only the used ones count
 
 
 def no_board() -> ObservedBoard:
@@ -471,17 +351,7 @@ def no_board() -> ObservedBoard:
 def observed_board(
     seen: SeenBoard | None, measurements: Measurements, cameras: Sequence[Camera]
 ) -> ObservedBoard:
-    """Return the used corners in the form that the residual takes.
-
-    Parameters
-    ----------
-    seen : SeenBoard or None
-        The board.
-    measurements : Measurements
-        The images.
-    cameras : sequence of Camera
-        The camera of each view.
-    """
+    """Return the used corners in the form that the residual takes."""
     if seen is None or not seen.corners.used.any():
         return no_board()
     corners = seen.corners
@@ -516,3 +386,12 @@ def board_seen_by(board: ObservedBoard, cameras: Sequence[Camera]) -> ObservedBo
         lens = cameras[v].pixels_per_unit(feet[of_view])
         constants[of_view] = np.swapaxes(lens, -1, -2).reshape(-1, 4)
     return replace(board, feet=feet, constants=constants)
+
+
+def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
+    """Return one axis for each leg at each pose in each view, weighted by the covariances.
+
+    Nothing is lost by it, and a fit is smaller by the number of images.
+    """
+    view, pose = measurements.view[axes.row], measurements.pose[axes.row]
+    return join_axes(axes, view * measurements.n_poses + pose)

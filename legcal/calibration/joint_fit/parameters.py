@@ -1,15 +1,14 @@
-"""From what somebody asks of parameters to choices: patterns resolved, contradictions refused."""
+"""Which parameters are estimated, fixed or known: choices, and how overrides resolve to them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Literal
 
 import numpy as np
 
-from legcal.calibration.joint_fit.choices import Choices, Prior
 from legcal.data import Action, Override, View
 from legcal.errors import DatasetError, UsageError
 from legcal.files import closest
@@ -25,6 +24,50 @@ from legcal.machine import (
 )
 from legcal.vision import intrinsic_names, intrinsic_unit, intrinsic_values, shared_cameras
 
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of a parameter before the fit: a mean and a standard deviation [its unit]."""
+
+    mean: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Choices of parameters by their full names.
+
+    Without any the fit estimates all kinematic parameters except twists, and radii with a prior;
+    intrinsics are fixed.
+    """
+
+    fixed: frozenset[str] = frozenset()  # at nominal, or at ``values``
+    free: frozenset[str] = frozenset()  # without a prior: radii, and what is fixed by default
+    priors: Mapping[str, Prior] = field(default_factory=dict)  # in place of those by default
+    values: Mapping[str, float] = field(default_factory=dict)  # [m, rad, px], axes as angles
+    notes: tuple[str, ...] = ()  # what gave way to what
+    least_shared_px: Mapping[str, float] = field(default_factory=dict)  # by edge_biases.KINDS
+
+    def holds(self, name: str, *, by_default: bool = False) -> bool:
+        """Say whether a parameter is held; ``by_default``: whether it is without a choice."""
+        if name in self.fixed:
+            return True
+        return by_default and name not in self.free and name not in self.priors
+
+    def document(self) -> dict[str, object]:
+        """Return what was chosen as JSON has it; nothing where nothing was."""
+        found = {
+            "fixed": sorted(self.fixed - self.values.keys()),
+            "fixed_at": dict(sorted(self.values.items())),
+            "free": sorted(self.free),
+            "priors": {name: [p.mean, p.sigma] for name, p in sorted(self.priors.items())},
+            "least_shared_px": dict(sorted(self.least_shared_px.items())),
+        }
+        return {key: value for key, value in found.items() if value}
+
+
+NO_CHOICES = Choices()
+
 Kind = Literal["kinematic", "radius", "intrinsic", "board"]
 BOARD_SCALE = "board.scale"  # the factor on the dimensions of a calibration board
 _RATIO = 10.0  # between a radius or length and its nominal value: more is a mistake of the unit
@@ -34,47 +77,27 @@ _COEFFICIENT = 1e3  # of distortion; far more than any lens has
 
 @dataclass(frozen=True)
 class KnownParameter:
-    """A parameter and what values make sense for it.
+    """A parameter and what values make sense for it."""
 
-    Attributes
-    ----------
-    nominal : float
-        Its value in the model or camera file [unit].
-    unit : {"m", "rad", "px", ""}
-        Its unit; "" for coefficients of distortion and for the size of a board.
-    kind : {"kinematic", "radius", "intrinsic", "board"}
-        What it belongs to.
-    least, most : float
-        Between these a stated value is believed [unit].
-    sigma : float or None
-        What its camera file says of its uncertainty, one standard deviation [unit].
-    """
-
-    nominal: float
-    unit: str
-    kind: Kind
-    least: float
-    most: float
+    nominal: float  # Its value in the model or camera file [unit]
+    unit: str  # Its unit; "" for coefficients of distortion and for the size of a board
+    kind: Kind  # What it belongs to
+    least: float  # Between these a stated value is believed [unit]
+    most: float  # Between these a stated value is believed [unit]
+    # What its camera file says of its uncertainty, one standard deviation [unit]
     sigma: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class KnownParameters:
-    """The parameters of a machine and of the cameras that look at it.
+    """The parameters of a machine and of the cameras that look at it."""
 
-    Attributes
-    ----------
-    by_name : mapping
-        The parameters, in the order kinematic ones with twists, radii, intrinsics, the size of the
-        calibration board.
-    others : mapping
-        Names that look like parameters and are none, and why: the end of a sentence.
-    synonyms : mapping
-        Other names of intrinsics, and the one that counts: views of one camera share them.
-    """
-
+    # The parameters, in the order kinematic ones with twists, radii, intrinsics, the size of the
+    # calibration board
     by_name: Mapping[str, KnownParameter]
+    # Names that look like parameters and are none, and why: the end of a sentence
     others: Mapping[str, str]
+    # Other names of intrinsics, and the one that counts: views of one camera share them
     synonyms: Mapping[str, str]
 
     @property
@@ -94,19 +117,7 @@ def known_parameters(
     axes_given: bool = False,
     with_board: bool = False,
 ) -> KnownParameters:
-    """Return the parameters of a machine and of the cameras of its views.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The nominal model.
-    views : sequence of View
-        The views of the dataset.
-    axes_given : bool
-        Leg axes were measured in place of outlines: radii and intrinsics are in them already.
-    with_board : bool
-        A calibration board stands on the base.
-    """
+    """Return the parameters of a machine and of the cameras of its views."""
     by_name, others = _kinematic(mechanism), _no_parameters(mechanism)
     seen: dict[str, KnownParameter] = dict(_radii(mechanism))
     intrinsics, synonyms = _intrinsics(views)
@@ -211,17 +222,6 @@ _DONE: Mapping[Action, str] = {"prior": "given a prior", "free": "freed", "fixed
 
 def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
     """Return the choices that overrides come to.
-
-    Parameters
-    ----------
-    overrides : sequence of Override
-        Of the dataset and of this run; the latter win.
-    known : KnownParameters
-        The parameters that there are.
-
-    Returns
-    -------
-    Choices
 
     Raises
     ------

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.constraints import platform_poses
-from legcal.calibration.joint_fit.solution import Sensitivity
+from legcal.calibration.joint_fit.poses import platform_poses
+from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.errors import DidNotConverge
-from legcal.geometry import Array, components
+from legcal.estimation import Frames
+from legcal.geometry import Array
 from legcal.machine import (
     LegGeometry,
     LegKind,
@@ -33,21 +34,15 @@ from legcal.machine import (
 class PlatformError:
     """How far the platform is off at poses, one number a pose.
 
-    Attributes
-    ----------
-    displacement : (n_poses,) array
-        Displacement of the origin of R_e, the platform joint of the first frame leg [m].
-    rotation : (n_poses,) array
-        Angle of rotation [rad].
-
     Notes
     -----
     A predicted error is one standard deviation of the whole vector: the root of the expected
     square of its length.
     """
 
+    # (n_poses,) Displacement of the origin of R_e, the platform joint of the first frame leg [m]
     displacement: Array
-    rotation: Array
+    rotation: Array  # (n_poses,) Angle of rotation [rad]
 
     @property
     def mean_displacement(self) -> float:
@@ -79,23 +74,6 @@ def predict_platform_error(
 ) -> PlatformError:
     """Return the predicted platform error at poses, one standard deviation.
 
-    Parameters
-    ----------
-    legs : sequence of LegGeometry
-        The calibrated legs in R_b and R_e.
-    parametrization : Parametrization
-        Their parameters.
-    covariance : (p, p) array
-        The covariance of these parameters [m^2, m rad, rad^2]; zero for what is known.
-    frame_legs : sequence of int
-        The legs that define R_b and R_e: three in space, two in a plane.
-    T_Rb_Re : sequence of RigidTransform
-        Platform poses.
-
-    Returns
-    -------
-    PlatformError
-
     Raises
     ------
     NotIdentifiable
@@ -120,34 +98,17 @@ def platform_by_parameters(
     NotIdentifiable
         If the readings do not determine a pose.
     """
-    return pose_sensitivity(legs, parametrization, frame_legs, *components(T_Rb_Re))
+    return pose_sensitivity(legs, parametrization, frame_legs, *Frames.of(T_Rb_Re))
 
 
 def expected_error(by_parameters: Array, covariance: Array) -> PlatformError:
-    """Return one standard deviation of the platform at poses.
-
-    Parameters
-    ----------
-    by_parameters : (n_poses, 6, p) array
-        From :func:`platform_by_parameters`.
-    covariance : (p, p) array
-        Of the parameters.
-    """
+    """Return one standard deviation of the platform at poses."""
     variance = np.sum((by_parameters @ covariance) * by_parameters, axis=2)
     return PlatformError(_root_of_sum(variance[:, 3:]), _root_of_sum(variance[:, :3]))
 
 
 def moved_by(by_parameters: Array, changes: Array) -> PlatformError:
-    """Return how far small changes of the parameters move the platform at poses.
-
-    Parameters
-    ----------
-    by_parameters : (n_poses, 6, p) array
-        From :func:`platform_by_parameters`.
-    changes : (p, c) array
-        Independent changes of the parameters [m, rad], of which the root of the sum of squares
-        is told.
-    """
+    """Return how far small changes of the parameters move the platform at poses."""
     motion = np.sum((by_parameters @ changes) ** 2, axis=2)
     return PlatformError(_root_of_sum(motion[:, 3:]), _root_of_sum(motion[:, :3]))
 
@@ -162,41 +123,24 @@ _REACHED = 1e-8  # [m]
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """What a mistake in something that counts as known would do to the platform.
+    """What a mistake in something that counts as known would do to the platform."""
 
-    Attributes
-    ----------
-    what : str
-        The mistake: ``a focal length 1 % longer``.
-    error : PlatformError
-        How far the platform would move, over the workspace; at the readings of the dataset where
-        that is not known.
-    """
-
-    what: str
+    what: str  # The mistake: ``a focal length 1 % longer``
+    # How far the platform would move, over the workspace; at the readings of the dataset where that
+    # is not known
     error: PlatformError
 
 
 @dataclass(frozen=True, eq=False)
 class PlatformAccuracy:
-    """What a fit means at the platform; angles and distances as in :class:`PlatformError`.
+    """What a fit means at the platform; angles and distances as in :class:`PlatformError`."""
 
-    Attributes
-    ----------
-    change : PlatformError
-        From the nominal to the calibrated platform at the readings of every pose.
-    sigma : PlatformError
-        Predicted error of the calibrated platform there, one standard deviation.
-    workspace : PlatformError or None
-        The same at poses all over the travel; None where the model cannot reach them.
-    effects : tuple of Effect
-        What mistakes in what counts as known would do.
-    """
-
+    # From the nominal to the calibrated platform at the readings of every pose
     change: PlatformError
-    sigma: PlatformError
+    sigma: PlatformError  # Predicted error of the calibrated platform there, one standard deviation
+    # The same at poses all over the travel; None where the model cannot reach them
     workspace: PlatformError | None
-    effects: tuple[Effect, ...]
+    effects: tuple[Effect, ...]  # What mistakes in what counts as known would do
 
 
 def platform_accuracy(
@@ -209,28 +153,6 @@ def platform_accuracy(
     sensitivities: Sequence[Sensitivity] = (),
 ) -> PlatformAccuracy | None:
     """Return what calibrated legs mean at the platform.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The nominal machine.
-    legs : sequence of LegGeometry
-        Its calibrated legs in R_b and R_e.
-    parametrization : Parametrization
-        Their parameters.
-    covariance : (p, p) array
-        The covariance of these [m^2, m rad, rad^2]; zero for what is held.
-    q : (n_poses, n_legs) array
-        The readings of the dataset [m].
-    T_Rb_Re : sequence of RigidTransform
-        The platform there, as fitted.
-    sensitivities : sequence of Sensitivity
-        What mistakes in what counts as known would do to the parameters.
-
-    Returns
-    -------
-    PlatformAccuracy or None
-        None where the motors do not determine the pose.
 
     Raises
     ------

@@ -1,178 +1,98 @@
-"""The result of the fit of everything."""
+"""The result of the joint fit, put together from a minimum, and put into the files' order."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.gammas import EstimatedGamma
+from legcal.calibration.joint_fit.contradictions import rejected_notes, scale_notes
+from legcal.calibration.joint_fit.determinacy import Held, held_spread, named_units
+from legcal.calibration.joint_fit.edge_biases import GAMMA_SUFFIX
+from legcal.calibration.joint_fit.gammas import EstimatedGamma, estimated_gammas
 from legcal.calibration.joint_fit.held_out import Posterior
-from legcal.calibration.joint_fit.normal import WeakDirection
-from legcal.data import Outlines
-from legcal.estimation import NoiseModel
-from legcal.geometry import Array
-from legcal.machine import KinematicParameters, LegGeometry, LegKind, Parametrization
+from legcal.calibration.joint_fit.parameters import known_parameters
+from legcal.calibration.joint_fit.problem import FitProblem
+from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
+from legcal.calibration.joint_fit.sensitivity import Sensitivity, focal_lengths, sensitivities
+from legcal.calibration.joint_fit.state import RefinementSettings, State
+from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
+from legcal.estimation import (
+    NoiseModel,
+    PseudoHuber,
+    WeakDirection,
+    information,
+    linearize,
+    named_covariance,
+    robust_cost,
+    worst_directions,
+)
+from legcal.geometry import Array, BoolArray, IntArray
+from legcal.machine import (
+    KinematicParameters,
+    LegGeometry,
+    LegKind,
+    Parametrization,
+    footed,
+    parametrize,
+    radius_name,
+)
 from legcal.vision import Camera
 
+_SIGNIFICANT = 5.0  # standard deviations of chi2
 Status = Literal["estimated", "fixed", "weak"]
-
-
-@dataclass(frozen=True)
-class Sensitivity:
-    """What a mistake in what was taken as known would do to the kinematic parameters.
-
-    Attributes
-    ----------
-    what : str
-        The mistake, in words.
-    steps : (p, c) array
-        Steps of all kinematic parameters from the fitted legs [m, rad], one for each of c
-        independent parts of the mistake.
-    """
-
-    what: str
-    steps: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A converged fit of everything.
+    """A converged joint fit; axes count as angles from the nominal axis."""
 
-    Attributes
-    ----------
-    legs : tuple of LegGeometry
-        The legs in R_b and R_e.
-    T_camera_Rb : tuple of RigidTransform
-        Camera poses, one a view. A view that shows nothing keeps that of the start.
-    cameras : tuple of Camera
-        The cameras of the views, with the intrinsics that the fit was asked for.
-    T_Rb_Re : tuple of RigidTransform
-        Platform poses.
-    radii : dict
-        Radius [m] for each (leg index, part) that was observed.
-    parametrization : Parametrization
-        All kinematic parameters.
-    values : mapping
-        Value of every parameter by its name [m, rad, px]: kinematic ones, observed radii, then the
-        intrinsics that the fit was asked for and the size of the calibration board. Axes are angles
-        from the nominal axis.
-    units : mapping
-        Their units.
-    status : mapping
-        ``estimated``; ``fixed`` at its value; or ``weak``: part of a direction that the
-        measurements leave open and that does not move the platform, held at nominal along it.
-    names : tuple of str
-        The estimated parameters, in the order of ``values``.
-    covariance : (n, n) array
-        Their covariance, with cameras and poses unknown.
-    sigma : (n,) array
-        Their standard deviations.
-    kinematic_covariance : (p, p) array
-        Covariance of steps of all kinematic parameters from the fitted legs, as
-        :func:`legcal.machine.parameters.moved_legs` and
-        :func:`legcal.machine.pose_sensitivity` have them (axes turn about the
-        vectors of where they are); zero where they are fixed, and along what is held.
-    held_covariance : (p, p) array
-        How far these may be off along what is held, if the nominal model is as wrong there as the
-        fit found it to be elsewhere; zero where nothing is held.
-    value_covariance : (p, p) array
-        The first covariance of the values of all kinematic parameters, axes as angles from the
-        nominal axis.
-    held_basis : (w, p) array
-        How these values change along each direction that is held, by a metre: angles count at the
-        mean length of the legs. As a set of metres, orthonormal but for what is not kinematic.
-    weak : tuple of WeakDirection
-        The directions of the estimated parameters known worst, worst first.
-    held : tuple of str
-        The directions that are held at nominal.
-    cost : float
-        Robust cost over all observations that came in, rejected ones too, with their claimed
-        covariances: comparable between fits of the same data.
-    chi2 : float
-        Sum of the squared whitened residuals of used outlines, axes, readings and priors.
-    dof : int
-        Their number, less the unknowns.
-    rms_px : float or None
-        Root mean square of the offsets of used outlines [px]; None if there are none.
-    rms_axes : float or None
-        Root mean square of the residuals of measured axes, over their claimed standard
-        deviations; None if there are none.
-    rms_corners_px : float or None
-        Root mean square of the residuals of corners of the calibration board [px]; None without.
-    rejected_corners : tuple of (str, int)
-        View and number of the corners that were left out, in all images of the view.
-    T_Rb_board : RigidTransform or None
-        The calibration board in R_b; None if no image shows one.
-    noise : NoiseModel
-        The estimated errors of outlines; ``noise.bias_px`` is tau.
-    gammas : tuple of EstimatedGamma
-        Of the cameras whose gamma is not told and whose outlines move with it.
-    biases : mapping
-        Shifts of outlines that several share, by name [px]: those that the residuals show.
-    shared_px : mapping
-        Standard deviations of these shifts by what they are, one of
-        :data:`legcal.calibration.joint_fit.biases.KINDS` [px]; empty where residuals show none.
-    sensitivities : tuple of Sensitivity
-        What mistakes in cameras and radii would do.
-    outlines : Outlines
-        The table that came in, with what the fit rejected and why.
-    start : str
-        Label of the start that led here.
-    iterations : int
-        Steps of the solver, all rounds.
-    posterior : Posterior
-        What it says of images that it has not seen; always in the order of the measurements that
-        were fitted.
-    notes : tuple of str
-        What else a reader should know, one sentence each.
-    focal_doubt : float
-        By what part of itself a focal length is wrong, if measurements contradict one; 0 otherwise.
-    doubtful_cameras : tuple of str
-        Views that stand for the cameras whose focal lengths the measurements contradict.
-    """
-
-    legs: tuple[LegGeometry, ...]
-    T_camera_Rb: tuple[RigidTransform, ...]
-    cameras: tuple[Camera, ...]
-    T_Rb_Re: tuple[RigidTransform, ...]
-    radii: dict[tuple[int, str], float]
-    parametrization: Parametrization
+    legs: tuple[LegGeometry, ...]  # in R_b and R_e
+    T_camera_Rb: tuple[RigidTransform, ...]  # one a view; of the start where it shows nothing
+    cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were asked for
+    T_Rb_Re: tuple[RigidTransform, ...]  # platform poses
+    radii: dict[tuple[int, str], float]  # [m] for each (leg index, part) that was observed
+    parametrization: Parametrization  # all kinematic parameters
+    # Of every parameter by name [m, rad, px]: kinematic, radii, intrinsics, size of the board.
     values: Mapping[str, float]
     units: Mapping[str, str]
-    status: Mapping[str, Status]
-    names: tuple[str, ...]
-    covariance: Array
-    sigma: Array
+    status: Mapping[str, Status]  # weak: part of a direction that is held at nominal
+    names: tuple[str, ...]  # the estimated parameters, in the order of ``values``
+    covariance: Array  # (n, n) of these, with cameras and poses unknown
+    sigma: Array  # (n,)
+    # (p, p) of steps of all kinematic parameters, as moved_legs and pose_sensitivity have them
+    # (axes turn about the vectors of where they are); zero where fixed, and along what is held.
     kinematic_covariance: Array
+    # (p, p) how far these may be off along what is held, if the nominal model is as wrong there as
+    # the fit found it to be elsewhere.
     held_covariance: Array
-    value_covariance: Array
-    held_basis: Array
-    weak: tuple[WeakDirection, ...]
-    held: tuple[str, ...]
-    cost: float
-    chi2: float
+    value_covariance: Array  # (p, p) kinematic_covariance of the values
+    held_basis: Array  # (w, p) how values change along each held direction, by a metre
+    weak: tuple[WeakDirection, ...]  # the estimated directions known worst, worst first
+    held: tuple[str, ...]  # the directions that are held at nominal
+    cost: float  # over all observations, rejected ones too, with claimed covariances: comparable
+    chi2: float  # of used outlines, axes, readings and priors
     dof: int
-    rms_px: float | None
-    rms_axes: float | None
-    rms_corners_px: float | None
-    rejected_corners: tuple[tuple[str, int], ...]
-    T_Rb_board: RigidTransform | None
-    noise: NoiseModel
-    gammas: tuple[EstimatedGamma, ...]
-    biases: Mapping[str, float]
-    shared_px: Mapping[str, float]
-    sensitivities: tuple[Sensitivity, ...]
-    outlines: Outlines
-    start: str
-    iterations: int
-    posterior: Posterior
-    notes: tuple[str, ...] = ()
-    focal_doubt: float = 0.0
-    doubtful_cameras: tuple[str, ...] = ()
+    rms_px: float | None  # of the offsets of used outlines [px]
+    rms_axes: float | None  # of measured axes, over their claimed standard deviations
+    rms_corners_px: float | None  # of corners of the calibration board [px]
+    rejected_corners: tuple[tuple[str, int], ...]  # view and number, in all images of the view
+    T_Rb_board: RigidTransform | None  # None if no image shows one
+    noise: NoiseModel  # errors of single outlines
+    gammas: tuple[EstimatedGamma, ...]  # of cameras whose gamma nobody told
+    biases: Mapping[str, float]  # common-mode edge biases by name [px]
+    shared_px: Mapping[str, float]  # their standard deviations by kind [px]; empty without any
+    sensitivities: tuple[Sensitivity, ...]  # to mistakes in what was taken as known
+    outlines: Outlines  # the table that came in, with what the fit rejected and why
+    start: str  # label of the start that led here
+    iterations: int  # of the solver, all rounds
+    posterior: Posterior  # what it predicts of other images; in the order that was fitted
+    notes: tuple[str, ...] = ()  # one sentence each
+    focal_doubt: float = 0.0  # by what part of itself a focal length is contradicted
+    doubtful_cameras: tuple[str, ...] = ()  # views that stand for such cameras
 
     @property
     def parameters(self) -> KinematicParameters:
@@ -188,3 +108,222 @@ def joints_of(legs: tuple[LegGeometry, ...]) -> KinematicParameters:
         np.array([leg.B for leg in legs]),
         np.array(lengths),
     )
+
+
+def assemble_solution(
+    fit: Fit, held: Held, outlines: Outlines, label: str, settings: RefinementSettings
+) -> Solution:
+    """Put together what was found.
+
+    Raises
+    ------
+    NotIdentifiable
+        If the outlines that are left do not determine the parameters.
+    """
+    problem, state, linear = fit.problem, fit.state, fit.minimum.linear
+    loss = PseudoHuber(settings.loss_width)
+    normal = information(problem, state, linear, loss)
+    kept = normal.kept_covariance()
+    covariance = named_covariance(problem, state, kept)
+    values, status = _values(problem, state), _status(problem, held)
+    names = tuple(name for name in values if status[name] == "estimated")
+    where = [problem.named.index(name) for name in names]
+    estimated = covariance[np.ix_(where, where)]
+    offsets = problem.offsets(state)
+    used = offsets[fit.accepted]
+    n_residuals = used.size + len(problem.readings) + len(problem.priors.mean)
+    n_residuals += linear["axes"].r.size + linear["corners"].r.size
+    chi2 = float(np.sum(linear.prior_r**2)) + sum(
+        float(np.sum(rows.r**2)) for rows in linear.rows.values()
+    )
+    dof = n_residuals - problem.n_unknowns + len(held.basis)
+    units = dict(zip(problem.named, problem.units, strict=True))
+    units |= dict(
+        zip(problem.legs.parametrization.names, problem.legs.parametrization.units, strict=True)
+    )
+    held_values = np.zeros((len(held.basis), len(problem.free)))
+    held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
+    biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
+    focal = focal_lengths(problem, state, linear)
+    doubtful = [f for f in focal if f.is_doubtful]
+    gammas = estimated_gammas(problem, state, kept, outlines)
+    return Solution(
+        legs=state.legs,
+        T_camera_Rb=state.camera_pose.motions,
+        cameras=state.cameras,
+        T_Rb_Re=state.platform_pose.motions,
+        radii=dict(zip(problem.outlines.parts, state.radii.tolist(), strict=True)),
+        parametrization=problem.legs.parametrization,
+        values=values,
+        units={name: units.get(name, "m") for name in values},
+        status=status,
+        names=names,
+        covariance=estimated,
+        sigma=np.sqrt(np.diagonal(estimated)),
+        kinematic_covariance=_of_kinematic(problem, kept),
+        held_covariance=_of_kinematic(problem, held_spread(problem, state, held)),
+        value_covariance=_of_kinematic(problem, covariance),
+        held_basis=held_values,
+        weak=worst_directions(estimated, names, named_units(problem, state)[where]),
+        held=held.directions,
+        cost=comparable_cost(problem, state, settings),
+        chi2=chi2,
+        dof=dof,
+        rms_px=_rms(used),
+        rms_axes=_rms(linear["axes"].r),
+        rejected_corners=tuple(
+            (problem.outlines.views[view], corner) for view, corner in problem.rejected_corners
+        ),
+        T_Rb_board=state.board_pose.motions[0] if len(problem.board) else None,
+        rms_corners_px=_rms(linear["corners"].r * problem.board.sigma[:, None]),
+        noise=fit.noise,
+        gammas=gammas,
+        biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
+        shared_px=fit.shifts.sizes,
+        sensitivities=sensitivities(problem, state, linear, normal, loss),
+        outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
+        start=label,
+        iterations=fit.iterations,
+        posterior=Posterior(problem, state, fit.shifts, fit.noise, kept),
+        focal_doubt=max((abs(f.change) for f in doubtful), default=0.0),
+        doubtful_cameras=tuple(f.view for f in doubtful),
+        notes=(
+            *fit.notes,
+            *rejected_notes(problem, fit.accepted),
+            *corner_notes(problem),
+            *map(str, gammas),
+            *scale_notes(problem, state, settings),
+            *(_misfit_of_axes(chi2, dof) if len(problem.axes) else ()),
+            *(str(f) for f in doubtful),
+        ),
+    )
+
+
+def comparable_cost(problem: FitProblem, state: State, settings: RefinementSettings) -> float:
+    """Return the robust cost of all observations with their claimed covariances."""
+    claimed, loss = problem.weighted(NoiseModel()), PseudoHuber(settings.loss_width)
+    return robust_cost(claimed, linearize(claimed, state), loss)
+
+
+def _values(problem: FitProblem, state: State) -> dict[str, float]:
+    """Return the values of all parameters: kinematic, radii, and intrinsics that are unknown."""
+    legs, biases = problem.legs, problem.block("biases").labels
+    names = (radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts)
+    values = dict(zip(legs.parametrization.names, legs.vector(state.legs).tolist(), strict=True))
+    values |= dict(zip(names, state.radii.tolist(), strict=True))
+    named = zip(problem.named, problem.coordinates(state).tolist(), strict=True)
+    return values | {name: value for name, value in named if name not in biases}
+
+
+def _status(problem: FitProblem, held: Held) -> dict[str, Status]:
+    """Return the status of every parameter."""
+    legs, biases = problem.legs, problem.block("biases").labels
+    names = [radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts]
+    status: dict[str, Status] = dict.fromkeys((*legs.parametrization.names, *names), "fixed")
+    status |= {name: "estimated" for name in problem.named if name not in biases}
+    return status | dict.fromkeys(held.names, "weak")
+
+
+def _of_kinematic(problem: FitProblem, covariance: Array) -> Array:
+    """Return of the covariance of unknowns that of all kinematic parameters, fixed ones too."""
+    free, n = problem.free, problem.n_kinematic
+    wide = np.zeros((len(free), len(free)))
+    wide[np.ix_(free, free)] = covariance[:n, :n]
+    return wide
+
+
+def _rms(values: Array) -> float | None:
+    """Return the root mean square of values, None of none."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
+def _misfit_of_axes(chi2: float, dof: int) -> tuple[str, ...]:
+    """Return a note where axes, whose errors are not estimated, are worse than they claim."""
+    if chi2 <= dof + _SIGNIFICANT * np.sqrt(2.0 * dof):
+        return ()
+    return (
+        f"The axes are worse than their standard deviations claim: chi2 is {chi2:.0f} for {dof} "
+        "degrees of freedom, so that the uncertainty of the result is about "
+        f"{np.sqrt(chi2 / max(dof, 1)):.1f} times what is stated; correct them.",
+    )
+
+
+def _with_rejections(
+    outlines: Outlines, problem: FitProblem, state: State, accepted: BoolArray, offsets: Array
+) -> Outlines:
+    """Return the table with what the fit rejected, and why."""
+    used, reason = outlines.used.copy(), list(outlines.reason)
+    rejected = np.flatnonzero(~accepted)
+    words = rejection_reasons(problem, state, rejected, offsets)
+    for row, why in zip(problem.outlines.index[rejected].tolist(), words, strict=True):
+        used[row] = False
+        reason[row] = why
+    return replace(outlines, used=used, reason=tuple(reason))
+
+
+def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solution:
+    """Return a solution found in the order of work, in the order of the dataset's files.
+
+    Parameters
+    ----------
+    solution : Solution
+        In the order of work.
+    order : Order
+        What that order is.
+    dataset : Dataset
+        In the order of the files.
+
+    Returns
+    -------
+    Solution
+        B of legs that are fixed to the platform is where models put it.
+    """
+    mechanism, measurements = dataset.mechanism, dataset.measurements
+    legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
+    origin = np.asarray(mechanism.T_platform_Re.inv().translation)
+    geometry = footed([solution.legs[j] for j in legs], origin)
+    by_leg = {leg: j for j, leg in enumerate(legs)}
+    radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
+    with_board = dataset.board is not None
+    known = known_parameters(mechanism, measurements.views, with_board=with_board).by_name
+    ordered = [name for name in known if name in solution.values]
+    names = tuple(name for name in ordered if name in solution.names)
+    names_of_legs, frame_legs = mechanism.leg_names, mechanism.frame_legs
+    parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
+    where = _places(names, solution.names)
+    steps = _places(parametrization.names, solution.parametrization.names)
+    return replace(
+        solution,
+        legs=geometry,
+        T_camera_Rb=tuple(solution.T_camera_Rb[v] for v in views),
+        cameras=tuple(solution.cameras[v] for v in views),
+        T_Rb_Re=tuple(solution.T_Rb_Re[p] for p in _poses(order, dataset).tolist()),
+        radii=dict(sorted(radii.items())),
+        parametrization=parametrization,
+        values={name: solution.values[name] for name in ordered},
+        units={name: solution.units[name] for name in ordered},
+        status={name: solution.status[name] for name in ordered},
+        names=names,
+        covariance=solution.covariance[np.ix_(where, where)],
+        sigma=solution.sigma[where],
+        kinematic_covariance=solution.kinematic_covariance[np.ix_(steps, steps)],
+        held_covariance=solution.held_covariance[np.ix_(steps, steps)],
+        value_covariance=solution.value_covariance[np.ix_(steps, steps)],
+        held_basis=solution.held_basis[:, steps],
+        sensitivities=tuple(replace(s, steps=s.steps[steps]) for s in solution.sensitivities),
+        outlines=order.restore(solution.outlines),
+    )
+
+
+def _places(names: tuple[str, ...], among: tuple[str, ...]) -> IntArray:
+    """Return where names stand among the same ones in another order."""
+    return np.array([among.index(name) for name in names], dtype=np.intp)
+
+
+def _poses(order: Order, dataset: Dataset) -> IntArray:
+    """Return for every pose of the dataset its number in the order of work."""
+    pose = dataset.measurements.pose
+    worked = reorder_measurements(dataset.measurements, order).pose[inverse(order.rows)]
+    found = np.empty(dataset.measurements.n_poses, dtype=np.intp)
+    found[pose] = worked
+    return found

@@ -1,15 +1,16 @@
-"""The choices of the fit of everything."""
+"""What the joint fit moves, where it starts, and its settings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array, BoolArray, IntArray, motions_of, turned
+from legcal.estimation import Frames
+from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     LegGeometry,
     Mechanism,
@@ -17,202 +18,60 @@ from legcal.machine import (
     geometries,
     moved_legs,
     parametrize,
+    tied_twist,
+    tied_twist_slope,
+    turn_of,
+    turn_slope,
     vector_of,
 )
 from legcal.vision import Camera, intrinsic_names, intrinsic_values, with_intrinsics
 
+A, B, LENGTH = slice(0, 3), slice(3, 6), 6  # among the twelve numbers of a leg
+BASE_AXIS, PLATFORM_AXIS, TWIST = slice(7, 9), slice(9, 11), 11
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """Settings of the joint fit; distances of outlines and axes are whitened."""
+
+    radius_sigma: float = 0.02  # of the prior on radii, as a part of the radius
+    board_scale_sigma: float = 0.001  # of the dimensions of a board: what printers and paper do
+    loss_width: float = 3.0  # where the loss of an outline turns from quadratic to linear
+    rejection: float = 4.5  # beyond, an outline is rejected; a right one in 25,000 is
+    rejection_rounds: int = 6  # at most, until the rejected outlines stay the same
+    noise_rounds: int = 10  # at most, in which the errors of outlines are estimated after that
+    settled: float = 0.02  # relative change of these errors below which the rounds end
+    axis_disagreement: float = 20.0  # beyond, an axis disagrees; if most do, the fit is refused
+    largest_rms_px: float = 3.0  # of the offsets of accepted outlines [px]
+    max_iterations: int = 200  # steps to try in each solve
+
+
+DEFAULT_SETTINGS = RefinementSettings()
+
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """Positions of the unknowns in x; ``size`` marks what is no unknown.
+class Start:
+    """Where a fit begins."""
 
-    Attributes
-    ----------
-    place : (n_legs, 12) array of int
-        The numbers of each leg, in the order of :class:`legcal.machine.parameters`.
-    kinematic : (p,) array of int
-        The kinematic parameters, in the order of their parametrization.
-    radius : (n_radii,) array of int
-        Radii, one for each of ``parts``.
-    bias : (n_biases,) array of int
-        Shifts of outlines.
-    intrinsic : (n_views, n_keys) array of int
-        Intrinsics of each view; views with one camera share them.
-    camera : (n_views, 6) array of int
-        Rotation and translation of each camera; cameras that show nothing are no unknowns.
-    board_scale : (1,) array of int
-        The factor on the dimensions of the calibration board.
-    board : (6,) array of int
-        Rotation and translation of the calibration board.
-    n_poses : int
-        Number of platform poses; each has six numbers at the end of x.
-    n_kept : int
-        Number of unknowns other than platform poses; they come first.
-    parts : tuple of (int, str)
-        Leg index and part of each radius.
-    intrinsic_keys : tuple of str
-        What the columns of ``intrinsic`` are.
-    """
-
-    place: IntArray
-    kinematic: IntArray
-    radius: IntArray
-    bias: IntArray
-    intrinsic: IntArray
-    camera: IntArray
-    board_scale: IntArray
-    board: IntArray
-    n_poses: int
-    n_kept: int
-    parts: tuple[tuple[int, str], ...]
-    intrinsic_keys: tuple[str, ...]
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.n_kept + 6 * self.n_poses
-
-    @property
-    def n_kinematic(self) -> int:
-        """Number of kinematic parameters that are unknowns; they come first of all."""
-        return int(np.sum(self.kinematic < self.size))
-
-    @property
-    def n_named(self) -> int:
-        """Number of unknowns that have a name and a prior: all but cameras, board and poses."""
-        without = np.concatenate([self.camera.ravel(), self.board])
-        without = without[without < self.size]
-        return int(without.min()) if without.size else self.n_kept
-
-    def of_poses(self, n_poses: int) -> Layout:
-        """Return the layout of the same unknowns with another number of platform poses."""
-        size = self.n_kept + 6 * n_poses
-
-        def marked(position: IntArray) -> IntArray:
-            return np.where(position < self.size, position, size)
-
-        return replace(
-            self,
-            place=marked(self.place),
-            kinematic=marked(self.kinematic),
-            radius=marked(self.radius),
-            intrinsic=marked(self.intrinsic),
-            camera=marked(self.camera),
-            board_scale=marked(self.board_scale),
-            board=marked(self.board),
-            n_poses=n_poses,
-        )
-
-
-def lay_out(
-    place: IntArray,
-    is_free: BoolArray,
-    radius_is_free: BoolArray,
-    parts: Sequence[tuple[int, str]],
-    intrinsic: IntArray,
-    intrinsic_keys: Sequence[str],
-    camera_is_seen: BoolArray,
-    board_is_free: tuple[bool, bool],
-    n_poses: int,
-) -> Layout:
-    """Return the layout of the unknowns, without shifts of outlines.
-
-    Parameters
-    ----------
-    place : (n_legs, 12) array of int
-        Where each leg's numbers stand in the vector of kinematic parameters; -1 for none.
-    is_free : (p,) array of bool
-        Which kinematic parameters are unknowns.
-    radius_is_free : (n_radii,) array of bool
-        Which radii are.
-    parts : sequence of (int, str)
-        Leg index and part of each radius.
-    intrinsic : (n_views, n_keys) array of int
-        Number of the unknown intrinsic of each view, counted from zero; -1 for none.
-    intrinsic_keys : sequence of str
-        What its columns are.
-    camera_is_seen : (n_views,) array of bool
-        Which views have outlines, axes or corners of a calibration board.
-    board_is_free : (bool, bool)
-        Whether the size and the place of the calibration board are unknowns.
-    n_poses : int
-        Number of platform poses.
-    """
-    n_intrinsics = int(intrinsic.max(initial=-1)) + 1
-    scale, place_of_board = (
-        np.full(n, free) for n, free in zip((1, 6), board_is_free, strict=True)
-    )
-    counts = [
-        is_free.sum(),
-        radius_is_free.sum(),
-        n_intrinsics,
-        scale.sum(),
-        6 * camera_is_seen.sum(),
-        place_of_board.sum(),
-    ]
-    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
-    n_kept = int(first[-1])
-    size = n_kept + 6 * n_poses
-    kinematic = _numbered(is_free, 0, size)
-    extended = np.append(kinematic, size)
-    return Layout(
-        place=extended[place],
-        kinematic=kinematic,
-        radius=_numbered(radius_is_free, first[1], size),
-        bias=np.zeros(0, dtype=np.intp),
-        intrinsic=np.where(intrinsic < 0, size, first[2] + intrinsic),
-        board_scale=_numbered(scale, first[3], size),
-        camera=_numbered(np.repeat(camera_is_seen[:, None], 6, axis=1), first[4], size),
-        board=_numbered(place_of_board, first[5], size),
-        n_poses=n_poses,
-        n_kept=n_kept,
-        parts=tuple(parts),
-        intrinsic_keys=tuple(intrinsic_keys),
-    )
-
-
-def _numbered(mask: BoolArray, first: int, size: int) -> IntArray:
-    """Return positions from *first* on where the mask is true, *size* elsewhere."""
-    position = np.full(mask.shape, size, dtype=np.intp)
-    position[mask] = first + np.arange(int(mask.sum()))
-    return position
+    legs: tuple[LegGeometry, ...]  # in R_b and R_e
+    T_camera_Rb: tuple[RigidTransform, ...]  # one a view
+    T_Rb_Re: tuple[RigidTransform, ...]  # one a pose
+    label: str  # where it comes from: ``nominal`` or ``staged``
+    T_Rb_board: RigidTransform = field(default_factory=RigidTransform.identity)
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Values of everything that the fit moves.
+    """Values of all blocks of variables of the joint fit, by their names."""
 
-    Attributes
-    ----------
-    legs : tuple of LegGeometry
-        The legs in R_b and R_e.
-    radii : (n_radii,) array
-        Radii [m] of the layout's parts.
-    biases : (n_biases,) array
-        Shifts of outlines that several of them share [px].
-    cameras : tuple of Camera
-        The intrinsics of each view.
-    R_camera, t_camera : (n_views, 3, 3) and (n_views, 3) array
-        Rotation and translation [m] of T_camera_Rb.
-    R_pose, t_pose : (n_poses, 3, 3) and (n_poses, 3) array
-        Rotation and translation [m] of T_Rb_Re.
-    R_board, t_board : (1, 3, 3) and (1, 3) array
-        Rotation and translation [m] of T_Rb_board, the calibration board in R_b.
-    board_scale : (1,) array
-        Factor on the dimensions of the board.
-    """
-
-    legs: tuple[LegGeometry, ...]
-    radii: Array
-    biases: Array
-    cameras: tuple[Camera, ...]
-    R_camera: Array
-    t_camera: Array
-    R_pose: Array
-    t_pose: Array
-    R_board: Array
-    t_board: Array
-    board_scale: Array
+    legs: tuple[LegGeometry, ...]  # in R_b and R_e
+    radii: Array  # (n_radii,) of the parts of legs [m]
+    cameras: tuple[Camera, ...]  # with the intrinsics of each view
+    board_scale: Array  # (1,) factor on the dimensions of the calibration board
+    biases: Array  # (n_biases,) common-mode edge biases [px] and logarithms of gammas
+    camera_pose: Frames  # T_camera_Rb, one a view
+    board_pose: Frames  # T_Rb_board, one; of no meaning where no image shows one
+    platform_pose: Frames  # T_Rb_Re, one a pose
 
     @cached_property
     def A(self) -> Array:
@@ -229,87 +88,27 @@ class State:
         """Offsets and constant lengths, (n_legs,) [m]."""
         return np.array([leg.q0 for leg in self.legs])
 
-    @property
-    def T_camera_Rb(self) -> tuple[RigidTransform, ...]:
-        """Camera poses, one a view."""
-        return motions_of(self.R_camera, self.t_camera)
+    @cached_property
+    def arms(self) -> Array:
+        """From the origin of R_e to B in R_b, (n_poses, n_legs, 3) [m]."""
+        return np.asarray(self.B @ np.swapaxes(self.platform_pose.R, 1, 2))
 
     @property
-    def T_Rb_board(self) -> RigidTransform:
-        """The calibration board in R_b; of no meaning where no image shows one."""
-        return motions_of(self.R_board, self.t_board)[0]
-
-    @property
-    def T_Rb_Re(self) -> tuple[RigidTransform, ...]:
-        """Platform poses."""
-        return motions_of(self.R_pose, self.t_pose)
-
-    def moved(self, x: Array, layout: Layout) -> State:
-        """Return the state after a change x of its unknowns [m, rad, px]."""
-        change = np.append(x, 0.0)
-        legs = self.legs
-        if np.any(layout.place < layout.size):
-            legs = moved_legs(legs, layout.place, x)
-        camera, pose = change[layout.camera], x[layout.n_kept :].reshape(-1, 6)
-        board = change[layout.board]
-        return State(
-            legs,
-            self.radii + change[layout.radius],
-            self.biases + change[layout.bias],
-            _changed(self.cameras, change[layout.intrinsic], layout.intrinsic_keys),
-            turned(self.R_camera, camera[:, :3]),
-            self.t_camera + camera[:, 3:],
-            turned(self.R_pose, pose[:, :3]),
-            self.t_pose + pose[:, 3:],
-            turned(self.R_board, board[None, :3]),
-            self.t_board + board[3:],
-            self.board_scale + change[layout.board_scale],
-        )
-
-
-def _changed(
-    cameras: tuple[Camera, ...], change: Array, keys: tuple[str, ...]
-) -> tuple[Camera, ...]:
-    """Return cameras whose intrinsics have changed by (n_views, n_keys)."""
-    if not np.any(change):
-        return cameras
-    changed = []
-    for camera, by in zip(cameras, change, strict=True):
-        moved = dict(zip(keys, by.tolist(), strict=True))
-        values = {key: intrinsic_of(camera, key) + d for key, d in moved.items() if d != 0.0}
-        changed.append(with_intrinsics(camera, values))
-    return tuple(changed)
-
-
-def intrinsic_of(camera: Camera, key: str) -> float:
-    """Return one number of a camera by its name."""
-    return float(intrinsic_values(camera)[intrinsic_names(camera).index(key)])
+    def mean_length(self) -> float:
+        """Mean distance of the joints of a leg over the poses [m]."""
+        ends = self.arms + self.platform_pose.t[:, None]
+        return float(np.linalg.norm(ends - self.A, axis=-1).mean())
 
 
 @dataclass(frozen=True, eq=False)
 class FittedLegs:
-    """The legs of a mechanism as the fit sees them.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Leg names in the mechanism's order.
-    nominal : tuple of LegGeometry
-        The nominal legs in R_b and R_e: what the axes count from, and what stays as it is where it
-        is fixed or held.
-    sign : (n_legs,) array of int
-        +1 where the leg grows with the reading, -1 where it shrinks: L = sign q + q0.
-    frame_legs : tuple of int
-        The legs whose joint centres define R_b and R_e: three in space, two in a plane.
-    radii : dict
-        Radius of the model [m] for each (leg index, part).
-    """
+    """The legs of a mechanism as the joint fit sees them."""
 
     names: tuple[str, ...]
-    nominal: tuple[LegGeometry, ...]
-    sign: IntArray
-    frame_legs: tuple[int, ...]
-    radii: dict[tuple[int, str], float]
+    nominal: tuple[LegGeometry, ...]  # in R_b and R_e: what axes count from, what fixed ones keep
+    sign: IntArray  # (n_legs,) L = sign q + q0
+    frame_legs: tuple[int, ...]  # whose joint centres define R_b and R_e: three, two in a plane
+    radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
 
     @property
     def n_legs(self) -> int:
@@ -346,46 +145,158 @@ def fitted_legs(mechanism: Mechanism) -> FittedLegs:
     )
 
 
-@dataclass(frozen=True)
-class RefinementSettings:
-    """Choices of the fit.
+@dataclass(frozen=True, eq=False)
+class LegParameters:
+    """The manifold of the legs: which parameters move, where the others are fixed."""
 
-    Attributes
-    ----------
-    radius_sigma : float
-        Standard deviation of the prior on radii, as a part of the radius.
-    board_scale_sigma : float
-        Standard deviation of the dimensions of a calibration board, as a part of them: what
-        printers and paper do.
-    loss_width : float
-        Whitened distance at which the loss of an outline turns from quadratic to linear.
-    rejection : float
-        Whitened distance beyond which an outline is rejected; a right one in 25,000 is, at 4.5.
-    rejection_rounds : int
-        Rounds, at most, until the rejected outlines stay the same.
-    noise_rounds : int
-        Rounds, at most, in which the errors of outlines are estimated after that.
-    settled : float
-        Relative change of these below which the rounds end.
-    axis_disagreement : float
-        Whitened distance of an axis beyond which it disagrees; a fit in which most do is
-        refused. Sigmas that are too small by less are told by chi2 alone.
-    largest_rms_px : float
-        Root mean square of the offsets of accepted outlines beyond which a fit is refused [px].
-    max_iterations : int
-        Steps to try in each solve, at most.
-    """
+    legs: FittedLegs
+    free: BoolArray  # (p,) which kinematic parameters are unknowns
+    values: Mapping[str, float]  # of fixed ones that are not at nominal
 
-    radius_sigma: float = 0.02
-    board_scale_sigma: float = 0.001
-    loss_width: float = 3.0
-    rejection: float = 4.5
-    rejection_rounds: int = 6
-    noise_rounds: int = 10
-    settled: float = 0.02
-    axis_disagreement: float = 20.0
-    largest_rms_px: float = 3.0
-    max_iterations: int = 200
+    @cached_property
+    def unknown(self) -> IntArray:
+        """The unknown that moves each of the twelve numbers of each leg, -1 for none."""
+        number = np.append(np.where(self.free, np.cumsum(self.free) - 1, -1), -1)
+        return np.asarray(number[self.legs.parametrization.place], dtype=np.intp)
+
+    @cached_property
+    def fixed(self) -> dict[int, float]:
+        """The values of the parameters that are no unknowns, by their number."""
+        nominal, names = self.legs.vector(self.legs.nominal), self.legs.parametrization.names
+        return {
+            int(i): self.values.get(names[i], float(nominal[i])) for i in np.flatnonzero(~self.free)
+        }
+
+    @cached_property
+    def turns(self) -> bool:
+        """Whether an axis is free, whose angles from nominal are not just added up."""
+        return bool(np.any(self.unknown[:, BASE_AXIS.start : TWIST] >= 0))
+
+    @cached_property
+    def _half_fixed(self) -> dict[int, float]:
+        """The fixed angles of axes whose other angle is free."""
+        place, found = self.legs.parametrization.place, dict[int, float]()
+        for own, unknown in zip(place, self.unknown, strict=True):
+            for axis in (BASE_AXIS, PLATFORM_AXIS):
+                is_fixed = (own[axis] >= 0) & (unknown[axis] < 0)
+                if is_fixed.sum() == 1:
+                    number = int(own[axis][is_fixed][0])
+                    found[number] = self.fixed[number]
+        return found
+
+    def at_fixed(self, geometry: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
+        """Return legs with everything that is fixed at its value."""
+        return self.tied(with_values(geometry, self.legs, self.fixed))
+
+    def retract(self, geometry: tuple[LegGeometry, ...], change: Array) -> tuple[LegGeometry, ...]:
+        """Return legs after a change (n_legs, 12) of their numbers."""
+        place = np.arange(change.size, dtype=np.intp).reshape(change.shape)
+        return self.tied(moved_legs(geometry, place, change.ravel()))
+
+    def tied(self, geometry: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
+        """Return legs whose fixed angles are where they are fixed, whatever turned the axes.
+
+        Turning an axis away and back on another way leaves what is tied to it turned about it, and
+        turning it by one of its angles changes the other a little.
+        """
+        moved = with_values(geometry, self.legs, self._half_fixed) if self._half_fixed else geometry
+        names = self.legs.names
+        return tuple(
+            replace(
+                leg,
+                twist=tied_twist(leg, nominal, self.values.get(f"{name}.twist", nominal.twist)),
+            )
+            if nominal.twist is not None and leg.platform_joint == "" and unknown[TWIST] < 0
+            else leg
+            for leg, nominal, name, unknown in zip(
+                moved, self.legs.nominal, names, self.unknown, strict=True
+            )
+        )
+
+    def coordinates(self, geometry: tuple[LegGeometry, ...]) -> Array:
+        """Return the values of the unknowns [m, rad]; axes as angles from the nominal ones."""
+        return np.asarray(self.legs.vector(geometry)[self.free])
+
+    def jacobian(self, geometry: tuple[LegGeometry, ...]) -> Array:
+        """Return their derivative by steps (p_free, p_free): one but for axes."""
+        J = np.eye(int(self.free.sum()))
+        for leg, nominal, unknown, number in zip(
+            geometry, self.legs.nominal, self.unknown, self.legs.parametrization.place, strict=True
+        ):
+            both = (leg.base_axis, nominal.base_axis), (leg.platform_axis, nominal.platform_axis)
+            for columns, axes in zip((BASE_AXIS, PLATFORM_AXIS), both, strict=True):
+                if np.all(unknown[columns] < 0):
+                    continue
+                by = np.zeros((len(self.free), 2))
+                by[number[columns]] = turn_slope(*axes)
+                if columns is PLATFORM_AXIS and number[TWIST] >= 0:
+                    by[number[TWIST]] = -tied_twist_slope(leg, nominal)
+                for x, column in zip(unknown[columns], by.T, strict=True):
+                    if x >= 0:
+                        J[:, x] = column[self.free]
+        return J
 
 
-DEFAULT_SETTINGS = RefinementSettings()
+def with_values(
+    geometry: tuple[LegGeometry, ...], legs: FittedLegs, values: Mapping[int, float]
+) -> tuple[LegGeometry, ...]:
+    """Return legs some of whose parameters, by their number, have given values [m, rad]."""
+    wanted = np.append(legs.vector(tuple(geometry)), 0.0)
+    wanted[list(values)] = list(values.values())
+    asked = np.isin(legs.parametrization.place, list(values))
+    found = []
+    for leg, nominal, place, own in zip(
+        geometry, legs.nominal, legs.parametrization.place, asked, strict=True
+    ):
+        if not own.any():
+            found.append(leg)
+            continue
+        numbers = wanted[place]
+        moved = replace(
+            leg,
+            A=np.where(own[A], numbers[A], leg.A),
+            B=np.where(own[B], numbers[B], leg.B),
+            q0=float(numbers[LENGTH]) if own[LENGTH] else leg.q0,
+            base_axis=_axis_at(
+                leg.base_axis, nominal.base_axis, numbers[BASE_AXIS], own[BASE_AXIS]
+            ),
+            platform_axis=_axis_at(
+                leg.platform_axis,
+                nominal.platform_axis,
+                numbers[PLATFORM_AXIS],
+                own[PLATFORM_AXIS],
+            ),
+        )
+        if leg.twist is not None and own[PLATFORM_AXIS.start :].any():
+            moved = replace(moved, twist=tied_twist(moved, nominal, float(numbers[TWIST])))
+        found.append(moved)
+    return tuple(found)
+
+
+def _axis_at(
+    axis: Array | None, nominal: Array | None, angles: Array, asked: BoolArray
+) -> Array | None:
+    """Return an axis at angles from the nominal one, as it was if none is asked for."""
+    if axis is None or nominal is None or not asked.any():
+        return axis
+    there = np.asarray(turn_of(nominal, angles).apply(nominal))
+    return there if there @ axis > 0.0 else -there
+
+
+def intrinsic_of(camera: Camera, key: str) -> float:
+    """Return one number of a camera by its name."""
+    return float(intrinsic_values(camera)[intrinsic_names(camera).index(key)])
+
+
+def changed_cameras(
+    cameras: tuple[Camera, ...], change: Array, keys: tuple[str, ...]
+) -> tuple[Camera, ...]:
+    """Return cameras whose intrinsics *keys* have changed by (n_views, n_keys)."""
+    if not np.any(change):
+        return cameras
+    changed = []
+    for camera, by in zip(cameras, change, strict=True):
+        moved = dict(zip(keys, by.tolist(), strict=True))
+        values = {key: intrinsic_of(camera, key) + d for key, d in moved.items() if d != 0.0}
+        changed.append(with_intrinsics(camera, values))
+    return tuple(changed)

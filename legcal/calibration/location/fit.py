@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from legcal import estimation
 from legcal.calibration.location.model import (
     N_FRAME,
     Frames,
@@ -25,7 +26,7 @@ from legcal.calibration.location.model import (
     stacked,
 )
 from legcal.calibration.location.problem import PlatformMotions
-from legcal.errors import DidNotConverge
+from legcal.estimation import Factor, GaussianPrior, Rows, Variables, all_free, minimise
 from legcal.geometry import Array, BoolArray, IntArray, nearest_rotation
 
 System = Callable[[Frames], tuple[Array, Array]]
@@ -190,13 +191,11 @@ def tool_orientation(R_base: Array, pairs: PosePairs) -> Array:
     return nearest_rotation(votes.sum(axis=-3) + 1e-12 * np.eye(3))
 
 
-STEPS_fit = 50
 ROUNDS = 30  # of frames and variances in turn
 REML_STEPS = 300
 SINGULAR = 1e-9  # of the largest singular value: what is below is open
 _SAME_FACTOR = 1e-7
-_HALVINGS = 12
-_WORSE = 1e-3  # a sum of squares may become before a step is halved
+_LARGEST_TURN = (0.5, 0.5, 0.5, np.inf, np.inf, np.inf)  # [rad] in one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,38 +288,66 @@ def fit(
     return finished(pairs, frames, noise, motions)
 
 
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What the fit moves: T_world_base, T_platform_tool, errors of the model in their sigmas."""
+
+    base: estimation.Frames
+    tool: estimation.Frames
+    errors: Array
+
+
+_TURN_FIRST = [3, 4, 5, 0, 1, 2]
+
+
 def _most_likely(
     pairs: PosePairs, frames: Frames, noise: Noise, motions: PlatformMotions | None
 ) -> Frames:
-    """Return the frames after Gauss-Newton, variances held; steps that do not help are halved."""
-    y, A = system(pairs, frames, noise, motions)
-    for _ in range(STEPS_fit):
-        step, before = _least_squares(A, y)[:N_FRAME], _profile(A, y)
-        for _ in range(_HALVINGS):
-            tried = frames.moved(step * pairs.scale)
-            y_tried, A_tried = system(pairs, tried, noise, motions)
-            if _profile(A_tried, y_tried) <= (1.0 + _WORSE) * before + _WORSE:
-                break
-            step = 0.5 * step
-        frames, y, A = tried, y_tried, A_tried
-        if np.abs(step).max() < _SMALL + 1e-8 * _typical(A):
-            return frames
-    raise DidNotConverge(
-        "The frames could not be found: the fit still moved after "
-        f"{STEPS_fit} steps, needed a minimum; check that readings and poses belong together."
+    """Return the frames of least squares, variances held; open directions stay where they are."""
+    n = len(pairs)
+
+    def frames_of(state: _State) -> Frames:
+        return Frames(state.base.R[0], state.base.t[0], state.tool.R[0], state.tool.t[0])
+
+    def rows_of(state: _State) -> Rows:
+        there = frames_of(state)
+        r, J = -residuals(there, pairs), jacobian(there, pairs)
+        by_model = np.zeros((n, 6, 0)) if motions is None else motions.of_tool(there, pairs)
+        turned_first = J[..., :6][..., _TURN_FIRST], J[..., 6:][..., _TURN_FIRST]
+        return Rows.of(
+            r + by_model @ state.errors, np.concatenate([*turned_first, by_model], axis=-1)
+        )
+
+    k = 0 if motions is None else motions.of_tool(frames, pairs).shape[-1]
+    one, whole = np.zeros(n, dtype=np.intp), slice(None)
+    every = np.tile(np.arange(k, dtype=np.intp), (n, 1))
+    standard = GaussianPrior(np.arange(k, dtype=np.intp), np.zeros(k), np.ones(k))
+    problem = estimation.Problem[_State](
+        variables=(
+            Variables("errors", all_free(k, 1), prior=standard),
+            Variables("base", all_free(1, 6), estimation.Frames.moved, largest=_LARGEST_TURN),
+            Variables("tool", all_free(1, 6), estimation.Frames.moved, largest=_LARGEST_TURN),
+        ),
+        eliminated=None,
+        factors=(
+            Factor(
+                "poses",
+                rows_of,
+                (("base", one, whole), ("tool", one, whole), ("errors", every, whole)),
+                n,
+                6,
+                whitening=noise.whitening(pairs.oriented),
+            ),
+        ),
+        name="fit of the frames",
+        remedy="check that readings and poses belong together",
     )
-
-
-def _profile(A: Array, y: Array) -> float:
-    """Return the sum of squares at some frames, the likeliest errors of the model taken out."""
-    E = A[:, N_FRAME:]
-    left = y - E @ np.linalg.lstsq(E, y, rcond=None)[0] if E.shape[1] else y
-    return float(left @ left)
-
-
-def _typical(A: Array) -> float:
-    """Return a typical standard deviation of what is best known."""
-    return float(1.0 / max(np.linalg.norm(A[:, :N_FRAME], axis=0).max(), 1e-300))
+    start = _State(
+        estimation.Frames(frames.R_base[None], frames.t_base[None]),
+        estimation.Frames(frames.R_tool[None], frames.t_tool[None]),
+        np.zeros(k),
+    )
+    return frames_of(minimise(problem, start).state)
 
 
 def _least_squares(A: Array, y: Array) -> Array:

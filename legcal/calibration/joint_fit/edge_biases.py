@@ -1,4 +1,4 @@
-"""Errors that outlines share: which shifts there may be, and how large, by the residuals.
+"""Common-mode edge biases: which errors outlines may share, and how large, by the residuals.
 
 Shading moves an edge of a leg alike in all images of a camera, a little differently where the leg
 stands elsewhere in the image; blur moves many edges. Such errors do not average out over images.
@@ -13,7 +13,7 @@ darker, and sideways shifts count twice (:data:`SIDEWAYS`).
 
 Where the gamma of a camera is not told, its outlines move together, each by its own amount, with
 the logarithm of that gamma over the one with which they were measured
-(:mod:`legcal.calibration.joint_fit.gammas`). How far that may be off is known beforehand.
+(``gammas.py``). How far that may be off is known beforehand.
 """
 
 from __future__ import annotations
@@ -45,31 +45,19 @@ _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
 @dataclass(frozen=True, eq=False)
 class SharedShifts:
-    """Shifts that outlines share, random with known variances.
+    """Biases that outlines share, random with known variances.
 
-    Attributes
-    ----------
-    names : tuple of str, length b
-        ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
-        ``c1.leg1.rod.inward.bias`` of both edges of a part in a view, ``c1.leg1.rod.sideways.bias``
-        and, for how it changes along x of the image, ``c1.leg1.rod.sideways.bias_x``; ``c1.gamma``
-        of a camera whose gamma is not told.
-    kind : (b,) array of int
-        What they are; it counts in ``KINDS``, and ``GAMMA`` comes after these.
-    sigma : (N_KINDS,) array
-        Standard deviation of each kind [px], and of the logarithm of a gamma.
-    index : (n, c) array of int
-        Which of them each outline has a part in.
-    shift : (n, c, 2) array
-        How far one unit of each moves both ends along the normal of the line [px]: one pixel, or
-        one of the logarithm.
+    Their names: ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
+    ``c1.leg1.rod.inward.bias`` of both edges of a part in a view, ``c1.leg1.rod.sideways.bias``
+    and, for how it changes along x of the image, ``c1.leg1.rod.sideways.bias_x``; ``c1.gamma``
+    of a camera whose gamma is not told.
     """
 
-    names: tuple[str, ...]
-    kind: IntArray
-    sigma: Array
-    index: IntArray
-    shift: Array
+    names: tuple[str, ...]  # b of them
+    kind: IntArray  # (b,) among ``KINDS``, then ``GAMMA``
+    sigma: Array  # (N_KINDS,) standard deviation of each kind [px], and of ln gamma
+    index: IntArray  # (n, c) which of them each outline has a part in
+    shift: Array  # (n, c, 2) how one unit of each moves both ends along the line's normal [px]
 
     @property
     def sigmas(self) -> Array:
@@ -109,18 +97,11 @@ def possible_shifts(
     leg_names: Sequence[str],
     fitted: ObservedOutlines | None = None,
 ) -> SharedShifts:
-    """Return all shifts that outlines may share, with a standard deviation of one unit.
+    """Return all biases that outlines may share, with a standard deviation of one unit.
 
-    Shifts of many edges are inward; those of one part in a view are inward and sideways and
-    change along x and y of the image, by one unit over the spread of places in all groups.
-
-    Parameters
-    ----------
-    outlines : ObservedOutlines
-    leg_names : sequence of str
-    fitted : ObservedOutlines, optional
-        Those with the same parts whose places say what change over the image one unit is, if not
-        these themselves: shifts of other images then mean the same.
+    Biases of many edges are inward; those of one part in a view are inward and sideways and
+    change along x and y of the image, by one unit over the spread of places in all groups: those of
+    the outlines *fitted* to, if not these themselves.
     """
     o = outlines
     parts = [f"{leg_names[leg]}.{part}" for leg, part in o.parts]
@@ -173,18 +154,9 @@ def estimated_shifts(
 ) -> SharedShifts:
     """Return the shifts that the residuals show: none at all where they are white.
 
-    Parameters
-    ----------
-    possible : SharedShifts
-    z, K : (b,) and (b, b) array
-        Scores of all of them and their covariance, as :class:`legcal.estimation.variances.Effects`
-        has them [1/px, 1/px^2].
-    least : (N_KINDS,) array
-        Standard deviations that are known from elsewhere, where the residuals show less [px].
-
-    Notes
-    -----
-    That of a gamma is known, whatever the residuals show.
+    *z* (b,) and *K* (b, b) are scores of all of them and their covariance (:class:`Effects`);
+    *least* (N_KINDS,) are standard deviations known from elsewhere, where the residuals show less
+    [px]. That of a gamma is known, whatever the residuals show.
     """
     sigma = np.zeros(N_KINDS)
     variances, _ = estimate_variances(Effects(z, K, possible.kind), _LEAST_GAIN)

@@ -1,0 +1,432 @@
+"""One estimation problem: blocks of variables, factors that touch them, and exact constraints.
+
+The unknowns x of a problem are small changes of a state: those of the kept variables first, block
+by block, then those of the eliminated ones (platform poses, say), one element after the other. A
+measurement touches few kept variables and one eliminated element at most, so that measurements
+which touch the same variables are summed by one matrix product, and what couples them to
+eliminated elements by constant sparse matrices that are built once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Generic, Protocol, Self, TypeVar
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from legcal.estimation.manifold import add
+from legcal.geometry import Array, IntArray
+
+S = TypeVar("S")  # the state: a dataclass with one field for each block of variables
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """Gaussian knowledge of single coordinates of a block of variables."""
+
+    unknown: IntArray  # (n,) which of the block's unknowns
+    mean: Array  # (n,)
+    sigma: Array  # (n,)
+
+    def __add__(self, other: GaussianPrior) -> GaussianPrior:
+        return GaussianPrior(
+            np.concatenate([self.unknown, other.unknown]),
+            np.concatenate([self.mean, other.mean]),
+            np.concatenate([self.sigma, other.sigma]),
+        )
+
+
+NO_PRIOR = GaussianPrior(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Variables:
+    """A block of variables: elements of one manifold, each moved by d numbers.
+
+    Its value is the field ``name`` of the state, whatever its type. Coordinates are what people
+    read of it, one number for each unknown; their derivative by x is one unless ``jacobian`` says
+    otherwise.
+    """
+
+    name: str
+    unknown: IntArray  # (n, d) the unknown that moves each number; -1 fixed, equal ones move as one
+    retract: Callable[[Any, Array], Any] = add  # (value, change (n, d)) -> value
+    labels: tuple[str, ...] = ()  # of the unknowns; blocks with labels come first
+    units: tuple[str, ...] = ()
+    coordinates: Callable[[Any], Array] | None = None  # value -> (n_unknowns,)
+    jacobian: Callable[[Any], Array] | None = None  # value -> (n_unknowns, n_unknowns)
+    prior: GaussianPrior = NO_PRIOR
+    largest: tuple[float, ...] = ()  # (d,) change of each number in one step, at most
+
+    @cached_property
+    def n_unknowns(self) -> int:
+        """Number of unknowns."""
+        return int(self.unknown.max(initial=-1)) + 1
+
+    def read(self, value: Any) -> Array:
+        """Return the coordinates (n_unknowns,) of a value."""
+        if self.coordinates is not None:
+            return self.coordinates(value)
+        unknown, first = np.unique(self.unknown, return_index=True)
+        return np.asarray(np.ravel(value)[first[unknown >= 0]])
+
+
+def all_free(n: int, d: int) -> IntArray:
+    """Return the unknowns (n, d) of elements that all move freely."""
+    return np.arange(n * d, dtype=np.intp).reshape(n, d)
+
+
+def fixed_at_start(n: int, d: int) -> IntArray:
+    """Return the unknowns (n, d) of elements that do not move."""
+    return np.full((n, d), -1, dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Residuals r (n, q) of n measurements, and slopes (n, q, l) by what they depend on directly.
+
+    ``chain`` turns slopes into derivatives by kept variables and by eliminated ones; it is asked
+    only where these are needed.
+    """
+
+    r: Array
+    slope: Array
+    chain: Callable[[Array], tuple[Array, Array]]
+
+    @classmethod
+    def of(cls, r: Array, J: Array, J_own: Array | None = None) -> Rows:
+        """Return rows whose derivatives by kept and by eliminated variables are known."""
+        own, m = np.zeros((*r.shape, 0)) if J_own is None else J_own, J.shape[-1]
+        return cls(
+            r, np.concatenate([J, own], axis=-1), lambda slope: (slope[..., :m], slope[..., m:])
+        )
+
+    @cached_property
+    def _derivatives(self) -> tuple[Array, Array]:
+        return self.chain(self.slope)
+
+    @property
+    def J(self) -> Array:
+        """Derivatives by the kept variables in the order of ``Factor.touches``, (n, q, m)."""
+        return self._derivatives[0]
+
+    @property
+    def J_own(self) -> Array:
+        """Derivatives by the eliminated element of each measurement, (n, q, d)."""
+        return self._derivatives[1]
+
+    @cached_property
+    def squared_norms(self) -> Array:
+        """Squared norms of the residuals, (n,)."""
+        return np.asarray(np.einsum("nq,nq->n", self.r, self.r))
+
+    def whitened(self, T: Array) -> Rows:
+        """Return the rows times T (n, q, q), or (n, 1, 1), or one number."""
+        if T.ndim == 0:
+            return Rows(float(T) * self.r, float(T) * self.slope, self.chain)
+        if T.shape[1:] == (1, 1):
+            return Rows(T[:, 0] * self.r, T * self.slope, self.chain)
+        return Rows((T @ self.r[..., None])[..., 0], T @ self.slope, self.chain)
+
+
+Touch = tuple[str, IntArray, slice]  # block, element(s) of each measurement, numbers of these
+
+
+@dataclass(frozen=True, eq=False)
+class Factor(Generic[S]):
+    """Measurements of one kind: residuals of the variables that they touch."""
+
+    name: str
+    rows: Callable[[S], Rows]  # residuals with derivatives, not whitened
+    touches: tuple[Touch, ...]  # kept variables, in the order of the columns of J
+    n: int  # measurements
+    n_rows: int  # residuals of each
+    own: IntArray | None = None  # (n,) the eliminated element of each; None where there is none
+    whitening: Array | float = 1.0  # (n, q, q) T with T C T^T = 1; zero leaves one out
+    robust: bool = False  # whether the loss is on it, or plain squares
+
+    def linearize(self, state: S) -> Rows:
+        """Return whitened rows at a state."""
+        return self.rows(state).whitened(np.asarray(self.whitening))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Which unknowns the measurements of a factor depend on, and the matrices that sum them up."""
+
+    index: IntArray  # (n, m) positions in x; n_kept for what is no unknown
+    own: IntArray | None  # (n,)
+    n_kept: int
+    n_own: int
+    order: IntArray  # (n,) measurements with the same unknowns one after the other: a group
+    bounds: tuple[tuple[int, int], ...]  # of each group in that order
+    columns: IntArray  # (n_groups, m)
+    to_kept: csr_array | None  # ((n_kept + 1) n_own, n m) sums what couples kept to own
+    to_own: csr_array | None  # (n_own, n)
+
+    @property
+    def groups(self) -> list[tuple[IntArray, IntArray]]:
+        """The measurements of each group and its unknowns."""
+        members = [self.order[start:end] for start, end in self.bounds]
+        return list(zip(members, self.columns, strict=True))
+
+
+def _places(index: IntArray, own: IntArray | None, n_kept: int, n_own: int) -> Places:
+    n, m = index.shape
+    if n:
+        columns, group = np.unique(index, axis=0, return_inverse=True)
+    else:
+        columns, group = index, np.zeros(0, dtype=np.intp)
+    ends = np.cumsum(np.bincount(group.ravel())).tolist()
+    order, bounds = np.argsort(group.ravel(), kind="stable"), tuple(pairwise([0, *ends]))
+    if own is None:
+        return Places(index, own, n_kept, n_own, order, bounds, columns, None, None)
+    row = (index * n_own + own[:, None]).ravel()
+    ones = np.ones(n * m)
+    to_kept = csr_array((ones, (row, np.arange(n * m))), shape=((n_kept + 1) * n_own, n * m))
+    to_own = csr_array((ones[:n], (own, np.arange(n))), shape=(n_own, n))
+    return Places(index, own, n_kept, n_own, order, bounds, columns, to_kept, to_own)
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """The motions of eliminated elements that exact constraints leave."""
+
+    Z: Array  # (n_own, d, f) basis with the kept variables at rest; zero columns where it has fewer
+    Q: Array  # (n_kept, n_own, d) motion with each kept unknown
+
+
+class Constraint(Protocol[S]):
+    """Equations of eliminated elements that hold exactly."""
+
+    def project(self, state: S) -> S:
+        """Return the state with every element put back; DidNotConverge where that fails."""
+
+    def tangent(self, problem: Any, state: S) -> Tangent | None:
+        """Return the motions that are left; None where all elements are free."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Where unknowns stand in x, for the variables and touches that it was made for."""
+
+    variables: tuple[Variables, ...]
+    eliminated: Variables | None
+    touches: tuple[tuple[tuple[Touch, ...], IntArray | None], ...]
+    place: Mapping[str, IntArray]  # (n, d) positions in x of each kept block; n_kept for none
+    n_kept: int
+    places: tuple[Places, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem(Generic[S]):
+    """Variables, factors and constraints; see :mod:`legcal.estimation`."""
+
+    variables: tuple[Variables, ...]  # kept, those with labels first
+    eliminated: Variables | None
+    factors: tuple[Factor[S], ...]
+    constraint: Constraint[S] | None = None
+    held: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (w, m <= n_kept) fixed gauge
+    name: str = "fit"  # in messages, with what to do where it fails
+    remedy: str = "check the starting values and the measurements"
+    _layout: _Layout | None = field(default=None, repr=False)  # made here
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_layout", self._laid_out(self._layout))
+
+    def _laid_out(self, old: _Layout | None) -> _Layout:
+        """Return the layout, with what is left of an old one."""
+        touches = tuple((factor.touches, factor.own) for factor in self.factors)
+        known: dict[int, Places] = {}
+        if (
+            old is not None
+            and len(old.variables) == len(self.variables)
+            and all(a is b for a, b in zip(old.variables, self.variables, strict=True))
+            and old.eliminated is self.eliminated
+        ):
+            place, n_kept = old.place, old.n_kept
+            known = {id(t): p for (t, _), p in zip(old.touches, old.places, strict=True)}
+        else:
+            counts = [block.n_unknowns for block in self.variables]
+            first = np.cumsum([0, *counts]).tolist()
+            n_kept = first[-1]
+            place = {
+                block.name: np.where(block.unknown < 0, n_kept, start + block.unknown)
+                for block, start in zip(self.variables, first, strict=False)
+            }
+        n_own = 0 if self.eliminated is None else len(self.eliminated.unknown)
+        places = []
+        for factor in self.factors:
+            if id(factor.touches) in known:
+                places.append(known[id(factor.touches)])
+                continue
+            parts = [place[name][element][..., d] for name, element, d in factor.touches]
+            columns = [part.reshape(factor.n, int(np.prod(part.shape[1:]))) for part in parts]
+            index = np.concatenate([np.zeros((factor.n, 0), dtype=np.intp), *columns], axis=1)
+            places.append(_places(index, factor.own, n_kept, n_own))
+        return _Layout(self.variables, self.eliminated, touches, place, n_kept, tuple(places))
+
+    @property
+    def _laid(self) -> _Layout:
+        return self._laid_out(None) if self._layout is None else self._layout
+
+    @property
+    def place(self) -> Mapping[str, IntArray]:
+        """Positions in x of each kept block, (n, d); ``n_kept`` for what is no unknown."""
+        return self._laid.place
+
+    @property
+    def places(self) -> Mapping[str, Places]:
+        """What the measurements of each factor depend on."""
+        return dict(zip((f.name for f in self.factors), self._laid.places, strict=True))
+
+    @property
+    def n_kept(self) -> int:
+        """Number of unknowns that are not eliminated."""
+        return self._laid.n_kept
+
+    @property
+    def n_own(self) -> int:
+        """Number of eliminated elements."""
+        return 0 if self.eliminated is None else len(self.eliminated.unknown)
+
+    @property
+    def d_own(self) -> int:
+        """Number of unknowns of each."""
+        return 0 if self.eliminated is None else self.eliminated.unknown.shape[1]
+
+    @property
+    def size(self) -> int:
+        """Number of all unknowns."""
+        return self.n_kept + self.n_own * self.d_own
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Names of the first unknowns: those of blocks with labels."""
+        return tuple(label for block in self.variables for label in block.labels)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their units."""
+        return tuple(unit for block in self.variables for unit in block.units)
+
+    @cached_property
+    def n_named(self) -> int:
+        """Number of unknowns with a name."""
+        return len(self.named)
+
+    @cached_property
+    def priors(self) -> GaussianPrior:
+        """All priors, by positions in x."""
+        found, first = NO_PRIOR, 0
+        for block in self.variables:
+            prior = block.prior
+            found = found + replace(prior, unknown=first + prior.unknown)
+            first += block.n_unknowns
+        return found
+
+    def where(self, name: str) -> IntArray:
+        """Return the positions in x of a block's unknowns."""
+        first = 0
+        for block in self.variables:
+            if block.name == name:
+                return np.arange(first, first + block.n_unknowns, dtype=np.intp)
+            first += block.n_unknowns
+        raise KeyError(name)
+
+    def block(self, name: str) -> Variables:
+        """Return the kept block of a name."""
+        return next(block for block in self.variables if block.name == name)
+
+    def factor(self, name: str) -> Factor[S]:
+        """Return the factor of a name."""
+        return next(factor for factor in self.factors if factor.name == name)
+
+    def with_parts(self, blocks: Sequence[Variables], factors: Sequence[Factor[S]]) -> Self:
+        """Return the problem with other blocks and factors in place of those of the same names."""
+        b, f = {block.name: block for block in blocks}, {factor.name: factor for factor in factors}
+        return replace(
+            self,
+            variables=tuple(b.get(block.name, block) for block in self.variables),
+            factors=tuple(f.get(factor.name, factor) for factor in self.factors),
+        )
+
+    def with_factors(self, *factors: Factor[S]) -> Self:
+        """Return the problem with other factors in place of those of the same names."""
+        return self.with_parts((), factors)
+
+    def moved(self, state: S, x: Array) -> S:
+        """Return the state after a change of its unknowns, whatever constraints say."""
+        change = np.append(x[: self.n_kept], 0.0)
+        values: dict[str, Any] = {
+            block.name: block.retract(getattr(state, block.name), change[self.place[block.name]])
+            for block in self.variables
+            if block.n_unknowns
+        }
+        if self.eliminated is not None:
+            own = x[self.n_kept :].reshape(-1, self.d_own)
+            block = self.eliminated
+            values[block.name] = block.retract(getattr(state, block.name), own)
+        return replace(state, **values)  # type: ignore[type-var]
+
+    def projected(self, state: S) -> S:
+        """Return the state with eliminated elements put back on their constraints."""
+        return state if self.constraint is None else self.constraint.project(state)
+
+    def overshoot(self, x: Array) -> float:
+        """Return by which factor a step exceeds the largest changes that blocks allow."""
+        change, parts = np.append(x[: self.n_kept], 0.0), [0.0]
+        for block in self.variables:
+            if block.largest and block.n_unknowns:
+                by = np.abs(change[self.place[block.name]]) / np.array(block.largest)
+                parts.append(float(by.max(initial=0.0)))
+        if self.eliminated is not None and self.eliminated.largest:
+            own = np.abs(x[self.n_kept :].reshape(-1, self.d_own))
+            parts.append(float((own / np.array(self.eliminated.largest)).max(initial=0.0)))
+        return max(parts)
+
+    def coordinates(self, state: S) -> Array:
+        """Return the values (n_named,) of the named unknowns."""
+        parts = [b.read(getattr(state, b.name)) for b in self.variables if b.labels]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def jacobian(self, state: S) -> Array:
+        """Return the derivative (n_named, n_named) of these values by x."""
+        J = np.eye(self.n_named)
+        for block in self.variables:
+            if block.labels and block.jacobian is not None:
+                where = self.where(block.name)
+                J[np.ix_(where, where)] = block.jacobian(getattr(state, block.name))
+        return J
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """Whitened residuals with derivatives of all factors and priors at a state."""
+
+    rows: Mapping[str, Rows]
+    prior_r: Array  # (n_priors,)
+    prior_J: Array  # (n_priors, n_kept)
+
+    def __getitem__(self, name: str) -> Rows:
+        return self.rows[name]
+
+
+def linearize(problem: Problem[S], state: S) -> Linearization:
+    """Return whitened residuals and derivatives of a problem at a state."""
+    n = len(problem.priors.mean)
+    r, J, row, first = np.zeros(n), np.zeros((n, problem.n_kept)), 0, 0
+    for block in problem.variables:
+        prior, size = block.prior, block.n_unknowns
+        if len(prior.mean):
+            value = getattr(state, block.name)
+            rows = slice(row, row := row + len(prior.mean))
+            r[rows] = (block.read(value)[prior.unknown] - prior.mean) / prior.sigma
+            by = np.eye(size) if block.jacobian is None else block.jacobian(value)
+            J[rows, first : first + size] = by[prior.unknown] / prior.sigma[:, None]
+        first += size
+    return Linearization({f.name: f.linearize(state) for f in problem.factors}, r, J)

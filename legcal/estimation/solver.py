@@ -1,0 +1,446 @@
+"""Levenberg-Marquardt on a problem: normal equations by blocks, and the search for a minimum.
+
+N x = -g with N = [[U, W], [W^T, V]]: kept unknowns first, then one block for each eliminated
+element. V is block diagonal, so that the Schur complement U - W V^-1 W^T is all that is solved.
+Where exact constraints bind the elements, V, W and their gradient belong to coordinates y inside
+what the constraints leave (:class:`Tangent`), and every step ends with a projection onto them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Generic
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, null_space
+
+from legcal.errors import DidNotConverge
+from legcal.estimation.loss import LEAST_SQUARES, Loss, PseudoHuber
+from legcal.estimation.problem import (
+    Linearization,
+    Places,
+    Problem,
+    Rows,
+    S,
+    Tangent,
+    linearize,
+)
+from legcal.geometry import Array, BoolArray, IntArray
+
+_FIRST_DAMPING = 1e-6
+_LEAST_DAMPING = 1e-10
+_MOST_DAMPING = 1e8
+_SMALLEST_FALL = 1e-12  # of the cost, in squared standard deviations: the minimum is reached
+_ROUNDING = 1e-13  # of the cost: below, its fall is not seen
+_MEDIANS = 5.0  # width of the loss while most measurements are beyond its final one
+_SLOW = 0.5  # of the cost: if the next step lowers it by less, this loss has done its work
+_NARROWING = 0.8  # of the width: smaller changes of the median do not change the loss
+_DONE = 0.01  # of the cost: where a step lowers it by less, the loss is narrowed in any case
+_HALF = 0.5  # of the width, then
+_OWN_STEPS = 3
+_SAFER = 3.0  # times a damping that failed is tried after one that did not
+_FORGOTTEN = 0.3  # of a damping that failed, every step
+_PATIENCE = 30  # steps before a minimum may be near enough
+_RANGE = 1e-13  # eigenvalues below this part of the largest are rounding
+_SAFE = 1e-9  # a scaled block with a pivot below may be singular
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum(Generic[S]):
+    """A minimum of the robust cost."""
+
+    state: S
+    linear: Linearization
+    cost: float
+    iterations: int  # steps that were tried
+
+
+def minimise(
+    problem: Problem[S],
+    state: S,
+    loss: Loss = LEAST_SQUARES,
+    *,
+    max_iterations: int = 200,
+    near_enough: float = 0.0,
+    must_converge: bool = True,
+) -> Minimum[S]:
+    """Minimise the robust cost from a state.
+
+    A pseudo-Huber loss begins as wide as most measurements need and is narrowed on the way.
+
+    Parameters
+    ----------
+    problem, state, loss
+        What to minimise, and where to start.
+    max_iterations : int
+        Steps to try.
+    near_enough : float
+        Fall of the cost, as a part of it, for which no more than some steps are tried: where
+        measurements that are wrong altogether bend the cost, the last steps are many and lead to
+        where these pull.
+    must_converge : bool
+        Whether to refuse where the steps do not come to an end; else the best state is returned.
+
+    Raises
+    ------
+    DidNotConverge
+        If no step lowers the cost although it is not at rest, or the steps do not come to an end.
+    """
+    state = problem.projected(state)
+    linear = linearize(problem, state)
+    wide = _widened(problem, linear, loss, np.inf)
+    damping, failed, fall_before = _FIRST_DAMPING, 0.0, np.inf
+    for iteration in range(1, max_iterations + 1):
+        cost = robust_cost(problem, linear, wide)
+        step, promised = normal_equations(problem, state, linear, wide).step(damping)
+        at_rest = promised < _SMALLEST_FALL + _ROUNDING * cost
+        trial = _tried(problem, state, step)
+        if trial is not None and not at_rest and not robust_cost(problem, trial[1], wide) < cost:
+            trial = _followed(problem, *trial, wide, cost)
+        fall = -np.inf if trial is None else cost - robust_cost(problem, trial[1], wide)
+        if trial is not None and np.isfinite(fall) and (fall > 0.0 or at_rest):
+            state, linear = trial
+            damping = max(_next(damping, fall / max(promised, 1e-300)), _SAFER * failed)
+            failed *= _FORGOTTEN
+            rate = promised / fall_before if np.isfinite(fall_before) else 1.0
+            expected = promised * min(rate, 1.0)
+            narrower = wide
+            if expected < _SLOW * (cost - fall):
+                narrower = _widened(problem, linear, loss, wide.width)
+            if narrower.width == wide.width and expected < _DONE * (cost - fall):
+                narrower = _of_width(loss, max(loss.width, _HALF * wide.width))
+            same = narrower.width == wide.width
+            smallest = near_enough * (cost - fall) if iteration > _PATIENCE else 0.0
+            if same and (at_rest or expected < max(smallest, _SMALLEST_FALL)):
+                return Minimum(state, linear, robust_cost(problem, linear, wide), iteration)
+            fall_before = promised if same else np.inf
+            wide = narrower
+            continue
+        failed, damping = damping, 10.0 * damping
+        fall_before = np.inf
+        if damping > _MOST_DAMPING:
+            break
+    if not must_converge:
+        return Minimum(state, linear, robust_cost(problem, linear, wide), iteration)
+    raise DidNotConverge(
+        f"The {problem.name} did not converge: found a cost that still falls by {promised:.2g} a "
+        f"step after {iteration} steps, needed a minimum; {problem.remedy}."
+    )
+
+
+def robust_cost(problem: Problem[S], linear: Linearization, loss: Loss) -> float:
+    """Return half the squares of priors and plain factors, and the loss of all others."""
+    plain, robust = float(np.sum(linear.prior_r**2)), 0.0
+    for factor in problem.factors:
+        rows = linear[factor.name]
+        if factor.robust:
+            robust += loss.cost(rows.squared_norms)
+        else:
+            plain += float(np.sum(rows.r**2))
+    return 0.5 * plain + robust
+
+
+def _of_width(loss: Loss, width: float) -> Loss:
+    """Return a loss of another width where losses are narrowed."""
+    return PseudoHuber(width) if isinstance(loss, PseudoHuber) else loss
+
+
+def _widened(problem: Problem[S], linear: Linearization, loss: Loss, before: float) -> Loss:
+    """Return the loss at a width of some medians while most measurements are far off."""
+    medians = [0.0]
+    for factor in problem.factors:
+        if factor.robust:
+            norms = linear[factor.name].squared_norms
+            norms = norms[norms > 0.0]
+            medians += [float(np.sqrt(np.median(norms)))] if len(norms) else []
+    median = max(medians)  # some kinds agree with each other before anything else does
+    wanted = loss.width if median <= loss.width else _MEDIANS * median
+    narrows = wanted == loss.width or wanted < _NARROWING * before
+    return _of_width(loss, wanted if narrows else before)
+
+
+def _next(damping: float, gain: float) -> float:
+    """Return the damping after a step that gave that part of what it promised."""
+    if gain > 0.75:
+        return max(0.1 * damping, _LEAST_DAMPING)
+    return damping if gain > 0.25 else 4.0 * damping
+
+
+def _tried(problem: Problem[S], state: S, step: Array) -> tuple[S, Linearization] | None:
+    """Return where a step leads, shortened where a block moves too far; None if nowhere."""
+    if not np.all(np.isfinite(step)):
+        return None
+    try:
+        moved = problem.moved(state, step / max(problem.overshoot(step), 1.0))
+        moved = problem.projected(moved)
+    except DidNotConverge:
+        return None
+    return moved, linearize(problem, moved)
+
+
+def _followed(
+    problem: Problem[S], state: S, linear: Linearization, loss: Loss, cost: float
+) -> tuple[S, Linearization] | None:
+    """Return where eliminated elements come to rest after a step that has not lowered the cost.
+
+    Some factors are nearly exact, and curved: a long straight step leaves them, and the elements
+    bring them back where the rest of the step was right.
+    """
+    there: tuple[S, Linearization] | None = (state, linear)
+    for _ in range(_OWN_STEPS if problem.eliminated is not None else 0):
+        if there is None or not np.isfinite(robust_cost(problem, there[1], loss)):
+            return None
+        step = normal_equations(problem, *there, loss).own_step()
+        there = _tried(problem, there[0], step)
+        if there is not None and robust_cost(problem, there[1], loss) < cost:
+            return there
+    return there
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """The normal equations of a problem at a state."""
+
+    U: Array  # (n_kept, n_kept)
+    W: Array  # (n_kept, n_own, f)
+    V: Array  # (n_own, f, f)
+    g_kept: Array  # (n_kept,) gradient of the cost
+    g_own: Array  # (n_own, f)
+    tangent: Tangent | None  # None where eliminated elements are free
+    held: Array  # (w, n_kept) directions that stay
+
+    @cached_property
+    def V_inverse(self) -> Array:
+        """The inverses of the eliminated blocks on their range, (n_own, f, f)."""
+        return inverse_on_range(self.V)
+
+    @property
+    def follow(self) -> Array:
+        """How elements follow the kept unknowns inside the constraints, (n_own, f, n_kept)."""
+        return np.asarray(-self.V_inverse @ np.moveaxis(self.W, 0, 2))
+
+    def inside(self, J_own: Array, own: IntArray) -> Array:
+        """Return derivatives (n, q, f) inside the constraints from those by elements (n, q, d)."""
+        return J_own if self.tangent is None else J_own @ self.tangent.Z[own]
+
+    def reduced(self) -> Array:
+        """Return the normal matrix (n_kept, n_kept) of the kept unknowns, the others free."""
+        R = self.U - _coupled(_by_element(self.W, self.V_inverse), self.W)
+        return np.asarray(0.5 * (R + R.T))
+
+    def contributions(self) -> Array:
+        """Return what each element takes off U, (n_own, n_kept, n_kept): W V^-1 W^T of each.
+
+        With the factors of an element alone, U less its contribution is what it adds to the
+        information of the kept unknowns, of rank no more than its residuals.
+        """
+        W = np.moveaxis(self.W, 1, 0)
+        return np.asarray(W @ self.V_inverse @ np.swapaxes(W, 1, 2))
+
+    def kept_covariance(self) -> Array:
+        """Return the inverse of the reduced matrix, held directions left out."""
+        R = self.reduced()
+        if len(self.held) == 0:
+            return inverse_on_range(R)
+        N = null_space(self.held)
+        return np.asarray(N @ inverse_on_range(N.T @ R @ N) @ N.T)
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """Return a Levenberg-Marquardt step (size,) and the fall of the cost that it promises.
+
+        *damping* is the part of the diagonal that is added to it.
+        """
+        V = _damped(self.V, damping)
+        V_inverse = np.asarray(np.linalg.inv(V), dtype=np.float64)
+        WV = _by_element(self.W, V_inverse)
+        U = _damped(self.U, damping)
+        R = U - _coupled(WV, self.W)
+        right = -self.g_kept + _flat(WV) @ self.g_own.ravel()
+        if len(self.held):
+            N = null_space(self.held)
+            kept = N @ _solve(N.T @ R @ N, N.T @ right)
+        else:
+            kept = _solve(R, right)
+        pull = self.g_own + (kept @ _flat(self.W)).reshape(self.g_own.shape)
+        y = -(V_inverse @ pull[..., None])[..., 0]
+        linear = float(self.g_kept @ kept + np.sum(self.g_own * y))
+        extra = float(
+            np.sum(np.diagonal(U - self.U) * kept**2)
+            + np.sum(np.einsum("kpp->kp", V - self.V) * y**2)
+        )
+        return self._whole(kept, y), 0.5 * (extra - linear)
+
+    def own_step(self) -> Array:
+        """Return the step (size,) of the eliminated elements alone."""
+        y = -(self.V_inverse @ self.g_own[..., None])[..., 0]
+        return self._whole(np.zeros(len(self.U)), y)
+
+    def _whole(self, kept: Array, y: Array) -> Array:
+        """Return a step of all unknowns, from one inside the constraints."""
+        own = y
+        if self.tangent is not None:
+            own = np.einsum("kpf,kf->kp", self.tangent.Z, y)
+            own = own + np.einsum("akp,a->kp", self.tangent.Q, kept)
+        return np.concatenate([kept, own.ravel()])
+
+
+def normal_equations(
+    problem: Problem[S], state: S, linear: Linearization, loss: Loss = LEAST_SQUARES
+) -> NormalEquations:
+    """Return the normal equations of the robust cost, with the loss's true curvature."""
+    weighted = {}
+    for factor in problem.factors:
+        rows = linear[factor.name]
+        if factor.robust and np.isfinite(loss.width):
+            rows = Rows(*loss.softened(rows.r, rows.slope), rows.chain)
+        weighted[factor.name] = rows
+    return _of_rows(problem, state, linear, weighted)
+
+
+def information(
+    problem: Problem[S],
+    state: S,
+    linear: Linearization,
+    loss: PseudoHuber = LEAST_SQUARES,
+    only: Collection[str] | None = None,
+) -> NormalEquations:
+    """Return the normal equations whose inverse is the covariance of the unknowns.
+
+    A robust loss does not keep all information of what it is on (its efficiency). With *only*
+    these factors enter, beside the priors.
+    """
+    weighted = {}
+    for factor in problem.factors:
+        if only is None or factor.name in only:
+            rows = linear[factor.name]
+            if factor.robust and np.isfinite(loss.width):
+                rows = rows.whitened(np.asarray(np.sqrt(loss.efficiency(factor.n_rows))))
+            weighted[factor.name] = rows
+    return _of_rows(problem, state, linear, weighted)
+
+
+def _of_rows(
+    problem: Problem[S], state: S, linear: Linearization, weighted: dict[str, Rows]
+) -> NormalEquations:
+    """Return normal equations, with motions inside the constraints in place of elements."""
+    places = problem.places
+    U, W, V, g_kept, g_own = _sums(
+        [(places[name], rows) for name, rows in weighted.items()], problem
+    )
+    U = U + linear.prior_J.T @ linear.prior_J
+    g_kept = g_kept + linear.prior_J.T @ linear.prior_r
+    motion = None
+    if problem.constraint is not None:
+        motion = problem.constraint.tangent(problem, state)
+    if motion is not None:
+        Z, Q = motion.Z, motion.Q
+        coupled, QV = _coupled(W, Q), _by_element(Q, V)
+        U = U + coupled + coupled.T + _coupled(Q, QV)
+        g_kept = g_kept + _flat(Q) @ g_own.ravel()
+        W = _by_element(W + QV, Z)
+        V = np.swapaxes(Z, 1, 2) @ V @ Z
+        g_own = np.einsum("kpf,kp->kf", Z, g_own)
+    held = np.zeros((len(problem.held), problem.n_kept))
+    held[:, : problem.held.shape[1]] = problem.held
+    return NormalEquations(U, W, V, g_kept, g_own, motion, held)
+
+
+def _sums(
+    kinds: list[tuple[Places, Rows]], problem: Problem[S]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the blocks U, W, V of J^T J and both parts of J^T r, all measurements added up."""
+    n_kept, n_own, d = problem.n_kept, problem.n_own, problem.d_own
+    U, g_kept = np.zeros((n_kept + 1, n_kept + 1)), np.zeros(n_kept + 1)
+    W = np.zeros(((n_kept + 1) * n_own, d))
+    V, g_own = np.zeros((n_own, d * d)), np.zeros((n_own, d))
+    for where, rows in kinds:
+        n, q, m = rows.J.shape
+        if n == 0:
+            continue
+        J, r = rows.J[where.order].reshape(n * q, m), rows.r[where.order].ravel()
+        squares, products = np.empty((len(where.bounds), m, m)), np.empty((len(where.bounds), m))
+        for group, (start, end) in enumerate(where.bounds):
+            of_group = slice(q * start, q * end)
+            squares[group] = J[of_group].T @ J[of_group]
+            products[group] = r[of_group] @ J[of_group]
+        np.add.at(U, (where.columns[:, :, None], where.columns[:, None, :]), squares)
+        np.add.at(g_kept, where.columns, products)
+        if where.to_kept is not None and where.to_own is not None:
+            J_own = rows.J_own
+            W += where.to_kept @ (np.swapaxes(rows.J, 1, 2) @ J_own).reshape(n * m, d)
+            V += where.to_own @ (np.swapaxes(J_own, 1, 2) @ J_own).reshape(n, d * d)
+            g_own += where.to_own @ np.einsum("nqi,nq->ni", J_own, rows.r)
+    blocks = W.reshape(n_kept + 1, n_own, d)[:n_kept], V.reshape(n_own, d, d)
+    return U[:n_kept, :n_kept], *blocks, g_kept[:n_kept], g_own
+
+
+def inverse_on_range(S: Array) -> Array:
+    """Return the inverse of symmetric positive semidefinite matrices (..., n, n) on their range.
+
+    The matrices are scaled to unit diagonal first, so that units do not matter.
+    """
+    if S.size == 0:
+        return S.copy()
+    flat = S.reshape(-1, *S.shape[-2:])
+    scale = _scale(flat)
+    scaled = scale[:, :, None] * flat * scale[:, None, :]
+    inverse = np.empty_like(scaled)
+    safe = _is_safe(scaled)
+    inverse[safe] = np.linalg.inv(scaled[safe])
+    value, vector = np.linalg.eigh(scaled[~safe])
+    kept = value > _RANGE * value[..., -1:]
+    reciprocal = np.where(kept, 1.0, 0.0) / np.where(kept, value, 1.0)
+    inverse[~safe] = (vector * reciprocal[..., None, :]) @ np.swapaxes(vector, -1, -2)
+    return np.asarray((scale[:, :, None] * inverse * scale[:, None, :]).reshape(S.shape))
+
+
+def _is_safe(scaled: Array) -> BoolArray:
+    """Say which matrices of unit diagonal are far from singular."""
+    try:
+        L = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        return np.zeros(len(scaled), dtype=np.bool_)
+    return np.asarray(np.einsum("kii->ki", L).min(axis=1, initial=1.0) ** 2 > _SAFE)
+
+
+def _scale(S: Array) -> Array:
+    """Return what scales diagonals (..., n) to one; one where they are zero."""
+    diagonal = np.einsum("...ii->...i", S)
+    return np.asarray(1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)))
+
+
+def _flat(W: Array) -> Array:
+    """Return what couples kept to eliminated unknowns as one matrix (n_kept, n_own f)."""
+    return W.reshape(len(W), W.shape[1] * W.shape[2])
+
+
+def _coupled(left: Array, right: Array) -> Array:
+    """Return the sum over elements of left right^T, both (n_kept, n_own, f)."""
+    return np.asarray(_flat(left) @ _flat(right).T)
+
+
+def _by_element(W: Array, blocks: Array) -> Array:
+    """Return W (n_kept, n_own, f) times the block (n_own, f, h) of each element."""
+    found = np.empty((*W.shape[:2], blocks.shape[2]))
+    np.matmul(W.swapaxes(0, 1), blocks, out=found.swapaxes(0, 1))
+    return found
+
+
+def _damped(M: Array, damping: float) -> Array:
+    """Return matrices with a part of their diagonal added to it; one where it is zero."""
+    diagonal = np.einsum("...ii->...i", M)
+    added = np.where(diagonal > 0.0, damping * diagonal, 1.0)
+    return np.asarray(M + added[..., None] * np.eye(M.shape[-1]))
+
+
+def _solve(S: Array, right: Array) -> Array:
+    """Return S^-1 right for a positive definite S, scaled; least squares where it is not."""
+    scale = _scale(S)
+    scaled = scale[:, None] * S * scale
+    try:
+        found = cho_solve(cho_factor(scaled, check_finite=False), scale * right)
+    except np.linalg.LinAlgError:
+        found = inverse_on_range(scaled) @ (scale * right)
+    return np.asarray(scale * found)

@@ -1,0 +1,211 @@
+"""What a problem's data hold: covariances, weak directions, influence and score tests.
+
+All of it is read off the normal equations at one state, eliminated elements following.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import null_space
+
+from legcal.estimation.problem import Linearization, Problem, S, linearize
+from legcal.estimation.solver import NormalEquations, inverse_on_range, normal_equations
+from legcal.geometry import Array, IntArray
+
+_NAMED = 0.3  # components of a direction that are named, relative to the largest
+
+
+@dataclass(frozen=True, eq=False)
+class WeakDirection:
+    """A combination of parameters that is known worst."""
+
+    sigma: float  # standard deviation along it, in the unit of the scaled parameters
+    parts: tuple[tuple[str, float], ...]  # its largest components, as a unit vector
+
+    def __str__(self) -> str:
+        return " ".join(f"{value:+.2f} {name}" for name, value in self.parts)
+
+
+def worst_directions(
+    covariance: Array, names: tuple[str, ...], unit: Array, n_directions: int = 3
+) -> tuple[WeakDirection, ...]:
+    """Return the directions known worst, worst first; parameters count in *unit* (n,) each."""
+    variance, vector = np.linalg.eigh(covariance / unit[:, None] / unit)
+    found = []
+    for i in range(min(n_directions, len(names))):
+        v = vector[:, -1 - i] * np.sign(vector[np.argmax(np.abs(vector[:, -1 - i])), -1 - i])
+        order = np.argsort(-np.abs(v), kind="stable")
+        named = [j for j in order if abs(v[j]) >= _NAMED * abs(v[order[0]])][:4]
+        sigma = float(np.sqrt(max(variance[-1 - i], 0.0)))
+        found.append(WeakDirection(sigma, tuple((names[j], float(v[j])) for j in named)))
+    return tuple(found)
+
+
+def named_covariance(problem: Problem[S], state: S, covariance: Array) -> Array:
+    """Return the covariance (n_named, n_named) of coordinates from that of all kept unknowns."""
+    n = problem.n_named
+    by_x = problem.jacobian(state)
+    return np.asarray(by_x @ covariance[:n, :n] @ by_x.T)
+
+
+def named_information(problem: Problem[S], state: S, normal: NormalEquations) -> Array:
+    """Return the normal matrix (n_named, n_named) of coordinates, all else unknown."""
+    R, n = normal.reduced(), problem.n_named
+    if n < len(R):
+        R = R[:n, :n] - R[:n, n:] @ inverse_on_range(R[n:, n:]) @ R[n:, :n]
+    back = np.linalg.inv(problem.jacobian(state))
+    return np.asarray(back.T @ R @ back)
+
+
+def marginal(information: Array, which: IntArray) -> Array:
+    """Return the normal matrix of some unknowns with all others unknown."""
+    others = np.setdiff1d(np.arange(len(information)), which)
+    mixed = information[np.ix_(others, which)]
+    inverse = inverse_on_range(information[np.ix_(others, others)])
+    return np.asarray(information[np.ix_(which, which)] - mixed.T @ inverse @ mixed)
+
+
+def reduced_jacobian(
+    problem: Problem[S], linear: Linearization, normal: NormalEquations, name: str
+) -> Array:
+    """Return a factor's derivatives (n, q, n_kept) by kept unknowns, elements following them."""
+    where, rows = problem.places[name], linear[name]
+    n, q, _ = rows.J.shape
+    G = np.zeros((n, q, where.n_kept + 1))
+    measurement, row = np.arange(n)[:, None, None], np.arange(q)[None, :, None]
+    np.add.at(G, (measurement, row, where.index[:, None, :]), rows.J)
+    G = G[..., :-1]
+    if where.own is None:
+        return np.asarray(G)
+    if normal.tangent is not None:
+        G = G + rows.J_own @ np.moveaxis(normal.tangent.Q, 0, 2)[where.own]
+    return np.asarray(G + normal.inside(rows.J_own, where.own) @ normal.follow[where.own])
+
+
+def explained_share(
+    problem: Problem[S],
+    linear: Linearization,
+    normal: NormalEquations,
+    name: str,
+    covariance: Array | None = None,
+) -> Array:
+    """Return the covariance (n, q, q) of a factor's predicted whitened residuals.
+
+    The residuals of a right fit have covariance one minus this, those of what it has not seen one
+    plus this. *covariance* is that of the kept unknowns, if not that of these equations.
+    """
+    where, rows = problem.places[name], linear[name]
+    G = reduced_jacobian(problem, linear, normal, name)
+    share = (G @ (normal.kept_covariance() if covariance is None else covariance)) @ np.swapaxes(
+        G, -1, -2
+    )
+    if where.own is None:
+        return np.asarray(share)
+    J_own = normal.inside(rows.J_own, where.own)
+    return np.asarray(share + J_own @ normal.V_inverse[where.own] @ np.swapaxes(J_own, -1, -2))
+
+
+def response(
+    problem: Problem[S],
+    linear: Linearization,
+    normal: NormalEquations,
+    changes: Mapping[str, Array],
+) -> Array:
+    """Return how kept unknowns (n_kept, c) move when factors' whitened residuals do.
+
+    *changes* has (n, q, c) for factors by name, c different changes.
+    """
+    n_changes = next(iter(changes.values())).shape[-1]
+    gradient = np.zeros((problem.n_kept + 1, n_changes))
+    own = np.zeros((problem.n_own, problem.d_own, n_changes))
+    for name, change in changes.items():
+        where, rows = problem.places[name], linear[name]
+        for member, column in where.groups:
+            part = np.einsum("nqm,nqc->mc", rows.J[member], change[member], optimize=True)
+            np.add.at(gradient, column, part)
+        if where.to_own is not None:
+            of_own = np.einsum("nqi,nqc->nic", rows.J_own, change)
+            of_own = of_own.reshape(len(change), problem.d_own * n_changes)
+            own += (where.to_own @ of_own).reshape(own.shape)
+    kept = gradient[:-1]
+    if normal.tangent is not None:
+        kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, own, optimize=True)
+        own = np.swapaxes(normal.tangent.Z, 1, 2) @ own
+    kept = kept - np.einsum("akf,kfc->ac", normal.W, normal.V_inverse @ own, optimize=True)
+    return np.asarray(-normal.kept_covariance() @ kept)
+
+
+def score_test(
+    problem: Problem[S],
+    linear: Linearization,
+    normal: NormalEquations,
+    columns: Mapping[str, Array],
+) -> tuple[Array, Array]:
+    """Return what the fit leaves of v^T r (c,) and of v^T v (c, c): Rao's test of new columns v.
+
+    *columns* has whitened columns (n, q, c) of factors by name; *normal* is of plain squares.
+    """
+    c = next(iter(columns.values())).shape[-1]
+    kept, score, left = np.zeros((problem.n_kept, c)), np.zeros(c), np.zeros((c, c))
+    by_own = np.zeros((*normal.V.shape[:2], c))
+    for name, v in columns.items():
+        where, rows = problem.places[name], linear[name]
+        G = reduced_jacobian(problem, linear, normal, name)
+        kept += np.einsum("nqk,nqc->kc", G, v, optimize=True)
+        score += np.einsum("nqc,nq->c", v, rows.r)
+        left += np.einsum("nqc,nqd->cd", v, v)
+        if where.own is not None:
+            J_own = normal.inside(rows.J_own, where.own)
+            np.add.at(by_own, where.own, np.swapaxes(J_own, 1, 2) @ v)
+    following, covariance = normal.V_inverse @ by_own, normal.kept_covariance()
+    own = (normal.V_inverse @ normal.g_own[..., None])[..., 0]
+    g_kept = normal.g_kept - np.einsum("akp,kp->a", normal.W, own)
+    score = score - kept.T @ covariance @ g_kept - np.einsum("kpc,kp->c", following, normal.g_own)
+    left = left - kept.T @ covariance @ kept - np.einsum("kpc,kpd->cd", following, by_own)
+    return score, left
+
+
+def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Array]:
+    """Return the scores of a block of random effects where all of them are zero.
+
+    Parameters
+    ----------
+    problem : Problem
+        With the block, whose every unknown has a prior of mean zero and comes last of the named.
+    state : S
+        Near a minimum of the problem with some of them or none; Gauss-Newton's step from there is
+        taken into account.
+    name : str
+        The block.
+
+    Returns
+    -------
+    z : (b,) array
+        B^T M r with B the whitened effects, r the residuals without any effect and M the projector
+        onto what the fit leaves of residuals.
+    K : (b, b) array
+        B^T M B: the covariance of z if all effects are zero.
+    """
+    normal = normal_equations(problem, state, linearize(problem, state))
+    R = normal.reduced()
+    own = (normal.V_inverse @ normal.g_own[..., None])[..., 0]
+    g = normal.g_kept - np.einsum("akp,kp->a", normal.W, own)
+    effects, block = problem.where(name), problem.block(name)
+    value = block.read(getattr(state, name))
+    others = np.setdiff1d(np.arange(len(R)), effects)
+    of_prior = 1.0 / block.prior.sigma**2
+    R_others, R_mixed = R[np.ix_(others, others)], R[np.ix_(others, effects)]
+    if len(normal.held):
+        N = null_space(normal.held[:, others])
+        inverse = N @ inverse_on_range(N.T @ R_others @ N) @ N.T
+    else:
+        inverse = inverse_on_range(R_others)
+    K = R[np.ix_(effects, effects)] - np.diag(of_prior) - R_mixed.T @ inverse @ R_mixed
+    # A difference of what nearly cancels where measurements determine little: rounded below zero.
+    eigenvalue, vector = np.linalg.eigh(0.5 * (K + K.T))
+    K = (vector * np.maximum(eigenvalue, 0.0)) @ vector.T
+    left = g[effects] - of_prior * value - R_mixed.T @ inverse @ g[others]
+    return K @ value - left, K
