@@ -63,11 +63,7 @@ class BoardViews:
             ],
             dtype=np.bool_,
         )
-        reason = tuple(
-            "disagrees with the fit" if is_wrong else why
-            for is_wrong, why in zip(wrong.tolist(), corners.reason, strict=True)
-        )
-        return replace(corners, used=corners.used & ~wrong, reason=reason)
+        return corners.reject(wrong, "disagrees with the fit")
 
     def by_view(self, T_x_camera: Poses) -> dict[int, RigidTransform]:
         """Return where each camera that shows the board has it, T_x_board, x any frame."""

@@ -158,12 +158,7 @@ def reject_unused_legs(
         ],
         dtype=np.bool_,
     )
-    out &= outlines.used
-    reason = tuple(
-        f"view {view.name} does not use this leg" if left_out else reason
-        for view, left_out, reason in zip(views, out.tolist(), outlines.reason, strict=True)
-    )
-    return replace(outlines, used=outlines.used & ~out, reason=reason)
+    return outlines.reject(out, [f"view {view.name} does not use this leg" for view in views])
 
 
 def write_observations(

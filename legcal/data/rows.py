@@ -64,6 +64,23 @@ class Rows:
         place = place[self.row]
         return replace(self.choose(place >= 0), row=place[place >= 0])
 
+    def reject(self, wrong: BoolArray, why: str | Sequence[str]) -> Self:
+        """Return a table of observations with some of those that were used rejected.
+
+        For one reason, or each for its own.
+        """
+        table = self._fields()
+        out = table["used"] & wrong
+        reasons = (why,) * len(self) if isinstance(why, str) else why
+        changed: dict[str, Any] = {
+            "used": table["used"] & ~out,
+            "reason": tuple(
+                new if is_out else old
+                for is_out, new, old in zip(out.tolist(), reasons, table["reason"], strict=True)
+            ),
+        }
+        return replace(self, **changed)
+
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -152,7 +152,10 @@ def camera_poses(
             covariance[v] = found.covariance
             for row, T in found.rows.items():
                 rows[row] = T
-            corners = _rejected(corners, here[found.wrong], found.off_px[found.wrong])
+            off = np.full(len(corners), np.nan)
+            off[here[found.wrong]] = found.off_px[found.wrong]
+            why = [f"{px:.2g} px from where the other corners put it" for px in off]
+            corners = corners.reject(~np.isnan(off), why)
         elif view.name in needed:
             n = int(np.sum(measurements.view == v))
             problems.setdefault(NotVisible, []).append(
@@ -351,17 +354,6 @@ def _in_plane(points: Array) -> bool:
         return False
     size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(size[1] > 1e-3 * size[0])
-
-
-def _rejected(corners: Corners, wrong: IntArray, off_px: Array) -> Corners:
-    """Return corners of which some are rejected."""
-    if not len(wrong):
-        return corners
-    used, reason = corners.used.copy(), list(corners.reason)
-    used[wrong] = False
-    for i, off in zip(wrong.tolist(), off_px.tolist(), strict=True):
-        reason[i] = f"{off:.2g} px from where the other corners put it"
-    return replace(corners, used=used, reason=tuple(reason))
 
 
 def _whole(board: Board) -> str:

@@ -63,17 +63,7 @@ def look_again(
     placement = _believed(search, groups, _by_fits(search, groups, placement, fits), fits)
     placed = np.array([T is not None for T in placement.T_base_camera])
     lost = ~placed[search.measurements.view[outlines.row]]
-    return placement, reject(outlines, lost, NOT_PLACED), fits
-
-
-def reject(outlines: Outlines, wrong: BoolArray, why: str) -> Outlines:
-    """Return outlines without some of those that were used; what people edited stays."""
-    out = outlines.used & wrong & ~is_edited(outlines)
-    reason = tuple(
-        why if is_out else reason
-        for is_out, reason in zip(out.tolist(), outlines.reason, strict=True)
-    )
-    return replace(outlines, used=outlines.used & ~out, reason=reason)
+    return placement, outlines.reject(lost & ~is_edited(outlines), NOT_PLACED), fits
 
 
 def _fits(
@@ -123,7 +113,8 @@ def _agreeing(
     }
     if not wrong:
         return outlines, fits
-    outlines = reject(outlines, _among(outlines, wrong), DISAGREES)
+    out = _among(outlines, wrong) & ~is_edited(outlines)  # what people edited stays
+    outlines = outlines.reject(out, DISAGREES)
     return outlines, _fits(search, groups, placement, outlines)
 
 
