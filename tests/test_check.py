@@ -14,6 +14,7 @@ from simulated import settings
 from typer.testing import CliRunner
 
 from legcal import calibrate, check
+from legcal.calibration import Result
 from legcal.calibration.fitting import Found, observe_and_fit
 from legcal.cli.app import app
 from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
@@ -112,6 +113,14 @@ def test_held_out_images_are_in_the_result(result: Path) -> None:
     assert found["platform"]["poses"] == 3
     assert 0.0 < found["platform"]["dX_m"] < 4.0 * found["platform"]["expected_dX_m"]
     assert set(found["views"]) <= {"c1", "c2"}
+
+
+def test_a_result_is_read_back_as_it_was_written(result: Path) -> None:
+    path = result / "result.json"
+    written = json.loads(path.read_text())
+    read = Result.read(path).document()
+    assert read == written
+    assert list(read) == list(written)
 
 
 Spoil = Callable[[Path, dict[str, Any]], None]

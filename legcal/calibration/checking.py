@@ -149,7 +149,7 @@ class Check:
 
     def document(self) -> dict[str, Any]:
         """Return the document that ``--json`` prints."""
-        movement, pair, solution = self.movement, self.at_platform, self.solution
+        movement, pair = self.movement, self.at_platform
         return CheckDocument(
             legcal_check=1,
             result=str(self.earlier.folder),
@@ -180,7 +180,7 @@ class Check:
                 sigma_dE_rad=pair.expected_rotation,
             ),
             images=self.dataset.measurements.n_rows,
-            residuals=CheckResiduals(chi2=solution.chi2, dof=solution.dof, rms_px=solution.rms_px),
+            residuals=CheckResiduals.model_validate(self.solution),
             notes=list(self.notes),
         ).document()
 

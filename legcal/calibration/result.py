@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -351,14 +350,7 @@ def result_of(calibration: Calibration) -> Result:
             if steps.legs is None
             else Staged(**_legs(names, steps.legs), diagnostics=list(steps.diagnostics))
         ),
-        residuals=Residuals(
-            chi2=solution.chi2,
-            dof=solution.dof,
-            rms_px=solution.rms_px,
-            rms_axes=solution.rms_axes,
-            noise=Noise(**asdict(solution.noise)),
-            shared_px=dict(solution.shared_px),
-        ),
+        residuals=Residuals.model_validate(solution),
         board=_board(calibration),
         start=solution.start,
         platform=_platform(calibration),
@@ -452,27 +444,24 @@ def _platform(calibration: Calibration) -> PlatformBlock | None:
         ],
         workspace=None if workspace is None else WorkspaceAccuracy(**_predicted(workspace)),
         sensitivities=[
-            SensitivityRow(
-                what=effect.what,
-                dX_m=effect.error.mean_displacement,
-                dE_rad=effect.error.mean_rotation,
-                dX_max_m=effect.error.max_displacement,
-                dE_max_rad=effect.error.max_rotation,
-            )
-            for effect in platform.effects
+            SensitivityRow(what=effect.what, **_errors(effect.error)) for effect in platform.effects
         ],
     )
 
 
+def _errors(error: PlatformError, prefix: str = "") -> dict[str, Any]:
+    """Return means and maxima of an error of the platform, as the document names them."""
+    return {
+        f"{prefix}dX_m": error.mean_displacement,
+        f"{prefix}dE_rad": error.mean_rotation,
+        f"{prefix}dX_max_m": error.max_displacement,
+        f"{prefix}dE_max_rad": error.max_rotation,
+    }
+
+
 def _predicted(error: PlatformError) -> dict[str, Any]:
     """Return the fields of :class:`WorkspaceAccuracy`."""
-    return {
-        "poses": len(error.displacement),
-        "sigma_dX_m": error.mean_displacement,
-        "sigma_dE_rad": error.mean_rotation,
-        "sigma_dX_max_m": error.max_displacement,
-        "sigma_dE_max_rad": error.max_rotation,
-    }
+    return {"poses": len(error.displacement), **_errors(error, "sigma_")}
 
 
 def _holdout(calibration: Calibration) -> Holdout | None:

@@ -97,7 +97,7 @@ class FileSchema(BaseModel):
 class Document(BaseModel):
     """A JSON document that is written: its fields are the keys, in their order."""
 
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, from_attributes=True)
 
     def document(self) -> dict[str, Any]:
         """Return what ``--json`` prints."""
