@@ -25,7 +25,7 @@ from legcal.machine import (
     platform_pose,
 )
 from legcal.machine.chain import ClosedChain, Closure
-from legcal.machine.kinematics import close_at, outside_travel
+from legcal.machine.kinematics import close_at
 from legcal.machine.mobility import mobility
 
 
@@ -178,11 +178,6 @@ def test_closing_at_a_pose_never_flips_a_leg(hexapod: Mechanism) -> None:
     for leg in hexapod.legs:
         q = configuration[hexapod.chain.q_index(str(leg.prismatic))]
         assert leg.sign * q + leg.q0 > 0.1
-
-
-def test_outside_travel_names_the_legs(hexapod: Mechanism) -> None:
-    q = np.array([0.0, 0.145, 0.05, -0.006, 0.144, -0.004])
-    assert outside_travel(hexapod, q) == pytest.approx({"leg2": 0.001, "leg4": -0.002})
 
 
 def test_motors_that_do_not_determine_the_pose_are_refused(hexapod: Mechanism) -> None:

@@ -36,17 +36,9 @@ class ClosedChain:
 
     Configurations are Pinocchio's (quaternions for floating joints, cosine and sine for planar
     and continuous ones), velocities its tangent vectors. The object holds Pinocchio's work space,
-    so that one object serves one thread; it pickles by being built again.
-
-    Parameters
-    ----------
-    text : str
-        A checked URDF.
-    closures : sequence of Closure
-        What coincides.
-    normals : sequence of (3,) array or None
-        For each frame closure that need hold in a plane only, the normal of the plane in its first
-        frame. Where all joints move in the plane, rounding of their axes opens it across.
+    so that one object serves one thread; it pickles by being built again. *normals* holds, for each
+    frame closure that need hold in a plane only, the normal of that plane in its first frame:
+    where all joints move in the plane, rounding of their axes opens it across.
 
     Raises
     ------

@@ -14,24 +14,12 @@ SHOWN = 0.02  # of the largest component
 def split_by_motion(
     motion: Array | None, basis: Array, length: float, harmless: float
 ) -> tuple[Array, Array]:
-    """Return a space of directions as that which moves the platform and that which does not.
+    """Return bases (a, p), (b, p) of directions that move the platform and of those that do not.
 
-    Parameters
-    ----------
-    motion : (k, 6, p) array or None
-        Rotation [rad] and displacement [m] of the platform at k poses by each parameter, all
-        in metres; None where the motors do not determine the pose, and everything counts.
-    basis : (w, p) array
-        Orthonormal basis of the space.
-    length : float
-        Mean leg length, by which rotations become displacements [m].
-    harmless : float
-        Motion of the platform, as a part of the change of the parameters, that counts as none.
-
-    Returns
-    -------
-    moving, still : (a, p) and (b, p) array
-        Orthonormal bases, a + b = w.
+    *motion* (k, 6, p) is rotation [rad] and displacement [m] of the platform at k poses by each
+    parameter, all in metres; None where the motors do not determine the pose, and everything
+    counts. *basis* (w, p) is orthonormal; rotations become displacements by the mean leg *length*
+    [m]; motion below *harmless*, a part of the change of the parameters, counts as none.
     """
     if motion is None or len(basis) == 0:
         return basis, basis[:0]
@@ -88,19 +76,9 @@ def leg_labels(leg_names: Sequence[str]) -> dict[str, str]:
 
 
 def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> str:
-    """Return a combination of parameters in words.
+    """Return in words which parameters change together: ``z of platform joints 2 and 4 together``.
 
-    Parameters
-    ----------
-    parameters : sequence of str
-        Names of the parameters that change.
-    leg_names : sequence of str
-        All legs.
-
-    Returns
-    -------
-    str
-        ``z of platform joints 2 and 4 together``, ``offset of leg 3``, ``fx of camera c1``.
+    Others are ``offset of leg 3`` and ``fx of camera c1``.
     """
     coordinates: dict[tuple[str, str], list[str]] = {}
     for name in parameters:

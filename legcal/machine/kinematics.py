@@ -136,19 +136,9 @@ class Follower:
 
 
 def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransform]:
-    """Return the platform poses at many rows of readings, in the assembly mode of home.
+    """Return T_base_platform of many rows of readings (n_rows, n_legs) [m], in the mode of home.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-    q : (n_rows, n_legs) array
-        Readings [m]; each row starts from the nearest one that is solved already, or from home.
-
-    Returns
-    -------
-    list of RigidTransform
-        T_base_platform of every row.
+    Each row starts from the nearest one that is solved already, or from home.
 
     Raises
     ------
@@ -166,21 +156,30 @@ def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransfo
 def followed_poses(
     mechanism: Mechanism, q: Array
 ) -> Iterator[tuple[RigidTransform, DidNotConverge | None]]:
-    """Yield the platform pose at each of many rows of readings, or one nearby, and why.
+    """Yield the platform pose at each of many rows of readings, and no failure.
 
-    Where a row is not reached, the pose is that of the nearest row that is, or home. Arguments and
-    other exceptions are those of :func:`forward_kinematics_many`.
+    Where a row is not reached, the pose of the nearest row that is, or home, comes with the
+    failure. Arguments and other exceptions are those of :func:`forward_kinematics_many`.
     """
-    readings = _readings(mechanism, np.asarray(q, dtype=np.float64))
-    for configuration, failure in follow_rows(mechanism, readings):
-        yield platform_pose(mechanism, configuration), failure
+    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
+    configurations = [mechanism.home_configuration]
+    for i, row in enumerate(_readings(mechanism, np.asarray(q, dtype=np.float64))):
+        nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
+        try:
+            configuration = follow(mechanism, nearest, row, f" of row {i + 1}")
+        except DidNotConverge as failure:
+            yield platform_pose(mechanism, nearest), failure
+            continue
+        known.append(row)
+        configurations.append(configuration)
+        yield platform_pose(mechanism, configuration), None
 
 
 def inverse_kinematics(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, q = sign (|AB| - q0).
 
     A length is a distance, so that no leg is ever flipped. Values outside the travel are
-    returned as they are; :func:`outside_travel` names them.
+    returned as they are.
 
     Parameters
     ----------
@@ -209,29 +208,6 @@ def inverse_kinematics(mechanism: Mechanism, T_base_platform: RigidTransform) ->
     q = readings_at(mechanism, T_base_platform)
     q[[leg.kind is LegKind.CONSTANT for leg in mechanism.legs]] = 0.0
     return q
-
-
-def outside_travel(mechanism: Mechanism, q: Array) -> dict[str, float]:
-    """Return the legs whose joint value lies outside their travel.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-    q : (n_legs,) array
-        Joint values [m].
-
-    Returns
-    -------
-    dict of str to float
-        Leg name, and how far outside [m]: negative below the travel, positive above it.
-    """
-    outside = {}
-    for leg, value in zip(mechanism.legs, q, strict=True):
-        lower, upper = leg.travel
-        if leg.kind is not LegKind.CONSTANT and not lower <= value <= upper:
-            outside[leg.name] = float(value - (lower if value < lower else upper))
-    return outside
 
 
 def _readings(mechanism: Mechanism, q: Array) -> Array:
@@ -274,19 +250,10 @@ def platform_in_base(mechanism: Mechanism, T_base_platform: RigidTransform) -> R
 def pose_differences(
     poses: Sequence[RigidTransform], references: Sequence[RigidTransform]
 ) -> tuple[Array, Array]:
-    """Return the displacement [m] and the rotation angle [rad] between poses of R_e, eq (20).
+    """Return displacement [m] and rotation angle [rad] between T_Rb_Re of two models, eq (20).
 
-    Parameters
-    ----------
-    poses, references : sequence of RigidTransform
-        T_Rb_Re of two models at the same readings.
-
-    Returns
-    -------
-    displacement : (n_poses,) array
-        Delta X: of the platform joint of the first frame leg, the origin of R_e [m].
-    rotation : (n_poses,) array
-        Delta E: the angle of the rotation between both orientations [rad].
+    The displacement, Delta X, is that of the platform joint of the first frame leg, the origin of
+    R_e; the angle, Delta E, that of the rotation between both orientations.
     """
     T, T_reference = (
         np.array([pose.as_matrix() for pose in several]).reshape(-1, 4, 4)
@@ -348,23 +315,11 @@ def solve_poses(
     lengthening: Array | None = None,
     steps: int = 60,
 ) -> SolvedPoses:
-    """Return the poses near given ones where legs meet what readings and joints demand.
+    """Return the poses near R, t of R_e in R_b where legs meet what readings and joints demand.
 
-    Where no pose meets it (parameters far from the truth) the one with least squares is found.
-
-    Parameters
-    ----------
-    legs : sequence of Leg
-        The legs in R_b and R_e.
-    frame_legs : sequence of int
-        The legs that define R_b and R_e.
-    R, t : (k, 3, 3) and (k, 3) array
-        Poses of R_e in R_b nearby, in the right assembly mode [m].
-    lengthening : (k, n_legs) array, optional
-        s q of actuated legs [m], NaN where unknown; others are not looked at. Without it poses
-        move to the nearest at which the constraints hold.
-    steps : int
-        At most; where they are few poses come nearer.
+    *lengthening* (k, n_legs) is s q of actuated legs [m], NaN where unknown; without it poses move
+    to the nearest at which the constraints hold. Where no pose meets all (parameters far from the
+    truth) the one with least squares is found. After few *steps* poses are only nearer.
     """
     fixed = np.ones(6, dtype=np.bool_)
     fixed[list(freedoms(frame_legs))] = False
@@ -676,28 +631,6 @@ def follow_pose(
 
     done = walk(attempt, shortest)
     return motion_of(pose[0, :, :3], pose[0, :, 3]), done
-
-
-def follow_rows(
-    mechanism: Mechanism, readings: Array
-) -> Iterator[tuple[Array, DidNotConverge | None]]:
-    """Yield the closed configuration at each row of readings (n_rows, n_motors), and no failure.
-
-    Each row starts from the nearest one that is solved already, or from home. Where a row is not
-    reached, this start comes with the failure.
-    """
-    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
-    configurations = [mechanism.home_configuration]
-    for i, row in enumerate(readings):
-        nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
-        try:
-            configuration = follow(mechanism, nearest, row, f" of row {i + 1}")
-        except DidNotConverge as failure:
-            yield nearest, failure
-            continue
-        known.append(row)
-        configurations.append(configuration)
-        yield configuration, None
 
 
 def _closed_from(
