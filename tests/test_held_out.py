@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.calibration.joint_fit import held_out as pose_by_outlines
-from legcal.calibration.joint_fit.edge_biases import N_KINDS, possible_shifts
+from legcal.calibration.joint_fit.edge_biases import N_KINDS, possible_biases
 from legcal.calibration.joint_fit.held_out import (
     HeldOut,
     Posterior,
@@ -54,7 +54,7 @@ def _truth(name: str) -> Truth:
     cameras = tuple(T.inv() for T in design.T_Rb_camera)
     poses = motions_of(design.R, design.t)
     state = problem.begin(Start(design.legs, cameras, poses, "truth"))
-    possible = possible_shifts(problem.outlines, legs.names)
+    possible = possible_biases(problem.outlines, legs.names)
     nothing = np.zeros((problem.n_kept, problem.n_kept))
     shifts = possible.of_sizes(np.zeros(N_KINDS))
     posterior = Posterior(problem, state, shifts, NoiseModel(), nothing)

@@ -16,7 +16,7 @@ from dense_fit import (
 from machine_session import LENS, PINHOLE, MachineSession, machine_session
 from thinned import thinned
 
-from legcal.calibration.joint_fit.edge_biases import N_KINDS, SharedShifts
+from legcal.calibration.joint_fit.edge_biases import N_KINDS, EdgeBiases
 from legcal.calibration.joint_fit.parameters import Choices, Prior
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.state import State
@@ -67,7 +67,7 @@ def _problem(name: str) -> FitProblem:
     index = np.stack([np.zeros(n, dtype=np.intp), 1 + problem.outlines.leg], axis=1)
     names = ("all", *problem.legs.names)
     kind = np.zeros(len(names), dtype=np.intp)
-    shifts = SharedShifts(names, kind, np.full(N_KINDS, 0.3), index, shift)
+    shifts = EdgeBiases(names, kind, np.full(N_KINDS, 0.3), index, shift)
     return problem.with_biases(shifts)
 
 

@@ -13,7 +13,7 @@ from hexapod_session import (
 )
 from thinned import thinned
 
-from legcal.calibration.joint_fit.edge_biases import possible_shifts
+from legcal.calibration.joint_fit.edge_biases import possible_biases
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.observations import observed_outlines
 from legcal.calibration.joint_fit.rounds import NO_CHANGES, Changes, unsettled
@@ -31,7 +31,7 @@ def _fit(session: Session, level: float, n_rounds: int) -> Solution:
     """Return a fit to outlines whose errors are shared by parts in views, in some rounds."""
     rng = np.random.default_rng(3)
     observed = observed_outlines(session.outlines, session.measurements, session.legs)
-    possible = possible_shifts(observed, session.legs.names)
+    possible = possible_biases(observed, session.legs.names)
     sigma = np.array([0.0, 0.0, level, level, 0.5 * level, 0.5 * level])
     values = sigma[possible.kind] * rng.standard_normal(len(possible))
     shift = np.einsum("nc,nce->ne", values[possible.index], possible.shift)

@@ -19,14 +19,14 @@ from hexapod_session import (
 from legcal.calibration.joint_fit.edge_biases import (
     KINDS,
     N_KINDS,
-    SharedShifts,
-    estimated_shifts,
-    possible_shifts,
+    EdgeBiases,
+    estimated_biases,
+    possible_biases,
 )
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.observations import ObservedOutlines, observed_outlines
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.rounds import with_shifts
+from legcal.calibration.joint_fit.rounds import with_edge_biases
 from legcal.calibration.joint_fit.state import State
 from legcal.data.outlines import Outlines
 from legcal.estimation import linearize, scores_of_block
@@ -96,9 +96,9 @@ def observed_in(session: Session) -> ObservedOutlines:
     return observed_outlines(session.outlines, session.measurements, session.legs)
 
 
-def scores_of(problem: FitProblem, state: State, possible: SharedShifts) -> tuple[Array, Array]:
+def scores_of(problem: FitProblem, state: State, possible: EdgeBiases) -> tuple[Array, Array]:
     """Return the scores of all biases that outlines may share, and their covariance."""
-    asked, there = with_shifts(problem, state, possible)
+    asked, there = with_edge_biases(problem, state, possible)
     return scores_of_block(asked, there, "biases")
 
 
@@ -108,7 +108,7 @@ def test_scores_are_those_of_the_residuals_that_a_fit_leaves(session: Session) -
     problem = build_fit(session.legs, measurements, outlines)
     state = problem.begin(disturbed_start(session, joints=1e-5, camera=1e-5, angle=1e-5))
     whitening = NoiseModel().whitening(problem.outlines.covariance)
-    possible = possible_shifts(problem.outlines, session.legs.names)
+    possible = possible_biases(problem.outlines, session.legs.names)
     z, K = scores_of(problem, state, possible)
     linear = linearize(problem, state)
     # All at once: outlines, readings and priors, without elimination.
@@ -131,10 +131,10 @@ def test_scores_do_not_depend_on_the_shifts_that_are_fitted(session: Session) ->
     measurements, outlines = noisy_readings(session, rng), noisy_outlines(session, rng)
     problem = build_fit(session.legs, measurements, outlines)
     state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
-    possible = possible_shifts(problem.outlines, session.legs.names)
+    possible = possible_biases(problem.outlines, session.legs.names)
     bare = scores_of(problem, state, possible)
     some = possible.of_sizes(np.array([0.0, 0.1, 0.2, 0.0, 0.1, 0.0]))
-    with_some, there = with_shifts(problem, state, some)
+    with_some, there = with_edge_biases(problem, state, some)
     there = replace(there, biases=0.1 * rng.standard_normal(len(some)))
     for one, other in zip(
         bare,
@@ -146,7 +146,7 @@ def test_scores_do_not_depend_on_the_shifts_that_are_fitted(session: Session) ->
 
 def test_shifts_have_names_of_their_own(session: Session) -> None:
     observed = observed_in(session)
-    possible = possible_shifts(observed, session.legs.names)
+    possible = possible_biases(observed, session.legs.names)
     assert len(set(possible.names)) == len(possible.names) == len(possible.kind)
     assert {"all.bias", "c1.tilt", "leg1.rod.bias"} <= set(possible.names)
     assert {"c1.leg5.rod.inward.bias", "c1.leg5.rod.sideways.tilt_x"} <= set(possible.names)
@@ -158,7 +158,7 @@ def shared_errors(
 ) -> Outlines:
     """Return outlines whose edges err alike in all images of a view, and change with place."""
     observed = observed_in(session)
-    possible = possible_shifts(observed, session.legs.names)
+    possible = possible_biases(observed, session.legs.names)
     sigma = np.array([0.0, 0.0, level, level, slope, slope])
     values = sigma[possible.kind] * rng.standard_normal(len(possible))
     shift = np.einsum("nc,nce->ne", values[possible.index], possible.shift)
@@ -193,7 +193,7 @@ def test_independent_errors_are_not_taken_for_shared_ones(session: Session) -> N
 
 def test_residuals_of_known_shifts_give_their_sizes(session: Session) -> None:
     observed = observed_in(session)
-    possible = possible_shifts(observed, session.legs.names)
+    possible = possible_biases(observed, session.legs.names)
     sigma, found = np.array([0.0, 0.0, 0.06, 0.04, 0.03, 0.0]), []
     problem = build_fit(session.legs, session.measurements, session.outlines)
     state = problem.begin(disturbed_start(session, joints=0.0, camera=0.0, angle=0.0))
@@ -204,6 +204,6 @@ def test_residuals_of_known_shifts_give_their_sizes(session: Session) -> None:
     for _ in range(40):
         b = sigma[possible.kind] * rng.standard_normal(len(possible))
         z = K @ b + root @ rng.standard_normal(len(possible))
-        found.append(estimated_shifts(possible, z, K).sigma ** 2)
+        found.append(estimated_biases(possible, z, K).sigma ** 2)
     found_sigma = np.sqrt(np.mean(found, axis=0))[: len(KINDS)]
     assert found_sigma == pytest.approx(sigma, rel=0.15, abs=0.03)

@@ -174,7 +174,7 @@ def refuse_contradicted_values(
     Parameters
     ----------
     problem : FitProblem
-        Without anything held, and without shifts.
+        Without anything held, and without edge biases.
     start, state
         Where the fit began, and a minimum with the values fixed or where it is looked for.
     settings : RefinementSettings

@@ -2,14 +2,14 @@
 
 Shading moves an edge of a leg alike in all images of a camera, a little differently where the leg
 stands elsewhere in the image; blur moves many edges. Such errors do not average out over images.
-So groups of outlines have unknown shifts, random with variances that restricted maximum
+So groups of outlines have unknown biases, random with variances that restricted maximum
 likelihood finds in the residuals. Where these are white there are none.
 
-Shifts that move both edges of a leg inwards show in the residuals, and depth and radius take
+Biases that move both edges of a leg inwards show in the residuals, and depth and radius take
 them up. Those that move a leg sideways hardly show, since the fit follows, and they are what moves
 joints. What shows must therefore say how large both are. If edges erred independently, both
 variances would be equal; light from one side makes one edge of a leg brighter and the other
-darker, and sideways shifts count twice (:data:`SIDEWAYS`).
+darker, and sideways biases count twice (:data:`SIDEWAYS`).
 
 Where the gamma of a camera is not told, its outlines move together, each by its own amount, with
 the logarithm of that gamma over the one with which they were measured
@@ -38,13 +38,13 @@ KINDS = (
 GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the end of the names of its shifts
 N_KINDS = len(KINDS) + 1
 GAMMA_SIGMA = 0.5  # of the logarithm: photographs are linear, or near 2.2
-SIDEWAYS = np.sqrt(2.0)  # standard deviation of sideways shifts, those inwards being one
+SIDEWAYS = np.sqrt(2.0)  # standard deviation of sideways biases, those inwards being one
 _LEAST_GAIN = 25.0  # of white residuals, one set in 20,000 gains that much
 _MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
 
 
 @dataclass(frozen=True, eq=False)
-class SharedShifts:
+class EdgeBiases:
     """Biases that outlines share, random with known variances.
 
     Their names: ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
@@ -61,7 +61,7 @@ class SharedShifts:
 
     @property
     def sigmas(self) -> Array:
-        """Standard deviation of each shift [px, or none], (b,)."""
+        """Standard deviation of each bias [px, or none], (b,)."""
         return np.asarray(self.sigma[self.kind])
 
     @property
@@ -71,19 +71,19 @@ class SharedShifts:
 
     @property
     def sizes(self) -> dict[str, float]:
-        """Standard deviation of each of ``KINDS`` [px], by its name; empty without such shifts."""
+        """Standard deviation of each of ``KINDS`` [px], by its name; empty without such biases."""
         sigma = self.sigma[: len(KINDS)].tolist()
         return dict(zip(KINDS, sigma, strict=True)) if np.any(self.kind != GAMMA) else {}
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def of_sizes(self, sigma: Array) -> SharedShifts:
-        """Return shifts with these standard deviations, without those where it is zero."""
+    def of_sizes(self, sigma: Array) -> EdgeBiases:
+        """Return biases with these standard deviations, without those where it is zero."""
         kept = sigma[self.kind] > 0.0
         number = np.cumsum(kept) - 1
-        columns = kept[self.index].all(axis=0)  # all shifts of a column are of one kind
-        return SharedShifts(
+        columns = kept[self.index].all(axis=0)  # all biases of a column are of one kind
+        return EdgeBiases(
             tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept),
             self.kind[kept],
             sigma,
@@ -92,11 +92,11 @@ class SharedShifts:
         )
 
 
-def possible_shifts(
+def possible_biases(
     outlines: ObservedOutlines,
     leg_names: Sequence[str],
     fitted: ObservedOutlines | None = None,
-) -> SharedShifts:
+) -> EdgeBiases:
     """Return all biases that outlines may share, with a standard deviation of one unit.
 
     Biases of many edges are inward; those of one part in a view are inward and sideways and
@@ -140,7 +140,7 @@ def possible_shifts(
         shift.append(np.repeat((-o.epsilon * o.by_gamma)[:, None], 2, axis=1))
         names += [f"{camera}{GAMMA_SUFFIX}" for camera in cameras]
         kind += [GAMMA] * len(cameras)
-    return SharedShifts(
+    return EdgeBiases(
         tuple(names),
         np.array(kind),
         np.ones(N_KINDS),
@@ -149,10 +149,10 @@ def possible_shifts(
     )
 
 
-def estimated_shifts(
-    possible: SharedShifts, z: Array, K: Array, least: Array | float = 0.0
-) -> SharedShifts:
-    """Return the shifts that the residuals show: none at all where they are white.
+def estimated_biases(
+    possible: EdgeBiases, z: Array, K: Array, least: Array | float = 0.0
+) -> EdgeBiases:
+    """Return the biases that the residuals show: none at all where they are white.
 
     *z* (b,) and *K* (b, b) are scores of all of them and their covariance (:class:`Effects`);
     *least* (N_KINDS,) are standard deviations known from elsewhere, where the residuals show less

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.edge_biases import SharedShifts, possible_shifts
+from legcal.calibration.joint_fit.edge_biases import EdgeBiases, possible_biases
 from legcal.calibration.joint_fit.observations import observed_outlines, of_parts, seen_by
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.state import State
@@ -46,7 +46,7 @@ class Posterior:
 
     problem: FitProblem  # with the biases that outlines share
     state: State
-    shifts: SharedShifts
+    edge_biases: EdgeBiases
     noise: NoiseModel
     covariance: Array  # (n_kept, n_kept)
 
@@ -60,8 +60,8 @@ class Posterior:
         fitted, legs, state = self.problem, self.problem.legs, self.state
         found = of_parts(observed_outlines(outlines, measurements, legs), fitted.outlines.parts)
         found = seen_by(found, state.cameras)
-        possible = possible_shifts(found, legs.names, fitted.outlines)
-        shifts = possible.of_sizes(self.shifts.sigma)
+        possible = possible_biases(found, legs.names, fitted.outlines)
+        shifts = possible.of_sizes(self.edge_biases.sigma)
         problem = fitted.with_measurements(measurements, found, shifts)
         values = dict(zip(fitted.block("biases").labels, state.biases.tolist(), strict=True))
         others = [legs.radii[part] for part in found.parts[len(state.radii) :]]
@@ -76,7 +76,7 @@ class Posterior:
             self._covariance_of(problem, shifts),
         )
 
-    def _covariance_of(self, problem: FitProblem, shifts: SharedShifts) -> Array:
+    def _covariance_of(self, problem: FitProblem, shifts: EdgeBiases) -> Array:
         """Return the covariance of the unknowns of a problem with other biases."""
         old = self.problem
         place = {name: i for i, name in enumerate(old.named)}

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from legcal.calibration.joint_fit.edge_biases import SharedShifts
+from legcal.calibration.joint_fit.edge_biases import EdgeBiases
 from legcal.calibration.joint_fit.factors import (
     axis_factor,
     corner_factor,
@@ -145,7 +145,7 @@ class FitProblem(Problem[State]):
         whitening = noise.whitening(self.outlines.covariance, accepted)
         return self.with_factors(replace(self.factor("outlines"), whitening=whitening))
 
-    def with_biases(self, biases: SharedShifts) -> FitProblem:
+    def with_biases(self, biases: EdgeBiases) -> FitProblem:
         """Return the problem with these common-mode edge biases in place of those it had."""
         outlines = replace(self.outlines, bias_index=biases.index, bias_shift=biases.shift)
         whitening = self.factor("outlines").whitening
@@ -159,7 +159,7 @@ class FitProblem(Problem[State]):
         return other.with_factors(corner_factor(board, self.keys))
 
     def with_measurements(
-        self, measurements: Measurements, outlines: ObservedOutlines, biases: SharedShifts
+        self, measurements: Measurements, outlines: ObservedOutlines, biases: EdgeBiases
     ) -> FitProblem:
         """Return the same unknowns, and other images of the same views without axes and board.
 
@@ -291,7 +291,7 @@ def _built(
     seen[outlines.view] = seen[lines.view] = seen[corners.view] = True
     camera_pose = np.full((len(cameras), 6), -1, dtype=np.intp)
     camera_pose[seen] = all_free(int(seen.sum()), 6)
-    no_shifts = Variables("biases", np.zeros((0, 1), dtype=np.intp))
+    no_biases = Variables("biases", np.zeros((0, 1), dtype=np.intp))
     nominal = np.array([legs.radii[part] for part in outlines.parts])
     radii = [radius_name(legs.names[leg], part) for leg, part in outlines.parts]
     blocks = (
@@ -306,7 +306,7 @@ def _built(
             np.array([settings.board_scale_sigma]),
             choices,
         ),
-        no_shifts,
+        no_biases,
         Variables("camera_pose", camera_pose, Frames.moved, largest=_LARGEST_TURN),
         Variables(
             "board_pose",
@@ -408,7 +408,7 @@ def _intrinsics(
     return block, keys
 
 
-def _bias_block(biases: SharedShifts) -> Variables:
+def _bias_block(biases: EdgeBiases) -> Variables:
     """Return the block of common-mode biases, random with known variances."""
     b = len(biases)
     prior = GaussianPrior(np.arange(b, dtype=np.intp), np.zeros(b), biases.sigmas)

@@ -14,9 +14,9 @@ import numpy as np
 from legcal.calibration.joint_fit.edge_biases import (
     KINDS,
     N_KINDS,
-    SharedShifts,
-    estimated_shifts,
-    possible_shifts,
+    EdgeBiases,
+    estimated_biases,
+    possible_biases,
     with_gamma,
 )
 from legcal.calibration.joint_fit.problem import FitProblem
@@ -58,7 +58,7 @@ class Fit:
     problem: FitProblem  # with the biases that outlines share
     minimum: Minimum[State]
     noise: NoiseModel
-    shifts: SharedShifts
+    edge_biases: EdgeBiases
     accepted: BoolArray  # (n_outlines,)
     iterations: int
     notes: tuple[str, ...]  # what the last round still changed, if that was more than it should
@@ -114,11 +114,11 @@ def fit_in_rounds(
     """
     claimed, noise = problem.outlines.covariance, NoiseModel()
     accepted = np.ones(len(claimed), dtype=np.bool_)
-    possible = possible_shifts(problem.outlines, problem.legs.names)
+    possible = possible_biases(problem.outlines, problem.legs.names)
     least = np.zeros(N_KINDS)
     least[: len(KINDS)] = [problem.choices.least_shared_px.get(kind, 0.0) for kind in KINDS]
-    shifts = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
-    problem, state = with_shifts(problem, first, shifts)
+    biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
+    problem, state = with_edge_biases(problem, first, biases)
 
     def solved(near_enough: float = 0.0) -> tuple[FitProblem, Minimum[State]]:
         weighted = problem.weighted(noise, accepted)
@@ -142,7 +142,7 @@ def fit_in_rounds(
         state, iterations = minimum.state, iterations + minimum.iterations
     asked, changes = problem.with_biases(possible), NO_CHANGES
     for _ in range(settings.noise_rounds if len(claimed) else 1):
-        errors_before, accepted_before = _sizes(noise, shifts), accepted
+        errors_before, accepted_before = _sizes(noise, biases), accepted
         noise = _noise(problem, state, noise, accepted, settings)
         accepted = _accepted(problem, state, noise, settings)
         problem, minimum = solved()
@@ -151,12 +151,12 @@ def fit_in_rounds(
             break
         there = replace(state, biases=_values(problem, state, possible))
         scores = scores_of_block(asked.weighted(noise, accepted), there, "biases")
-        shifts = estimated_shifts(possible, *scores, least)
-        if len(shifts) or len(state.biases):
-            problem, state = with_shifts(problem, state, shifts)
+        biases = estimated_biases(possible, *scores, least)
+        if len(biases) or len(state.biases):
+            problem, state = with_edge_biases(problem, state, biases)
             problem, minimum = solved()
             state, iterations = minimum.state, iterations + minimum.iterations
-        errors = _sizes(noise, shifts)
+        errors = _sizes(noise, biases)
         n_changed = int(np.sum(accepted != accepted_before))
         changes = Changes(errors_before, errors, n_changed, int(accepted.sum()))
         if changes.are_settled(settings):
@@ -171,21 +171,21 @@ def fit_in_rounds(
             "sigmas."
         )
     notes = unsettled(changes, claimed, settings)
-    return Fit(problem, minimum, noise, shifts, accepted, iterations, notes)
+    return Fit(problem, minimum, noise, biases, accepted, iterations, notes)
 
 
-def with_shifts(
-    problem: FitProblem, state: State, shifts: SharedShifts
+def with_edge_biases(
+    problem: FitProblem, state: State, biases: EdgeBiases
 ) -> tuple[FitProblem, State]:
     """Return problem and state with these biases in place of others, known ones as they are."""
-    values = _values(problem, state, shifts)
-    return problem.with_biases(shifts), replace(state, biases=values)
+    values = _values(problem, state, biases)
+    return problem.with_biases(biases), replace(state, biases=values)
 
 
-def _values(problem: FitProblem, state: State, shifts: SharedShifts) -> Array:
+def _values(problem: FitProblem, state: State, biases: EdgeBiases) -> Array:
     """Return the values of biases at a state of a problem, zero where it has none of that name."""
     known = dict(zip(problem.block("biases").labels, state.biases.tolist(), strict=True))
-    return np.array([known.get(name, 0.0) for name in shifts.names])
+    return np.array([known.get(name, 0.0) for name in biases.names])
 
 
 def _noise(
@@ -286,9 +286,9 @@ class Changes:
 NO_CHANGES = Changes(np.zeros(0), np.zeros(0), 0, 0)
 
 
-def _sizes(noise: NoiseModel, shifts: SharedShifts) -> Array:
+def _sizes(noise: NoiseModel, biases: EdgeBiases) -> Array:
     """Return all standard deviations of errors in one vector: a factor, the others [px]."""
-    return np.array([noise.scale, noise.bias_px, noise.tilt_px, *shifts.sigma[: len(KINDS)]])
+    return np.array([noise.scale, noise.bias_px, noise.tilt_px, *biases.sigma[: len(KINDS)]])
 
 
 def unsettled(changes: Changes, claimed: Array, settings: RefinementSettings) -> tuple[str, ...]:
