@@ -23,8 +23,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset
-from legcal.simulation.session import simulate
-from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import SimulationSettings
 
 MODELS = Path(__file__).parents[1] / "models"
 HEADER = (

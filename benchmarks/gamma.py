@@ -20,7 +20,7 @@ from honesty import honesty
 
 from legcal import Appearance, LegcalError, calibrate, load_dataset, load_mechanism
 from legcal.data.dataset import Dataset
-from legcal.simulation.session import simulate
+from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import SimulationSettings
 
 ENCODED = 2.2

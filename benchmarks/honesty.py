@@ -26,7 +26,7 @@ from legcal.calibration.verdict import Calibration
 from legcal.geometry import components
 from legcal.geometry.types import Array
 from legcal.machine import Mechanism, geometries, pose_sensitivity, vector_of
-from legcal.simulation.session import simulate
+from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import SimulationSettings
 
 ROOT = Path(__file__).parents[1]

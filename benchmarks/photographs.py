@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry.types import Array
 from legcal.machine import Mechanism, load_mechanism, random_configurations
 from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.scene import prepare_scene
+from legcal.simulation.rendering.scene import prepare_view
 from legcal.simulation.solids import PlacedSolid, dressed, link_poses, placed
 from legcal.vision.camera import Camera
 
@@ -61,10 +61,10 @@ def measure(mechanism: Mechanism, n: int) -> str:
     solids = dressed(mechanism)
     poses = [placed(solids, link_poses(mechanism, q)) for q in configurations]
     T = looking_at(poses[0])
-    prepare_scene(poses[0], CAMERA, T, Appearance(), np.random.default_rng(0))  # loads and caches
+    prepare_view(poses[0], CAMERA, T, Appearance(), np.random.default_rng(0))  # loads and caches
     rng = np.random.default_rng(0)
     begin = time.process_time()
-    scene = prepare_scene(poses[0], CAMERA, T, Appearance(), rng)
+    scene = prepare_view(poses[0], CAMERA, T, Appearance(), rng)
     preparing = time.process_time() - begin
     rendering, images = [], []
     for pose in poses:

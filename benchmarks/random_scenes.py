@@ -17,9 +17,11 @@ from legcal.geometry.types import Array, BoolArray, Image
 from legcal.machine import Cylinder as Visible
 from legcal.machine import LegKind, Mechanism, load_mechanism
 from legcal.simulation.cameras import look_at
-from legcal.simulation.poses import Sampling, commanded_poses
+from legcal.simulation.poses import commanded_poses
 from legcal.simulation.rendering.appearance import Appearance, Light
-from legcal.simulation.rendering.scene import prepare_scene
+from legcal.simulation.rendering.scene import prepare_view
+from legcal.simulation.request import Sampling
+from legcal.simulation.settings import ParameterErrors, Spread
 from legcal.simulation.solids import (
     Box,
     Cylinder,
@@ -30,7 +32,7 @@ from legcal.simulation.solids import (
     dressed,
     pose_machine,
 )
-from legcal.simulation.truth import ParameterErrors, Spread, write_true_model
+from legcal.simulation.truth import write_true_model
 from legcal.simulation.visibility import LegView, legs_in_image
 from legcal.vision.camera import Camera
 
@@ -131,7 +133,7 @@ def draw(seed: int) -> Scene:
     occluders: tuple[PlacedSolid, ...] = ()
     if occluded:
         occluders, shown_legs = _occluders(truth, machines, camera, T, shown_legs, rng)
-    scene = prepare_scene(machines[0].solids, camera, T, appearance, rng)
+    scene = prepare_view(machines[0].solids, camera, T, appearance, rng)
     images = tuple(scene.render((*machine.solids, *occluders), rng) for machine in machines)
     measurements = _measurements(nominal, camera, poses.readings, rng)
     A, B = _nominal_joints(nominal, measurements)

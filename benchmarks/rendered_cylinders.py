@@ -14,7 +14,7 @@ from legcal.geometry.types import Array, Image
 from legcal.perception.light import Grey, to_grey
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.rays import in_view
-from legcal.simulation.rendering.scene import Canvas, develop, prepare_scene
+from legcal.simulation.rendering.scene import Canvas, develop, prepare_view
 from legcal.simulation.solids import Cylinder, Material, PlacedSolid, Solid
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
@@ -172,7 +172,7 @@ def _radiance(solid: PlacedSolid, camera: Camera, appearance: Appearance) -> Gre
     K[:2, 2] += 0.5 * (FINE - 1)
     K[2, 2] = 1.0
     camera = replace(camera, K=K, width=FINE * camera.width, height=FINE * camera.height)
-    scene = prepare_scene([solid], camera, RigidTransform.identity(), appearance, rng)
+    scene = prepare_view([solid], camera, RigidTransform.identity(), appearance, rng)
     canvas = Canvas(scene.canvas.z.copy(), scene.canvas.terms.sum(axis=0)[None])
     scene.painter.paint(canvas, in_view([solid], scene.T_camera_base))
     return np.asarray(canvas.terms[0, 0].reshape(camera.height, camera.width))

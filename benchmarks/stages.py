@@ -19,11 +19,16 @@ from legcal.errors import LegcalError
 from legcal.machine import KinematicParameters
 from legcal.paper.four_steps import run_steps
 from legcal.paper.nominal import Criteria
-from legcal.simulation.cameras import cameras_around
-from legcal.simulation.machine import Machine, extreme_poses, hexapod, perturb
-from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.studies.paper import nominal_of, platform_errors, simulate_session
-from legcal.simulation.table_noise import TableNoise
+from legcal.simulation.hexapod import (
+    Machine,
+    cameras_around,
+    extreme_poses,
+    hexapod,
+    hexapod_session,
+    perturb,
+)
+from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.paper import nominal_of, platform_errors
 
 NOISES: dict[str, OutlineNoise | TableNoise] = {
     "outlines, 0.001 px a point, 300 points": OutlineNoise(1e-3, 300),
@@ -54,7 +59,7 @@ def _print_times() -> None:
         rng = np.random.default_rng(0)
         machine = perturb(hexapod(), rng, 0.002)
         nominal = perturb(machine, rng, 0.002)
-        session = simulate_session(
+        session = hexapod_session(
             machine,
             cameras_around(machine, rng),
             rng,
@@ -96,7 +101,7 @@ def _errors(
     nominal = perturb(machine, rng, 0.002)
     views = cameras_around(machine, rng)
     n_images = 3 if isinstance(noise, TableNoise) else 1
-    session = simulate_session(machine, views, rng, noise=noise, n_images=n_images)
+    session = hexapod_session(machine, views, rng, noise=noise, n_images=n_images)
     found = {"nominal": _platform_error(machine, nominal.parameters)}
     for criteria in CRITERIA:
         try:

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from legcal.simulation.session import simulate
+from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import SimulationSettings
 
 MODELS = ("hexapod", "3-upu-tilted", "3-rpr", "tricept")

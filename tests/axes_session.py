@@ -12,10 +12,8 @@ from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
 from legcal.data.measurements import Measurements
 from legcal.geometry.types import Array
 from legcal.machine import KinematicParameters, from_vector, point_like_legs, to_vector
-from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
-from legcal.simulation.machine import hexapod, perturb
-from legcal.simulation.studies.paper import simulate_session
-from legcal.simulation.table_noise import TableNoise
+from legcal.simulation.hexapod import PAPER_VIEWS, cameras_around, hexapod, hexapod_session, perturb
+from legcal.simulation.observe import TableNoise
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +76,11 @@ def axes_session(
     rng = np.random.default_rng(3)
     machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
     cameras = cameras_around(machine, rng, legs=legs)
-    session = simulate_session(
+    session = hexapod_session(
         machine, cameras, rng, noise=TableNoise(), noisy=False, n_poses=n_poses, n_images=n_images
     )
     # Rough camera poses, about 1 degree and 1 cm wrong.
-    rough = simulate_session(machine, cameras, rng, noise=TableNoise(), n_poses=1).measurements
+    rough = hexapod_session(machine, cameras, rng, noise=TableNoise(), n_poses=1).measurements
     legs_true = point_like_legs(machine.parameters)
     return AxesSession(
         FittedLegs(machine.leg_names, legs_true, machine.sign, machine.frame_legs, {}),

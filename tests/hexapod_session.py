@@ -1,6 +1,6 @@
 """A simulated calibration session with exact outlines, for the tests of the fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.joint_fit.state import FittedLegs, Start
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
-from legcal.geometry.types import Array, IntArray
+from legcal.geometry.types import Array
 from legcal.machine import (
     KinematicParameters,
     LegGeometry,
@@ -17,8 +17,9 @@ from legcal.machine import (
     from_vector,
     to_vector,
 )
+from legcal.simulation.observe import outlines_of, plain_scene
+from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera
-from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
 FRAME_LEGS = (0, 2, 4)
 RADIUS = 0.010
@@ -90,13 +91,21 @@ def simulate(
         (lengths - TRUTH.offsets)[pose],
         2e-6,
     )
-    blocks = []
-    for row in range(n_rows):
-        T = T_cameras[view[row]]
-        ends_of_legs = T.apply(A), T.apply(poses[pose[row]].apply(B))
-        nearest = np.sort(np.argsort(ends_of_legs[0][:, 2])[:legs_seen])
-        blocks.append((row, nearest, ends_of_legs[0][nearest], ends_of_legs[1][nearest]))
-    outlines = _outlines(blocks, camera, radius, sigma_px)
+    # Images show the legs whose base joints are nearest to the camera.
+    depth = np.array([T.apply(A)[:, 2] for T in T_cameras])
+    nearest = [np.sort(np.argsort(depth[v])[:legs_seen]).tolist() for v in view]
+    scene = plain_scene(
+        np.broadcast_to(A, (*lengths.shape, 3)),
+        np.array([T.apply(B) for T in poses]),
+        [Viewpoint(f"c{v + 1}", camera, T.inv()) for v, T in enumerate(T_cameras)],
+        view,
+        pose,
+        {(j, "rod"): radius for j in range(6)},
+        nearest,
+        span=(0.08, 0.92),
+    )
+    white = np.tile(sigma_px**2 * np.eye(2), (2 * legs_seen * n_rows, 1, 1))
+    outlines = replace(outlines_of(scene), covariance=white)
     radii = {(i, "rod"): RADIUS for i in range(6)}
     sign = np.ones(6, dtype=np.intp)
     legs = FittedLegs(names, geometry_of(TRUTH), sign, FRAME_LEGS, radii)
@@ -123,7 +132,7 @@ def moved_outlines(outlines: Outlines, camera: Camera, offsets_px: Array) -> Out
     h = np.cross(rays[:, 0], rays[:, 1])
     h /= np.linalg.norm(h, axis=1, keepdims=True)
     h *= np.sign(np.sum(h * outlines.h, axis=1, keepdims=True))
-    return _replaced(outlines, h=h, ends=ends)
+    return replace(outlines, h=h, ends=ends)
 
 
 def noisy_outlines(session: Session, rng: np.random.Generator) -> Outlines:
@@ -171,11 +180,6 @@ def gauge_is_kept(parameters: KinematicParameters) -> bool:
     return not (parameters.base_joints[fixed].any() or parameters.platform_joints[fixed].any())
 
 
-def _replaced(outlines: Outlines, *, h: Array, ends: Array) -> Outlines:
-    o = outlines
-    return Outlines(o.row, o.leg, o.part, o.edge, h, ends, o.covariance, o.used, o.reason, o.source)
-
-
 def _camera_around(angle: float) -> RigidTransform:
     """Return T_camera_Rb of a camera 0.9 m away that looks at the middle of the machine."""
     middle = np.array([0.23, 0.15, 0.17])
@@ -202,33 +206,4 @@ def _shaken(
     rotation = Rotation.from_rotvec(angle * turn / np.linalg.norm(turn))
     return RigidTransform.from_components(
         T.translation + distance * shift / np.linalg.norm(shift), rotation * T.rotation
-    )
-
-
-def _outlines(
-    blocks: list[tuple[int, IntArray, Array, Array]], camera: Camera, radius: float, sigma_px: float
-) -> Outlines:
-    rows, legs, hs, ends = [], [], [], []
-    for row, nearest, A, B in blocks:
-        u = (B - A) / np.linalg.norm(B - A, axis=1, keepdims=True)
-        h = outlines_of_axis(u, A, radius)
-        for j, leg in enumerate(nearest):
-            on_axis = A[j] + np.array([[0.08], [0.92]]) * (B[j] - A[j])
-            for edge in range(2):
-                rows.append(row)
-                legs.append(int(leg))
-                hs.append(h[j, edge])
-                ends.append(camera.project(on_axis - EPSILON[edge] * radius * h[j, edge]))
-    n = len(rows)
-    return Outlines(
-        np.array(rows, dtype=np.intp),
-        np.array(legs, dtype=np.intp),
-        ("rod",) * n,
-        np.tile(np.array([1, 2], dtype=np.intp), n // 2),
-        np.array(hs),
-        np.array(ends),
-        np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)),
-        np.ones(n, dtype=np.bool_),
-        ("",) * n,
-        ("detected",) * n,
     )

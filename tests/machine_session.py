@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from outline_study import closed_poses, moved_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.poses import start_from
@@ -24,9 +25,14 @@ from legcal.machine import (
     moved_legs,
     platform_in_base,
 )
-from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.studies.paper import closed_poses, moved_poses
-from legcal.simulation.visibility import silhouette
+from legcal.simulation.observe import (
+    OutlineNoise,
+    moved_outlines,
+    noisy_outlines,
+    outlines_of,
+    plain_scene,
+)
+from legcal.simulation.visibility import Viewpoint
 from legcal.vision.camera import Camera
 
 K = np.array([[1290.0, 0.0, 518.0], [0.0, 1280.0, 380.0], [0.0, 0.0, 1.0]])
@@ -75,18 +81,14 @@ class MachineSession:
 
     def noisy(self, seed: int) -> tuple[Measurements, Outlines]:
         """Return readings and outlines with the errors that they claim."""
-        rng, m, exact = np.random.default_rng(seed), self.measurements, self.outlines
+        rng, m = np.random.default_rng(seed), self.measurements
         q = m.q + m.sigma_q * rng.standard_normal(m.q.shape)
-        root = np.linalg.cholesky(exact.covariance)
-        offsets = np.einsum("nij,nj->ni", root, rng.standard_normal((len(exact), 2)))
-        return replace(m, q=q), shifted(self, exact, offsets)
+        return replace(m, q=q), noisy_outlines(self.outlines, m.views[0].camera, rng)
 
 
 def shifted(session: MachineSession, outlines: Outlines, offsets: Array) -> Outlines:
     """Return outlines moved across themselves by (n, 2) pixels at their ends."""
-    camera = session.measurements.views[0].camera
-    h, ends = shifted_outlines(camera, outlines.h, outlines.ends, offsets)
-    return replace(outlines, h=h, ends=ends)
+    return moved_outlines(outlines, session.measurements.views[0].camera, offsets)
 
 
 @cache
@@ -192,33 +194,15 @@ def shown_outlines(
     radii: Mapping[tuple[int, str], float], m: Measurements, truth: Start
 ) -> Outlines:
     """Return both outlines of every part of every leg in every image."""
-    rows, of_leg, parts, hs, ends = [], [], [], [], []
-    for row, (v, pose) in enumerate(zip(m.view, m.pose, strict=True)):
-        T, platform = truth.T_camera_Rb[v], truth.T_Rb_Re[pose]
-        for (j, part), radius in radii.items():
-            A, B = T.apply(truth.legs[j].A), T.apply(platform.apply(truth.legs[j].B))
-            along = float(np.linalg.norm(B - A))
-            u = (B - A) / along
-            h, offset = silhouette(u, A, np.array(radius))
-            points = A + along * np.array([[0.15], [0.85]]) * u
-            rows += [row, row]
-            of_leg += [j, j]
-            parts += [part, part]
-            hs.append(h)
-            ends.append(m.views[v].camera.project(points + offset[:, None]))
-    n = len(rows)
-    return Outlines(
-        np.array(rows, dtype=np.intp),
-        np.array(of_leg, dtype=np.intp),
-        tuple(parts),
-        np.tile(np.array([1, 2], dtype=np.intp), n // 2),
-        np.concatenate(hs),
-        np.concatenate(ends),
-        np.tile(OutlineNoise(0.2, 150).covariance, (n, 1, 1)),
-        np.ones(n, dtype=np.bool_),
-        ("",) * n,
-        ("detected",) * n,
-    )
+    R, t = components(truth.T_Rb_Re)
+    A, B = (np.array([getattr(leg, joint) for leg in truth.legs]) for joint in "AB")
+    ends = np.einsum("kij,lj->kli", R, B) + t[:, None]
+    views = [
+        Viewpoint(view.name, view.camera, T.inv())
+        for view, T in zip(m.views, truth.T_camera_Rb, strict=True)
+    ]
+    scene = plain_scene(np.broadcast_to(A, ends.shape), ends, views, m.view, m.pose, radii)
+    return outlines_of(scene, OutlineNoise(0.2, 150))
 
 
 def _wrong(

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from legcal.geometry.types import Array
-from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.request import Level
+from legcal.simulation.settings import SimulationSettings
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 

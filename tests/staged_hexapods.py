@@ -7,11 +7,16 @@ import numpy as np
 
 from legcal.geometry.types import Array
 from legcal.machine import KinematicParameters, from_vector, to_vector
-from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
-from legcal.simulation.machine import Machine, hexapod, perturb
-from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.studies.paper import SimulatedSession, simulate_session
-from legcal.simulation.table_noise import TableNoise
+from legcal.simulation.hexapod import (
+    PAPER_VIEWS,
+    HexapodSession,
+    Machine,
+    cameras_around,
+    hexapod,
+    hexapod_session,
+    perturb,
+)
+from legcal.simulation.observe import OutlineNoise, TableNoise
 
 
 @cache
@@ -23,11 +28,11 @@ def exact_session(
     legs: tuple[tuple[int, ...], ...] = PAPER_VIEWS,
     n_poses: int = 6,
     share_poses: bool = False,
-) -> SimulatedSession:
+) -> HexapodSession:
     """Return a session without noise of a hexapod 2 mm off its drawing."""
     rng = np.random.default_rng(seed)
     machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
-    return simulate_session(
+    return hexapod_session(
         machine,
         cameras_around(machine, rng, legs=legs),
         rng,
@@ -41,12 +46,12 @@ def exact_session(
 @cache
 def noisy_session(
     seed: int, noise: OutlineNoise | TableNoise, *, coplanar: bool = False, n_poses: int = 15
-) -> tuple[SimulatedSession, Machine]:
+) -> tuple[HexapodSession, Machine]:
     """Return a session with noise, and a nominal machine up to 2 mm wrong in every parameter."""
     rng = np.random.default_rng(seed)
     machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
     nominal = perturb(machine, rng, 0.002)
-    session = simulate_session(
+    session = hexapod_session(
         machine,
         cameras_around(machine, rng),
         rng,

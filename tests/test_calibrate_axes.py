@@ -18,8 +18,7 @@ from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.machine import to_vector
 from legcal.report import summary
-from legcal.simulation.cameras import PAPER_VIEWS
-from legcal.simulation.machine import Machine
+from legcal.simulation.hexapod import PAPER_VIEWS, Machine
 
 Rows = list[dict[str, str]]
 

@@ -20,7 +20,7 @@ from legcal.data.corners import found_corners
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.machine import geometries, vector_of
-from legcal.simulation.settings import Level
+from legcal.simulation.request import Level
 from legcal.vision.board import Board
 from legcal.vision.camera import Camera
 

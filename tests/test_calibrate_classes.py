@@ -13,7 +13,7 @@ from legcal import calibrate, evaluate
 from legcal.calibration.joint_fit.platform import poses_at_readings
 from legcal.errors import LegcalError, NotIdentifiable, NotVisible
 from legcal.machine import geometries, load_mechanism, pose_differences
-from legcal.simulation.session import simulate
+from legcal.simulation.dataset import simulate
 
 Row = dict[str, str]
 

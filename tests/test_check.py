@@ -20,7 +20,7 @@ from legcal.cli.app import app
 from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
 from legcal.machine import geometries, load_mechanism, moved_legs, parametrization_of, vector_of
 from legcal.machine.written import turns_between
-from legcal.simulation.session import simulate
+from legcal.simulation.dataset import simulate
 
 MODEL = "3-rpr"
 

@@ -14,8 +14,8 @@ from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.measurements import Measurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array, IntArray
+from legcal.simulation.dataset import simulate
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.session import simulate
 
 EXACT = 1e-4  # [px]: errors of the outlines on which others are put
 NOISE = OutlineNoise(0.1, 150)
@@ -34,11 +34,11 @@ def _with_errors(dataset: Dataset, rng: np.random.Generator, shared: float = 0.0
     """
     o, m = dataset.observations, dataset.measurements
     assert o is not None
-    offsets = rng.multivariate_normal(np.zeros(2), NOISE.covariance, size=len(o))
+    offsets = rng.multivariate_normal(np.zeros(2), NOISE.covariance(0.0), size=len(o))
     shift = shared * rng.standard_normal((len(m.views), 1 + o.leg.max(), 2))
     offsets += shift[m.view[o.row], o.leg, o.edge - 1][:, None]
     h, ends = _moved(m, o.row, o.h, o.ends, offsets)
-    covariance = np.tile(NOISE.covariance, (len(o), 1, 1))
+    covariance = np.tile(NOISE.covariance(0.0), (len(o), 1, 1))
     return replace(dataset, observations=replace(o, h=h, ends=ends, covariance=covariance))
 
 

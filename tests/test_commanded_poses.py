@@ -10,7 +10,8 @@ import legcal
 from legcal.errors import DidNotConverge
 from legcal.machine import Mechanism
 from legcal.simulation import poses as module
-from legcal.simulation.poses import Sampling, commanded_poses, draw_poses
+from legcal.simulation.poses import commanded_poses, draw_poses
+from legcal.simulation.request import Sampling
 from legcal.simulation.truth import write_true_model
 
 

@@ -35,7 +35,7 @@ from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError
-from legcal.simulation.session import simulate as simulate_folder
+from legcal.simulation.dataset import simulate as simulate_folder
 from legcal.vision.cylinder import EPSILON
 
 __all__ = ["folder"]

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from outline_study import Noise, StartErrors, design_of, draw_session
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
@@ -19,13 +20,12 @@ from legcal.calibration.joint_fit.held_out import (
     poses_by_outlines,
 )
 from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.state import FittedLegs, Start
+from legcal.calibration.joint_fit.state import Start
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.estimation.noise import NoiseModel
 from legcal.geometry import motions_of
 from legcal.machine import LegGeometry
-from legcal.simulation.studies.outlines import Noise, StartErrors, design_of, draw_session
 
 MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")
 
@@ -49,11 +49,11 @@ def _truth(name: str) -> Truth:
     design = design_of(name, 3, 4, 0.1)
     rng = np.random.default_rng(8)
     session = draw_session(design, Noise(), StartErrors(0.0, 0.0, 0.0, 0.0, False), rng)
-    legs = FittedLegs(design.leg_names, design.legs, design.sign, design.frame_legs, design.radii)
+    legs = design.legs
     problem = build_fit(legs, session.measurements, session.outlines)
     cameras = tuple(T.inv() for T in design.T_Rb_camera)
     poses = motions_of(design.R, design.t)
-    state = problem.begin(Start(design.legs, cameras, poses, "truth"))
+    state = problem.begin(Start(legs.nominal, cameras, poses, "truth"))
     possible = possible_biases(problem.outlines, legs.names)
     nothing = np.zeros((problem.n_kept, problem.n_kept))
     shifts = possible.of_sizes(np.zeros(N_KINDS))

@@ -11,7 +11,7 @@ from staged_hexapods import exact_session
 
 from legcal.machine import LegGeometry, LegKind
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
-from legcal.simulation.cameras import PAPER_VIEWS
+from legcal.simulation.hexapod import PAPER_VIEWS
 
 EVERY = ((0, 1, 2),)
 

@@ -21,8 +21,8 @@ from legcal.paper.leg_directions import directions_through_joints
 from legcal.paper.platform import RigidProblem, build_rigid
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.platform_unknowns import PlatformUnknowns
-from legcal.simulation.machine import Machine
-from legcal.simulation.studies.paper import nominal_of
+from legcal.simulation.hexapod import Machine
+from legcal.simulation.paper import nominal_of
 
 VIEWS = [
     ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5)),

@@ -11,23 +11,28 @@ from legcal.data.outlines import Outlines
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array
-from legcal.simulation.cameras import cameras_around, sample_camera
-from legcal.simulation.machine import hexapod, perturb
+from legcal.simulation.cameras import sample_camera
+from legcal.simulation.hexapod import (
+    HexapodSession,
+    cameras_around,
+    hexapod,
+    hexapod_session,
+    perturb,
+)
 from legcal.simulation.observe import OutlineNoise, shifted_outlines
-from legcal.simulation.studies.paper import SimulatedSession, simulate_session
 from legcal.vision.camera import Camera
 
 LENS = replace(sample_camera(), distortion=np.array([-0.2, 0.1, 0.001, -0.002, 0.0]))
 
 
-def _session(camera: Camera, n_poses: int = 2) -> SimulatedSession:
+def _session(camera: Camera, n_poses: int = 2) -> HexapodSession:
     rng = np.random.default_rng(3)
     machine = perturb(hexapod(), rng, 0.002)
     views = cameras_around(machine, rng, camera=camera)
-    return simulate_session(machine, views, rng, noise=OutlineNoise(), noisy=False, n_poses=n_poses)
+    return hexapod_session(machine, views, rng, noise=OutlineNoise(), noisy=False, n_poses=n_poses)
 
 
-def _axes(session: SimulatedSession, outlines: Outlines) -> LegAxes:
+def _axes(session: HexapodSession, outlines: Outlines) -> LegAxes:
     return axes_from_outlines(outlines, session.measurements, session.machine.radius_of_part())
 
 
@@ -84,7 +89,9 @@ def test_the_covariance_of_axes_is_that_of_many_noisy_outlines() -> None:
     root = np.linalg.cholesky(exact.covariance)
     normalised = []
     for _ in range(150):
-        offsets = rng.multivariate_normal(np.zeros(2), OutlineNoise().covariance, len(outlines))
+        offsets = rng.multivariate_normal(
+            np.zeros(2), OutlineNoise().covariance(0.0), len(outlines)
+        )
         h, ends = shifted_outlines(LENS, outlines.h, outlines.ends, offsets)
         axes = _axes(session, replace(outlines, h=h, ends=ends))
         normalised.append(np.linalg.solve(root, _coordinates(axes, exact)[..., None])[..., 0])

@@ -13,7 +13,7 @@ from legcal.geometry.types import Array
 from legcal.machine import Mechanism, load_mechanism
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.rays import PixelRays
-from legcal.simulation.rendering.scene import prepare_scene, render
+from legcal.simulation.rendering.scene import prepare_view, render
 from legcal.simulation.solids import (
     Box,
     Cylinder,
@@ -194,7 +194,7 @@ def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: floa
         lights=(Light((-0.5, 0.0, -1.0), distance=3.0, radius=size),), ambient=0.0, shadows=True
     )
     rng = np.random.default_rng(0)
-    prepared = prepare_scene(scene, LENSES["pinhole"], IDENTITY, looks, rng)
+    prepared = prepare_view(scene, LENSES["pinhole"], IDENTITY, looks, rng)
     lamp = prepared.painter.light.lamps[0].position
     image = prepared.render(scene, rng) / 65535.0
     centre = ball.T_base_solid.translation
@@ -231,7 +231,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_does_not() -> None:
 
     def picture(scene_seed: int, noise_seed: int) -> Array:
         rng = np.random.default_rng(scene_seed)
-        scene = prepare_scene([ball], camera, IDENTITY, Appearance(clutter=2, cables=2), rng)
+        scene = prepare_view([ball], camera, IDENTITY, Appearance(clutter=2, cables=2), rng)
         return np.asarray(scene.render([ball], np.random.default_rng(noise_seed)))
 
     first = picture(1, 2)
@@ -304,7 +304,7 @@ def test_a_camera_below_the_machine_does_not_look_at_a_table() -> None:
     above = RigidTransform.from_components([0.0, 0.0, 2.0], Rotation.from_rotvec([3.0, 0.0, 0.0]))
     for T, n_tables in ((IDENTITY, 0), (above, 1)):
         rng = np.random.default_rng(0)
-        scene = prepare_scene([ball], LENSES["pinhole"], T, Appearance(clutter=0), rng)
+        scene = prepare_view([ball], LENSES["pinhole"], T, Appearance(clutter=0), rng)
         assert len(scene.surroundings.floor) == n_tables
 
 

@@ -11,12 +11,11 @@ from simulated import files_of, settings, small_camera
 
 from legcal import cli
 from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.simulation.dataset import simulate
 from legcal.simulation.folder import TRUTH_NAME
-from legcal.simulation.poses import Sampling
-from legcal.simulation.session import simulate
-from legcal.simulation.settings import Level
-from legcal.simulation.table_noise import TableNoise
-from legcal.simulation.truth import Distribution, ParameterErrors, Spread
+from legcal.simulation.observe import TableNoise
+from legcal.simulation.request import Level, Sampling
+from legcal.simulation.settings import Distribution, ParameterErrors, Spread
 
 QUICK = ("--level", "outlines", "--poses", "1", "--views", "1")
 LOOKING_AWAY = "{xyz: [1.5, 0.0, 0.2], quat_xyzw: [0.5, 0.5, 0.5, 0.5]}"

@@ -10,9 +10,9 @@ from simulated import files_of, settings, small_camera
 import legcal
 from legcal.data.dataset import load_dataset
 from legcal.data.outlines import read_observations
-from legcal.simulation.session import SimulatedDataset, simulate
-from legcal.simulation.settings import Level
-from legcal.simulation.truth import ParameterErrors, Spread
+from legcal.simulation.dataset import SimulatedDataset, simulate
+from legcal.simulation.request import Level
+from legcal.simulation.settings import ParameterErrors, Spread
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_without_errors_and_noise_readings_and_outlines_are_those_of_the_model(
 
 
 def test_uniform_noise_of_readings_stays_in_its_limits(tmp_path: Path) -> None:
-    from legcal.simulation.truth import Distribution
+    from legcal.simulation.settings import Distribution
 
     wide = Spread(1e-4, Distribution.UNIFORM)
     made = simulate("hexapod", tmp_path / "set", settings(readings=wide, poses=6, views=1))

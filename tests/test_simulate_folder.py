@@ -14,8 +14,8 @@ from simulated import files_of, settings, small_camera
 import legcal
 from legcal.data.outlines import format_observations
 from legcal.errors import OutOfResources, UsageError
+from legcal.simulation.dataset import simulate, summary_table
 from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
-from legcal.simulation.session import simulate, summary_table
 
 FEW = settings(poses=1, views=1)
 OWN = ("dataset.yaml", "images/c1_p01.png", "models/a.yaml", "truth/models/a.yaml")

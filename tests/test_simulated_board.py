@@ -16,9 +16,9 @@ from legcal.files import motion_from_xyz_quat
 from legcal.machine import Mechanism, load_mechanism
 from legcal.perception.boards import camera_poses
 from legcal.simulation.board import chosen_board
-from legcal.simulation.request import Request, requested
-from legcal.simulation.session import simulate
-from legcal.simulation.settings import Level, SimulationSettings
+from legcal.simulation.dataset import simulate
+from legcal.simulation.request import Level, Request
+from legcal.simulation.settings import SimulationSettings, requested
 from legcal.vision.board import Board, described_board
 from legcal.vision.corners import find_corners
 
@@ -163,7 +163,7 @@ def test_settings_of_boards_that_contradict_others_are_refused(
             "found both --hand-held and --cameras",
         ),
         (Request(board="charucoo"), "--board could not be used: .* did you mean 'charuco'"),
-        (Request(level="axes", pixel_noise="0.2px"), "--pixel-noise could not be used"),
+        (Request(level=Level.AXES, pixel_noise="0.2px"), "--pixel-noise could not be used"),
     ],
 )
 def test_options_of_boards_that_contradict_others_are_refused(
@@ -174,6 +174,6 @@ def test_options_of_boards_that_contradict_others_are_refused(
 
 
 def test_pixel_noise_of_axes_is_that_of_the_board() -> None:
-    settings = requested(Request(level="axes", board="charuco", pixel_noise="0.2px"), machine())
+    settings = requested(Request(level=Level.AXES, board="charuco", pixel_noise="0.2px"), machine())
     assert settings.sigma_px == pytest.approx(0.2)
     assert not isinstance(settings.board, Board)

@@ -11,9 +11,9 @@ from thinned import thinned
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.outlines import Outlines, read_observations
 from legcal.geometry.types import Array
+from legcal.simulation.dataset import simulate
 from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.session import simulate
-from legcal.simulation.settings import Level
+from legcal.simulation.request import Level
 from legcal.vision.camera import Camera
 from legcal.vision.camera_file import camera_info
 

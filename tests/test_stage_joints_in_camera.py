@@ -12,17 +12,18 @@ from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.paper.nominal import Criteria
+from legcal.simulation.hexapod import HexapodSession
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.studies.paper import SimulatedSession, nominal_of
+from legcal.simulation.paper import nominal_of
 
 
-def _locate(session: SimulatedSession, axes: LegAxes, criteria: Criteria) -> JointsInCamera:
+def _locate(session: HexapodSession, axes: LegAxes, criteria: Criteria) -> JointsInCamera:
     return locate_joints_in_cameras(
         nominal_of(session.machine), axes, session.measurements, criteria=criteria
     )
 
 
-def _true(session: SimulatedSession) -> Array:
+def _true(session: HexapodSession) -> Array:
     A_Rb = session.machine.parameters.base_joints
     return np.array([v.T_Rb_camera.inv().apply(A_Rb) for v in session.cameras])
 

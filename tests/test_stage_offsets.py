@@ -20,12 +20,12 @@ from legcal.paper.leg_directions import (
 )
 from legcal.paper.nominal import Criteria
 from legcal.paper.offsets import build_consecutive, identify_offsets, leg_ends, pairs_apart
-from legcal.simulation.machine import Machine
+from legcal.simulation.hexapod import HexapodSession, Machine
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.studies.paper import SimulatedSession, nominal_of
+from legcal.simulation.paper import nominal_of
 
 
-def _directions(session: SimulatedSession, nominal: Machine, criteria: Criteria) -> LegDirections:
+def _directions(session: HexapodSession, nominal: Machine, criteria: Criteria) -> LegDirections:
     joints = locate_joints_in_cameras(
         nominal_of(nominal), session.axes, session.measurements, criteria=criteria
     )

@@ -15,10 +15,16 @@ from legcal.paper.leg_directions import LegDirections, directions_through_joints
 from legcal.paper.nominal import Criteria, NominalMechanism
 from legcal.paper.offsets import Offsets, identify_offsets
 from legcal.paper.platform import PlatformJoints, locate_platform_joints
-from legcal.simulation.cameras import cameras_around
-from legcal.simulation.machine import Machine, hexapod, perturb
+from legcal.simulation.hexapod import (
+    HexapodSession,
+    Machine,
+    cameras_around,
+    hexapod,
+    hexapod_session,
+    perturb,
+)
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.studies.paper import SimulatedSession, nominal_of, simulate_session
+from legcal.simulation.paper import nominal_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +43,7 @@ class Before:
         return locate_platform_joints(self.mechanism, *known, 2e-6, criteria=criteria)
 
 
-def _until_offsets(session: SimulatedSession, nominal: Machine) -> Before:
+def _until_offsets(session: HexapodSession, nominal: Machine) -> Before:
     axes, measurements = session.axes, session.measurements
     mechanism = nominal_of(nominal)
     joints = locate_joints_in_cameras(mechanism, axes, measurements)
@@ -130,7 +136,7 @@ def test_a_constant_length_leg_gets_its_length_as_offset() -> None:
     travel[5] = offsets[5] = 0.4137
     A, B = drawn.parameters.base_joints, drawn.parameters.platform_joints
     machine = replace(drawn, travel=travel, parameters=KinematicParameters(A, B, offsets))
-    session = simulate_session(
+    session = hexapod_session(
         machine, cameras_around(machine, rng), rng, noise=OutlineNoise(), noisy=False, n_poses=6
     )
     assert np.abs(session.measurements.q[:, 5]).max() < 1e-12

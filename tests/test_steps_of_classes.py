@@ -27,10 +27,9 @@ from legcal.paper.least_squares import LeastSquares, Solution, solve_least_squar
 from legcal.paper.nominal import Criteria, Transformation
 from legcal.paper.platform import RigidProblem, build_rigid
 from legcal.paper.platform_unknowns import PlatformUnknowns
-from legcal.simulation.cameras import PAPER_VIEWS, cameras_around
-from legcal.simulation.machine import hexapod, perturb
+from legcal.simulation.hexapod import PAPER_VIEWS, cameras_around, hexapod, hexapod_session, perturb
 from legcal.simulation.observe import OutlineNoise
-from legcal.simulation.studies.paper import nominal_of, simulate_session
+from legcal.simulation.paper import nominal_of
 
 LIKE_HEXAPOD = ("nategh-agheli", "6-sps", "hexapod-strut", "hexapod-rod")
 WITH_AXES = ("3-spr", "3-upu-tilted", "tricept")
@@ -219,7 +218,7 @@ def test_two_platform_joints_at_one_place_are_found() -> None:
     machine, nominal = (
         replace(m, parameters=p) for m, p in zip((machine, nominal), merged, strict=True)
     )
-    session = simulate_session(
+    session = hexapod_session(
         machine,
         cameras_around(machine, rng, legs=PAPER_VIEWS),
         rng,

@@ -14,20 +14,23 @@ from test_cli import run
 
 from legcal.errors import DidNotConverge, UsageError
 from legcal.machine import KinematicParameters, from_vector, to_vector
-from legcal.simulation.machine import Machine, hexapod, random_poses
-from legcal.simulation.studies import paper as estimators
-from legcal.simulation.studies.paper import (
+from legcal.simulation.hexapod import (
+    HexapodSession,
+    Machine,
+    hexapod,
+    noncoplanar_hexapod,
+    random_poses,
+)
+from legcal.simulation.observe import TableNoise
+from legcal.simulation.paper import (
+    ESTIMATORS,
     PaperStudy,
-    SimulatedSession,
-    coplanar_hexapod,
     expected_errors,
     expected_norm,
-    noncoplanar_hexapod,
     platform_by_parameters,
     platform_errors,
 )
-from legcal.simulation.studies.runner import StudyResult, child_seed, run_study
-from legcal.simulation.table_noise import TableNoise
+from legcal.simulation.study import StudyResult, child_seed, run_study
 
 N_RUNS = 2
 
@@ -55,7 +58,7 @@ def _changed(machine: Machine, change: np.ndarray) -> KinematicParameters:
 
 
 def test_the_truths_are_the_shipped_hexapod_and_one_with_joints_out_of_the_planes() -> None:
-    coplanar, raised = (m.parameters for m in (coplanar_hexapod(), noncoplanar_hexapod()))
+    coplanar, raised = (m.parameters for m in (hexapod(), noncoplanar_hexapod()))
     assert np.array_equal(coplanar.base_joints, hexapod().parameters.base_joints)
     change = raised.base_joints - coplanar.base_joints
     assert np.array_equal(change[:, 2], [0.0, 0.03] * 3)
@@ -72,7 +75,7 @@ def test_eq20_of_the_truth_is_zero_and_of_equal_offsets_the_travel_of_a_lift() -
 
 
 def test_the_norm_of_small_euler_angles_is_nearly_the_angle_of_the_rotation() -> None:
-    machine = coplanar_hexapod()
+    machine = hexapod()
     change = np.random.default_rng(1).uniform(-2e-3, 2e-3, 30)
     errors = platform_errors(machine, _changed(machine, change), _poses(machine))
     assert errors.angle > 1e-3
@@ -201,17 +204,17 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
 ) -> None:
     calls = []
 
-    def often_fails(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
+    def often_fails(session: HexapodSession, nominal: Machine) -> KinematicParameters:
         calls.append(session)
         if len(calls) % 2:
             raise DidNotConverge("It did not.")
         return nominal.parameters
 
-    def always_fails(session: SimulatedSession, nominal: Machine) -> KinematicParameters:
+    def always_fails(session: HexapodSession, nominal: Machine) -> KinematicParameters:
         raise DidNotConverge("It never does.")
 
     for name, estimate in (("literal", often_fails), ("default", always_fails)):
-        monkeypatch.setitem(estimators.ESTIMATORS, name, estimate)
+        monkeypatch.setitem(ESTIMATORS, name, estimate)
     found = run_study(PaperStudy(n_poses=4), 2)
     rows = {(row["estimator"], row["coplanar"]): row for row in found.document()["rows"]}
     assert rows["literal", True]["failures"] == {"DidNotConverge": 2}

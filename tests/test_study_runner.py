@@ -16,7 +16,7 @@ import pytest
 from toy_studies import Deadly, Draws, Mistaken
 
 from legcal.errors import DidNotConverge, OutOfResources, UsageError
-from legcal.simulation.studies.runner import (
+from legcal.simulation.study import (
     CHECKPOINT_NAME,
     DOCUMENT_NAME,
     child_seed,

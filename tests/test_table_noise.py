@@ -8,7 +8,7 @@ from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
 from legcal.errors import NotVisible
 from legcal.geometry.lines import distance_to_line
 from legcal.geometry.types import Array, IntArray
-from legcal.simulation.table_noise import TableNoise, observe_axes, table_of_lines
+from legcal.simulation.observe import TableNoise, table_of, table_of_lines
 from legcal.vision.cylinder import (
     angles_of_direction,
     direction_derivative,
@@ -23,8 +23,7 @@ def _indices(n: int) -> tuple[IntArray, IntArray]:
 
 def _observed(u: Array, A: Array, noise: TableNoise, rng: np.random.Generator | None) -> LegAxes:
     """Return axes with the noise of Table 1 as the method takes them from the table."""
-    table = observe_axes(*_indices(len(u)), u, A, noise, rng)
-    return axes_of_table(table.row, table.leg, table.values, table.sigmas)
+    return axes_of_table(*table_of(*_indices(len(u)), u, A, noise, rng))
 
 
 def _random_lines(n: int, seed: int = 0) -> tuple[Array, Array]:
@@ -137,4 +136,4 @@ def test_angles_and_points_come_back_from_axes_wherever_their_points_lie() -> No
 def test_table_1_does_not_exist_for_a_leg_parallel_to_the_image_x_axis() -> None:
     u, A = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.1, 0.9]])
     with pytest.raises(NotVisible, match="parallel to the image x axis"):
-        observe_axes(*_indices(1), u, A, TableNoise(), None)
+        table_of(*_indices(1), u, A, TableNoise(), None)

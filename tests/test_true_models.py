@@ -32,16 +32,11 @@ from legcal.machine import (
 from legcal.machine.parameters import in_links
 from legcal.machine.urdf import UrdfPatch
 from legcal.simulation import truth
+from legcal.simulation.dataset import simulate
 from legcal.simulation.poses import draw_poses
-from legcal.simulation.session import simulate
-from legcal.simulation.settings import Level, SimulationSettings
-from legcal.simulation.truth import (
-    Distribution,
-    ParameterErrors,
-    Spread,
-    draw_errors,
-    write_true_model,
-)
+from legcal.simulation.request import Level
+from legcal.simulation.settings import Distribution, ParameterErrors, SimulationSettings, Spread
+from legcal.simulation.truth import draw_errors, write_true_model
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LAYOUTS = {

@@ -10,9 +10,10 @@ from thinned import thinned
 import legcal
 from legcal.geometry.types import Array
 from legcal.machine import Configurations, Mechanism
-from legcal.simulation.cameras import look_at, places_around, sample_camera
+from legcal.simulation.cameras import look_at, sample_camera
+from legcal.simulation.places import cameras_around
 from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
-from legcal.simulation.visibility import SEEN, LegView, Viewpoint, legs_in_image, take_images
+from legcal.simulation.visibility import SEEN, LegView, legs_in_image, take_images
 
 SHIPPED = (
     "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",
@@ -131,15 +132,15 @@ def test_cylinders_of_one_radius_are_one_part() -> None:
 def test_cameras_around_any_machine_see_its_legs_and_all_of_it(name: str) -> None:
     mechanism, camera = machine(name), sample_camera()
     machines = posed(name, 3, bare=False)
-    places = places_around(mechanism, machines, [camera], np.random.default_rng(1))
+    views, _ = cameras_around(mechanism, machines, {"c1": camera}, np.random.default_rng(1))
     for m in machines:
-        for T in places:
+        for view in views:
+            T = view.T_base_camera
             inside = camera.project(T.inv().apply(m.vertices))
             assert np.all(inside > 0.0)
             assert np.all(inside < [camera.width, camera.height])
             assert not m.encloses(T.translation)
-    views = tuple(Viewpoint(f"c{v}", camera, T) for v, T in enumerate(places))
-    images = take_images(mechanism.legs, machines, views, 1, shared_poses=True)
+    images = take_images(mechanism.legs, machines, views, [range(len(machines))], 1)
     seen = np.array([[leg.is_seen for leg in shown] for shown in images.shown])
     assert seen.mean() > 0.7
 
@@ -149,10 +150,10 @@ def test_walls_do_not_drive_cameras_away_from_the_machine() -> None:
     machines = posed("hexapod", 2, bare=False)
     walled = posed("hexapod", 2, box(np.array([0.0, -9.0, 0.0]), (20.0, 0.1, 20.0)), bare=False)
     one, two = (
-        places_around(mechanism, m, [camera], np.random.default_rng(1))[0]
+        cameras_around(mechanism, m, {"c1": camera}, np.random.default_rng(1))[0][0]
         for m in (machines, walled)
     )
-    assert np.array_equal(one.as_matrix(), two.as_matrix())
+    assert np.array_equal(one.T_base_camera.as_matrix(), two.T_base_camera.as_matrix())
 
 
 def test_cameras_of_a_machine_far_from_the_origin_stand_around_it() -> None:

@@ -1,8 +1,15 @@
-"""``legcal simulate``."""
+"""``legcal simulate``: its options are the fields of :class:`legcal.simulation.Request`."""
 
 from __future__ import annotations
 
-import legcal.cli.simulate_options as opt
+import inspect
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
 from legcal.cli.options import (
     JsonOption,
     ModelArgument,
@@ -10,37 +17,22 @@ from legcal.cli.options import (
     print_json,
     print_table,
 )
+from legcal.simulation import Request
+
+OutputOption = Annotated[
+    Path, typer.Option("--output", "-o", metavar="DATASET", help="The folder to write.")
+]
+ForceOption = Annotated[
+    bool, typer.Option("--force", help="Replace an earlier simulated dataset in that folder.")
+]
 
 
 def simulate(
     model: ModelArgument,
-    output: opt.OutputOption,
-    level: opt.LevelOption = opt.LevelChoice.PHOTOGRAPHS,
-    seed: opt.SeedOption = 0,
-    force: opt.ForceOption = False,
-    error: opt.ErrorOption = None,
-    coplanar: opt.CoplanarOption = False,
-    poses: opt.PosesOption = "15",
-    sampling: opt.SamplingOption = None,
-    shared_poses: opt.SharedPosesOption = None,
-    images: opt.ImagesOption = 1,
-    views: opt.ViewsOption = None,
-    cameras: opt.CamerasOption = None,
-    camera: opt.CameraOption = None,
-    board: opt.BoardOption = None,
-    board_pose: opt.BoardPoseOption = False,
-    hand_held: opt.HandHeldOption = False,
-    hints: opt.HintsOption = True,
-    tell_gamma: opt.TellGammaOption = None,
-    pixel_noise: opt.PixelNoiseOption = None,
-    table_noise: opt.TableNoiseOption = None,
-    encoder_noise: opt.EncoderNoiseOption = "2um",
-    appearance: opt.AppearanceOption = None,
-    blur: opt.BlurOption = None,
-    clutter: opt.ClutterOption = None,
-    bits: opt.BitsOption = None,
-    colour: opt.ColourOption = None,
+    output: OutputOption,
+    force: ForceOption = False,
     as_json: JsonOption = False,
+    **options: Any,
 ) -> None:
     """Simulate a dataset of a machine whose true model is known, and write it with the truth.
 
@@ -48,37 +40,11 @@ def simulate(
     """
     from legcal.machine import load_mechanism
     from legcal.report import progress_on_stderr
-    from legcal.simulation import Request, requested, summary_document, summary_table
+    from legcal.simulation import requested, summary_document, summary_table
     from legcal.simulation import simulate as run
 
-    request = Request(
-        level=level.value,
-        seed=seed,
-        error=tuple(error or ()),
-        coplanar=coplanar,
-        poses=poses,
-        sampling=None if sampling is None else sampling.value,
-        shared_poses=shared_poses,
-        images=images,
-        views=views,
-        cameras=cameras,
-        camera=camera,
-        board=board,
-        board_pose=board_pose,
-        hand_held=hand_held,
-        hints=hints,
-        tell_gamma=tell_gamma,
-        pixel_noise=pixel_noise,
-        table_noise=None if table_noise is None else table_noise.value,
-        encoder_noise=encoder_noise,
-        appearance=appearance,
-        blur=blur,
-        clutter=clutter,
-        bits=bits,
-        colour=colour,
-    )
     nominal = load_mechanism(model)
-    settings = requested(request, nominal)
+    settings = requested(Request(**options), nominal)
     workers = image_workers()
     with progress_on_stderr() as progress:
         made = run(nominal, output, settings, force=force, workers=workers, progress=progress)
@@ -86,3 +52,30 @@ def simulate(
         print_json(summary_document(made))
     else:
         print_table(summary_table(made))
+
+
+def _requested() -> Iterator[inspect.Parameter]:
+    """Return the fields of a request as parameters of a command."""
+    types = get_type_hints(Request)
+    for field in fields(Request):
+        how = dict(field.metadata["option"])
+        option = typer.Option(*how.pop("flags"), **how)
+        yield inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=field.default,
+            annotation=Annotated[types[field.name], option],
+        )
+
+
+def _declare() -> None:
+    """Give the command the signature that Typer reads: its own options in the order of the help."""
+    own = inspect.signature(simulate, eval_str=True).parameters
+    level, seed, *others = _requested()
+    order = [own["model"], own["output"], level, seed, own["force"], *others, own["as_json"]]
+    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in order]
+    simulate.__annotations__ = {p.name: p.annotation for p in parameters}
+    vars(simulate)["__signature__"] = inspect.Signature(parameters)
+
+
+_declare()

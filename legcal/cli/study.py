@@ -1,18 +1,16 @@
-"""``legcal study``: the commands of the studies, each with the settings that are its own."""
+"""``legcal study``: section 4.3 of the paper; other studies are benchmarks of the source tree."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from legcal.cli.options import JsonOption, print_json, print_table
+from legcal.errors import UsageError
 from legcal.processors import processors
-
-if TYPE_CHECKING:
-    from legcal.simulation import F, Judge, OutlineExperiment, OutlineStudy, Study
 
 RunsOption = Annotated[int, typer.Option(help="Number of runs.")]
 SeedOption = Annotated[int, typer.Option(help="Seed of all runs.")]
@@ -28,6 +26,23 @@ OutputOption = Annotated[
         metavar="OUT",
         help="Folder for the runs, the document and the figures. A study that was stopped "
         "goes on from what is there.",
+    ),
+]
+MachineOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--machine",
+        metavar="NAME",
+        help="6-spu-noncoplanar, 6-spu-coplanar, 3-upu-tilted or 3-rpr; may be repeated, all "
+        "without it.",
+    ),
+]
+ModelOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--machine",
+        metavar="NAME",
+        help="The name of a shipped model; may be repeated, all without it.",
     ),
 ]
 
@@ -49,29 +64,27 @@ def paper(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat section 4.3 of the paper: calibrations of a 6-SPU, before and after."""
-    from legcal.simulation import PaperStudy, TableNoise
+    from legcal.report import progress_on_stderr
+    from legcal.simulation import PaperStudy, TableNoise, run_study
 
     noise = TableNoise.in_radians() if radians else TableNoise()
-    _run(PaperStudy(noise), runs, seed, workers, output, as_json=as_json)
+    with progress_on_stderr() as progress:
+        result = run_study(
+            PaperStudy(noise),
+            runs,
+            seed=seed,
+            workers=processors() if workers is None else workers,
+            output=output,
+            progress=progress,
+        )
+    if as_json:
+        print_json(result.document())
+        return
+    from rich.console import Group
+    from rich.text import Text
 
-
-MachineOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--machine",
-        metavar="NAME",
-        help="6-spu-noncoplanar, 6-spu-coplanar, 3-upu-tilted or 3-rpr; may be repeated, all "
-        "without it.",
-    ),
-]
-ModelOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--machine",
-        metavar="NAME",
-        help="The name of a shipped model; may be repeated, all without it.",
-    ),
-]
+    where = [Text(f"\nRuns, document and figures: {output}")] if output is not None else []
+    print_table(Group(result.summary.table(), *where))
 
 
 @study.command()
@@ -83,11 +96,8 @@ def bound(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the errors of a calibration, and its sigmas, with the Cramer-Rao bound."""
-    from legcal.simulation import BOUND as EXPERIMENT
-    from legcal.simulation import BoundJudge
-
-    _run(_outlines(BoundJudge(), EXPERIMENT, machine), runs, seed, workers, output, as_json=as_json)
+    """Name the benchmark: errors of a calibration, and its sigmas, beside the Cramer-Rao bound."""
+    raise _moved("bound", "bound.py", runs, machine, seed, workers, output, as_json=as_json)
 
 
 @study.command()
@@ -99,12 +109,10 @@ def convergence(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Count where calibrations end that start 5 mm and 3 deg off in everything."""
-    from legcal.simulation import CONVERGENCE as EXPERIMENT
-    from legcal.simulation import ConvergenceJudge
-
-    chosen = _outlines(ConvergenceJudge(), EXPERIMENT, machine)
-    _run(chosen, runs, seed, workers, output, as_json=as_json)
+    """Name the benchmark: where calibrations end that start 5 mm and 3 deg off in everything."""
+    raise _moved(
+        "convergence", "convergence.py", runs, machine, seed, workers, output, as_json=as_json
+    )
 
 
 @study.command()
@@ -116,45 +124,30 @@ def classes(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate every shipped machine, by the four steps and by the fit, beside the bound."""
-    from legcal.simulation import CLASSES as EXPERIMENT
-    from legcal.simulation import ClassesJudge
-
-    chosen = _outlines(ClassesJudge(), EXPERIMENT, machine)
-    _run(chosen, runs, seed, workers, output, as_json=as_json)
+    """Name the benchmark: shipped machines by the four steps and by the fit, beside the bound."""
+    raise _moved(
+        "classes", "classes_study.py", runs, machine, seed, workers, output, as_json=as_json
+    )
 
 
-def _outlines(
-    judge: Judge[F], experiment: OutlineExperiment, machines: list[str] | None
-) -> OutlineStudy[F]:
-    """Return the study of a judge, on the machines that were asked for or on all."""
-    from legcal.simulation import OutlineStudy
-
-    chosen = replace(experiment, machines=tuple(machines)) if machines else experiment
-    return OutlineStudy(judge, chosen)
-
-
-def _run(
-    chosen: Study, runs: int, seed: int, workers: int | None, output: Path | None, *, as_json: bool
-) -> None:
-    """Run a study and print what it found."""
-    from legcal.report import progress_on_stderr
-    from legcal.simulation import run_study
-
-    with progress_on_stderr() as progress:
-        result = run_study(
-            chosen,
-            runs,
-            seed=seed,
-            workers=processors() if workers is None else workers,
-            output=output,
-            progress=progress,
-        )
-    if as_json:
-        print_json(result.document())
-    else:
-        from rich.console import Group
-        from rich.text import Text
-
-        where = [Text(f"\nRuns, document and figures: {output}")] if output is not None else []
-        print_table(Group(result.summary.table(), *where))
+def _moved(
+    name: str,
+    program: str,
+    runs: int,
+    machines: list[str] | None,
+    seed: int,
+    workers: int | None,
+    output: Path | None,
+    *,
+    as_json: bool,
+) -> UsageError:
+    """Return that a study is a benchmark, with the command line that runs it as asked for."""
+    words = ["python", f"benchmarks/{program}", "--runs", f"{runs}", "--seed", f"{seed}"]
+    words += [word for machine in machines or () for word in ("--machine", machine)]
+    words += [] if workers is None else ["--workers", f"{workers}"]
+    words += [] if output is None else ["-o", str(output)]
+    words += ["--json"] * as_json
+    return UsageError(
+        f"The study {name} could not be run: found a command of an earlier version, needed the "
+        f"benchmark of the source tree; run {shlex.join(words)}."
+    )

@@ -1,4 +1,4 @@
-"""Which calibration board a simulated machine gets: one of a fitting size, or from a file."""
+"""A calibration board beside a simulated machine: its print, its plate, the corners that show."""
 
 from __future__ import annotations
 
@@ -32,6 +32,18 @@ from legcal.vision import (
 
 INK = 0.06  # how much of the light that white returns black does
 TAG_BORDER = 2  # modules of the black frame of a tag, as Kalibr prints it
+
+_THICKNESS = 0.02  # of the longer side of the plate
+_RIM = 0.06  # of the longer side that stays white around the print
+_LEAST_COSINE = 0.42  # between the normal and the line of sight at which corners are seen
+_BESIDE = 0.3  # of a square around a corner that must be seen with it
+_IN_FRONT = 0.2  # of the thickness before a corner from which on a hit hides it
+_LEAST_SHARE = 0.5  # of the corners that an image must show to count
+_LEAST_CORNERS = 8
+
+KINDS: tuple[BoardKind, ...] = ("chessboard", "charuco", "aprilgrid")
+_WIDTH = 0.42  # of the size of the machine
+_DIGITS = 3  # of a side in metres: whole millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +123,6 @@ def _marker(name: str, number: int, border: int) -> NDArray[np.bool_]:
     n = markers.markerSize + 2 * border
     picture = cv2.aruco.generateImageMarker(markers, number, n, borderBits=border)
     return np.asarray(np.asarray(picture) == 0, dtype=np.bool_)
-
-
-_THICKNESS = 0.02  # of the longer side of the plate
-_RIM = 0.06  # of the longer side that stays white around the print
-_LEAST_COSINE = 0.42  # between the normal and the line of sight at which corners are seen
-_BESIDE = 0.3  # of a square around a corner that must be seen with it
-_IN_FRONT = 0.2  # of the thickness before a corner from which on a hit hides it
-_LEAST_SHARE = 0.5  # of the corners that an image must show to count
-_LEAST_CORNERS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,18 +226,6 @@ class PlacedBoard:
         step = _BESIDE * self.board.side
         aside = step * np.array([[0, 0, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
         return np.asarray(self.board.points[:, None] + aside)
-
-
-def without_pose(document: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Return the block of a board as it is where its pose is not known."""
-    if document is None:
-        return None
-    return {key: value for key, value in document.items() if key != "T_base_board"}
-
-
-KINDS: tuple[BoardKind, ...] = ("chessboard", "charuco", "aprilgrid")
-_WIDTH = 0.42  # of the size of the machine
-_DIGITS = 3  # of a side in metres: whole millimetres
 
 
 def chosen_board(

@@ -15,9 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from scipy.spatial.transform import RigidTransform
 
 from legcal.data import (
     AXES_NAME,
@@ -26,7 +24,6 @@ from legcal.data import (
     OBSERVATIONS_NAME,
     OUTLINE_COLUMNS,
     Measurements,
-    View,
 )
 from legcal.errors import DatasetError, UsageError
 from legcal.files import (
@@ -41,72 +38,45 @@ from legcal.files import (
     read_table,
     result_folder,
 )
-from legcal.geometry import Array
-from legcal.machine import Configurations, LegKind, Mechanism, main_cylinders
+from legcal.machine import LegKind, Mechanism, main_cylinders
+from legcal.simulation.session import Session
 from legcal.simulation.settings import SimulationSettings
-from legcal.simulation.visibility import Images, Viewpoint
 from legcal.version import __version__
 from legcal.vision import camera_info
 
-LEAST_SIGMA_Q = 1e-9  # [m] that readings without noise claim
-
-
-def pose_labels(n_poses: int) -> tuple[str, ...]:
-    """Return the names of poses: p01, p02, ..."""
-    width = max(2, len(str(n_poses)))
-    return tuple(f"p{i + 1:0{width}d}" for i in range(n_poses))
-
-
-def image_names(images: Images, views: Sequence[Viewpoint], labels: Sequence[str]) -> list[str]:
-    """Return the name of every photograph, relative to the dataset."""
-    repeats = int(images.repeat.max()) + 1
-    return [
-        f"images/{views[v].name}_{labels[p]}{f'_{k + 1}' * (repeats > 1)}.png"
-        for v, p, k in zip(images.view, images.pose, images.repeat, strict=True)
-    ]
-
-
-def measurements_of(
-    images: Images,
-    views: Sequence[View],
-    labels: Sequence[str],
-    names: Sequence[str],
-    q: Array,
-    sigma_q: float,
-) -> Measurements:
-    """Return the rows of the dataset."""
-    kept, pose = np.unique(images.pose, return_inverse=True)
-    return Measurements(
-        views=tuple(views),
-        image=tuple(names),
-        view=images.view,
-        pose=pose.astype(np.intp),
-        q=q[images.pose],
-        sigma_q=max(sigma_q, LEAST_SIGMA_Q),
-        pose_labels=tuple(labels[p] for p in kept),
-    )
+TRUTH = "truth"
+TRUTH_NAME = f"{TRUTH}/truth.json"
+_FOLDERS = ("images", "models", "urdf", TRUTH)
+_TABLES = ("measurements.csv", OBSERVATIONS_NAME, AXES_NAME, CORNERS_NAME)
+_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml")
+SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 
 def write_session(
     folder: Path,
-    mechanism: Mechanism,
-    model: str,
+    mechanism: Mechanism,  # the nominal model
+    model: str,  # path of its YAML in the dataset
     m: Measurements,
     *,
-    groups: Sequence[str] = (),
-    board: Mapping[str, Any] | None = None,
+    groups: Sequence[str] = (),  # view of the file of each view, where cameras are in the hand
+    board: Mapping[str, Any] | None = None,  # its block
 ) -> None:
     """Write ``dataset.yaml``, ``measurements.csv`` and the camera files."""
-    cameras = _write_cameras(folder, m.views)
+    cameras: dict[int, str] = {}
     views: dict[str, Any] = {}
-    for v, (view, camera) in enumerate(zip(m.views, cameras, strict=True)):
-        entry: dict[str, Any] = {"camera": camera}
+    for v, view in enumerate(m.views):
+        if id(view.camera) not in cameras:
+            name = f"camera_info{f'_{view.name}' * bool(cameras)}.yaml"
+            (folder / name).write_text(camera_info(view.camera, view.name), encoding="utf-8")
+            cameras[id(view.camera)] = name
+        entry: dict[str, Any] = {"camera": cameras[id(view.camera)]}
         if groups:
             entry["hand_held"] = True
         if view.camera.gamma_is_given:
             entry["gamma"] = view.camera.gamma
-        if view.T_base_camera is not None:
-            entry["T_base_camera"] = _rounded(view.T_base_camera)
+        if view.T_base_camera is not None:  # rough: five digits are enough
+            rough = motion_to_xyz_quat(view.T_base_camera)
+            entry["T_base_camera"] = {key: [round(x, 5) for x in rough[key]] for key in rough}
         if view.legs is not None:
             entry["legs"] = list(view.legs)
         views[groups[v] if groups else view.name] = entry
@@ -121,81 +91,54 @@ def write_session(
         document["board"] = dict(board)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     (folder / "dataset.yaml").write_text(text, encoding="utf-8")
-    (folder / "measurements.csv").write_text(
-        _measurements_text(mechanism, m, groups), encoding="utf-8"
+    motors = list(mechanism.motors)
+    joints = [str(mechanism.legs[j].prismatic) for j in motors]
+    names, readings = list(groups) or [view.name for view in m.views], m.q[:, motors].tolist()
+    rows = (
+        [names[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row]]
+        for row, v in enumerate(m.view.tolist())
     )
+    text = format_table(["view", "image", "pose", *joints], rows)
+    (folder / "measurements.csv").write_text(text, encoding="utf-8")
 
 
 def write_truth(
     path: Path,
+    session: Session,
     settings: SimulationSettings,
-    mechanism: Mechanism,
-    views: Sequence[Viewpoint],
-    poses: Configurations,
-    labels: Sequence[str],
-    files: Sequence[str],
-    board: Mapping[str, Any] | None = None,
+    files: Sequence[str],  # the other files of the dataset
 ) -> None:
     """Write ``truth.json``: settings, radii, cameras, poses and board as they really were."""
+    truth, poses = session.truth, session.poses
     sliders = [
         (j, str(leg.prismatic))
-        for j, leg in enumerate(mechanism.legs)
+        for j, leg in enumerate(truth.legs)
         if leg.kind is not LegKind.CONSTANT
     ]
     document = {
         "legcal_truth": 1,
         "legcal": __version__,
-        "model": f"models/{mechanism.yaml_path.name}",
+        "model": f"models/{truth.yaml_path.name}",
         "settings": _plain(asdict(settings)),
         "radii": {
             leg.name: {part: c.radius for part, c in main_cylinders(leg.cylinders).items()}
-            for leg in mechanism.legs
+            for leg in truth.legs
         },
         "views": {
-            view.name: {"T_base_camera": motion_to_xyz_quat(view.T_base_camera)} for view in views
+            view.name: {"T_base_camera": motion_to_xyz_quat(view.T_base_camera)}
+            for view in session.scene.views
         },
         "poses": {
             label: {
                 "T_base_platform": motion_to_xyz_quat(T),
                 "joints": {name: float(readings[j]) for j, name in sliders},
             }
-            for label, T, readings in zip(labels, poses.poses, poses.readings, strict=True)
+            for label, T, readings in zip(session.labels, poses.poses, poses.readings, strict=True)
         },
-        **({} if board is None else {"board": dict(board)}),
+        **({} if session.board is None else {"board": session.board.document()}),
         "files": list(files),
     }
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _write_cameras(folder: Path, views: Sequence[View]) -> list[str]:
-    """Write the file of every camera; return the name of each view's."""
-    written: dict[int, str] = {}
-    names = []
-    for view in views:
-        if id(view.camera) not in written:
-            name = f"camera_info{f'_{view.name}' * bool(written)}.yaml"
-            (folder / name).write_text(camera_info(view.camera, view.name), encoding="utf-8")
-            written[id(view.camera)] = name
-        names.append(written[id(view.camera)])
-    return names
-
-
-def _measurements_text(mechanism: Mechanism, m: Measurements, groups: Sequence[str]) -> str:
-    """Return the text of ``measurements.csv``."""
-    motors = list(mechanism.motors)
-    joints = [str(mechanism.legs[j].prismatic) for j in motors]
-    views = list(groups) or [view.name for view in m.views]
-    readings = m.q[:, motors].tolist()
-    rows = (
-        [views[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row]]
-        for row, v in enumerate(m.view.tolist())
-    )
-    return format_table(["view", "image", "pose", *joints], rows)
-
-
-def _rounded(T: RigidTransform) -> dict[str, list[float]]:
-    """Return a rough pose with as many digits as it deserves."""
-    return {key: [round(x, 5) for x in numbers] for key, numbers in motion_to_xyz_quat(T).items()}
 
 
 def _plain(value: Any) -> Any:
@@ -209,14 +152,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value
-
-
-TRUTH = "truth"
-TRUTH_NAME = f"{TRUTH}/truth.json"
-_FOLDERS = ("images", "models", "urdf", TRUTH)
-_TABLES = ("measurements.csv", OBSERVATIONS_NAME, AXES_NAME, CORNERS_NAME)
-_FILES = ("dataset.yaml", *_TABLES, "camera_info*.yaml")
-SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 
 def check_dataset_destination(destination: Path, *, force: bool) -> None:

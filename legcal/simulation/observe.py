@@ -1,45 +1,160 @@
-"""What simulated cameras see: outlines with noise in pixels."""
+"""What cameras see of a machine in its poses: outlines, axes, corners, exact or with known noise.
+
+A :class:`Scene` is the truth of a session. Where it comes from does not matter here: rays may have
+found what each image shows (:func:`legcal.simulation.visibility.take_images`), or every leg that a
+view is said to see shows the middle of its length (:func:`plain_scene`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from legcal.data import Outlines
+from legcal.data import Corners, Outlines, found_corners, join_corners
+from legcal.errors import NotVisible
 from legcal.geometry import Array, IntArray
-from legcal.simulation.visibility import silhouette
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.solids import PosedMachine
+from legcal.simulation.visibility import Images, LegView, Stretch, Viewpoint, silhouette
 from legcal.vision import Camera
+
+EXACT_PX = 1e-3  # standard deviation that outlines and corners without noise claim
+_SIDEWAYS = 1e-3  # component along the image y axis below which a leg has no point M_LS
+_LEAST_UPRIGHT = 1e-9  # the same, below which there are no numbers for it
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A machine in its poses and what cameras see of it, in a frame L: the base link or R_b."""
+
+    A: Array  # (n_poses, n_legs, 3) base joint centres in L [m]
+    B: Array  # (n_poses, n_legs, 3) platform joint centres in L [m]
+    views: tuple[Viewpoint, ...]  # with T_L_camera
+    images: Images
+
+    def leg_in_camera(self, row: int, leg: int) -> tuple[Array, Array]:
+        """Return direction u (3,) and base joint A (3,) [m] of a leg in the camera of an image."""
+        A, B = (joints[self.images.pose[row], leg] for joints in (self.A, self.B))
+        T = self.views[self.images.view[row]].T_base_camera.inv()
+        return T.rotation.apply((B - A) / np.linalg.norm(B - A)), T.apply(A)
+
+
+def plain_scene(
+    A: Array,  # (n_poses, n_legs, 3)
+    B: Array,
+    views: Sequence[Viewpoint],
+    view: IntArray,  # (n_rows,) view and pose of each image
+    pose: IntArray,
+    radii: Mapping[tuple[int, str], float],  # of each (leg, part) [m]
+    seen: Sequence[Sequence[int]] | None = None,  # legs of each row; None for all
+    span: tuple[float, float] = (0.15, 0.85),  # of the length of a leg that is seen
+) -> Scene:
+    """Return a scene in which nothing is hidden: images show legs over one part of their length."""
+    length = np.linalg.norm(B - A, axis=-1)
+    shown = []
+    for row, k in enumerate(pose.tolist()):
+        stretches: list[list[Stretch]] = [[] for _ in length[k]]
+        for (j, part), radius in radii.items():
+            if seen is None or j in seen[row]:
+                start, end = (float(part_of * length[k, j]) for part_of in span)
+                stretches[j].append(Stretch(j, part, radius, start, end))
+        shown.append(
+            tuple(LegView((span[1] - span[0]) * bool(s), 0.0, tuple(s)) for s in stretches)
+        )
+    images = Images(view, pose, np.zeros(len(view), dtype=np.intp), tuple(shown))
+    return Scene(A, B, tuple(views), images)
+
+
+# Outlines
 
 
 @dataclass(frozen=True)
 class OutlineNoise:
-    """White noise of the edge points of an outline."""
+    """White noise of the edge points of an outline, to which a line is fitted."""
 
-    sigma_px: float = 0.1  # standard deviation of each point [px]
-    n_points: int = 300  # points of each outline, equally spaced
+    sigma_px: float = 0.1  # of each point [px]
+    n_points: int | None = 300  # equally spaced; None for one in every pixel
 
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the fitted line's offsets at its ends, (2, 2) [px^2]."""
-        t = np.linspace(0.0, 1.0, self.n_points)
+    def covariance(self, length_px: float) -> Array:
+        """Return the covariance of the line's offsets at its ends, (2, 2) [px^2]."""
+        n = max(2, round(length_px)) if self.n_points is None else self.n_points
+        t = np.linspace(0.0, 1.0, n)
         design = np.stack([1.0 - t, t], axis=-1)
         return np.asarray(self.sigma_px**2 * np.linalg.inv(design.T @ design))
 
 
-def exact_outlines(
-    camera: Camera, u: Array, M: Array, length: Array, radius: Array, *, margin: float = 0.15
-) -> tuple[Array, Array]:
-    """Return the outlines of legs without noise."""
-    h, offsets = silhouette(u, M, radius)
-    parts = np.array([margin, 1.0 - margin])
-    axis_points = M[:, None] + (length[:, None] * parts)[..., None] * u[:, None]
-    return h, camera.project(axis_points[:, None] + offsets[:, :, None])
+EVERY_PIXEL = OutlineNoise(n_points=None)
+
+
+def outlines_of(
+    scene: Scene, noise: OutlineNoise = EVERY_PIXEL, rng: np.random.Generator | None = None
+) -> Outlines:
+    """Return the outlines of all visible stretches by row, leg and edge; exact without *rng*.
+
+    They carry the covariance of the noise in either case.
+    """
+    claimed = replace(noise, sigma_px=max(noise.sigma_px, EXACT_PX))
+    images = scene.images
+    rows, stretches, h, ends, covariances = [], [], [], [], []
+    for row in range(len(images)):
+        view = scene.views[images.view[row]]
+        T = view.T_base_camera.inv()
+        for leg in images.seen(row):
+            A, B = (joints[images.pose[row], leg] for joints in (scene.A, scene.B))
+            u = (B - A) / np.linalg.norm(B - A)
+            for stretch in images.shown[row][leg].stretches:
+                axis = T.apply(A + np.array([[stretch.start], [stretch.end]]) * u)
+                line, offsets = silhouette(
+                    T.as_matrix()[:3, :3] @ u, axis[0], np.asarray(stretch.radius)
+                )
+                pixels = view.camera.project(axis[None] + offsets[:, None])
+                length = float(np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1).mean())
+                covariance = claimed.covariance(length)
+                if rng is not None and noise.sigma_px > 0.0:
+                    errors = rng.multivariate_normal(np.zeros(2), covariance, size=2)
+                    line, pixels = shifted_outlines(view.camera, line, pixels, errors)
+                rows.append(row)
+                stretches.append(stretch)
+                h.append(line)
+                ends.append(pixels)
+                covariances.append(covariance)
+    n = 2 * len(rows)
+    return Outlines(
+        row=np.repeat(np.array(rows, dtype=np.intp), 2),
+        leg=np.repeat(np.array([s.leg for s in stretches], dtype=np.intp), 2),
+        part=tuple(s.part for s in stretches for _ in range(2)),
+        edge=np.tile(np.array([1, 2], dtype=np.intp), len(rows)),
+        h=np.array(h).reshape(n, 3),
+        ends=np.array(ends).reshape(n, 2, 2),
+        covariance=np.repeat(np.array(covariances).reshape(-1, 2, 2), 2, axis=0),
+        used=np.ones(n, dtype=np.bool_),
+        reason=("",) * n,
+        source=("detected",) * n,
+    )
+
+
+def noisy_outlines(exact: Outlines, camera: Camera, rng: np.random.Generator) -> Outlines:
+    """Return exact outlines of one camera with errors of the covariance that they carry."""
+    root = np.linalg.cholesky(exact.covariance)
+    return moved_outlines(
+        exact, camera, np.einsum("nij,nj->ni", root, rng.normal(size=(len(exact), 2)))
+    )
+
+
+def moved_outlines(outlines: Outlines, camera: Camera, offsets: Array) -> Outlines:
+    """Return outlines of one camera whose ends are moved across them by (n, 2) pixels."""
+    h, ends = shifted_outlines(camera, outlines.h, outlines.ends, offsets)
+    return replace(outlines, h=h, ends=ends)
 
 
 def shifted_outlines(camera: Camera, h: Array, ends: Array, offsets: Array) -> tuple[Array, Array]:
-    """Return outlines whose ends are moved across the line by offsets in pixels."""
+    """Return normals h (..., 3) and ends (..., 2, 2) moved across the line by (..., 2) pixels.
+
+    Offsets are positive where h . (x, y, 1) > 0.
+    """
     xy = camera.undistort(ends)
     J = camera.pixels_per_unit(xy)
     ab = np.broadcast_to(h[..., None, :2], xy.shape)
@@ -53,41 +168,128 @@ def shifted_outlines(camera: Camera, h: Array, ends: Array, offsets: Array) -> t
     return n / np.linalg.norm(n, axis=-1, keepdims=True), moved
 
 
-def observe_outlines(
-    camera: Camera,
-    legs: tuple[Array, Array, Array, Array],
-    noise: OutlineNoise,
+# Axes
+
+
+@dataclass(frozen=True)
+class TableNoise:
+    """The noise of Table 1, on the Euler angles of an axis and on its point M_LS = (x, 0, z).
+
+    The paper prints 0.05 and 0.06 "rad"; its results fit degrees only, so the default reads
+    them as degrees. :meth:`in_radians` is the table to the letter.
+
+    Attributes
+    ----------
+    psi, theta : float
+        Standard deviations of the angles (:mod:`legcal.vision.cylinder`) [rad].
+    x, z : float
+        Standard deviations of the coordinates of M_LS [m].
+    """
+
+    psi: float = float(np.deg2rad(0.05))
+    theta: float = float(np.deg2rad(0.06))
+    x: float = 0.05e-3
+    z: float = 0.10e-3
+
+    @classmethod
+    def in_radians(cls) -> TableNoise:
+        """Return the table with its angles read as radians."""
+        return cls(psi=0.05, theta=0.06)
+
+    @property
+    def sigmas(self) -> Array:
+        """The four standard deviations, (4,) [rad, rad, m, m]."""
+        return np.array([self.psi, self.theta, self.x, self.z])
+
+
+class AxisTable(NamedTuple):
+    """Axes of legs as Table 1 states them."""
+
+    row: IntArray  # (n,) image
+    leg: IntArray  # (n,)
+    values: Array  # (n, 4) psi, theta, x, z [rad, rad, m, m]
+    sigmas: Array  # (n, 4) their standard deviations
+
+
+def axes_of(scene: Scene, noise: TableNoise, rng: np.random.Generator | None = None) -> AxisTable:
+    """Return the axes of all legs that images show, by row and leg; exact without *rng*.
+
+    A leg parallel to the image x axis has no point M_LS = (x, 0, z) and is left out.
+    """
+    row, leg, u, A = [], [], [], []
+    for r in range(len(scene.images)):
+        for j in scene.images.seen(r):
+            direction, joint = scene.leg_in_camera(r, j)
+            if abs(direction[1]) > _SIDEWAYS:
+                row.append(r)
+                leg.append(j)
+                u.append(direction)
+                A.append(joint)
+    place = np.array([row, leg], dtype=np.intp)
+    line = np.array([u, A]).reshape(2, -1, 3)
+    return table_of(place[0], place[1], line[0], line[1], noise, rng)
+
+
+def table_of(
+    row: IntArray,
+    leg: IntArray,
+    u: Array,  # (n, 3) in the camera frame
+    A: Array,
+    noise: TableNoise,
     rng: np.random.Generator | None,
-) -> tuple[Array, Array]:
-    """Return the outlines of legs (u, A, length, radius) with noise; without it if rng is None."""
-    h, ends = exact_outlines(camera, *legs)
-    if rng is None:
-        return h, ends
-    offsets = rng.multivariate_normal(np.zeros(2), noise.covariance, size=h.shape[:2])
-    return shifted_outlines(camera, h, ends, offsets)
+) -> AxisTable:
+    """Return the table of axes with noise; exact without *rng*."""
+    values = table_of_lines(u, A)
+    if rng is not None:
+        values += rng.normal(size=values.shape) * noise.sigmas
+    return AxisTable(row, leg, values, np.broadcast_to(noise.sigmas, values.shape))
 
 
-def outline_table(
-    rows: Sequence[int],
-    seen: Sequence[IntArray],
-    h: Sequence[Array],
-    ends: Sequence[Array],
-    parts: Sequence[str],
-    noise: OutlineNoise,
-) -> Outlines:
-    """Return the table of outlines of images: by row, then leg, then edge."""
-    row = np.concatenate([np.full(2 * len(s), r) for r, s in zip(rows, seen, strict=True)])
-    leg = np.concatenate([np.repeat(s, 2) for s in seen])
-    n = len(row)
-    return Outlines(
-        row=row.astype(np.intp),
-        leg=leg.astype(np.intp),
-        part=tuple(parts[j] for j in leg),
-        edge=np.tile(np.array([1, 2], dtype=np.intp), n // 2),
-        h=np.concatenate([x.reshape(-1, 3) for x in h]),
-        ends=np.concatenate([x.reshape(-1, 2, 2) for x in ends]),
-        covariance=np.broadcast_to(noise.covariance, (n, 2, 2)).copy(),
-        used=np.ones(n, dtype=np.bool_),
-        reason=("",) * n,
-        source=("detected",) * n,
-    )
+def table_of_lines(u: Array, A: Array) -> Array:
+    """Return psi, theta [rad] and x, z of M_LS [m] of lines u, A (n, 3), by way of their moments.
+
+    The direction u is at 90 deg - psi to the optical axis, and its picture u_y - i u_x as a complex
+    number is at theta to the image's y axis. M_LS is in the plane y = 0 and has the moment of
+    the line, M x u = A x u. The method finds the same by other ways, so that a mistake shows.
+    """
+    u_x, u_y, u_z = u.T
+    if np.any(np.abs(u_y) < _LEAST_UPRIGHT):
+        raise NotVisible(
+            "The axis of a simulated leg could not be tabulated: found it parallel to the image x "
+            "axis, needed a leg that crosses the plane y = 0 of its camera; turn the camera."
+        )
+    # The angle to the optical axis from the chords to both of its ends: exact for all angles.
+    across = np.hypot(u_x, u_y)
+    psi = 0.5 * np.pi - 2.0 * np.arctan2(np.hypot(across, u_z - 1.0), np.hypot(across, u_z + 1.0))
+    theta = np.angle(u_y - 1j * u_x)
+    moment = np.cross(A, u)
+    return np.stack([psi, theta, moment[:, 2] / u_y, -moment[:, 0] / u_y], axis=-1)
+
+
+# Corners
+
+
+def corners_of(
+    scene: Scene,
+    machines: Sequence[PosedMachine],  # in every pose, with the board beside them
+    placed: PlacedBoard,
+    sigma_px: float,
+    rng: np.random.Generator | None = None,
+) -> Corners:
+    """Return the corners of the board that images show, by row and number; exact without *rng*."""
+    P_base = placed.T_base_board.apply(placed.board.points)
+    found = []
+    for row, (v, k) in enumerate(zip(scene.images.view, scene.images.pose, strict=True)):
+        camera, T = scene.views[v].camera, scene.views[v].T_base_camera
+        corner = np.flatnonzero(placed.seen(machines[k], camera, T))
+        if not len(corner):
+            continue
+        px = camera.project(T.inv().apply(P_base[corner]))
+        if rng is not None:
+            px = px + sigma_px * rng.normal(size=px.shape)
+            size = np.array([camera.width, camera.height]) - 0.5
+            inside = np.all((px >= -0.5) & (px <= size), axis=1)
+            corner, px = corner[inside], px[inside]
+        sigma = np.full(len(corner), max(sigma_px, EXACT_PX))
+        found.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
+    return join_corners(found)

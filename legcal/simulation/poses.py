@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +30,24 @@ from legcal.machine import (
     strolled,
 )
 from legcal.progress import Report, no_progress
+from legcal.simulation.request import Sampling
+
+JITTER = 0.12  # of the travel, by which extreme lengths stay away from its ends at most
+
+ROUNDING = 1e-9  # [rad]
+
+TRIES = 60  # draws for each pose
+FULL_EXTREME, FULL = 12, 2  # of them over all of the travel; the next nearer to home
+NEARER = 0.85  # each
+LEARNED = 6  # draws before those that reached the last pose; extremes are tried first always
+WAY = (0.25, 0.5, 0.75, 1.0)  # parts of the way from home: no leg goes through another before
+SHORTEST = 0.25  # of such a part; what is harder to reach is drawn again
+
+STAGE = "Poses"
+HOPELESS = 5  # poses in vain, one after the other
+
+_REGULAR = 0.05  # of the nominal model's singularity measure at home
+_ROUNDS = 20  # of draws for those that were left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +70,6 @@ def read_readings(path: Path, mechanism: Mechanism) -> GivenReadings:
     readings, _ = readings_in(table, mechanism.legs)
     table.check()
     return GivenReadings(tuple(table.where), readings)
-
-
-JITTER = 0.12  # of the travel, by which extreme lengths stay away from its ends at most
 
 
 def near_ends(end: IntArray, chance: Array) -> Array:
@@ -108,9 +122,6 @@ class Clearance:
         span = np.diff(along, axis=1) * u
         distance = segment_distance(start[one], span[one], start[two], span[two])
         return np.asarray(distance < self._needed)
-
-
-ROUNDING = 1e-9  # [rad]
 
 
 class Admission:
@@ -170,14 +181,6 @@ class Admission:
         i = int(beyond[0])
         limits = f"{np.degrees(lower[i]):.1f} to {np.degrees(upper[i]):.1f} deg"
         return f"joint '{self._revolutes[i]}' outside its limits of {limits}"
-
-
-TRIES = 60  # draws for each pose
-FULL_EXTREME, FULL = 12, 2  # of them over all of the travel; the next nearer to home
-NEARER = 0.85  # each
-LEARNED = 6  # draws before those that reached the last pose; extremes are tried first always
-WAY = (0.25, 0.5, 0.75, 1.0)  # parts of the way from home: no leg goes through another before
-SHORTEST = 0.25  # of such a part; what is harder to reach is drawn again
 
 
 class Draws:
@@ -251,17 +254,6 @@ class Draws:
         if nearer < 1.0:
             q = np.clip(self._home + nearer * (q - self._home), self._lower, self._upper)
         return np.asarray(q)
-
-
-STAGE = "Poses"
-HOPELESS = 5  # poses in vain, one after the other
-
-
-class Sampling(StrEnum):
-    """How poses are drawn: every motor near an end of its travel, or anywhere in it."""
-
-    EXTREME = "extreme"
-    WORKSPACE = "workspace"
 
 
 def draw_poses(
@@ -352,10 +344,6 @@ def _poses(mechanism: Mechanism, configurations: list[Array]) -> Configurations:
         np.array([joint_values(mechanism, c) for c in configurations]),
         [platform_pose(mechanism, c) for c in configurations],
     )
-
-
-_REGULAR = 0.05  # of the nominal model's singularity measure at home
-_ROUNDS = 20  # of draws for those that were left out
 
 
 def commanded_poses(

@@ -1,89 +1,295 @@
-"""What ``legcal simulate`` tells about the dataset that it wrote."""
+"""The session simulator: from a machine and settings to what is measured of it, in memory.
+
+:func:`simulate_session` puts a true machine into poses and cameras around it, and returns readings,
+outlines or axes, corners of a board, and the truth. :func:`photographs` renders its images.
+"""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
 
-from legcal.data import Measurements
-from legcal.errors import OutOfResources, UsageError
-from legcal.files import output_path
-from legcal.geometry import Array, Image
-from legcal.machine import Mechanism, load_mechanism, write_model
+from legcal.data import Corners, Measurements, Outlines, View
+from legcal.errors import NotVisible, OutOfResources
+from legcal.machine import Configurations, Mechanism
 from legcal.progress import Report, no_progress
-from legcal.simulation.board import without_pose
-from legcal.simulation.folder import (
-    SIMULATED,
-    TRUTH,
-    TRUTH_NAME,
-    check_dataset_destination,
-    dataset_folder,
-    files_in,
-    write_session,
-    write_truth,
+from legcal.simulation.board import PlacedBoard, chosen_board
+from legcal.simulation.cameras import mild_lens, read_cameras, read_lens, rough_pose
+from legcal.simulation.observe import (
+    EVERY_PIXEL,
+    AxisTable,
+    OutlineNoise,
+    Scene,
+    axes_of,
+    corners_of,
+    outlines_of,
 )
-from legcal.simulation.imaged_machine import image_machine
-from legcal.simulation.poses import are_extreme
-from legcal.simulation.recording import recorded, write_tables
+from legcal.simulation.places import (
+    HAND_TRIES,
+    board_and_cameras,
+    board_before,
+    camera_in_hand,
+    cameras_around,
+)
+from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.rendering.scene import Scene, prepare_scene
-from legcal.simulation.settings import Level, SimulationSettings, whole_number
-from legcal.simulation.solids import PlacedSolid, PosedMachine
-from legcal.simulation.truth import write_true_model
-from legcal.simulation.visibility import Images, Viewpoint
+from legcal.simulation.rendering.scene import RenderedView, prepare_view
+from legcal.simulation.request import Level
+from legcal.simulation.settings import Distribution, SimulationSettings
+from legcal.simulation.solids import PlacedSolid, PosedMachine, dressed, pose_machine
+from legcal.simulation.visibility import Images, Viewpoint, take_images
+from legcal.vision import Camera
 from legcal.workers import worker_pool
 
-STAGE = "Photographs"
+Streams = Mapping[str, np.random.Generator]
+
+_PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
+             "corners")  # fmt: skip
+_LEAST_SIGMA_Q = 1e-9  # [m] that readings without noise claim
+_OFTEN = 0.5  # of the photographs of a view that show a leg which its hint names
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written faster without
 
 
-def take_photographs(
-    folder: Path,
-    names: Sequence[str],
-    images: Images,
-    machines: Sequence[PosedMachine],
-    viewpoints: Sequence[Viewpoint],
-    appearance: Appearance,
-    rng: np.random.Generator,
-    workers: int,
-    progress: Report,
-) -> None:
-    """Render all images and write them.
+def streams(seed: int) -> dict[str, np.random.Generator]:
+    """Return a source of chance for every purpose; what one draws leaves the others alone."""
+    children = np.random.SeedSequence(seed).spawn(len(_PURPOSES))
+    return {
+        name: np.random.default_rng(child) for name, child in zip(_PURPOSES, children, strict=True)
+    }
 
-    What stands around the machine is drawn once for each view, the noise of the sensor for each
-    image: images do not depend on how many processes make them.
-    """
-    of_views, of_images = rng.spawn(len(viewpoints)), rng.spawn(len(images))
-    (folder / "images").mkdir()
-    done = 0
-    progress(STAGE, done, len(images))
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """What is measured of a simulated machine, and the truth behind it."""
+
+    measurements: Measurements
+    outlines: Outlines | None  # with noise, where the settings ask for them
+    axes: AxisTable | None
+    corners: Corners | None
+    truth: Mechanism
+    poses: Configurations  # all that were drawn; images may show only some
+    labels: tuple[str, ...]  # their names
+    machines: tuple[PosedMachine, ...]  # in every pose, with the board
+    scene: Scene
+    left_out: int  # images that show no leg, which a table of outlines or axes has no row for
+    board: PlacedBoard | None
+    groups: tuple[str, ...]  # view of the dataset of each camera in the hand; empty if they stand
+
+
+def simulate_session(
+    truth: Mechanism,
+    nominal: Mechanism,
+    settings: SimulationSettings,
+    chance: Streams,
+    progress: Report = no_progress,
+) -> Session:
+    """Return a session of a true machine of which the nominal model is known."""
+    cameras, given = _cameras(settings)
+    shared = settings.shared_poses or not isinstance(settings.poses, int)
+    n_sets = 1 if shared else len(cameras)
+    if isinstance(settings.poses, int):
+        n_poses = settings.poses * n_sets
+        poses = commanded_poses(
+            truth, nominal, n_poses, chance["poses"], settings.sampling, progress
+        )
+    else:
+        poses = given_poses(truth, settings.poses)
+    settings.check_images(len(cameras), len(poses.poses) // n_sets)
+    # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
+    shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
+    machines = pose_machine(truth, dressed(shown), poses)
+    board = chosen_board(settings.board, machines)
+    placed: PlacedBoard | None = None
+    groups: tuple[str, ...] = ()
+    if board is None:
+        views = given or cameras_around(truth, machines, cameras, chance["cameras"], progress)[0]
+    elif given:
+        placed, views = board_before(board, truth, machines, given), given
+    else:
+        in_turn = [machines[p] for v in range(len(cameras)) for p in _poses_of(v, n_sets, machines)]
+        bodies = in_turn if settings.hand_held else machines
+        placed, views = board_and_cameras(
+            board, truth, bodies, cameras, chance["cameras"], progress
+        )
+    if placed is not None:
+        machines = tuple(placed.beside(machine) for machine in machines)
+    if placed is not None and settings.hand_held:
+        views, groups = _in_hand(truth, machines, n_sets, cameras, placed, chance, progress)
+    if settings.level is Level.PHOTOGRAPHS:
+        views = _encoding(views, settings.appearance.gamma, settings.tell_gamma)
+    poses_of = [
+        [v % len(machines)] if groups else _poses_of(v, n_sets, machines) for v in range(len(views))
+    ]
+    images = take_images(truth.legs, machines, views, poses_of, settings.images, progress)
+    rows = list(range(len(images)))
+    if settings.level is not Level.PHOTOGRAPHS:
+        rows = [row for row in rows if images.seen(row)]
+    kept = images.chosen(rows)
+    if groups:
+        kept, views, groups = _numbered(kept, views, groups)
+    A, B = (np.array([getattr(m, joint) for m in machines]) for joint in "AB")
+    scene = Scene(A, B, views, kept)
+    outlines = axes = corners = None
+    if settings.level is Level.OUTLINES:
+        noise = OutlineNoise(settings.sigma_px, n_points=None)
+        outlines = outlines_of(scene, noise, chance["observations"])
+    elif settings.level is Level.AXES:
+        axes = axes_of(scene, settings.table, chance["observations"])
+    if placed is not None and settings.level is not Level.PHOTOGRAPHS:
+        corners = corners_of(scene, machines, placed, settings.sigma_px, chance["corners"])
+    width = max(2, len(str(len(poses.poses))))
+    labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(poses.poses)))
+    measurements = _recorded(truth, poses, labels, scene, settings, chance, told=not groups)
+    return Session(
+        measurements, outlines, axes, corners, truth, poses, labels, machines, scene,
+        len(images) - len(rows), placed, groups,
+    )  # fmt: skip
+
+
+def exact_outlines(scene: Scene) -> Outlines:
+    """Return the outlines of a scene as they are, with next to no noise claimed."""
+    return outlines_of(scene, replace(EVERY_PIXEL, sigma_px=0.0))
+
+
+def _cameras(settings: SimulationSettings) -> tuple[dict[str, Camera], tuple[Viewpoint, ...]]:
+    """Return the camera of each view, and where all of them stand if that is given."""
+    camera = mild_lens() if settings.camera is None else read_lens(settings.camera)
+    if isinstance(settings.views, int):
+        return {f"c{v + 1}": camera for v in range(settings.views)}, ()
+    given = read_cameras(settings.views, camera)
+    cameras = {name: lens for name, (lens, _) in given.items()}
+    return cameras, tuple(Viewpoint(name, lens, T) for name, (lens, T) in given.items())
+
+
+def _poses_of(view: int, n_sets: int, machines: Sequence[PosedMachine]) -> range:
+    """Return the poses that a view sees: all of them, or those of its own set."""
+    own = len(machines) // n_sets
+    return range(own) if n_sets == 1 else range(view * own, (view + 1) * own)
+
+
+def _in_hand(
+    truth: Mechanism,
+    machines: Sequence[PosedMachine],  # with the board
+    n_sets: int,
+    cameras: Mapping[str, Camera],
+    placed: PlacedBoard,
+    chance: Streams,
+    progress: Report,
+) -> tuple[tuple[Viewpoint, ...], tuple[str, ...]]:
+    """Return a place for each image from which it shows board and legs, and the view of each."""
+    views: list[Viewpoint] = []
+    groups: list[str] = []
+    n_images = len(cameras) * len(machines) // n_sets
+    for v, (name, camera) in enumerate(cameras.items()):
+        for k, pose in enumerate(_poses_of(v, n_sets, machines)):
+            progress("Camera places", len(views), n_images)
+            T = camera_in_hand(truth, machines[pose], camera, chance["cameras"], placed)
+            if T is None:
+                raise NotVisible(
+                    f"view {name}: a camera in the hand could not be placed: found none of "
+                    f"{HAND_TRIES} places from which image {k + 1} shows the board and a leg, "
+                    "needed one; use a smaller board."
+                )
+            views.append(Viewpoint(f"{name}-{k + 1}", camera, T))
+            groups.append(name)
+    progress("Camera places", n_images, n_images)
+    return tuple(views), tuple(groups)
+
+
+def _numbered(
+    images: Images, views: Sequence[Viewpoint], groups: Sequence[str]
+) -> tuple[Images, tuple[Viewpoint, ...], tuple[str, ...]]:
+    """Return hand-held views counted anew by the images that are left, one for each of them."""
+    counts = dict.fromkeys(groups, 0)
+    left, names = [], []
+    for v in images.view.tolist():
+        name = groups[v]
+        counts[name] += 1
+        left.append(replace(views[v], name=f"{name}-{counts[name]}"))
+        names.append(name)
+    own = replace(images, view=np.arange(len(images), dtype=np.intp))
+    return own, tuple(left), tuple(names)
+
+
+def _encoding(views: Sequence[Viewpoint], gamma: float, is_told: bool) -> tuple[Viewpoint, ...]:
+    """Return views whose cameras encode light in their grey levels, as their makers say or not."""
+    cameras = {
+        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_given=is_told) for view in views
+    }
+    return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
+
+
+def _recorded(
+    truth: Mechanism,
+    poses: Configurations,
+    labels: Sequence[str],
+    scene: Scene,
+    settings: SimulationSettings,
+    chance: Streams,
+    *,
+    told: bool,  # roughly where cameras stand, if hints are wanted
+) -> Measurements:
+    """Return the rows of the dataset: readings with their errors, and what is told of cameras."""
+    legs, images = truth.leg_names, scene.images
+    photographs = settings.level is Level.PHOTOGRAPHS
+    # Tables say themselves what is seen; in photographs nobody looks for a leg that often hides.
+    least = _OFTEN if photographs else 0.0
+    views = []
+    for v, view in enumerate(scene.views):
+        T = rough_pose(view.T_base_camera, chance["hints"])
+        shown = tuple(legs[j] for j in images.seen_in_view(v, least))
+        hint = shown if 0 < len(shown) < len(legs) else None
+        hints = (T, hint) if settings.hints and told else (None, None)
+        views.append(View(view.name, view.camera, *hints))
+    q, size = poses.readings, settings.readings.size
+    if settings.readings.distribution is Distribution.UNIFORM:
+        q = q + chance["readings"].uniform(-size, size, q.shape)
+    else:
+        q = q + size * chance["readings"].normal(size=q.shape)
+    names = [""] * len(images)
+    if photographs:
+        repeated = int(images.repeat.max()) > 0
+        names = [
+            f"images/{views[v].name}_{labels[p]}{f'_{k + 1}' * repeated}.png"
+            for v, p, k in zip(images.view, images.pose, images.repeat, strict=True)
+        ]
+    seen, pose = np.unique(images.pose, return_inverse=True)
+    return Measurements(
+        views=tuple(views),
+        image=tuple(names),
+        view=images.view,
+        pose=pose.astype(np.intp),
+        q=q[images.pose],
+        sigma_q=max(settings.encoder_sigma, _LEAST_SIGMA_Q),
+        pose_labels=tuple(labels[p] for p in seen),
+    )
+
+
+# Photographs: surroundings are drawn once for each view, the noise of the sensor for each image.
+# Images do not depend on how many processes make them.
+
+
+def photographs(
+    session: Session, appearance: Appearance, rng: np.random.Generator, workers: int = 1
+) -> Generator[tuple[int, bytes]]:
+    """Yield row and PNG of all images of a session."""
+    views, images = session.scene.views, session.scene.images
+    of_views, of_images = rng.spawn(len(views)), rng.spawn(len(images))
     try:
         with worker_pool(workers) as run:
-            for v, viewpoint in enumerate(viewpoints):
+            for v, view in enumerate(views):
                 rows = np.flatnonzero(images.view == v).tolist()
-                machine = {row: machines[images.pose[row]].solids for row in rows}
-                nearby = next(iter(machine.values()), ())
-                studio = _Studio(
-                    _Place(f"{folder} {v}", viewpoint, nearby, appearance, of_views[v]),
-                    machine,
-                    {row: folder / names[row] for row in rows},
-                    {row: of_images[row] for row in rows},
-                )
-                for _ in run(studio.photograph, rows):
-                    done += 1
-                    progress(STAGE, done, len(images))
+                machines = {row: session.machines[images.pose[row]].solids for row in rows}
+                nearby = next(iter(machines.values()), ())
+                place = _Place(f"{id(session)} {v}", view, nearby, appearance, of_views[v])
+                studio = _Studio(place, machines, {row: of_images[row] for row in rows})
+                yield from zip(rows, run(studio.photograph, rows), strict=True)
     finally:
-        _scene.cache_clear()
+        _rendered_view.cache_clear()
 
 
 @dataclass(frozen=True)
@@ -98,12 +304,10 @@ class _Place:
 
 
 @lru_cache(maxsize=1)
-def _scene(place: _Place) -> Scene:
+def _rendered_view(place: _Place) -> RenderedView:
     """Return the camera in front of its surroundings, painted once in each process."""
     view = place.viewpoint
-    return prepare_scene(
-        place.machine, view.camera, view.T_base_camera, place.appearance, place.rng
-    )
+    return prepare_view(place.machine, view.camera, view.T_base_camera, place.appearance, place.rng)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,235 +316,16 @@ class _Studio:
 
     place: _Place
     machines: Mapping[int, tuple[PlacedSolid, ...]]
-    paths: Mapping[int, Path]
     sensor_rngs: Mapping[int, np.random.Generator]
 
-    def photograph(self, row: int) -> None:
-        """Write the photograph of a row."""
-        image = _scene(self.place).render(self.machines[row], self.sensor_rngs[row])
-        self._write(self.paths[row], image)
-
-    def _write(self, path: Path, image: Image) -> None:
-        """Write a photograph."""
+    def photograph(self, row: int) -> bytes:
+        """Return the PNG of a row."""
+        image = _rendered_view(self.place).render(self.machines[row], self.sensor_rngs[row])
         encoded, content = cv2.imencode(".png", image, _FAST if image.ndim == 3 else ())
         if not encoded:
             raise OutOfResources(
-                f"{path}: the photograph could not be encoded: found an image of {image.shape[1]} "
-                f"x {image.shape[0]} px that PNG does not take, needed a smaller one; use another "
-                "camera."
+                f"The photograph of row {row + 1} could not be encoded: found an image of "
+                f"{image.shape[1]} x {image.shape[0]} px that PNG does not take, needed a smaller "
+                "one; use another camera."
             )
-        path.write_bytes(content.tobytes())
-
-
-_STREAMS = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
-            "corners")  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedDataset:
-    """What was written.
-
-    Attributes
-    ----------
-    folder : Path
-        The dataset.
-    level : Level
-        What it gives a calibration to work on.
-    nominal, truth : Mechanism
-        The model of the dataset, and the machine that was measured.
-    truth_path : Path
-        The YAML of the true model.
-    measurements : Measurements
-        The rows.
-    seen : (n_rows, n_legs) array of bool
-        Which legs each image shows.
-    left_out : int
-        Images that show no leg, which a dataset of axes or outlines has no row for.
-    n_extreme : int
-        Poses with every motor near an end of its travel.
-    """
-
-    folder: Path
-    level: Level
-    nominal: Mechanism
-    truth: Mechanism
-    truth_path: Path
-    measurements: Measurements
-    seen: Array
-    left_out: int
-    n_extreme: int
-
-
-def simulate(
-    model: str | Path | Mechanism,
-    output: str | Path,
-    settings: SimulationSettings | None = None,
-    *,
-    force: bool = False,
-    workers: int = 1,
-    progress: Report = no_progress,
-) -> SimulatedDataset:
-    """Write a dataset of a machine that differs from its nominal model by drawn errors.
-
-    The same settings give the same files, to the last bit, on one machine. What is drawn for one
-    purpose does not depend on the others: two levels with one seed show the same machine in the
-    same poses.
-
-    Parameters
-    ----------
-    model : str, Path or Mechanism
-        The nominal model, as :func:`legcal.load_mechanism` takes it.
-    output : path
-        The folder of the dataset.
-    settings : SimulationSettings, optional
-        What to simulate.
-    force : bool
-        Replace an earlier simulated dataset.
-    workers : int
-        Render photographs in that many processes.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-
-    Returns
-    -------
-    SimulatedDataset
-
-    Raises
-    ------
-    UsageError
-        If the output holds something else, or a camera is inside the machine.
-    ModelError, DatasetError, OutOfClass
-        If a file is malformed or not covered.
-    DidNotConverge
-        If the machine does not reach such poses.
-    NotVisible
-        If a view shows no leg. Nothing is written in any of these cases.
-    """
-    settings = settings or SimulationSettings()
-    destination = output_path(output, SIMULATED)
-    whole_number("workers", workers, 1)
-    check_dataset_destination(destination, force=force)
-    nominal = model if isinstance(model, Mechanism) else load_mechanism(model)
-    _check_readings(nominal, settings)
-    chance = _streams(settings.seed)
-    with dataset_folder(destination, force=force) as folder:
-        yaml_path, _ = write_model(nominal, folder)
-        truth = write_true_model(nominal, settings.errors, chance["errors"], folder / TRUTH)
-        imaged = image_machine(truth, nominal, settings, chance, progress)
-        m = recorded(imaged, settings, chance)
-        board = None if imaged.board is None else imaged.board.document()
-        told = board if settings.board_pose else without_pose(board)
-        model_name = yaml_path.relative_to(folder).as_posix()
-        write_session(folder, nominal, model_name, m, groups=imaged.groups, board=told)
-        write_tables(folder, imaged, m, settings, chance)
-        if settings.level is Level.PHOTOGRAPHS:
-            take_photographs(
-                folder, m.image, imaged.images, imaged.machines, imaged.views,
-                settings.appearance, chance["photographs"], workers, progress,
-            )  # fmt: skip
-        files = [*files_in(folder), TRUTH_NAME]
-        write_truth(
-            folder / TRUTH_NAME, settings, truth, imaged.views, imaged.poses,
-            imaged.labels, files, board,
-        )  # fmt: skip
-    readings = imaged.poses.readings[np.unique(imaged.images.pose)]
-    return SimulatedDataset(
-        folder=destination,
-        level=settings.level,
-        nominal=nominal,
-        truth=truth,
-        truth_path=destination / TRUTH / "models" / truth.yaml_path.name,
-        measurements=m,
-        seen=np.array([[leg.is_seen for leg in shown] for shown in imaged.images.shown]),
-        left_out=imaged.left_out,
-        n_extreme=int(np.sum(are_extreme(truth, readings))),
-    )
-
-
-def _check_readings(nominal: Mechanism, settings: SimulationSettings) -> None:
-    """Refuse errors of readings that are larger than what is read."""
-    travel = min((np.ptp(nominal.legs[j].travel) for j in nominal.motors), default=np.inf)
-    if settings.readings.size > travel:
-        raise UsageError(
-            f"The readings could not be simulated: found errors of {settings.readings.size:g} m, "
-            f"needed at most the shortest travel of a motor, {travel:g} m; give them with the "
-            "unit that is meant."
-        )
-
-
-def _streams(seed: int) -> dict[str, np.random.Generator]:
-    """Return a source of chance for every purpose."""
-    children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
-    return {
-        name: np.random.default_rng(child) for name, child in zip(_STREAMS, children, strict=True)
-    }
-
-
-def summary_document(made: SimulatedDataset) -> dict[str, Any]:
-    """Return the document of ``legcal simulate --json``."""
-    views = {}
-    for v, view in enumerate(made.measurements.views):
-        rows = made.measurements.view == v
-        seen = made.seen[rows].sum(axis=0).tolist()
-        legs = dict(zip(made.nominal.leg_names, seen, strict=True))
-        views[view.name] = {"images": int(np.sum(rows)), "legs": legs}
-    return {
-        "dataset": str(made.folder),
-        "level": made.level.value,
-        "mechanism": made.nominal.name,
-        "truth": str(made.truth_path),
-        "images": made.measurements.n_rows,
-        "poses": made.measurements.n_poses,
-        "extreme_poses": made.n_extreme,
-        "left_out": made.left_out,
-        "views": views,
-    }
-
-
-def summary_table(made: SimulatedDataset) -> RenderableType:
-    """Return what was simulated as people read it: how many images of a view show each leg."""
-    document = summary_document(made)
-    size = f"{_count(document['images'], 'image')} of {_count(document['poses'], 'pose')}"
-    heading = Text.assemble((document["mechanism"], "bold"), f": {document['level']}, {size}")
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("view", overflow="fold")
-    table.add_column("images", justify="right")
-    for name in made.nominal.leg_names:
-        table.add_column(Text(name), justify="right")
-    for name, view in document["views"].items():
-        counts = [str(n) for n in view["legs"].values()]
-        table.add_row(Text(name), str(view["images"]), *counts)
-    folder = shlex.quote(str(made.folder))
-    lines = [
-        "Images of each view that show 40 % of a leg or more in one piece.",
-        *([_left_out(made.left_out)] if made.left_out else []),
-        f"{made.n_extreme} of {made.measurements.n_poses} poses have every motor near an end of "
-        "its travel.",
-        f"\nwritten: {made.folder}",
-        f"the true model: {made.truth_path}",
-        f"calibrate with: legcal calibrate {folder} -o OUT",
-        f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(str(made.truth_path))}",
-        *([f"measure noise with: legcal noise {folder}"] if _is_repeated(made) else []),
-    ]
-    return Group(heading, Text(), table, Text(), *(Text(s, overflow="fold") for s in lines))
-
-
-def _is_repeated(made: SimulatedDataset) -> bool:
-    """Say whether there are several photographs of a pose in a view."""
-    m = made.measurements
-    places = set(zip(m.view.tolist(), m.pose.tolist(), strict=True))
-    return made.level is Level.PHOTOGRAPHS and len(places) < m.n_rows
-
-
-def _left_out(n: int) -> str:
-    """Return how many images are left out, in words."""
-    return (
-        "1 image shows no leg and is left out."
-        if n == 1
-        else f"{n} images show no leg and are left out."
-    )
-
-
-def _count(n: int, what: str) -> str:
-    """Return a number of things."""
-    return f"{n} {what}{'s' * (n != 1)}"
+        return content.tobytes()

@@ -1,23 +1,142 @@
-"""What a simulated dataset is made of: the choices, with defaults, and the limits of each."""
+"""What a simulated dataset is made of: the choices, with defaults, and the limits of each.
+
+:class:`SimulationSettings` is what Python gives; :func:`requested` makes it of the options of
+``legcal simulate``.
+"""
 
 from __future__ import annotations
 
 import math
 import operator
-from dataclasses import dataclass, field
+import re
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import Field as DataclassField
 from enum import StrEnum
+from functools import cache
 from numbers import Real
 from pathlib import Path
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
+from pydantic import Field, create_model
 
 from legcal.data import SIGMA_RANGE
 from legcal.errors import UsageError
-from legcal.simulation.poses import Sampling
-from legcal.simulation.rendering.appearance import Appearance
-from legcal.simulation.table_noise import TableNoise
-from legcal.simulation.truth import KINDS, LARGEST, Distribution, ParameterErrors, Spread
+from legcal.files import (
+    ANGLE,
+    LENGTH,
+    PIXELS,
+    FileSchema,
+    closest,
+    describe,
+    parse_quantity,
+    parse_yaml,
+    read_text,
+    validate,
+)
+from legcal.machine import Mechanism, parametrization_of
+from legcal.simulation.board import KINDS as BOARD_KINDS
+from legcal.simulation.observe import TableNoise
+from legcal.simulation.rendering.appearance import Appearance, Light
+from legcal.simulation.request import Angles, Level, Request, Sampling
 from legcal.vision import Board
+
+LARGEST = 1.0  # [m] or [rad]
+ANGLES = ("axes", "twists")
+
+
+class Distribution(StrEnum):
+    """How errors of one kind are distributed, about zero."""
+
+    UNIFORM = "uniform"
+    NORMAL = "normal"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How large the errors of one kind of parameter are.
+
+    Attributes
+    ----------
+    size : float
+        Half of the width where they are uniform, one standard deviation where they are normal
+        [m] or [rad].
+    distribution : Distribution
+        How they are distributed.
+
+    Raises
+    ------
+    UsageError
+        If the size is no number, or there is no such distribution.
+    """
+
+    size: float = 0.0
+    distribution: Distribution = Distribution.UNIFORM
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.size, Real) or self.distribution not in list(Distribution):
+            raise UsageError(
+                f"A spread could not be used: found the size {self.size!r} and the distribution "
+                f"{self.distribution!r}, needed a number [m, rad] and "
+                f"{' or '.join(Distribution)}; correct it."
+            )
+        object.__setattr__(self, "size", float(self.size))
+        object.__setattr__(self, "distribution", Distribution(self.distribution))
+
+
+@dataclass(frozen=True)
+class ParameterErrors:
+    """How large the errors of each kind of parameter are.
+
+    Attributes
+    ----------
+    base_joints, platform_joints : Spread
+        Of every coordinate of the joint centres [m].
+    offsets : Spread
+        Of actuated legs [m].
+    lengths : Spread
+        Of legs of constant length [m].
+    axes : Spread
+        Of both angles of axes at base and platform [rad].
+    twists : Spread
+        Of the angles that legs without an S joint keep [rad].
+    radii : Spread
+        Of the cylinders that legs are seen as [m]; no parameter of the kinematics.
+    coplanar : bool
+        Whether joint centres keep their heights, their z in R_b and R_e: what is coplanar stays so.
+    """
+
+    base_joints: Spread = Spread()
+    platform_joints: Spread = Spread()
+    offsets: Spread = Spread()
+    lengths: Spread = Spread()
+    axes: Spread = Spread()
+    twists: Spread = Spread()
+    radii: Spread = Spread()
+    coplanar: bool = False
+
+
+ERRORS_OF = {  # kind of parameter, as in its name
+    "base": "base_joints",
+    "platform": "platform_joints",
+    "offset": "offsets",
+    "length": "lengths",
+    "base_axis": "axes",
+    "platform_axis": "axes",
+    "twist": "twists",
+}
+
+
+KINDS = (*dict.fromkeys(ERRORS_OF.values()), "radii")  # the fields that are sizes
+
+
+def kinds_of(mechanism: Mechanism) -> set[str]:
+    """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
+    names = parametrization_of(mechanism, twists=True).names
+    kinds = {ERRORS_OF[name.split(".")[1]] for name in names}
+    return kinds | ({"radii"} if any(leg.cylinders for leg in mechanism.legs) else set())
+
 
 _MILLIMETRES = Spread(2e-3)  # of the size by which the paper disturbs its machine
 _TENTH_DEGREE = Spread(float(np.deg2rad(0.1)))
@@ -32,14 +151,6 @@ DEFAULT_ERRORS = ParameterErrors(
 DEFAULT_READINGS = Spread(2e-6, Distribution.NORMAL)
 MOST_IMAGES = 100_000
 MOST_SIGMA_PX = 100.0
-
-
-class Level(StrEnum):
-    """What a simulated dataset gives the calibration to work on."""
-
-    AXES = "axes"
-    OUTLINES = "outlines"
-    PHOTOGRAPHS = "photographs"
 
 
 @dataclass(frozen=True)
@@ -247,3 +358,219 @@ def _unit(name: str) -> str:
     if name.endswith("points"):
         return "px"
     return "rad" if name.endswith(("axes", "twists", "psi", "theta")) else "m"
+
+
+def read_appearance(path: Path) -> Appearance:
+    """Return the appearance that a file describes."""
+    found = parse_yaml(read_text(path, "appearance file"), path, "appearance file")
+    entry = validate(_schema(), found, path)
+    values = {name: getattr(entry, name) for name in entry.model_fields_set}
+    if "lights" in values:
+        values["lights"] = tuple(Light(**light.model_dump()) for light in values["lights"])
+    return Appearance(**values)
+
+
+@cache
+def _schema() -> type[FileSchema]:
+    """Return the schema of the file."""
+    light = _schema_of(Light, {})
+    electrons = Annotated[float, Field(allow_inf_nan=True)]  # .inf: no noise
+    other_types = {"lights": tuple[light, ...], "electrons": electrons}  # type: ignore[valid-type]
+    return _schema_of(Appearance, other_types)
+
+
+def _schema_of(described: type[Any], other_types: dict[str, Any]) -> type[FileSchema]:
+    """Return the schema of a dataclass."""
+    types = get_type_hints(described) | other_types
+    columns: dict[str, Any] = {f.name: (types[f.name], _default(f)) for f in fields(described)}
+    return create_model(described.__name__, __base__=FileSchema, **columns)
+
+
+def _default(field: DataclassField[Any]) -> Any:
+    """Return the default of a field, or that it must be given."""
+    return ... if field.default is MISSING else field.default
+
+
+_ERROR_KINDS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
+    "joints": (("base_joints", "platform_joints"), LENGTH),
+    "base-joints": (("base_joints",), LENGTH),
+    "platform-joints": (("platform_joints",), LENGTH),
+    "offsets": (("offsets",), LENGTH),
+    "lengths": (("lengths",), LENGTH),
+    "axes": (("axes",), ANGLE),
+    "twists": (("twists",), ANGLE),
+    "radii": (("radii",), LENGTH),
+}
+
+
+def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
+    """Return the settings that options ask for."""
+    given = _poses(request.poses)
+    _refuse_contradictions(request, given, nominal)
+    _refuse_other_levels(request)
+    if isinstance(given, Path) and not given.exists():
+        raise UsageError(
+            f"--poses could not be used: found {describe(request.poses)}, neither a whole number "
+            "nor a file, needed the number of poses or the path of a CSV; correct it."
+        )
+    noise = request.pixel_noise or "0.1px"
+    return SimulationSettings(
+        level=request.level,
+        errors=replace(_errors(request, nominal), coplanar=request.coplanar),
+        poses=given,
+        sampling=request.sampling or Sampling.EXTREME,
+        shared_poses=bool(request.shared_poses) or isinstance(given, Path),
+        images=request.images,
+        views=request.cameras or (3 if request.views is None else request.views),
+        camera=request.camera,
+        board=_board(request.board),
+        board_pose=request.board_pose,
+        hand_held=request.hand_held,
+        hints=request.hints,
+        tell_gamma=request.tell_gamma is not False,
+        sigma_px=parse_quantity(noise, PIXELS, "--pixel-noise"),
+        table=TableNoise.in_radians() if request.table_noise is Angles.RADIANS else TableNoise(),
+        readings=_spread(request.encoder_noise, LENGTH, Distribution.NORMAL, "--encoder-noise"),
+        appearance=_appearance(request),
+        seed=request.seed,
+    )
+
+
+def _refuse_contradictions(request: Request, poses: int | Path, nominal: Mechanism) -> None:
+    """Refuse options that others make void."""
+    problems = []
+    if request.views is not None and request.cameras is not None:
+        problems.append(
+            "The cameras could not be placed: found both --views and --cameras, needed one of "
+            "them; leave out --views, the file says how many there are."
+        )
+    if isinstance(poses, Path) and request.shared_poses is False:
+        problems.append(
+            "The poses could not be used: found --own-poses with a file of poses, needed poses "
+            "that all views see; leave out --own-poses."
+        )
+    if isinstance(poses, Path) and request.sampling is not None:
+        problems.append(
+            "The poses could not be used: found --sampling with a file of poses, needed a number "
+            "of poses to draw; leave out --sampling."
+        )
+    elif request.sampling is not None and not nominal.is_determined:
+        problems.append(
+            "The poses could not be drawn: found --sampling for a machine whose motors do not "
+            "determine its pose, needed none, it takes a random walk; leave out --sampling."
+        )
+    if request.hand_held and request.cameras is not None:
+        problems.append(
+            "The cameras could not be placed: found both --hand-held and --cameras, needed one of "
+            "them; leave out one of the two."
+        )
+    for option, given in (("--hand-held", request.hand_held), ("--board-pose", request.board_pose)):
+        if given and request.board is None:
+            problems.append(
+                f"{option} could not be used: found no --board, needed a board on the base; add "
+                "--board charuco."
+            )
+    if problems:
+        raise UsageError(problems)
+
+
+def _refuse_other_levels(request: Request) -> None:
+    """Refuse options that belong to another level."""
+    problems = []
+    for option in fields(request):
+        level = option.metadata["only"]
+        given = level not in (None, request.level) and getattr(request, option.name) is not None
+        of_corners = request.level is Level.AXES and request.board is not None
+        if given and not (option.name == "pixel_noise" and of_corners):
+            flags = option.metadata["option"]["flags"] or (f"--{option.name.replace('_', '-')}",)
+            problems.append(
+                f"{flags[0].replace('/', ' or ')} could not be used: found --level "
+                f"{request.level}, needed --level {level}, the only one that it has an effect on; "
+                "leave it out or give that level."
+            )
+    if problems:
+        raise UsageError(problems)
+
+
+def _board(choice: str | None) -> str | Path | None:
+    """Return a kind of board, or the path of a file."""
+    if choice is None or choice in BOARD_KINDS:
+        return choice
+    if not Path(choice).exists():
+        raise UsageError(
+            f"--board could not be used: found {describe(choice)}, neither a kind of board nor a "
+            f"file, needed {', '.join(BOARD_KINDS)} or the path of a YAML file; "
+            f"{closest(choice, BOARD_KINDS)}"
+        )
+    return Path(choice)
+
+
+def _appearance(request: Request) -> Appearance:
+    """Return how photographs look."""
+    base = Appearance() if request.appearance is None else read_appearance(request.appearance)
+    given = {name: getattr(request, name) for name in ("blur", "clutter", "bits", "colour")}
+    return replace(base, **{name: value for name, value in given.items() if value is not None})
+
+
+def _poses(text: str) -> int | Path:
+    """Return a number of poses, or the path of a CSV."""
+    if not re.fullmatch(r"[-+]?[\d.]+", text):
+        return Path(text)
+    if not text.lstrip("+").isdecimal():
+        raise UsageError(
+            f"--poses could not be used: found {describe(text)}, needed a whole number of one or "
+            "more, or the path of a CSV; correct it."
+        )
+    return int(text)
+
+
+def _errors(request: Request, nominal: Mechanism) -> ParameterErrors:
+    """Return the errors of parameters that options ask for."""
+    found, possible = DEFAULT_ERRORS, kinds_of(nominal)
+    for text in request.error or ():
+        if text == "none":
+            found = ParameterErrors()
+            continue
+        kind, equals, size = text.partition("=")
+        if kind in _ERROR_KINDS and not size:
+            raise UsageError(
+                f"--error could not be used: found {describe(text)} without a size, needed "
+                f"KIND=SIZE; write {kind}={'2mm' if _ERROR_KINDS[kind][1] is LENGTH else '0.1deg'}."
+            )
+        if not equals or kind not in _ERROR_KINDS:
+            raise UsageError(
+                f"--error could not be used: found {describe(text)}, needed KIND=SIZE or none, "
+                f"such as joints=2mm; {closest(kind, _ERROR_KINDS)}"
+            )
+        kinds, units = _ERROR_KINDS[kind]
+        spread = _spread(size, units, Distribution.UNIFORM, f"--error {kind}")
+        if spread.size > LARGEST:
+            most = f"{LARGEST / units['deg']:.3g}deg" if "deg" in units else f"{LARGEST:g}m"
+            raise UsageError(
+                f"--error {kind} could not be used: found {describe(size)}, needed 0 to {most}; "
+                "correct it and its unit."
+            )
+        if spread.size > 0.0 and not possible & set(kinds):
+            raise UsageError(
+                f"--error {kind} could not be used: found none in the mechanism "
+                f"'{nominal.name}', needed one that has them; leave it out."
+            )
+        for kind_of_joint in kinds:
+            found = replace(found, **{kind_of_joint: spread})  # type: ignore[arg-type]
+    if request.coplanar and found.base_joints.size == found.platform_joints.size == 0.0:
+        raise UsageError(
+            "--coplanar could not be used: found no errors of joints, needed some; leave it out."
+        )
+    return found
+
+
+def _spread(text: str, units: Mapping[str, float], usual: Distribution, what: str) -> Spread:
+    """Return a spread such as ``2mm`` or ``2mm:normal``."""
+    size, colon, name = text.partition(":")
+    if colon and name not in list(Distribution):
+        raise UsageError(
+            f"{what} could not be used: found the distribution {describe(name)}, needed uniform "
+            "(the size is half the width) or normal (the size is one standard deviation); "
+            "correct it."
+        )
+    return Spread(parse_quantity(size, units, what), Distribution(name) if colon else usual)

@@ -1,4 +1,4 @@
-"""A machine in one pose as viewing rays meet it: triangles, hit by embree."""
+"""A machine as solids: visuals of its URDF and what they lack, in any pose, as rays meet it."""
 
 from __future__ import annotations
 
@@ -18,6 +18,18 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from legcal.errors import ModelError
 from legcal.geometry import Array, BoolArray, IntArray, distance_to_line, product
 from legcal.machine import COAXIAL, Configurations, Leg, Mechanism, Urdf, number_list, parse_robot
+
+_SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
+
+_BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
+_POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
+_DEFAULT_RADIUS = 0.02  # of the distance between joints, where a leg shows no cylinder
+_GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
+_FLAT = 0.2  # cosine between legs and plates below which the legs lie along the plates
+
+_SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
+_SUBDIVISIONS = 2  # of an icosahedron that stands for a sphere
+_FLAT_JOINTS = 1e-3  # thickness of joint centres that lie in a plane, of their size
 
 
 @dataclass(frozen=True)
@@ -51,9 +63,6 @@ class Mesh:
 
 
 Shape = Cylinder | Sphere | Box | Mesh
-
-
-_SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
 
 
 class Visual(NamedTuple):
@@ -352,11 +361,6 @@ def _material(visual: Visual, leg: Leg | None) -> Material:
 _BALL = Material(albedo=0.06, specular=1.0, shininess=250.0, limb=0.2)
 _POST = Material(albedo=0.04, specular=0.10, shininess=20.0, limb=0.3)
 _PLATE = Material(albedo=0.09, specular=0.10, shininess=18.0, limb=0.1, texture=0.06)
-_BALL_SIZE, _POST_SIZE = 1.4, 1.1  # in radii of the leg
-_POST_LENGTH, _PLATE_THICKNESS, _PLATE_RIM = 4.5, 1.8, 3.5  # in radii of the thickest leg
-_DEFAULT_RADIUS = 0.02  # of the distance between joints, where a leg shows no cylinder
-_GAP = 1.5  # between the plates of a planar machine, in radii of the thickest leg
-_FLAT = 0.2  # cosine between legs and plates below which the legs lie along the plates
 
 
 def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
@@ -447,11 +451,6 @@ def _radius(leg: Leg, mechanism: Mechanism) -> float:
     return _DEFAULT_RADIUS * float(length)
 
 
-_SECTIONS = 48  # sides of a cylinder of triangles: 0.2 % of its radius too thin at most
-_SUBDIVISIONS = 2  # of an icosahedron that stands for a sphere
-_FLAT_posed_machine = 1e-3  # thickness of joint centres that lie in a plane, of their size
-
-
 @dataclass(frozen=True, eq=False)
 class PosedMachine:
     """A machine in one pose."""
@@ -484,7 +483,7 @@ class PosedMachine:
             return True
         joints = np.concatenate([self.A, self.B])
         size = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
-        if len(joints) < 5 or size[2] < _FLAT_posed_machine * size[0]:
+        if len(joints) < 5 or size[2] < _FLAT_JOINTS * size[0]:
             return False
         from scipy.spatial import Delaunay
 

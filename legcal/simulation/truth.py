@@ -9,9 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
-from numbers import Real
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,102 +31,21 @@ from legcal.machine import (
     parametrization_of,
     write_urdf,
 )
+from legcal.simulation.settings import (
+    ANGLES,
+    ERRORS_OF,
+    KINDS,
+    LARGEST,
+    Distribution,
+    ParameterErrors,
+    Spread,
+)
 from legcal.simulation.solids import Cylinder, solids_of
 
-LARGEST = 1.0  # [m] or [rad]
-ANGLES = ("axes", "twists")
-
-
-class Distribution(StrEnum):
-    """How errors of one kind are distributed, about zero."""
-
-    UNIFORM = "uniform"
-    NORMAL = "normal"
-
-
-@dataclass(frozen=True)
-class Spread:
-    """How large the errors of one kind of parameter are.
-
-    Attributes
-    ----------
-    size : float
-        Half of the width where they are uniform, one standard deviation where they are normal
-        [m] or [rad].
-    distribution : Distribution
-        How they are distributed.
-
-    Raises
-    ------
-    UsageError
-        If the size is no number, or there is no such distribution.
-    """
-
-    size: float = 0.0
-    distribution: Distribution = Distribution.UNIFORM
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.size, Real) or self.distribution not in list(Distribution):
-            raise UsageError(
-                f"A spread could not be used: found the size {self.size!r} and the distribution "
-                f"{self.distribution!r}, needed a number [m, rad] and "
-                f"{' or '.join(Distribution)}; correct it."
-            )
-        object.__setattr__(self, "size", float(self.size))
-        object.__setattr__(self, "distribution", Distribution(self.distribution))
-
-
-@dataclass(frozen=True)
-class ParameterErrors:
-    """How large the errors of each kind of parameter are.
-
-    Attributes
-    ----------
-    base_joints, platform_joints : Spread
-        Of every coordinate of the joint centres [m].
-    offsets : Spread
-        Of actuated legs [m].
-    lengths : Spread
-        Of legs of constant length [m].
-    axes : Spread
-        Of both angles of axes at base and platform [rad].
-    twists : Spread
-        Of the angles that legs without an S joint keep [rad].
-    radii : Spread
-        Of the cylinders that legs are seen as [m]; no parameter of the kinematics.
-    coplanar : bool
-        Whether joint centres keep their heights, their z in R_b and R_e: what is coplanar stays so.
-    """
-
-    base_joints: Spread = Spread()
-    platform_joints: Spread = Spread()
-    offsets: Spread = Spread()
-    lengths: Spread = Spread()
-    axes: Spread = Spread()
-    twists: Spread = Spread()
-    radii: Spread = Spread()
-    coplanar: bool = False
-
-
-_FIELDS = {
-    "base": "base_joints",
-    "platform": "platform_joints",
-    "offset": "offsets",
-    "length": "lengths",
-    "base_axis": "axes",
-    "platform_axis": "axes",
-    "twist": "twists",
-}
-
-
-KINDS = (*dict.fromkeys(_FIELDS.values()), "radii")  # the fields that are sizes
-
-
-def kinds_of(mechanism: Mechanism) -> set[str]:
-    """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
-    names = parametrization_of(mechanism, twists=True).names
-    kinds = {_FIELDS[name.split(".")[1]] for name in names}
-    return kinds | ({"radii"} if any(leg.cylinders for leg in mechanism.legs) else set())
+_MOST = {Distribution.UNIFORM: 0.5, Distribution.NORMAL: 0.1}  # of the thinnest cylinder
+_ALIKE = 1e-9  # [m]; cylinders of one leg with one radius are one tube and stay so
+DRAWS = 20
+FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the true legs demand
 
 
 def draw_errors(
@@ -158,7 +75,7 @@ def _spread(errors: ParameterErrors, name: str) -> Spread:
     _, kind, *more = name.split(".")
     if errors.coplanar and kind in ("base", "platform") and more == ["z"]:
         return Spread()
-    found: Spread = getattr(errors, _FIELDS[kind])
+    found: Spread = getattr(errors, ERRORS_OF[kind])
     return found
 
 
@@ -175,10 +92,6 @@ def _check(errors: ParameterErrors) -> None:
             )
     if problems:
         raise UsageError(problems)
-
-
-_MOST = {Distribution.UNIFORM: 0.5, Distribution.NORMAL: 0.1}  # of the thinnest cylinder
-_ALIKE = 1e-9  # [m]; cylinders of one leg with one radius are one tube and stay so
 
 
 def draw_radii(
@@ -216,10 +129,6 @@ def _check_radii(spread: Spread, thinnest: float) -> None:
             f"needed at most {1e3 * most:.3g} mm ({spread.distribution}) for cylinders as thin as "
             f"{1e3 * thinnest:g} mm; make it smaller."
         )
-
-
-DRAWS = 20
-FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the true legs demand
 
 
 def write_true_model(

@@ -1,4 +1,4 @@
-"""Which images a simulated dataset has: for each its view, its pose and the legs it shows."""
+"""What cameras see of legs: silhouettes of cylinders, and stretches that nothing hides."""
 
 from __future__ import annotations
 
@@ -16,6 +16,15 @@ from legcal.machine import Cylinder, Leg, main_cylinders
 from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
 from legcal.vision import Camera
+
+SEEN = 0.4  # of a leg's length that one stretch must show
+SHORTEST_PX = 20.0  # a stretch of one cylinder that gives an outline
+SAMPLES = 96  # points along a leg
+_BORDER_PX = 2.0  # of the image, where nothing counts as seen
+_ALIKE = 0.01  # relative difference of radii that shows no step
+_ASIDE = 0.01  # of the radius: how far beside its outline a leg is looked past
+_END_ON = 1.01  # radii from the axis within which a leg shows its end and no outline
+_IN_FRONT = 0.1  # radii before an outline from which on a hit hides it
 
 
 def contact_offsets(u: Array, A: Array, radius: Array) -> Array:
@@ -49,16 +58,6 @@ def silhouette(u: Array, A: Array, radius: Array) -> tuple[Array, Array]:
     offsets = contact_offsets(u, A, radius)
     moments = np.cross(u[..., None, :], A[..., None, :] + offsets)
     return moments / np.linalg.norm(moments, axis=-1, keepdims=True), offsets
-
-
-SEEN = 0.4  # of a leg's length that one stretch must show
-SHORTEST_PX = 20.0  # a stretch of one cylinder that gives an outline
-SAMPLES = 96  # points along a leg
-_BORDER_PX = 2.0  # of the image, where nothing counts as seen
-_ALIKE = 0.01  # relative difference of radii that shows no step
-_ASIDE = 0.01  # of the radius: how far beside its outline a leg is looked past
-_END_ON = 1.01  # radii from the axis within which a leg shows its end and no outline
-_IN_FRONT = 0.1  # radii before an outline from which on a hit hides it
 
 
 @dataclass(frozen=True)
@@ -263,21 +262,15 @@ def take_images(
     legs: Sequence[Leg],
     machines: Sequence[PosedMachine],
     viewpoints: Sequence[Viewpoint],
-    n_images: int,
-    *,
-    shared_poses: bool,
+    poses_of: Sequence[Sequence[int]],  # poses that each view sees
+    n_images: int,  # of each pose in each view
     progress: Report = no_progress,
 ) -> Images:
     """Return the images that cameras take of a machine in its poses."""
-    own = len(machines) // len(viewpoints)
-    of_view = [
-        range(len(machines)) if shared_poses else range(v * own, (v + 1) * own)
-        for v in range(len(viewpoints))
-    ]
     rows: list[tuple[int, int, int]] = []
     shown: list[tuple[LegView, ...]] = []
     problems = []
-    for v, (viewpoint, poses) in enumerate(zip(viewpoints, of_view, strict=True)):
+    for v, (viewpoint, poses) in enumerate(zip(viewpoints, poses_of, strict=True)):
         progress("Views", v, len(viewpoints))
         camera, T = viewpoint.camera, viewpoint.T_base_camera
         _refuse_inside(viewpoint, [machines[p] for p in poses])

@@ -1,1 +1,1 @@
-"""rendering."""
+"""The renderer: photographs of solids with known edges, light, lens and sensor."""

@@ -1,4 +1,4 @@
-"""Smooth random patterns: mottled surfaces and backgrounds out of focus."""
+"""How a photograph looks: lights, lens, sensor, and random patterns of surfaces and backgrounds."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -12,6 +12,16 @@ from legcal.errors import UsageError
 from legcal.simulation.rendering.rays import Single
 
 SAMPLES = (13, 21, 34, 55, 89, 144)  # Fibonacci numbers: the lattices of a pixel's rays
+
+_POSITIVE = ("exposure", "gamma")
+_LEAST = {"electrons": 1.0}
+_MOST = {
+    "blur": 20.0, "gamma": 10.0, "clutter": 500.0, "cables": 100.0, "limb": 1.0, "texture": 10.0,
+    "electrons": math.inf,
+}  # fmt: skip
+
+_SIZE = 512  # points of the tile along a side
+_PERIOD = 0.25  # [m] after which a surface's pattern repeats
 
 
 @dataclass(frozen=True)
@@ -155,14 +165,6 @@ class Appearance:
         return replace(plain, **changes)  # type: ignore[arg-type]
 
 
-_POSITIVE = ("exposure", "gamma")
-_LEAST = {"electrons": 1.0}
-_MOST = {
-    "blur": 20.0, "gamma": 10.0, "clutter": 500.0, "cables": 100.0, "limb": 1.0, "texture": 10.0,
-    "electrons": math.inf,
-}  # fmt: skip
-
-
 def _check_number(name: str, value: float) -> None:
     """Refuse a number that makes no sense."""
     most = _MOST.get(name, 1e6)
@@ -182,10 +184,6 @@ def _check_choice(name: str, value: int, choices: tuple[int, ...]) -> None:
             f"The appearance could not be used: found {name} = {value}, needed one of "
             f"{', '.join(map(str, choices))}; choose one."
         )
-
-
-_SIZE = 512  # points of the tile along a side
-_PERIOD = 0.25  # [m] after which a surface's pattern repeats
 
 
 @lru_cache(maxsize=1)

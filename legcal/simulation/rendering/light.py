@@ -1,4 +1,4 @@
-"""Lit parts of a picture, and the shadows on all of them at once."""
+"""Light on surfaces: what each lamp gives them, and the shadows that solids cast on them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,6 +22,12 @@ _TINY = 1e-12
 _SMALLEST = 1e-5  # [m] half-shadow of a point-like lamp
 _CHUNK = 8192  # points at a time
 _SPARE = 1e-4  # [m] for rounding
+
+_SHARP = 0.3  # strength of highlights from which a surface mirrors its surroundings
+
+_STEP = 4  # [px] between traced pixels
+
+_LARGE = 20_000  # pixels of a solid from which its shadows are traced coarsely
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +166,6 @@ def _half_shadow(gap: Single, t: Single, lamp: Lamp) -> Single:
     return np.asarray(share * share * (3.0 - 2.0 * share))
 
 
-_SHARP = 0.3  # strength of highlights from which a surface mirrors its surroundings
-
-
 @dataclass(frozen=True, eq=False)
 class Lighting:
     """The light of a view, in the camera frame."""
@@ -257,9 +260,6 @@ def _channels(
     return bgr if mirrored is None else bgr + mirrored
 
 
-_STEP = 4  # [px] between traced pixels
-
-
 class CoarseSurface:
     """A large surface: the points of it that are traced."""
 
@@ -288,9 +288,6 @@ class CoarseSurface:
         fine = cv2.resize(share, None, fx=_STEP, fy=_STEP, interpolation=cv2.INTER_LINEAR)
         whole = fine[: self._rays.height, : self._rays.width]
         return np.ascontiguousarray(whole, dtype=np.float32).ravel()
-
-
-_LARGE = 20_000  # pixels of a solid from which its shadows are traced coarsely
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What is printed on a face of a box, as rays see it."""
+"""Rays of a camera's pixels, and where they meet solids: depths, faces, normals and prints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +20,17 @@ Faces = NDArray[np.integer[Any]]
 
 _TILE = 64  # pixels after which the shifts of the lattice repeat
 _SPACING = 8  # [px] between the pixels at which distortion is undone
+
+LATERAL, CAP = 0, 1  # faces of a cylinder
+_TINY = 1e-12
+
+NEAR = 1e-4  # [m] in front of the camera
+MARGIN = 2  # [px]
+_SPARE = 0.02  # of the picture, around it
+_SHIFT = 4  # bits of a fraction of a pixel
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+_PIXELS = 8192  # at a time
 
 
 class PixelRays:
@@ -170,10 +181,6 @@ def _caster(mesh: Mesh) -> Any:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).ray
 
 
-LATERAL, CAP = 0, 1  # faces of a cylinder
-_TINY = 1e-12
-
-
 def intersect(solid: SolidInView, x: Single, y: Single) -> tuple[Single, Faces]:
     """Return where rays enter a solid."""
     shape = solid.shape
@@ -273,13 +280,6 @@ def _box(solid: SolidInView, shape: Box, x: Single, y: Single) -> tuple[Single, 
     return enter, face
 
 
-NEAR = 1e-4  # [m] in front of the camera
-MARGIN = 2  # [px]
-_SPARE = 0.02  # of the picture, around it
-_SHIFT = 4  # bits of a fraction of a pixel
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-
-
 def footprint(rays: PixelRays, solid: SolidInView) -> IntArray:
     """Return the pixels that a solid may cover, with a small margin.
 
@@ -365,9 +365,6 @@ def _filled(hull: Array, width: int, height: int) -> IntArray:
     where = np.flatnonzero(mask)
     skipped = width - mask.shape[1]  # pixels between the end of a row and the start of the next
     return np.asarray(where + where // mask.shape[1] * skipped + low[1] * width + low[0])
-
-
-_PIXELS = 8192  # at a time
 
 
 def printed(solid: SolidInView, x: Single, y: Single, face: Faces) -> Single | None:

@@ -1,4 +1,4 @@
-"""What stays the same in the images of a view: camera, light and surroundings."""
+"""Photographs: surroundings of a view, what pixels show, what lens and sensor make of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,6 +47,12 @@ from legcal.vision import Camera
 _TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=0.08,
                   tint=(1.15, 1.0, 0.85))  # fmt: skip
 _CABLE = Material(albedo=0.04, specular=0.15, shininess=15.0, limb=0.2)
+
+_TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
+_THIN = 3.0  # [px] solids that rays through pixel centres may miss
+_PIXELS = 8192  # on edges, at a time
+_SHADED = 3  # of so many of a pixel's rays that meet a solid, one is shaded
+_FACES = 8  # that are told apart in the search for edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,13 +225,6 @@ def develop(radiance: Single, appearance: Appearance, rng: np.random.Generator) 
     level *= full
     level += 0.5
     return level.astype(np.uint8 if appearance.bits == 8 else np.uint16)
-
-
-_TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
-_THIN = 3.0  # [px] solids that rays through pixel centres may miss
-_PIXELS = 8192  # on edges, at a time
-_SHADED = 3  # of so many of a pixel's rays that meet a solid, one is shaded
-_FACES = 8  # that are told apart in the search for edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,7 +406,7 @@ def _thickness(solid: SolidInView) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderedView:
     """A camera in front of its surroundings, painted once for all images of a view."""
 
     T_camera_base: RigidTransform  # pose of the base frame in the camera
@@ -452,13 +451,13 @@ class Scene:
         return CoarseSurface(self.painter.rays, near, self.canvas.z[near])
 
 
-def prepare_scene(
+def prepare_view(
     placed: Sequence[PlacedSolid],
     camera: Camera,
     T_base_camera: RigidTransform,
     appearance: Appearance,
     rng: np.random.Generator,
-) -> Scene:
+) -> RenderedView:
     """Return the scene of a view: its surroundings drawn, lit and painted."""
     rays = pixel_rays(camera)
     T_camera_base = T_base_camera.inv()
@@ -469,7 +468,7 @@ def prepare_scene(
     bystanders = in_view(surroundings.clutter, T_camera_base)
     painter.paint(canvas, [*in_view(surroundings.floor, T_camera_base), *bystanders])
     foreground = in_view(surroundings.cables, T_camera_base)
-    return Scene(
+    return RenderedView(
         T_camera_base,
         appearance,
         surroundings,
@@ -487,8 +486,8 @@ def render(
     appearance: Appearance,
     rng: np.random.Generator,
 ) -> Image:
-    """Return one photograph; :func:`prepare_scene` saves half of the time for more of a view."""
-    return prepare_scene(placed, camera, T_base_camera, appearance, rng).render(placed, rng)
+    """Return one photograph; :func:`prepare_view` saves half of the time for more of a view."""
+    return prepare_view(placed, camera, T_base_camera, appearance, rng).render(placed, rng)
 
 
 def _lighting(

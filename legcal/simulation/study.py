@@ -19,6 +19,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from io import FileIO
+from math import isfinite
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
@@ -81,6 +82,10 @@ class Study(Protocol):
 _KEY = "legcal_study"
 _VERSION = 1
 
+_LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
+_PROCESSES = 4  # for each core; more only wait for each other
+_CHUNKS = 16  # for each process: the work is shared evenly to the end
+
 IsRecord = Callable[[Any], bool]
 """Tells what a study records from anything else."""
 
@@ -130,6 +135,16 @@ def is_failure(found: Any) -> bool:
         and found.keys() == {"kind", "message"}
         and all(isinstance(text, str) for text in found.values())
     )
+
+
+def has_keys(found: Any, keys: set[str]) -> bool:
+    """Return whether a document is an object with exactly these keys."""
+    return isinstance(found, dict) and found.keys() == keys
+
+
+def is_number(found: Any) -> bool:
+    """Return whether a document is a finite number."""
+    return isinstance(found, float | int) and not isinstance(found, bool) and isfinite(found)
 
 
 def check_header(path: Path, line: bytes, expected: dict[str, Any]) -> None:
@@ -298,11 +313,6 @@ def _lock(path: Path, file: FileIO) -> None:
             f"{path}: the study could not be continued: found that another process writes this "
             "checkpoint, needed it alone; wait for that one, or give another output folder."
         ) from error
-
-
-_LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
-_PROCESSES = 4  # for each core; more only wait for each other
-_CHUNKS = 16  # for each process: the work is shared evenly to the end
 
 
 def child_seed(seed: int, run: int) -> np.random.SeedSequence:

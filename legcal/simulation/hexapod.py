@@ -1,14 +1,18 @@
-"""Random platform poses of simulated machines (section 4.3)."""
+"""The 6-SPU of section 4.3 in numbers alone: its parameters, poses, cameras, and a session of it.
+
+It needs no model file, and finds hundreds of poses at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from legcal.data import LegAxes, Measurements, Outlines, View, axes_from_outlines, axes_of_table
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
 from legcal.machine import (
@@ -19,7 +23,26 @@ from legcal.machine import (
     solve_poses,
     to_vector,
 )
+from legcal.simulation.cameras import look_at, rough_pose, sample_camera
+from legcal.simulation.observe import (
+    OutlineNoise,
+    Scene,
+    TableNoise,
+    axes_of,
+    outlines_of,
+    plain_scene,
+)
 from legcal.simulation.poses import near_ends
+from legcal.simulation.visibility import Viewpoint
+from legcal.vision import Camera
+
+PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
+RAISED = 0.030  # [m] out of the plane of the others
+
+_EXACT = 1e-12  # of the lengths
+_SINGULAR = 0.1  # smallest singular value of the scaled Jacobian that a pose may have
+_STEPS = 6  # from home
+_ROUNDS = 1000  # of draws of poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +103,18 @@ def hexapod(scale: float = 1.0) -> Machine:
     )
 
 
+def noncoplanar_hexapod() -> Machine:
+    """Return that hexapod with joints 2, 4 and 6 moved out of the planes of 1, 3 and 5.
+
+    They are 30 mm higher at the base and 30 mm lower at the platform.
+    """
+    machine = hexapod()
+    A, B = machine.parameters.base_joints.copy(), machine.parameters.platform_joints.copy()
+    A[1::2, 2] += RAISED
+    B[1::2, 2] -= RAISED
+    return replace(machine, parameters=KinematicParameters(A, B, machine.parameters.offsets))
+
+
 def perturb(
     machine: Machine, rng: np.random.Generator, half_width: float, *, coplanar: bool = False
 ) -> Machine:
@@ -122,11 +157,6 @@ def length_jacobian(parameters: KinematicParameters, R: Array, t: Array) -> Arra
     legs, arms = legs_and_arms(parameters, R, t)
     u = legs / np.linalg.norm(legs, axis=-1, keepdims=True)
     return np.concatenate([u, np.cross(arms, u)], axis=-1)
-
-
-_EXACT = 1e-12  # of the lengths
-_SINGULAR = 0.1  # smallest singular value of the scaled Jacobian that a pose may have
-_STEPS = 6  # from home
 
 
 class Followed(NamedTuple):
@@ -188,9 +218,6 @@ def _solved(parameters: KinematicParameters, lengths: Array, R: Array, t: Array)
     return solve_poses(legs, range(3), R, t, lengths - parameters.offsets)
 
 
-_ROUNDS = 1000
-
-
 def extreme_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> RigidTransform:
     """Return random poses with every leg near its shortest or its longest (section 4.3).
 
@@ -229,3 +256,125 @@ def _drawn(machine: Machine, n_poses: int, draw: Callable[[], Array]) -> RigidTr
             "check its travel."
         )
     return RigidTransform.from_components(t, Rotation.from_matrix(R))
+
+
+@dataclass(frozen=True, eq=False)
+class LegCamera:
+    """A camera around a machine in memory, and the legs that it is said to see."""
+
+    camera: Camera  # its intrinsics
+    T_Rb_camera: RigidTransform  # its pose in R_b
+    legs: tuple[int, ...]  # the legs that its images show
+
+
+def cameras_around(
+    machine: Machine,
+    rng: np.random.Generator,
+    *,
+    legs: Sequence[Sequence[int]] = PAPER_VIEWS,
+    distance: float = 0.9,
+    camera: Camera | None = None,
+) -> tuple[LegCamera, ...]:
+    """Return cameras that stand around a machine, each on the side of the legs it sees."""
+    A_Rb = machine.parameters.base_joints
+    B_Rb = machine.home.apply(machine.parameters.platform_joints)
+    middle = 0.5 * (A_Rb + B_Rb)
+    centre = middle.mean(axis=0)
+    cameras = []
+    for seen in legs:
+        outward = (middle[list(seen)] - centre).mean(axis=0)
+        outward[2] = 0.0
+        if np.linalg.norm(outward) < 1e-3 * distance:  # every leg is seen: any side will do
+            outward = np.array([*rng.normal(size=2), 0.0])
+        outward /= np.linalg.norm(outward)
+        lift = rng.uniform(0.0, 0.25)
+        toward = np.array([*(outward[:2] * np.cos(lift)), np.sin(lift)])
+        position = centre + distance * rng.uniform(0.95, 1.05) * toward
+        pose = look_at(position, centre, roll=rng.uniform(-0.1, 0.1))
+        cameras.append(LegCamera(camera or sample_camera(), pose, tuple(seen)))
+    return tuple(cameras)
+
+
+@dataclass(frozen=True, eq=False)
+class HexapodSession:
+    """Measurements of a simulated machine, and what is true of it; its base link's frame is R_b."""
+
+    measurements: Measurements  # with rough camera poses
+    outlines: Outlines | None  # None where Table 1 gave the noise of the axes
+    axes: LegAxes
+    machine: Machine
+    cameras: tuple[LegCamera, ...]
+    T_Rb_Re: RigidTransform  # n_poses of them
+    scene: Scene
+
+
+def hexapod_session(
+    machine: Machine,
+    cameras: Sequence[LegCamera],
+    rng: np.random.Generator,
+    *,
+    noise: OutlineNoise | TableNoise,
+    noisy: bool = True,  # else all is exact; observations carry covariances in either case
+    sigma_q: float = 2e-6,  # of readings [m]
+    uniform_readings: bool = False,  # of that standard deviation, instead of normal
+    n_poses: int = 15,  # for each view
+    n_images: int = 1,  # of each pose in each view
+    share_poses: bool = False,  # several cameras at once
+) -> HexapodSession:
+    """Return a session of a machine before cameras, in poses with extreme leg lengths."""
+    n_views = len(cameras)
+    T_Rb_Re = extreme_poses(machine, n_poses if share_poses else n_views * n_poses, rng)
+    view = np.repeat(np.arange(n_views), n_poses * n_images)
+    pose = np.repeat(np.arange(n_views * n_poses), n_images)
+    pose = (pose % n_poses if share_poses else pose).astype(np.intp)
+    R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
+    legs, arms = legs_and_arms(machine.parameters, R, t)
+    q = (np.linalg.norm(legs, axis=-1) - machine.parameters.offsets) * machine.sign
+    if noisy and uniform_readings:
+        half_width = np.sqrt(3.0) * sigma_q
+        q = q + rng.uniform(-half_width, half_width, q.shape)
+    elif noisy:
+        q = q + rng.normal(scale=sigma_q, size=q.shape)
+    views = []
+    for v, camera in enumerate(cameras):
+        T = rough_pose(camera.T_Rb_camera, rng) if noisy else camera.T_Rb_camera
+        names = tuple(machine.leg_names[j] for j in camera.legs)
+        views.append(
+            View(f"c{v + 1}", camera.camera, T, names if len(names) < machine.n_legs else None)
+        )
+    measurements = Measurements(
+        views=tuple(views),
+        image=("",) * len(view),
+        view=view.astype(np.intp),
+        pose=pose,
+        q=q[pose],
+        sigma_q=sigma_q,
+    )
+    scene = plain_scene(
+        np.broadcast_to(machine.parameters.base_joints, arms.shape),
+        arms + t[:, None],
+        [
+            Viewpoint(view.name, c.camera, c.T_Rb_camera)
+            for view, c in zip(views, cameras, strict=True)
+        ],
+        measurements.view,
+        pose,
+        {(j, part): float(machine.radius[j]) for j, part in enumerate(machine.parts)},
+        [cameras[v].legs for v in view.tolist()],
+    )
+    outlines, axes = observed(machine, scene, measurements, noise, rng if noisy else None)
+    return HexapodSession(measurements, outlines, axes, machine, tuple(cameras), T_Rb_Re, scene)
+
+
+def observed(
+    machine: Machine,
+    scene: Scene,
+    measurements: Measurements,
+    noise: OutlineNoise | TableNoise,
+    rng: np.random.Generator | None,
+) -> tuple[Outlines | None, LegAxes]:
+    """Return outlines, unless Table 1 has the noise, and axes of a scene; exact without *rng*."""
+    if isinstance(noise, TableNoise):
+        return None, axes_of_table(*axes_of(scene, noise, rng))
+    outlines = outlines_of(scene, noise, rng)
+    return outlines, axes_from_outlines(outlines, measurements, machine.radius_of_part())

@@ -1,0 +1,279 @@
+"""``legcal.simulate``: a true machine, its session in memory, the folder of both, and a summary."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from legcal.data import (
+    AXES_NAME,
+    CORNERS_NAME,
+    OBSERVATIONS_NAME,
+    Measurements,
+    write_axis_table,
+    write_corners,
+    write_observations,
+)
+from legcal.errors import UsageError
+from legcal.files import output_path
+from legcal.geometry import Array
+from legcal.machine import Mechanism, load_mechanism, write_model
+from legcal.progress import Report, no_progress
+from legcal.simulation.folder import (
+    SIMULATED,
+    TRUTH,
+    TRUTH_NAME,
+    check_dataset_destination,
+    dataset_folder,
+    files_in,
+    write_session,
+    write_truth,
+)
+from legcal.simulation.observe import corners_of
+from legcal.simulation.poses import are_extreme
+from legcal.simulation.request import Level
+from legcal.simulation.session import (
+    Session,
+    Streams,
+    exact_outlines,
+    photographs,
+    simulate_session,
+    streams,
+)
+from legcal.simulation.settings import SimulationSettings, whole_number
+from legcal.simulation.truth import write_true_model
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedDataset:
+    """What was written.
+
+    Attributes
+    ----------
+    folder : Path
+        The dataset.
+    level : Level
+        What it gives a calibration to work on.
+    nominal, truth : Mechanism
+        The model of the dataset, and the machine that was measured.
+    truth_path : Path
+        The YAML of the true model.
+    measurements : Measurements
+        The rows.
+    seen : (n_rows, n_legs) array of bool
+        Which legs each image shows.
+    left_out : int
+        Images that show no leg, which a dataset of axes or outlines has no row for.
+    n_extreme : int
+        Poses with every motor near an end of its travel.
+    """
+
+    folder: Path
+    level: Level
+    nominal: Mechanism
+    truth: Mechanism
+    truth_path: Path
+    measurements: Measurements
+    seen: Array
+    left_out: int
+    n_extreme: int
+
+
+def simulate(
+    model: str | Path | Mechanism,
+    output: str | Path,
+    settings: SimulationSettings | None = None,
+    *,
+    force: bool = False,
+    workers: int = 1,
+    progress: Report = no_progress,
+) -> SimulatedDataset:
+    """Write a dataset of a machine that differs from its nominal model by drawn errors.
+
+    The same settings give the same files, to the last bit, on one machine. What is drawn for one
+    purpose does not depend on the others: two levels with one seed show the same machine in the
+    same poses.
+
+    Parameters
+    ----------
+    model : str, Path or Mechanism
+        The nominal model, as :func:`legcal.load_mechanism` takes it.
+    output : path
+        The folder of the dataset.
+    settings : SimulationSettings, optional
+        What to simulate.
+    force : bool
+        Replace an earlier simulated dataset.
+    workers : int
+        Render photographs in that many processes.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    SimulatedDataset
+
+    Raises
+    ------
+    UsageError
+        If the output holds something else, or a camera is inside the machine.
+    ModelError, DatasetError, OutOfClass
+        If a file is malformed or not covered.
+    DidNotConverge
+        If the machine does not reach such poses.
+    NotVisible
+        If a view shows no leg. Nothing is written in any of these cases.
+    """
+    settings = settings or SimulationSettings()
+    destination = output_path(output, SIMULATED)
+    whole_number("workers", workers, 1)
+    check_dataset_destination(destination, force=force)
+    nominal = model if isinstance(model, Mechanism) else load_mechanism(model)
+    _check_readings(nominal, settings)
+    chance = streams(settings.seed)
+    with dataset_folder(destination, force=force) as folder:
+        yaml_path, _ = write_model(nominal, folder)
+        truth = write_true_model(nominal, settings.errors, chance["errors"], folder / TRUTH)
+        session = simulate_session(truth, nominal, settings, chance, progress)
+        m, legs = session.measurements, truth.leg_names
+        board = None if session.board is None else session.board.document()
+        if board is not None and not settings.board_pose:
+            del board["T_base_board"]
+        model_name = yaml_path.relative_to(folder).as_posix()
+        write_session(folder, nominal, model_name, m, groups=session.groups, board=board)
+        exact = exact_outlines(session.scene)
+        write_observations(folder / TRUTH / "outlines.csv", exact, m, legs)
+        if session.outlines is not None:
+            write_observations(folder / OBSERVATIONS_NAME, session.outlines, m, legs)
+        if session.axes is not None:
+            write_axis_table(folder / AXES_NAME, *session.axes, m, legs)
+        if session.board is not None:
+            exact_corners = corners_of(session.scene, session.machines, session.board, 0.0)
+            write_corners(folder / TRUTH / CORNERS_NAME, exact_corners, m)
+        if session.corners is not None:
+            write_corners(folder / CORNERS_NAME, session.corners, m)
+        if settings.level is Level.PHOTOGRAPHS:
+            _write_photographs(folder, session, settings, chance, workers, progress)
+        files = [*files_in(folder), TRUTH_NAME]
+        write_truth(folder / TRUTH_NAME, session, settings, files)
+    seen = [[leg.is_seen for leg in shown] for shown in session.scene.images.shown]
+    readings = session.poses.readings[np.unique(session.scene.images.pose)]
+    return SimulatedDataset(
+        folder=destination,
+        level=settings.level,
+        nominal=nominal,
+        truth=truth,
+        truth_path=destination / TRUTH / "models" / truth.yaml_path.name,
+        measurements=m,
+        seen=np.array(seen),
+        left_out=session.left_out,
+        n_extreme=int(np.sum(are_extreme(truth, readings))),
+    )
+
+
+def _write_photographs(
+    folder: Path,
+    session: Session,
+    settings: SimulationSettings,
+    chance: Streams,
+    workers: int,
+    progress: Report,
+) -> None:
+    """Write the photograph of every row."""
+    names = session.measurements.image
+    (folder / "images").mkdir()
+    progress("Photographs", 0, len(names))
+    rendered = photographs(session, settings.appearance, chance["photographs"], workers)
+    with closing(rendered):
+        for done, (row, png) in enumerate(rendered, 1):
+            (folder / names[row]).write_bytes(png)
+            progress("Photographs", done, len(names))
+
+
+def _check_readings(nominal: Mechanism, settings: SimulationSettings) -> None:
+    """Refuse errors of readings that are larger than what is read."""
+    travel = min((np.ptp(nominal.legs[j].travel) for j in nominal.motors), default=np.inf)
+    if settings.readings.size > travel:
+        raise UsageError(
+            f"The readings could not be simulated: found errors of {settings.readings.size:g} m, "
+            f"needed at most the shortest travel of a motor, {travel:g} m; give them with the "
+            "unit that is meant."
+        )
+
+
+def summary_document(made: SimulatedDataset) -> dict[str, Any]:
+    """Return the document of ``legcal simulate --json``."""
+    views = {}
+    for v, view in enumerate(made.measurements.views):
+        rows = made.measurements.view == v
+        seen = made.seen[rows].sum(axis=0).tolist()
+        legs = dict(zip(made.nominal.leg_names, seen, strict=True))
+        views[view.name] = {"images": int(np.sum(rows)), "legs": legs}
+    return {
+        "dataset": str(made.folder),
+        "level": made.level.value,
+        "mechanism": made.nominal.name,
+        "truth": str(made.truth_path),
+        "images": made.measurements.n_rows,
+        "poses": made.measurements.n_poses,
+        "extreme_poses": made.n_extreme,
+        "left_out": made.left_out,
+        "views": views,
+    }
+
+
+def summary_table(made: SimulatedDataset) -> RenderableType:
+    """Return what was simulated as people read it: how many images of a view show each leg."""
+    document = summary_document(made)
+    size = f"{_count(document['images'], 'image')} of {_count(document['poses'], 'pose')}"
+    heading = Text.assemble((document["mechanism"], "bold"), f": {document['level']}, {size}")
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("view", overflow="fold")
+    table.add_column("images", justify="right")
+    for name in made.nominal.leg_names:
+        table.add_column(Text(name), justify="right")
+    for name, view in document["views"].items():
+        counts = [str(n) for n in view["legs"].values()]
+        table.add_row(Text(name), str(view["images"]), *counts)
+    folder = shlex.quote(str(made.folder))
+    lines = [
+        "Images of each view that show 40 % of a leg or more in one piece.",
+        *([_left_out(made.left_out)] if made.left_out else []),
+        f"{made.n_extreme} of {made.measurements.n_poses} poses have every motor near an end of "
+        "its travel.",
+        f"\nwritten: {made.folder}",
+        f"the true model: {made.truth_path}",
+        f"calibrate with: legcal calibrate {folder} -o OUT",
+        f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(str(made.truth_path))}",
+        *([f"measure noise with: legcal noise {folder}"] if _is_repeated(made) else []),
+    ]
+    return Group(heading, Text(), table, Text(), *(Text(s, overflow="fold") for s in lines))
+
+
+def _is_repeated(made: SimulatedDataset) -> bool:
+    """Say whether there are several photographs of a pose in a view."""
+    m = made.measurements
+    places = set(zip(m.view.tolist(), m.pose.tolist(), strict=True))
+    return made.level is Level.PHOTOGRAPHS and len(places) < m.n_rows
+
+
+def _left_out(n: int) -> str:
+    """Return how many images are left out, in words."""
+    return (
+        "1 image shows no leg and is left out."
+        if n == 1
+        else f"{n} images show no leg and are left out."
+    )
+
+
+def _count(n: int, what: str) -> str:
+    """Return a number of things."""
+    return f"{n} {what}{'s' * (n != 1)}"

@@ -1,0 +1,324 @@
+"""Where cameras and a calibration board stand, so that images show the legs, and the board if any.
+
+A camera is judged by how long the legs are in its images. A board lies flat near the base joints,
+among the legs or beside them; for cameras with given places it may also be raised and turned.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.errors import NotVisible
+from legcal.geometry import Array, normal_basis
+from legcal.machine import Mechanism
+from legcal.progress import Report, no_progress
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.cameras import UPWARD, look_at
+from legcal.simulation.rendering.rays import in_view, surrounding_points
+from legcal.simulation.solids import PosedMachine
+from legcal.simulation.visibility import Viewpoint, field_of_view, legs_in_image
+from legcal.vision import Board, Camera
+
+_TURNS = (-0.35, -0.15, 0.0, 0.15, 0.35)  # within its sector, in sectors of a right angle at most
+_LIFTS = (0.1, 0.25, 0.45, 0.7, 0.95, 1.2)  # [rad] above the plane across the machine
+_LIFTS_PLANAR = (0.8, 0.95, 1.1, 1.25, 1.4)  # [rad] above the plane of motion
+_TRIED = 5  # poses at which places are judged
+_SAMPLES = 32  # points of a leg in that
+_ROLL = 0.08  # [rad] by which cameras are not upright
+_FURTHER = 0.08  # of the least distance, by which cameras stand further away
+_HAND_ROLL, _HAND_FURTHER = 0.3, 0.25  # the same for cameras that are held in the hand
+_HAND_GOOD, HAND_TRIES = 3, 60  # places that see board and legs, the best is taken; and tries
+_MARGIN = 0.03  # of the image that stays free at each side
+_CENTRINGS = 3  # steps that bring the machine into the middle of the image
+_MOSTLY = 0.75  # of the poses in which a camera must see the board
+_BEHIND = 0.3  # machine sizes that lie between the camera and the machine, at least
+
+_ENOUGH = 2  # places of a board with cameras, of which the better is taken
+_SIDES = 4  # directions beside the machine
+_AWAY = 1.05  # half diagonals of the board beyond the base joints
+_LEVELS = (0.0, -0.08, 0.25)  # of the size of the machine, above the base joints
+_TILTS = (0.0, 0.6, 1.1)  # [rad] from lying flat, towards cameras with given places
+_HIDDEN = 0.9  # of what is seen of the legs that must stay seen
+
+
+def cameras_around(
+    mechanism: Mechanism,
+    machines: Sequence[PosedMachine],  # in the poses that the cameras are to see
+    cameras: Mapping[str, Camera],
+    rng: np.random.Generator,  # of the first sector, roll and distance
+    progress: Report = no_progress,
+    board: PlacedBoard | None = None,  # that every camera must see, beside the machines
+) -> tuple[tuple[Viewpoint, ...], float]:
+    """Return cameras around a machine, each in a sector of its own, and how much they see.
+
+    That is the least mean length of the legs in the images of a view [px], zero if a camera does
+    not see the board.
+    """
+    reached, tried, up = _reached(machines), _some(machines), _upward(mechanism)
+    sector = 2.0 * np.pi / len(cameras)
+    first = rng.uniform(0.0, 2.0 * np.pi)
+    lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
+    found, least = [], np.inf
+    for v, (name, camera) in enumerate(cameras.items()):
+        progress("Cameras", v, len(cameras))
+        roll, further = rng.uniform(-_ROLL, _ROLL), 1.0 + _FURTHER * rng.random()
+        candidates = [
+            _before(
+                _direction(up, first + v * sector + turn, lift), up, roll, further, reached, camera
+            )
+            for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
+            for lift in lifts
+        ]
+        scores = [_score(mechanism, tried, camera, T, board) for T in candidates]
+        found.append(Viewpoint(name, camera, candidates[int(np.argmax(scores))]))
+        least = min(least, max(scores))
+    progress("Cameras", len(cameras), len(cameras))
+    return tuple(found), least
+
+
+def camera_in_hand(
+    mechanism: Mechanism,
+    machine: PosedMachine,  # in the pose that the image is to show, with the board
+    camera: Camera,
+    rng: np.random.Generator,
+    board: PlacedBoard,
+) -> RigidTransform | None:
+    """Return T_base_camera that shows board and legs, the best of a few; None if there is none."""
+    up, reached = _upward(mechanism), _reached([machine])
+    lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
+    good = []
+    for _ in range(HAND_TRIES):
+        toward = _direction(up, rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lifts[0], lifts[-1]))
+        roll, further = rng.uniform(-_HAND_ROLL, _HAND_ROLL), 1.0 + _HAND_FURTHER * rng.random()
+        T = _before(toward, up, roll, further, reached, camera)
+        score = _score(mechanism, [machine], camera, T, board)
+        if score > 0.0:
+            good.append((score, T))
+        if len(good) == _HAND_GOOD:
+            break
+    return max(good, key=lambda found: found[0])[1] if good else None
+
+
+def board_and_cameras(
+    board: Board,
+    mechanism: Mechanism,
+    machines: Sequence[PosedMachine],
+    cameras: Mapping[str, Camera],
+    rng: np.random.Generator,
+    progress: Report = no_progress,
+) -> tuple[PlacedBoard, tuple[Viewpoint, ...]]:
+    """Return a board on the base of a machine, and cameras around both."""
+    good: list[tuple[float, PlacedBoard, tuple[Viewpoint, ...]]] = []
+    for placed in _lying(board, mechanism, _some(machines)):
+        together = [placed.beside(machine) for machine in machines]
+        views, score = cameras_around(
+            mechanism, together, cameras, copy.deepcopy(rng), progress, placed
+        )
+        if score > 0.0:
+            good.append((score, placed, views))
+        if len(good) == _ENOUGH:
+            break
+    if not good:
+        raise _nowhere(board, "every camera around the machine", "use a smaller board")
+    _, placed, views = max(good, key=lambda found: found[0])
+    return placed, views
+
+
+def board_before(
+    board: Board,
+    mechanism: Mechanism,
+    machines: Sequence[PosedMachine],
+    views: Sequence[Viewpoint],
+) -> PlacedBoard:
+    """Return a board where cameras whose places are given see it."""
+    tried = _some(machines)
+    towards = np.mean([view.T_base_camera.translation for view in views], axis=0)
+    most, best = 0.0, None
+    for placed in _lying(board, mechanism, tried, towards):
+        together = [placed.beside(machine) for machine in tried]
+        seen = min(_share(placed, together, view) for view in views)
+        if seen > most and not any(_hides(mechanism, tried, together, view) for view in views):
+            most, best = seen, placed
+    if best is None:
+        raise _nowhere(
+            board, "all of the given cameras", "turn or move the cameras, or use another"
+        )
+    return best
+
+
+def _upward(mechanism: Mechanism) -> Array:
+    """Return the direction from base to platform at home, or the normal of the plane of motion."""
+    if mechanism.base_normal is not None:
+        return mechanism.base_normal
+    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
+    across = (B - A).mean(axis=0)
+    size = float(np.linalg.norm(across))
+    reach = float(np.ptp(A, axis=0).max())
+    return np.asarray(across / size) if size > 1e-3 * reach else UPWARD
+
+
+def _direction(up: Array, turn: float, lift: float) -> Array:
+    """Return the unit direction at an angle around *up* and a height [rad]."""
+    x, y = normal_basis(up)
+    level = np.cos(turn) * x + np.sin(turn) * y
+    return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
+
+
+def _some(machines: Sequence[PosedMachine]) -> list[PosedMachine]:
+    """Return a machine in a few of its poses."""
+    return [machines[i] for i in np.unique(np.linspace(0, len(machines) - 1, _TRIED).astype(int))]
+
+
+def _joints(machines: Sequence[PosedMachine]) -> Array:
+    """Return the joint centres (n, 3) of a machine in all of its poses [m]."""
+    return np.concatenate([part for m in machines for part in (m.A, m.B)])
+
+
+def _reached(machines: Sequence[PosedMachine]) -> Array:
+    """Return points (n, 3) around a machine in all of its poses, without its walls and floors."""
+    joints = _joints(machines)
+    size = float(np.linalg.norm(np.ptp(joints, axis=0)))
+    solids = [s for m in machines for s in in_view(m.solids, RigidTransform.identity())]
+    around = [surrounding_points(s) for s in solids if s.reach < size]
+    points = np.concatenate([joints, *around])
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:  # all of them in a plane
+        return points
+
+
+def _before(
+    toward: Array, up: Array, roll: float, further: float, points: Array, camera: Camera
+) -> RigidTransform:
+    """Return the pose of a camera in a direction from which all points are in the image."""
+    target = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    rotation = look_at(target + toward, target, roll, up=up).rotation
+    low, high = field_of_view(camera)
+    low, high = (1.0 - 2.0 * _MARGIN) * low, (1.0 - 2.0 * _MARGIN) * high
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    p = rotation.inv().apply(points - target)
+    for _ in range(_CENTRINGS):
+        needed = [np.max(p[:, :2] / limit - p[:, 2:]) for limit in (low, high)]
+        distance = float(max(*needed, _BEHIND * size - p[:, 2].min()))
+        seen = p[:, :2] / (p[:, 2:] + distance)
+        middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) - 0.5 * (low + high)
+        aside = np.append(distance * middle, 0.0)
+        p = p - aside
+        target = target + rotation.apply(aside)
+    return look_at(target + further * distance * toward, target, roll, up=up)
+
+
+def _lengths(
+    mechanism: Mechanism, machines: Sequence[PosedMachine], camera: Camera, T: RigidTransform
+) -> list[float]:
+    """Return the length of every leg in every image [px], zero where it does not count as seen."""
+    return [
+        leg.length_px if leg.is_seen else 0.0
+        for machine in machines
+        for leg in legs_in_image(mechanism.legs, machine, camera, T, samples=_SAMPLES)
+    ]
+
+
+def _score(
+    mechanism: Mechanism,
+    machines: Sequence[PosedMachine],
+    camera: Camera,
+    T: RigidTransform,
+    board: PlacedBoard | None,
+) -> float:
+    """Return the mean length in the image [px] of all legs, those hidden counted as nothing.
+
+    It counts by the share of the poses in which the board is seen, which must be most of them.
+    """
+    share = 1.0
+    if board is not None:
+        shown = [board.is_enough(board.seen(machine, camera, T)) for machine in machines]
+        share = float(np.mean(shown))
+        if share < _MOSTLY:
+            return 0.0
+    return share * float(np.mean(_lengths(mechanism, machines, camera, T)))
+
+
+def _lying(
+    board: Board,
+    mechanism: Mechanism,
+    machines: Sequence[PosedMachine],
+    towards: Array | None = None,
+) -> Iterator[PlacedBoard]:
+    """Yield places near the base that the machine leaves free, also tilted towards a point."""
+    up, A = _upward(mechanism), mechanism.A_base
+    middle = A.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(_joints(machines), axis=0)))
+    flat = A - middle - ((A - middle) @ up)[:, None] * up
+    reach = float(np.linalg.norm(flat, axis=1).max())
+    half = 0.5 * float(np.linalg.norm(np.ptp(board.extent, axis=0)))
+    x, y = normal_basis(up)
+    around = [np.cos(t) * x + np.sin(t) * y for t in 2.0 * np.pi * np.arange(_SIDES) / _SIDES]
+    feet = [(np.zeros(3), x), *(((reach + _AWAY * half) * side, side) for side in around)]
+    for foot, side in feet:
+        places = (
+            PlacedBoard(board, _facing(board, place, _tilted(up, towards, place, tilt), side))
+            for place in (middle + foot + level * size * up for level in _LEVELS)
+            for tilt in (_TILTS if towards is not None else _TILTS[:1])
+        )
+        for placed in places:
+            if not any(placed.runs_through(machine) for machine in machines):
+                yield placed
+                break  # one place at each foot
+
+
+def _tilted(up: Array, towards: Array | None, place: Array, tilt: float) -> Array:
+    """Return a direction that leans from *up* by an angle, from a place towards a point if any."""
+    if towards is None:
+        return up
+    level = towards - place - ((towards - place) @ up) * up
+    length = float(np.linalg.norm(level))
+    if length < 1e-9:
+        return up
+    return np.asarray(np.cos(tilt) * up + np.sin(tilt) * level / length)
+
+
+def _facing(board: Board, place: Array, normal: Array, side: Array) -> RigidTransform:
+    """Return T_base_board with the middle of the print at a place and its face along a normal."""
+    z = normal if board.kind == "aprilgrid" else -normal
+    y = side - (side @ z) * z
+    if np.linalg.norm(y) < 1e-6:
+        y = normal_basis(z)[0]
+    y = y / np.linalg.norm(y)
+    turn = Rotation.from_matrix(np.column_stack([np.cross(y, z), y, z]))
+    return RigidTransform.from_components(place - turn.apply(board.extent.mean(axis=0)), turn)
+
+
+def _share(placed: PlacedBoard, together: Sequence[PosedMachine], view: Viewpoint) -> float:
+    """Return the share of the corners that a view shows, zero if too few in one of the poses."""
+    shown = [placed.seen(machine, view.camera, view.T_base_camera) for machine in together]
+    return float(np.mean(shown)) if all(map(placed.is_enough, shown)) else 0.0
+
+
+def _hides(
+    mechanism: Mechanism,
+    alone: Sequence[PosedMachine],
+    together: Sequence[PosedMachine],
+    view: Viewpoint,
+) -> bool:
+    """Say whether a board beside a machine hides much of its legs from a view."""
+    free, left = (
+        sum(_lengths(mechanism, machines, view.camera, view.T_base_camera))
+        for machines in (alone, together)
+    )
+    return left < _HIDDEN * free
+
+
+def _nowhere(board: Board, who: str, remedy: str) -> NotVisible:
+    """Return that a board has no place."""
+    width, height = np.ptp(board.extent, axis=0)[:2].tolist()
+    return NotVisible(
+        f"The board could not be placed: found no place near the base at which {who} would see a "
+        f"{board.kind} of {1000 * width:.0f} x {1000 * height:.0f} mm well enough, needed one in "
+        f"all images; {remedy}."
+    )
