@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from legcal import calibrate_camera, cli
 from legcal.calibration.camera import CameraCalibration
 from legcal.calibration.joint_fit.parameters import Prior, known_parameters, resolve
-from legcal.data.dataset import overrides_of_call
 from legcal.data.measurements import View
+from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array, IntArray
 from legcal.machine import load_mechanism

@@ -8,7 +8,7 @@ from chosen import HEXAPOD, choose, known
 
 from legcal import load_mechanism
 from legcal.calibration.joint_fit.parameters import NO_CHOICES, Prior, resolve
-from legcal.data.dataset import overrides_of_call
+from legcal.data.overrides import overrides_of_call
 from legcal.machine import parametrization_of
 
 

@@ -6,7 +6,7 @@ import pytest
 from chosen import HEXAPOD, choose, known
 
 from legcal.calibration.joint_fit.parameters import resolve
-from legcal.data.dataset import overrides_of_call
+from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, UsageError
 
 

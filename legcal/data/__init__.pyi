@@ -17,12 +17,9 @@ from .dataset import CACHE_NAME as CACHE_NAME
 from .dataset import CORNERS_NAME as CORNERS_NAME
 from .dataset import LEAST_CORNERS as LEAST_CORNERS
 from .dataset import OBSERVATIONS_NAME as OBSERVATIONS_NAME
-from .dataset import Action as Action
 from .dataset import Dataset as Dataset
 from .dataset import ImageReader as ImageReader
-from .dataset import Override as Override
 from .dataset import load_dataset as load_dataset
-from .dataset import overrides_of_call as overrides_of_call
 from .holdout import Split as Split
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images
@@ -42,6 +39,9 @@ from .outlines import merge_edited as merge_edited
 from .outlines import no_outlines as no_outlines
 from .outlines import reject_unused_legs as reject_unused_legs
 from .outlines import write_observations as write_observations
+from .overrides import Action as Action
+from .overrides import Override as Override
+from .overrides import overrides_of_call as overrides_of_call
 from .rows import Order as Order
 from .rows import Rows as Rows
 from .rows import canonical_order as canonical_order

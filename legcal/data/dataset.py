@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, field_validator
@@ -16,9 +16,9 @@ from legcal.data.axes import LegAxes, read_axes
 from legcal.data.corners import Corners, read_corners
 from legcal.data.measurements import Measurements, View, read_measurements
 from legcal.data.outlines import Outlines, read_observations
-from legcal.errors import DatasetError, UsageError
+from legcal.data.overrides import Override, read_override
+from legcal.errors import DatasetError
 from legcal.files import (
-    EXAMPLE,
     FileSchema,
     MotionEntry,
     Name,
@@ -31,7 +31,6 @@ from legcal.files import (
     path_problem,
     read_prior,
     read_text,
-    read_value,
     validate,
 )
 from legcal.geometry import Image
@@ -39,141 +38,12 @@ from legcal.machine import DATASET_YAML, Mechanism, load_mechanism, shipped_fold
 from legcal.vision import Board, Camera, image_problem, read_board, read_camera, read_image
 
 AXES_NAME = "axes.csv"
-
-
-def read_given_axes(
-    path: Path, leg_names: Sequence[str], measurements: Measurements
-) -> tuple[LegAxes | None, list[str]]:
-    """Return the axes of the legs that the views use, and a note about others."""
-    if not os.path.exists(path):
-        return None, []
-    axes = read_axes(path, leg_names, measurements)
-    views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
-    names = [leg_names[leg] for leg in axes.leg.tolist()]
-    wanted = [
-        view.legs is None or name in view.legs for view, name in zip(views, names, strict=True)
-    ]
-    used = np.flatnonzero(wanted)
-    if len(used) == 0:
-        raise DatasetError(
-            f"{path}: the axes could not be used: found only legs that their views leave out, "
-            "needed legs that dataset.yaml names for the views; correct these or the table."
-        )
-    left_out = len(axes) - len(used)
-    note = f"{path}: {left_out} axes of legs that their views leave out are not used."
-    return axes.choose(used), [note] if left_out else []
-
-
-def rows_without_axes(table_path: Path, measurements: Measurements, axes: LegAxes) -> list[str]:
-    """Return one sentence for each row of the measurements that has no axis."""
-    blank = np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist()
-    return [
-        f"{table_path}, row {row + 1}: the row could not be used: found no axis of it in "
-        f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row."
-        for row in blank
-    ]
-
-
 CORNERS_NAME = "corners.csv"
-LEAST_CORNERS = 4  # in an image that must place its camera
-
-
-def read_given_corners(
-    path: Path, board: Board | None, measurements: Measurements
-) -> Corners | None:
-    """Return the corners beside a dataset, if there are any."""
-    if not os.path.exists(path):
-        return None
-    if board is None:
-        raise DatasetError(
-            f"{path}: the corners could not be used: found no board in the dataset file, needed "
-            "the one that they belong to; describe it in the block board, or remove the table."
-        )
-    return read_corners(path, board, measurements)
-
-
-def rows_without_board(
-    table_path: Path, measurements: Measurements, corners: Corners, hand_held: Sequence[int]
-) -> list[str]:
-    """Return one sentence for each row of a hand-held view in which the board has no pose."""
-    counts = np.bincount(corners.row[corners.used], minlength=measurements.n_rows)
-    return [
-        f"{table_path}, row {row + 1}: its camera could not be placed: found "
-        f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {LEAST_CORNERS} in "
-        "every image of a camera that is held in the hand; add them or remove the row."
-        for row in hand_held
-        if counts[row] < LEAST_CORNERS
-    ]
-
-
-Action = Literal["prior", "fixed", "free"]
-_WORDS: Mapping[Action, str] = {
-    "prior": "prior",
-    "fixed": "parameter to fix",
-    "free": "parameter to free",
-}
-
-
-@dataclass(frozen=True)
-class Override:
-    """What somebody asks of one parameter, or of all that a pattern matches."""
-
-    name: str  # or a pattern
-    action: Action  # what to do with it
-    where: str  # where this was said: the start of a sentence about it
-    stated: Stated | None = None  # the prior, or the value that it is fixed at
-    in_file: bool = False  # said in ``dataset.yaml``, which gives way to what is asked for in a run
-
-
-def overrides_of_call(
-    priors: Mapping[str, object] | Sequence[str] = (),
-    fixed: Sequence[str] = (),
-    free: Sequence[str] = (),
-) -> tuple[Override, ...]:
-    """Return what the arguments of a call or the options of a command ask for."""
-    entries: list[tuple[Action, str, object]] = []
-    if isinstance(priors, Mapping):
-        entries += [("prior", str(name), value) for name, value in priors.items()]
-    else:
-        entries += [("prior", text, None) for text in _listed(priors)]
-    entries += [("fixed", text, None) for text in _listed(fixed)]
-    entries += [("free", text, None) for text in _listed(free)]
-    found: list[Override] = []
-    problems: list[str] = []
-    for action, text, value in entries:
-        where = f"The {_WORDS[action]} {describe(text)}"
-        try:
-            found.append(read_override(action, text, where, value))
-        except ValueError as error:
-            problems.append(f"{where} could not be used: {error}")
-    if problems:
-        raise UsageError(problems)
-    return tuple(found)
-
-
-def read_override(
-    action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
-) -> Override:
-    """Return an override as it was written."""
-    name, stated = text, None
-    if value is not None:
-        stated = read_prior(value)
-    elif action != "free" and "=" in text:
-        name, _, behind = text.rpartition("=")
-        stated = read_prior(behind) if action == "prior" else read_value(behind)
-    if action == "prior" and stated is None:
-        raise ValueError(
-            f"found no value, needed one and its sigma; write them behind the name: {EXAMPLE}."
-        )
-    return Override(name, action, where, stated, in_file)
-
-
-def _listed(texts: Iterable[str]) -> list[str]:
-    """Return texts as a list; a single text is one of them."""
-    return [texts] if isinstance(texts, str) else [str(text) for text in texts]
-
-
 OBSERVATIONS_NAME = "observations.csv"
+CACHE_NAME = ".legcal-cache.json"
+LEAST_CORNERS = 4  # in an image that must place its camera
+ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
+GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,41 +112,6 @@ class ImageReader:
                 f"image; name one or give its outlines in {OBSERVATIONS_NAME}."
             )
         return read_image(path, self.cameras[k], self.places[k])
-
-
-def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
-    """Return one sentence for each row that neither an image nor tables make usable."""
-    table_path, measurements = dataset.table_path, dataset.measurements
-    if dataset.corners is None:
-        problems = [
-            f"{table_path}, row {row + 1}, column image: its camera could not be placed: found "
-            f"neither an image nor {CORNERS_NAME}, needed the board in every image of a camera "
-            "that is held in the hand; name an image or give the corners."
-            for row in hand_held
-            if not measurements.image[row]
-        ]
-    else:
-        problems = rows_without_board(table_path, measurements, dataset.corners, hand_held)
-    if dataset.axes is not None:
-        return [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
-    outlines = dataset.observations
-    given = set() if outlines is None else set(outlines.row.tolist())
-    for row in range(measurements.n_rows):
-        path = dataset.image_path(row)
-        if path is None and row not in given:
-            problems.append(
-                f"{table_path}, row {row + 1}, column image: the row could not be used: "
-                f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
-                "them; name an image or remove the row."
-            )
-        elif path is not None and (os.path.exists(path) or row not in given):
-            found = dataset.image_problem(row)
-            problems += [found] if found else []
-    return problems
-
-
-ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
-GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
 
 
 class ViewEntry(FileSchema):
@@ -350,56 +185,6 @@ class DatasetEntry(FileSchema):
                 "of a reading in metres."
             )
         return sigma
-
-
-def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board: bool) -> list[str]:
-    """Return what keeps views from being hand-held."""
-    held = {name: view for name, view in views.items() if view.hand_held}
-    problems = [
-        f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
-        "board on the base in every image of a camera that is held in the hand; describe it in "
-        "the block board."
-        for name in held
-        if not has_board
-    ]
-    problems += [
-        f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "
-        "held in the hand, needed none, the board tells the pose of every image; remove it."
-        for name, view in held.items()
-        if view.T_base_camera is not None
-    ]
-    return problems
-
-
-def expand_hand_held(
-    path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
-) -> tuple[Measurements, tuple[int, ...], list[str]]:
-    """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows."""
-    new: list[View] = []
-    origin: list[int] = []
-    problems: list[str] = []
-    index = np.zeros_like(measurements.view)
-    for v, (name, entry) in enumerate(views.items()):
-        rows = np.flatnonzero(measurements.view == v)
-        if not entry.hand_held:
-            index[rows] = len(new)
-            new.append(measurements.views[v])
-            origin.append(v)
-            continue
-        for k, row in enumerate(rows.tolist(), start=1):
-            index[row] = len(new)
-            new.append(replace(measurements.views[v], name=f"{name}-{k}", hand_held=True))
-            origin.append(v)
-        taken = [f"{name}-{k + 1}" for k in range(len(rows)) if f"{name}-{k + 1}" in views]
-        problems += [
-            f"{path}: views.{other} could not be used: found the name that an image of the "
-            f"hand-held view {name} gets, needed another; rename it."
-            for other in taken
-        ]
-    return replace(measurements, views=tuple(new), view=index), tuple(origin), problems
-
-
-CACHE_NAME = ".legcal-cache.json"
 
 
 def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
@@ -576,3 +361,142 @@ def _unused_views(path: Path, measurements: Measurements) -> list[str]:
         for v, view in enumerate(measurements.views)
         if not np.any(measurements.view == v)
     ]
+
+
+def read_given_axes(
+    path: Path, leg_names: Sequence[str], measurements: Measurements
+) -> tuple[LegAxes | None, list[str]]:
+    """Return the axes of the legs that the views use, and a note about others."""
+    if not os.path.exists(path):
+        return None, []
+    axes = read_axes(path, leg_names, measurements)
+    views = [measurements.views[v] for v in measurements.view[axes.row].tolist()]
+    names = [leg_names[leg] for leg in axes.leg.tolist()]
+    wanted = [
+        view.legs is None or name in view.legs for view, name in zip(views, names, strict=True)
+    ]
+    used = np.flatnonzero(wanted)
+    if len(used) == 0:
+        raise DatasetError(
+            f"{path}: the axes could not be used: found only legs that their views leave out, "
+            "needed legs that dataset.yaml names for the views; correct these or the table."
+        )
+    left_out = len(axes) - len(used)
+    note = f"{path}: {left_out} axes of legs that their views leave out are not used."
+    return axes.choose(used), [note] if left_out else []
+
+
+def rows_without_axes(table_path: Path, measurements: Measurements, axes: LegAxes) -> list[str]:
+    """Return one sentence for each row of the measurements that has no axis."""
+    blank = np.setdiff1d(np.arange(measurements.n_rows), axes.row).tolist()
+    return [
+        f"{table_path}, row {row + 1}: the row could not be used: found no axis of it in "
+        f"{AXES_NAME}, needed one of a leg that its view uses; add one or remove the row."
+        for row in blank
+    ]
+
+
+def read_given_corners(
+    path: Path, board: Board | None, measurements: Measurements
+) -> Corners | None:
+    """Return the corners beside a dataset, if there are any."""
+    if not os.path.exists(path):
+        return None
+    if board is None:
+        raise DatasetError(
+            f"{path}: the corners could not be used: found no board in the dataset file, needed "
+            "the one that they belong to; describe it in the block board, or remove the table."
+        )
+    return read_corners(path, board, measurements)
+
+
+def rows_without_board(
+    table_path: Path, measurements: Measurements, corners: Corners, hand_held: Sequence[int]
+) -> list[str]:
+    """Return one sentence for each row of a hand-held view in which the board has no pose."""
+    counts = np.bincount(corners.row[corners.used], minlength=measurements.n_rows)
+    return [
+        f"{table_path}, row {row + 1}: its camera could not be placed: found "
+        f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {LEAST_CORNERS} in "
+        "every image of a camera that is held in the hand; add them or remove the row."
+        for row in hand_held
+        if counts[row] < LEAST_CORNERS
+    ]
+
+
+def row_problems(dataset: Dataset, hand_held: Sequence[int]) -> list[str]:
+    """Return one sentence for each row that neither an image nor tables make usable."""
+    table_path, measurements = dataset.table_path, dataset.measurements
+    if dataset.corners is None:
+        problems = [
+            f"{table_path}, row {row + 1}, column image: its camera could not be placed: found "
+            f"neither an image nor {CORNERS_NAME}, needed the board in every image of a camera "
+            "that is held in the hand; name an image or give the corners."
+            for row in hand_held
+            if not measurements.image[row]
+        ]
+    else:
+        problems = rows_without_board(table_path, measurements, dataset.corners, hand_held)
+    if dataset.axes is not None:
+        return [*problems, *rows_without_axes(table_path, measurements, dataset.axes)]
+    outlines = dataset.observations
+    given = set() if outlines is None else set(outlines.row.tolist())
+    for row in range(measurements.n_rows):
+        path = dataset.image_path(row)
+        if path is None and row not in given:
+            problems.append(
+                f"{table_path}, row {row + 1}, column image: the row could not be used: "
+                f"found neither an image nor outlines of it in {OBSERVATIONS_NAME}, needed one of "
+                "them; name an image or remove the row."
+            )
+        elif path is not None and (os.path.exists(path) or row not in given):
+            found = dataset.image_problem(row)
+            problems += [found] if found else []
+    return problems
+
+
+def hand_held_problems(path: Path, views: Mapping[str, ViewEntry], *, has_board: bool) -> list[str]:
+    """Return what keeps views from being hand-held."""
+    held = {name: view for name, view in views.items() if view.hand_held}
+    problems = [
+        f"{path}: views.{name}.hand_held could not be used: found no board, needed a calibration "
+        "board on the base in every image of a camera that is held in the hand; describe it in "
+        "the block board."
+        for name in held
+        if not has_board
+    ]
+    problems += [
+        f"{path}: views.{name}.T_base_camera could not be used: found one pose of a camera that is "
+        "held in the hand, needed none, the board tells the pose of every image; remove it."
+        for name, view in held.items()
+        if view.T_base_camera is not None
+    ]
+    return problems
+
+
+def expand_hand_held(
+    path: Path, measurements: Measurements, views: Mapping[str, ViewEntry]
+) -> tuple[Measurements, tuple[int, ...], list[str]]:
+    """Give every image of a hand-held view a view of its own: NAME-1, NAME-2, ... by rows."""
+    new: list[View] = []
+    origin: list[int] = []
+    problems: list[str] = []
+    index = np.zeros_like(measurements.view)
+    for v, (name, entry) in enumerate(views.items()):
+        rows = np.flatnonzero(measurements.view == v)
+        if not entry.hand_held:
+            index[rows] = len(new)
+            new.append(measurements.views[v])
+            origin.append(v)
+            continue
+        for k, row in enumerate(rows.tolist(), start=1):
+            index[row] = len(new)
+            new.append(replace(measurements.views[v], name=f"{name}-{k}", hand_held=True))
+            origin.append(v)
+        taken = [f"{name}-{k + 1}" for k in range(len(rows)) if f"{name}-{k + 1}" in views]
+        problems += [
+            f"{path}: views.{other} could not be used: found the name that an image of the "
+            f"hand-held view {name} gets, needed another; rename it."
+            for other in taken
+        ]
+    return replace(measurements, views=tuple(new), view=index), tuple(origin), problems

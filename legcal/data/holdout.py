@@ -1,4 +1,4 @@
-"""Images that are kept aside: a fit that has not seen them must foretell what they show.
+"""Held-out images: a fit that has not seen them must predict what they show.
 
 Whole poses are kept aside, since images of one pose share what is unknown of it. They are drawn
 by chance, in an order that does not depend on the files, and so that every leg in every view

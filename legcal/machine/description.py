@@ -1,4 +1,4 @@
-"""What cannot be in a described machine: sizes, lengths and axes out of place, in sentences."""
+"""A machine as a table or a family describes it, and what cannot be in one."""
 
 import re
 from dataclasses import dataclass

@@ -1,4 +1,9 @@
-"""Reading a mechanism of any format: which one it is, and the reader of that format."""
+"""Reading a mechanism of any format: which one it is, and the reader of that format.
+
+A YAML with its URDF (ours, or Gepetto's, whose joints may stand for others), a URDF that closes its
+loops itself, or MJCF (:mod:`legcal.machine.mjcf`): all become a :class:`Source`, a tree with pairs
+of frames that coincide. Without a block ``legcal`` the tree is closed near where it is drawn.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -42,8 +47,108 @@ from legcal.machine.urdf import (
     read_urdf,
 )
 
+XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 _AXES = dict(zip("XYZ", np.eye(3), strict=True))
+TRIALS = 24
+STEPS = 200
+CLOSED = 1e-10  # [m] and [rad]
+_SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
+_LONGEST = 0.3  # step [rad, m]
+
+_NO_BLOCK = (
+    ("legcal.home could not be used", "the pose that the file draws could not be used"),
+    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
+    ("write legcal.home", "add a block legcal with home"),
+    ("correct legcal.home", "add a block legcal with another home"),
+    ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
+    ("correct legcal.base or legcal.platform", "add a block legcal with another base or platform"),
+    (", legcal.base and legcal.platform", ", or add a block legcal with another base and platform"),
+    ("write legcal.base, legcal.platform and legcal.legs",
+     "add a block legcal with base, platform and legs"),
+)  # fmt: skip
+
+KINDS: dict[str, LoopKind] = {
+    **dict.fromkeys(("spherical", "ball", "point"), "point"),
+    **dict.fromkeys(("fixed", "weld"), "weld"),
+    **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
+    "universal": "universal",
+}
+_WORDS = (("closed_loop", "<loop_joint> or <constraint>"), *DRAWING)
+
+
+def read_source(model: str | Path) -> Source:
+    """Return the tree and the closures of a mechanism, checked in themselves."""
+    path = find_model(model)
+    is_xml = path.suffix.lower() in XML_SUFFIXES
+    source = _read_xml(path) if is_xml else read_yaml_source(path)
+    if source.file.legcal is not None:
+        return source
+    check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
+    return completed(source)
+
+
+def _read_xml(path: Path) -> Source:
+    """Return the mechanism of an XML file, whose outermost element tells the format."""
+    beside = yaml_of_urdf(path)
+    if beside is not None and path.suffix.lower() != ".mjcf":
+        return read_yaml_source(beside)
+    content = read_file(path, "mechanism file")
+    root = parse_xml(path, content, "mechanism file")
+    if root.tag == "mujoco":
+        return read_mjcf_source(path, content)
+    if root.tag != "robot":
+        raise ModelError(
+            f"{path}, line {root.sourceline}: the mechanism could not be read: found <{root.tag}> "
+            "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give one of them."
+        )
+    if any(element.tag in LOOP_TAGS for element in root):
+        return read_loop_source(path, content)
+    raise OutOfClass(
+        f"{path}: this is not a parallel mechanism: found a URDF, which is a tree without closed "
+        f"loops, and no YAML that closes them; write {path.with_suffix('.yaml')} with closed_loop, "
+        "type, name_mot and a legcal block."
+    )
+
+
+def read_yaml_source(path: Path) -> Source:
+    """Return a mechanism from its YAML and the URDF that it names.
+
+    A file without the block ``legcal`` may leave the travel of sliders open, as Gepetto's do.
+    """
+    file = read_mechanism_file(path)
+    block = file.legcal
+    urdf = read_urdf(
+        find_urdf(path, None if block is None else block.urdf), travel_needed=block is not None
+    )
+    check_stand_ins(file, urdf, path)
+    if not file.joint_name:
+        return Source(path, file, urdf, words=_NO_BLOCK if block is None else ())
+    return _converted(path, file, urdf)
+
+
+def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
+    """Return a mechanism whose URDF has joints that stand for others."""
+    robot = parse_robot(urdf.path, urdf.content)
+    frames = replace_stand_ins(robot, file, urdf)
+    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    travel_needed = file.legcal is not None
+    completed = parse_urdf(urdf.path, content, travel_needed=travel_needed)
+    changes = {
+        "closed_loop": [[frames.get(name, name) for name in pair] for pair in file.closed_loop],
+        "joint_name": [],
+        "joint_type": [],
+    }
+    if file.legcal is not None:
+        on_replaced = [joint for joint in file.legcal.legs.values() if joint in frames]
+        if on_replaced:
+            raise ModelError(
+                f"{path}: legcal.legs could not be used: found '{on_replaced[0]}', which stands "
+                "for another joint (joint_name), needed another joint of that leg; name its "
+                "prismatic joint."
+            )
+    words = _NO_BLOCK if file.legcal is None else ()
+    return Source(path, file.model_copy(update=changes), completed, True, words=words)
 
 
 def check_stand_ins(file: MechanismFile, urdf: Urdf, path: Path) -> None:
@@ -118,183 +223,6 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
             robot.insert(at, new)
         text = added
     return replaced
-
-
-TRIALS = 24
-STEPS = 200
-CLOSED = 1e-10  # [m] and [rad]
-_SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
-_LONGEST = 0.3  # step [rad, m]
-
-
-def completed(source: Source) -> Source:
-    """Return a mechanism without a block with the poses where it is closed, and all travels."""
-    known = {*source.urdf.links, *source.urdf.joints}
-    if not all(name in known for pair in source.file.closed_loop for name in pair):
-        return source  # refused later, with the place of the name
-    closures = [
-        Closure("3d" if kind == "3d" else "6d", one, two)
-        for (one, two), kind in zip(source.file.closed_loop, source.file.type, strict=True)
-    ]
-    try:
-        chain = ClosedChain(source.urdf.text, closures)
-    except ModelError as error:
-        raise ModelError(
-            [f"{source.urdf.path}: {problem}" for problem in error.problems]
-        ) from error
-    start = chain.neutral()
-    for joint, value in source.values.items():
-        start[chain.q_index(joint)] = value
-    found = closed_near(chain, start, source.urdf.links)
-    configuration = start if found is None else found
-    urdf = source.urdf
-    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
-    sliders = sliders_without_travel(urdf)
-    if sliders:
-        readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
-        source = _with_travel(source, readings, poses)
-    return source if found is None else replace(source, poses=poses)
-
-
-def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array | None:
-    """Return a closed configuration near a given one, or None where none was found.
-
-    Of what several starts find, the one is taken where links have turned least.
-    """
-    if _off(chain, start) <= CLOSED:
-        return start
-    rng = np.random.default_rng(1965)
-    best: tuple[float, Array] | None = None
-    drawn = chain.turns(start, links[0], links)
-    for trial in range(TRIALS):
-        away = chain.integrate(start, _SPREAD * trial * rng.normal(size=chain.nv))
-        found = _close(chain, away)
-        if found is None:
-            continue
-        turned = _turned(drawn, chain.turns(found, links[0], links))
-        if best is None or turned < best[0] - 1e-6:
-            best = turned, found
-    return None if best is None else best[1]
-
-
-def _turned(before: Array, after: Array) -> float:
-    """Return by how much rotations (n, 3, 3) differ, all together [rad]."""
-    apart = np.swapaxes(before, 1, 2) @ after
-    return float(Rotation.from_matrix(apart).magnitude().sum())
-
-
-def _close(chain: ClosedChain, configuration: Array) -> Array | None:
-    """Close the loops by damped Gauss-Newton steps, or return None."""
-    damping = 1e-2
-    residual, jacobian = chain.linearize(configuration)
-    for _ in range(STEPS):
-        if float(np.abs(residual).max()) <= CLOSED:
-            return configuration
-        square = jacobian @ jacobian.T + damping * np.eye(len(residual))
-        if not np.linalg.cond(square) < 1e15:  # numbers of hugely different size
-            return None
-        step = -jacobian.T @ np.linalg.solve(square, residual)
-        step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
-        tried = chain.integrate(configuration, step)
-        new_residual, new_jacobian = chain.linearize(tried)
-        if new_residual @ new_residual < residual @ residual:
-            configuration, residual, jacobian = tried, new_residual, new_jacobian
-            damping = max(0.2 * damping, 1e-12)
-        elif damping > 1e6:
-            return None
-        else:
-            damping *= 10.0
-    return None
-
-
-def _off(chain: ClosedChain, configuration: Array) -> float:
-    """Return how far the loops are from closed."""
-    residual = chain.residual(configuration)
-    return float(np.abs(residual).max()) if len(residual) else 0.0
-
-
-def _with_travel(
-    source: Source, readings: Mapping[str, float], poses: Mapping[str, RigidTransform]
-) -> Source:
-    """Write a travel about some readings into the URDF, and note it."""
-    travel = assumed_travel(poses)
-    robot = parse_robot(source.urdf.path, source.urdf.content)
-    set_travel(robot, readings, travel)
-    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
-    names: Sequence[str] = list(readings)
-    return replace(
-        source,
-        urdf=parse_urdf(source.urdf.path, content),
-        converted=True,
-        notes=(*source.notes, travel_note(names, travel)),
-    )
-
-
-_NO_BLOCK = (
-    ("legcal.home could not be used", "the pose that the file draws could not be used"),
-    ("legcal.home is not given", "no closed pose was found near the one that the file draws"),
-    ("write legcal.home", "add a block legcal with home"),
-    ("correct legcal.home", "add a block legcal with another home"),
-    ("check legcal.home or the limits", "check the limits, or add a block legcal with home"),
-    ("correct legcal.base or legcal.platform", "add a block legcal with another base or platform"),
-    (", legcal.base and legcal.platform", ", or add a block legcal with another base and platform"),
-    ("write legcal.base, legcal.platform and legcal.legs",
-     "add a block legcal with base, platform and legs"),
-)  # fmt: skip
-
-
-def read_yaml_source(path: Path) -> Source:
-    """Return a mechanism from its YAML and the URDF that it names.
-
-    A file without the block ``legcal`` may leave the travel of sliders open, as Gepetto's do.
-    """
-    file = read_mechanism_file(path)
-    block = file.legcal
-    urdf = read_urdf(
-        find_urdf(path, None if block is None else block.urdf), travel_needed=block is not None
-    )
-    check_stand_ins(file, urdf, path)
-    if not file.joint_name:
-        return Source(path, file, urdf, words=_NO_BLOCK if block is None else ())
-    return _converted(path, file, urdf)
-
-
-def _converted(path: Path, file: MechanismFile, urdf: Urdf) -> Source:
-    """Return a mechanism whose URDF has joints that stand for others."""
-    robot = parse_robot(urdf.path, urdf.content)
-    frames = replace_stand_ins(robot, file, urdf)
-    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
-    travel_needed = file.legcal is not None
-    completed = parse_urdf(urdf.path, content, travel_needed=travel_needed)
-    changes = {
-        "closed_loop": [[frames.get(name, name) for name in pair] for pair in file.closed_loop],
-        "joint_name": [],
-        "joint_type": [],
-    }
-    if file.legcal is not None:
-        on_replaced = [joint for joint in file.legcal.legs.values() if joint in frames]
-        if on_replaced:
-            raise ModelError(
-                f"{path}: legcal.legs could not be used: found '{on_replaced[0]}', which stands "
-                "for another joint (joint_name), needed another joint of that leg; name its "
-                "prismatic joint."
-            )
-    words = _NO_BLOCK if file.legcal is None else ()
-    return Source(path, file.model_copy(update=changes), completed, True, words=words)
-
-
-KINDS: dict[str, LoopKind] = {
-    **dict.fromkeys(("spherical", "ball", "point"), "point"),
-    **dict.fromkeys(("fixed", "weld"), "weld"),
-    **dict.fromkeys(("revolute", "continuous", "hinge"), "revolute"),
-    "universal": "universal",
-}
-_WORDS = (("closed_loop", "<loop_joint> or <constraint>"), *DRAWING)
-
-
-def has_loops(robot: etree._Element) -> bool:
-    """Say whether a ``<robot>`` closes loops."""
-    return any(element.tag in LOOP_TAGS for element in robot)
 
 
 def read_loop_source(path: Path, content: bytes) -> Source:
@@ -463,38 +391,104 @@ def _motors(robot: etree._Element, urdf: Urdf, problems: Problems) -> tuple[list
     ] * bool(sliders)
 
 
-XML_SUFFIXES = (".urdf", ".xml", ".mjcf")
-
-
-def read_source(model: str | Path) -> Source:
-    """Return the tree and the closures of a mechanism, checked in themselves."""
-    path = find_model(model)
-    is_xml = path.suffix.lower() in XML_SUFFIXES
-    source = _read_xml(path) if is_xml else read_yaml_source(path)
-    if source.file.legcal is not None:
-        return source
-    check_one_mechanism(source.urdf, source.file.closed_loop, source.path)
-    return completed(source)
-
-
-def _read_xml(path: Path) -> Source:
-    """Return the mechanism of an XML file, whose outermost element tells the format."""
-    beside = yaml_of_urdf(path)
-    if beside is not None and path.suffix.lower() != ".mjcf":
-        return read_yaml_source(beside)
-    content = read_file(path, "mechanism file")
-    root = parse_xml(path, content, "mechanism file")
-    if root.tag == "mujoco":
-        return read_mjcf_source(path, content)
-    if root.tag != "robot":
+def completed(source: Source) -> Source:
+    """Return a mechanism without a block with the poses where it is closed, and all travels."""
+    known = {*source.urdf.links, *source.urdf.joints}
+    if not all(name in known for pair in source.file.closed_loop for name in pair):
+        return source  # refused later, with the place of the name
+    closures = [
+        Closure("3d" if kind == "3d" else "6d", one, two)
+        for (one, two), kind in zip(source.file.closed_loop, source.file.type, strict=True)
+    ]
+    try:
+        chain = ClosedChain(source.urdf.text, closures)
+    except ModelError as error:
         raise ModelError(
-            f"{path}, line {root.sourceline}: the mechanism could not be read: found <{root.tag}> "
-            "as the outermost element, needed <robot> (URDF) or <mujoco> (MJCF); give one of them."
-        )
-    if has_loops(root):
-        return read_loop_source(path, content)
-    raise OutOfClass(
-        f"{path}: this is not a parallel mechanism: found a URDF, which is a tree without closed "
-        f"loops, and no YAML that closes them; write {path.with_suffix('.yaml')} with closed_loop, "
-        "type, name_mot and a legcal block."
+            [f"{source.urdf.path}: {problem}" for problem in error.problems]
+        ) from error
+    start = chain.neutral()
+    for joint, value in source.values.items():
+        start[chain.q_index(joint)] = value
+    found = closed_near(chain, start, source.urdf.links)
+    configuration = start if found is None else found
+    urdf = source.urdf
+    poses = {link: chain.pose(configuration, urdf.root, link) for link in urdf.links}
+    sliders = sliders_without_travel(urdf)
+    if sliders:
+        readings = {name: float(configuration[chain.q_index(name)]) for name in sliders}
+        source = _with_travel(source, readings, poses)
+    return source if found is None else replace(source, poses=poses)
+
+
+def closed_near(chain: ClosedChain, start: Array, links: Sequence[str]) -> Array | None:
+    """Return a closed configuration near a given one, or None where none was found.
+
+    Of what several starts find, the one is taken where links have turned least.
+    """
+    if _off(chain, start) <= CLOSED:
+        return start
+    rng = np.random.default_rng(1965)
+    best: tuple[float, Array] | None = None
+    drawn = chain.turns(start, links[0], links)
+    for trial in range(TRIALS):
+        away = chain.integrate(start, _SPREAD * trial * rng.normal(size=chain.nv))
+        found = _close(chain, away)
+        if found is None:
+            continue
+        turned = _turned(drawn, chain.turns(found, links[0], links))
+        if best is None or turned < best[0] - 1e-6:
+            best = turned, found
+    return None if best is None else best[1]
+
+
+def _turned(before: Array, after: Array) -> float:
+    """Return by how much rotations (n, 3, 3) differ, all together [rad]."""
+    apart = np.swapaxes(before, 1, 2) @ after
+    return float(Rotation.from_matrix(apart).magnitude().sum())
+
+
+def _close(chain: ClosedChain, configuration: Array) -> Array | None:
+    """Close the loops by damped Gauss-Newton steps, or return None."""
+    damping = 1e-2
+    residual, jacobian = chain.linearize(configuration)
+    for _ in range(STEPS):
+        if float(np.abs(residual).max()) <= CLOSED:
+            return configuration
+        square = jacobian @ jacobian.T + damping * np.eye(len(residual))
+        if not np.linalg.cond(square) < 1e15:  # numbers of hugely different size
+            return None
+        step = -jacobian.T @ np.linalg.solve(square, residual)
+        step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
+        tried = chain.integrate(configuration, step)
+        new_residual, new_jacobian = chain.linearize(tried)
+        if new_residual @ new_residual < residual @ residual:
+            configuration, residual, jacobian = tried, new_residual, new_jacobian
+            damping = max(0.2 * damping, 1e-12)
+        elif damping > 1e6:
+            return None
+        else:
+            damping *= 10.0
+    return None
+
+
+def _off(chain: ClosedChain, configuration: Array) -> float:
+    """Return how far the loops are from closed."""
+    residual = chain.residual(configuration)
+    return float(np.abs(residual).max()) if len(residual) else 0.0
+
+
+def _with_travel(
+    source: Source, readings: Mapping[str, float], poses: Mapping[str, RigidTransform]
+) -> Source:
+    """Write a travel about some readings into the URDF, and note it."""
+    travel = assumed_travel(poses)
+    robot = parse_robot(source.urdf.path, source.urdf.content)
+    set_travel(robot, readings, travel)
+    content = etree.tostring(robot, xml_declaration=True, encoding="utf-8") + b"\n"
+    names: Sequence[str] = list(readings)
+    return replace(
+        source,
+        urdf=parse_urdf(source.urdf.path, content),
+        converted=True,
+        notes=(*source.notes, travel_note(names, travel)),
     )

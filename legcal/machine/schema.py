@@ -1,4 +1,4 @@
-"""The YAML of a mechanism, written: :mod:`legcal.machine.schema` reads it."""
+"""The YAML of a mechanism: its schema, read strictly and written."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

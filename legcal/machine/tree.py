@@ -1,7 +1,9 @@
-"""Closures of formats that join two links by a joint, written as frames that coincide.
+"""Models of other formats rewritten as a tree with pairs of frames that coincide.
 
-A point becomes a ``3d`` pair and a weld a ``6d`` pair. A revolute or universal joint that closes a
-loop becomes one or two revolute joints with massless links, welded to the other side.
+:class:`Source` is what every reader returns, :class:`TreeText` the URDF while it is put together.
+A joint that closes a loop (:class:`Loop`) becomes a pair of frames: a point a ``3d`` pair, a weld a
+``6d`` pair; a revolute or universal joint becomes one or two revolute joints with massless links,
+welded to the other side.
 """
 
 from collections.abc import Iterable, Mapping, Sequence, Set

@@ -1,4 +1,9 @@
-"""Axes are written as turns of the nominal ones; here as turns of the calibrated ones."""
+"""Models written with other numbers: the URDF by moved origins, the YAML beside it.
+
+A leg's number is carried by the origin of a joint. Where an origin moves that leg alone it is a
+:class:`Handle`, and :func:`moved_origins` says where all of them go; what is written is loaded
+again and checked. Axes count as turns of the nominal ones, see :func:`turns_between`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A board in a word: ``chessboard:9x6:25mm``, or the file that describes it."""
+"""Calibration boards: what is printed on them, their points, and how files and options name one."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The numbers of a camera by their names: focal lengths, principal point, distortion.
+"""The camera: a pinhole with the distortions of OpenCV, and its numbers by their names.
 
-A fit may look for them. Views whose cameras have the same numbers are taken to show one camera:
+A fit may look for the numbers. Views whose cameras have the same ones are taken to show one camera:
 they share its intrinsics, named after the first of them in the order of names.
 """
 

@@ -1,4 +1,4 @@
-"""Camera files as legcal writes them: ROS camera_info."""
+"""Camera files: ROS camera_info, OpenCV and Kalibr read, ROS written."""
 
 import re
 from collections.abc import Mapping, Sequence

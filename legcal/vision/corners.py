@@ -1,4 +1,4 @@
-"""What an image shows where a board is not found: one of other dimensions, or a part of it."""
+"""Corners of a board in an image: searched, fitted as saddles of grey levels, judged."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -336,7 +336,7 @@ def _flat(numbers: object, corners: object) -> tuple[IntArray, Array]:
 
 FEWEST = 4  # corners that place a camera
 _NEAR = 1.5  # squares within which corners tell how the board lies in the image around one
-_STRAIGHT_corner_search = 0.9  # of what is straight around a corner that is used
+_STRAIGHT_AROUND = 0.9  # of what is straight around a corner that is used
 _FRAME = 0.2  # of the side of a tag that its black frame is wide, as Kalibr prints it
 _MOST_BLURRED, _MOST_MISFIT = 1.5, 2.5  # times what is usual in the image
 _GOOD_FIT = 0.03  # of the contrast left over: never a reason for doubt
@@ -394,10 +394,10 @@ def _clearance(board: Board) -> tuple[float, float]:
     """Return how far edges through a corner are straight, and free of other print beside [m]."""
     if board.kind == "aprilgrid":
         gap = board.spacing * board.side
-        return _STRAIGHT_corner_search * gap, min(_FRAME * board.side, gap)
+        return _STRAIGHT_AROUND * gap, min(_FRAME * board.side, gap)
     gap = 0.5 * (board.side - board.marker)
     band = gap if board.kind == "charuco" else board.side
-    return 0.5 * _STRAIGHT_corner_search * board.side, band
+    return 0.5 * _STRAIGHT_AROUND * board.side, band
 
 
 def _axes(board: Board, numbers: IntArray, px: Array) -> Array:

@@ -1,9 +1,9 @@
-"""Euler angles of a leg's axis in the camera frame, the (psi, theta) of Table 1.
+"""A cylinder seen by a camera, eqs (1) to (5): its outlines, its axis, and the axis in angles.
 
-The paper names the angles and does not define them. Here psi is the tilt out of the plane of
-the image and theta the angle in the image, from its y axis: the axis is the camera's y axis turned
-by psi about x and then by theta about z, ``u = Rz(theta) Rx(psi) e_y``. An image tells theta far
-better than psi.
+The paper names the Euler angles of Table 1 and does not define them. Here psi is the tilt out of
+the plane of the image and theta the angle in the image, from its y axis: the axis is the camera's y
+axis turned by psi about x and then by theta about z, ``u = Rz(theta) Rx(psi) e_y``. An image tells
+theta far better than psi.
 """
 
 import numpy as np

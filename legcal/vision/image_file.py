@@ -1,4 +1,4 @@
-"""Images made larger, for searches that do not see what is only a few pixels wide."""
+"""Image files: checked without decoding, read as grey levels, made larger for searches."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Where the model says that the legs are seen in an image."""
+"""Which parts of which legs an image should show: outlines, bands along legs, what hides."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

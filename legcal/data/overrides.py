@@ -1,0 +1,76 @@
+"""Overrides: what a dataset or a call asks of parameters by name, to fix, free or give a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from legcal.errors import UsageError
+from legcal.files import EXAMPLE, Stated, describe, read_prior, read_value
+
+Action = Literal["prior", "fixed", "free"]
+_WORDS: Mapping[Action, str] = {
+    "prior": "prior",
+    "fixed": "parameter to fix",
+    "free": "parameter to free",
+}
+
+
+@dataclass(frozen=True)
+class Override:
+    """What somebody asks of one parameter, or of all that a pattern matches."""
+
+    name: str  # or a pattern
+    action: Action  # what to do with it
+    where: str  # where this was said: the start of a sentence about it
+    stated: Stated | None = None  # the prior, or the value that it is fixed at
+    in_file: bool = False  # said in ``dataset.yaml``, which gives way to what is asked for in a run
+
+
+def overrides_of_call(
+    priors: Mapping[str, object] | Sequence[str] = (),
+    fixed: Sequence[str] = (),
+    free: Sequence[str] = (),
+) -> tuple[Override, ...]:
+    """Return what the arguments of a call or the options of a command ask for."""
+    entries: list[tuple[Action, str, object]] = []
+    if isinstance(priors, Mapping):
+        entries += [("prior", str(name), value) for name, value in priors.items()]
+    else:
+        entries += [("prior", text, None) for text in _listed(priors)]
+    entries += [("fixed", text, None) for text in _listed(fixed)]
+    entries += [("free", text, None) for text in _listed(free)]
+    found: list[Override] = []
+    problems: list[str] = []
+    for action, text, value in entries:
+        where = f"The {_WORDS[action]} {describe(text)}"
+        try:
+            found.append(read_override(action, text, where, value))
+        except ValueError as error:
+            problems.append(f"{where} could not be used: {error}")
+    if problems:
+        raise UsageError(problems)
+    return tuple(found)
+
+
+def read_override(
+    action: Action, text: str, where: str, value: object = None, *, in_file: bool = False
+) -> Override:
+    """Return an override as it was written."""
+    name, stated = text, None
+    if value is not None:
+        stated = read_prior(value)
+    elif action != "free" and "=" in text:
+        name, _, behind = text.rpartition("=")
+        stated = read_prior(behind) if action == "prior" else read_value(behind)
+    if action == "prior" and stated is None:
+        raise ValueError(
+            f"found no value, needed one and its sigma; write them behind the name: {EXAMPLE}."
+        )
+    return Override(name, action, where, stated, in_file)
+
+
+def _listed(texts: Iterable[str]) -> list[str]:
+    """Return texts as a list; a single text is one of them."""
+    return [texts] if isinstance(texts, str) else [str(text) for text in texts]
