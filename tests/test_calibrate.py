@@ -14,7 +14,7 @@ from hexapod_example import HEXAPOD, ROOT, TRUTH, Run, copy_of_the_example
 from thinned import thinned
 
 from legcal import LegcalError, calibrate, evaluate, load_dataset, load_mechanism
-from legcal.calibration.identify.analysis import check_identifiable
+from legcal.calibration.identify.judge import check_identifiable
 from legcal.errors import NotIdentifiable, UsageError
 from legcal.machine import geometries, parametrization_of, vector_of
 

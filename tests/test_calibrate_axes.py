@@ -13,7 +13,8 @@ from axes_dataset import MODEL, write_axes_dataset
 from rich.console import Console
 
 from legcal import calibrate, load_dataset, load_mechanism
-from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
+from legcal.calibration.identify.judge import identifiability_of_dataset
+from legcal.calibration.identify.planning import recorded_session
 from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.machine import to_vector

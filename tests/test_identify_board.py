@@ -13,10 +13,10 @@ from rich.console import Console
 from test_identify_command import run
 
 import legcal
-from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
-from legcal.calibration.identify.ranks import locate_joints
+from legcal.calibration.identify.judge import identifiability_of_dataset
+from legcal.calibration.identify.planning import planned_session, recorded_session
 from legcal.calibration.identify.report import Identifiability
-from legcal.calibration.identify.session import planned_session
+from legcal.calibration.identify.steps import locate_joints
 from legcal.data.corners import found_corners
 from legcal.errors import UsageError
 from legcal.machine import Mechanism
@@ -83,7 +83,7 @@ def test_only_a_board_lets_the_steps_use_a_camera_in_the_hand() -> None:
     found = report("paper", board=True, hand_held=True)
     assert (len(found.views), set(found.images)) == (45, {1})
     assert found.staged.rank == found.full.rank == 30
-    assert found.paper.ok
+    assert found.conditions_hold
     assert found.board.without.staged_rank == 0
     assert {"two_directions", "staged"} <= set(found.board.needed_for)
     assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
@@ -104,7 +104,7 @@ def test_smallest_views_with_a_board_suffice_with_it() -> None:
     assert found.recommendation
     for choice in found.recommendation:
         again = legcal.identifiability(tricept, choice.views, board=True)
-        assert again.paper.ok
+        assert again.conditions_hold
         assert again.staged.complete
         assert again.identifiable
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hexapod_example import HEXAPOD
 
-from legcal.calibration.identify.analysis import check_identifiable, identifiability_of_dataset
+from legcal.calibration.identify.judge import check_identifiable, identifiability_of_dataset
 from legcal.calibration.joint_fit.parameters import Choices, Prior
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at

@@ -19,7 +19,8 @@ from thinned import thinned
 
 import legcal
 from legcal import cli
-from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
+from legcal.calibration.identify.judge import identifiability_of_dataset
+from legcal.calibration.identify.planning import recorded_session
 from legcal.calibration.identify.ranks import WeakDirection
 from legcal.data.dataset import load_dataset
 from legcal.errors import UsageError
@@ -77,7 +78,7 @@ def test_the_api_returns_the_same_object() -> None:
     views = [view.split(",") for view in PAPER]
     first, again = (legcal.identifiability(mechanism, views, images=5) for _ in range(2))
     assert first.document() == again.document()
-    assert (first.full.rank, first.paper.ok, first.images) == (30, True, (5, 5, 5))
+    assert (first.full.rank, first.conditions_hold, first.images) == (30, True, (5, 5, 5))
     assert first == again
 
 

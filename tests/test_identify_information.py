@@ -11,15 +11,17 @@ from hypothesis import strategies as st
 from random_legs import changed, closed_leg
 from scipy.spatial.transform import Rotation
 
-from legcal.calibration.identify.analysis import identifiability
-from legcal.calibration.identify.ranks import (
+from legcal.calibration.identify.information import (
     SIGMA_EXACT,
+    by_cameras,
     compress,
     demands_of,
     eliminate,
     image_rows,
-    information,
+    of_parameters,
 )
+from legcal.calibration.identify.judge import identifiability
+from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import (
     SIGMA_PX,
     Session,
@@ -200,7 +202,7 @@ def test_views_with_a_board_have_one_camera_in_common(seed: int, shown: list[boo
     basis, singular, _ = np.linalg.svd(own, full_matrices=False)
     kept = basis[:, singular > 1e-3]
     rest = shared - kept @ (kept.T @ shared)
-    found = information(session, images, demands)
+    found = of_parameters(session, by_cameras(session, images, demands))
     scale = max(1.0, float(np.abs(rest).max()) ** 2)
     np.testing.assert_allclose(found.T @ found / scale, rest.T @ rest / scale, atol=1e-6)
 
@@ -218,7 +220,7 @@ def test_a_further_image_of_a_known_pose_takes_nothing_away(seed: int) -> None:
 
 
 def _information(session: Session) -> Array:
-    return information(session, image_rows(session), demands_of(session))
+    return Analysis(session).information
 
 
 def _with(session: Session, **changes: Any) -> Session:

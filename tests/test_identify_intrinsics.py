@@ -9,15 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_identify_information import FAST, SEEDS, random_session
 
-from legcal.calibration.identify.analysis import identifiability_of_dataset, recorded_session
+from legcal.calibration.identify.intrinsics import NAMES, _changes, _scales, judge_intrinsics
+from legcal.calibration.identify.judge import identifiability_of_dataset
+from legcal.calibration.identify.planning import looking_at, recorded_session
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.remedies import (
-    NAMES,
-    _changes,
-    _scales,
-    judge_intrinsics,
-    looking_at,
-)
 from legcal.calibration.identify.session import at_base_joints
 from legcal.data.dataset import load_dataset
 from legcal.data.holdout import dataset_at

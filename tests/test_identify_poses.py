@@ -9,7 +9,7 @@ from layouts import Layout, write_machine
 from machines import MACHINES, of_types, ring
 
 import legcal
-from legcal.calibration.identify.session import (
+from legcal.calibration.identify.planning import (
     default_cameras,
     planned_session,
 )

@@ -10,10 +10,10 @@ from authoring import made
 from thinned import thinned
 
 import legcal
-from legcal.calibration.identify.analysis import identifiability
+from legcal.calibration.identify.judge import identifiability
+from legcal.calibration.identify.planning import planned_session
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
-from legcal.calibration.identify.session import planned_session
 from legcal.machine import Mechanism
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
@@ -43,7 +43,7 @@ def counts(found: Identifiability) -> list[tuple[int | None, int | None]]:
 def test_the_papers_views_of_a_hexapod_determine_all_30_parameters() -> None:
     found = report("hexapod", [(0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5)])
     assert counts(found) == [(18, 12), (18, 6), (18, 12)]
-    assert found.paper.ok
+    assert found.conditions_hold
     assert (found.staged.rank, found.full.rank, found.full.of) == (30, 30, 30)
     assert found.identifiable
     assert not found.remedies
@@ -66,7 +66,7 @@ def test_three_legs_count_as_the_paper_prints(name: str, expected: list[tuple[in
 def test_counts_pass_where_a_joint_hangs_on_one_distance() -> None:
     found = report("hexapod", WEAK_JOINT)
     assert counts(found)[0] == (21, 12)
-    assert found.paper.ok
+    assert found.conditions_hold
     assert rank_of(found, "base_joints", "default") == (10, 12)
     assert rank_of(found, "platform_joints", "default") == (10, 12)
     assert found.staged.rank == 26
@@ -80,7 +80,7 @@ def test_counts_fail_where_everything_at_once_is_determined(
     views: tuple[tuple[int, ...], ...],
 ) -> None:
     found = report("hexapod", views)
-    assert not found.paper.ok
+    assert not found.conditions_hold
     assert found.staged.rank < 30
     assert (found.full.rank, found.identifiable) == (30, True)
 
@@ -149,7 +149,7 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
     found = identifiability(model(name))
     assert found.recommendation
     assert found.views == found.recommendation[0].views
-    assert found.paper.ok
+    assert found.conditions_hold
     assert found.identifiable
     assert found.staged.complete
     harmless = 6 if name == "3-upu" else 0

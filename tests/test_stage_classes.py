@@ -7,8 +7,8 @@ import pytest
 from machine_session import SHIPPED
 from staged_machines import Observed, Steps, planned, shipped, three_steps
 
+from legcal.calibration.identify.planning import planned_session
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.session import planned_session
 from legcal.errors import NotIdentifiable
 from legcal.machine import LegKind, load_mechanism
 from legcal.paper.joints_in_base import locate_joints_in_base

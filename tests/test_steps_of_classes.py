@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from staged_hexapods import errors, five_millimetres_away
 from staged_machines import Observed, planned, shipped, three_steps
 
+from legcal.calibration.identify.planning import planned_session
 from legcal.calibration.identify.ranks import Analysis, determined
-from legcal.calibration.identify.session import planned_session
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine import (

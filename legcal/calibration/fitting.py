@@ -22,7 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.board import BoardViews, Poses, base_of_board, in_one_camera, observe_board
 from legcal.calibration.disagreement import disagreeing_images
-from legcal.calibration.identify.analysis import check_identifiable
+from legcal.calibration.identify.judge import check_identifiable
 from legcal.calibration.joint_fit import (
     ROUNDS,
     EstimatedGamma,

@@ -10,7 +10,7 @@ import numpy as np
 
 from legcal.calibration.board import board_notes
 from legcal.calibration.fitting import Found, observe_and_fit
-from legcal.calibration.identify.analysis import check_identifiable
+from legcal.calibration.identify.judge import check_identifiable
 from legcal.calibration.joint_fit import (
     DEFAULT_SETTINGS,
     Choices,

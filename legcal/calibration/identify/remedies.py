@@ -1,4 +1,8 @@
-"""What would mend what is missing: candidates, each tried by computing the ranks again."""
+"""What would help where directions are not determined: each remedy is tried.
+
+A calibration board is judged for every session; the others are candidates, tried by computing the
+ranks again.
+"""
 
 from __future__ import annotations
 
@@ -9,94 +13,68 @@ from itertools import combinations
 
 import numpy as np
 
+from legcal.calibration.identify.planning import FOCAL_PX, cameras_for
 from legcal.calibration.identify.ranks import (
     Analysis,
-    PlatformError,
     WeakDirection,
-    base_by_frames,
-    by_cameras,
-    compress,
-    eliminate,
     missing,
-    offsets_from_distances,
-    scattered,
     undetermined,
     weak_directions,
 )
+from legcal.calibration.identify.recommend import Recommendation
 from legcal.calibration.identify.session import (
-    FOCAL_PX,
-    Across,
     Session,
-    at_base_joints,
-    at_platform_joints,
-    cameras_for,
     legs_around,
     legs_in_words,
     neighbours,
-    planned_session,
     steps_apart,
     views_in_words,
 )
+from legcal.calibration.identify.steps import scattered
 from legcal.geometry import Array, IntArray
-from legcal.machine import Mechanism, joined
-from legcal.paper import Condition, count_conditions, three_legs_at_once
+from legcal.machine import joined
+from legcal.paper import Condition
 
 _MENDED = 1e-6  # part of a direction outside of what stays open
+_MOST_OF_A_KIND = 2
+_MOST_TRIED = 8  # of a kind
+_MOST_FIXED = 4  # parameters
+ENOUGH_IMAGES = 15  # a view
+_KNOWN = 1e12  # 1/m
+_ORDINAL = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 
 
 @dataclass(frozen=True)
 class BoardRanks:
-    """The ranks of all parameters, with a board in every image or with none.
+    """The ranks of all parameters, with a board in every image or with none."""
 
-    Attributes
-    ----------
-    staged_rank, full_rank : int
-        Step by step, and everything at once.
-    identifiable : bool
-        Whether everything at once determines all directions that move the platform.
-    """
-
-    staged_rank: int
+    staged_rank: int  # staged_rank, full_rank: step by step, and the joint fit
     full_rank: int
+    # whether the joint fit determines all directions that move the platform
     identifiable: bool
 
 
 @dataclass(frozen=True)
 class BoardReport:
-    """What a calibration board does for a session.
+    """What a calibration board does for a session."""
 
-    Attributes
-    ----------
-    present : bool
-        Whether the session has one, in every view.
-    needed_for : tuple of str
-        What fails without a board and holds with it: ``eq12``, ``two_directions``, ``staged``
-        (the four steps determine all that moves the platform), ``full`` (everything at once does).
-    without, with_board : BoardRanks
-        The ranks without and with a board in every image.
-    mends : tuple of str
-        The directions that only a board lets step by step or at once determine, in words.
-    """
-
-    present: bool
+    present: bool  # whether the session has one, in every view
+    # what fails without a board and holds with it: ``eq12``, ``two_directions``, ``staged`` (the
+    # four steps determine all that moves the platform), ``full`` (the joint fit does)
     needed_for: tuple[str, ...]
-    without: BoardRanks
+    without: BoardRanks  # without, with_board: the ranks without and with a board in every image
     with_board: BoardRanks
+    # the directions that only a board lets step by step or at once determine, in words
     mends: tuple[str, ...]
 
 
 def judge_board(
-    analysis: Analysis, without: Sequence[Condition], with_board: Sequence[Condition]
+    analysis: Analysis,  # the session, as it is
+    # without, with_board: the paper's conditions without a board and with one in every view
+    without: Sequence[Condition],
+    with_board: Sequence[Condition],
 ) -> BoardReport:
-    """Return what a board does for a session, whether it has one or not.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        The session, as it is.
-    without, with_board : sequence of Condition
-        The paper's conditions without a board and with one in every view.
-    """
+    """Return what a board does for a session, whether it has one or not."""
     shown = analysis.session.board
     none = analysis.with_board(board=False) if shown.any() else analysis
     every = analysis if shown.all() else analysis.with_board()
@@ -141,382 +119,36 @@ def _outside(space: Array, part: Array) -> Array:
     return np.asarray(basis[singular > _MENDED])
 
 
-NAMES = ("fx", "fy", "cx", "cy")
-RADIUS = 0.02  # standard deviation of a radius, relative, as a fit has it
-LARGEST_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
-OPEN = 0.05  # component of an open direction from which on an intrinsic is part of it
-
-
-@dataclass(frozen=True)
-class CameraIntrinsics:
-    """What the legs tell of one camera, its four numbers looked for together with all others.
-
-    Attributes
-    ----------
-    camera : str
-        The view after whose name the intrinsics are called.
-    determined : bool
-        Whether the legs determine all four.
-    sigma : dict of str
-        Standard deviations of ``fx``, ``fy``, ``cx``, ``cy`` to expect with outlines good to
-        0.1 px, radii known to 2 % [px]; None for those that stay open.
-    """
-
-    camera: str
-    determined: bool
-    sigma: dict[str, float | None]
-
-
-def judge_intrinsics(
-    analysis: Analysis, orientation: Array, owners: Sequence[str]
-) -> tuple[CameraIntrinsics, ...]:
-    """Return what the legs tell of the cameras of a session.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What the session says of the machine.
-    orientation : (n_views, 3, 3) array
-        R of every camera in R_b, its optical axis last.
-    owners : sequence of str, length n_views
-        The camera of every view: views with the same one share their intrinsics.
-    """
-    session = analysis.session
-    cameras = tuple(dict.fromkeys(owners))
-    of_view = np.array([cameras.index(owner) for owner in owners], dtype=np.intp)
-    images = np.concatenate(
-        [analysis.images, _by_radii_and_intrinsics(session, orientation, of_view, len(cameras))],
-        axis=3,
-    )
-    n_p, n_legs, n_numbers = len(session.unit), session.n_legs, len(NAMES) * len(cameras)
-    demands = analysis.demands
-    wide = np.pad(demands.by_parameters, ((0, 0), (0, 0), (0, n_legs + n_numbers)))
-    rows = by_cameras(session, images, replace(demands, by_parameters=wide))
-    rows = compress(eliminate(rows[None], rows.shape[1] - n_p - n_legs - n_numbers))
-    known = np.zeros((n_legs, rows.shape[1]))
-    known[:, n_p : n_p + n_legs] = np.diag(1.0 / (RADIUS * session.radius))
-    of_parameters = np.zeros((0, rows.shape[1]))
-    if analysis.known is not None:
-        of_parameters = np.pad(analysis.known, ((0, 0), (0, rows.shape[1] - n_p)))
-    rows = compress(np.concatenate([rows, known, of_parameters]))
-    left = compress(eliminate(rows[None], n_p + n_legs))
-    _, singular, basis = np.linalg.svd(left)
-    # An unknown of one metre is one of as many pixels as a leg's length is long from afar.
-    is_seen = singular > 1.0 / (LARGEST_SIGMA * session.mean_length)
-    spread = np.sqrt(np.sum((basis[is_seen].T / singular[is_seen]) ** 2, axis=1))
-    is_open = np.sqrt(np.sum(basis[~is_seen] ** 2, axis=0)) > OPEN
-    sigma = spread.reshape(-1, len(NAMES)) * _unit(session, of_view)[:, None]
-    return tuple(
-        CameraIntrinsics(
-            camera,
-            not any(lost),
-            {name: None if out else one for name, one, out in zip(NAMES, own, lost, strict=True)},
-        )
-        for camera, own, lost in zip(
-            cameras, sigma.tolist(), is_open.reshape(sigma.shape).tolist(), strict=True
-        )
-    )
-
-
-def looking_at(session: Session) -> Array:
-    """Return orientations (n_views, 3, 3) of cameras that look at the legs of their views."""
-    middle = 0.5 * (session.A + (session.arm + session.t[:, None]).mean(axis=0))
-    orientations = []
-    for place, shown in zip(session.camera, session.seen, strict=True):
-        z = (middle[shown] if shown.any() else middle).mean(axis=0) - place
-        z /= np.linalg.norm(z)
-        x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-        x /= np.linalg.norm(x)
-        orientations.append(np.column_stack([x, np.cross(z, x), z]))
-    return np.array(orientations).reshape(-1, 3, 3)
-
-
-def _unit(session: Session, of_view: IntArray) -> Array:
-    """Return what a metre of the intrinsics of each camera is [px]."""
-    first = np.unique(of_view, return_index=True)[1]
-    return np.asarray(session.focal[first] / session.mean_length)
-
-
-def _by_radii_and_intrinsics(
-    session: Session, orientation: Array, of_view: IntArray, n_cameras: int
-) -> Array:
-    """Return derivatives (n_images, n_legs, 4, n_legs + 4 n_cameras) of what images say."""
-    n_images, n_legs = len(session.view), session.n_legs
-    rows = np.zeros((n_images, n_legs, 4, n_legs + len(NAMES) * n_cameras))
-    legs = np.arange(n_legs)
-    camera = of_view[session.view]
-    for k, across in enumerate((at_base_joints(session), at_platform_joints(session))):
-        aside, wider = _changes(session, across, orientation)
-        sigma_lateral, towards = _scales(session, across)
-        unit = (session.focal / session.mean_length)[session.view][:, None, None]
-        by_numbers = np.stack([aside / sigma_lateral[..., None], wider * towards[..., None]], 2)
-        for c in range(n_cameras):
-            first = n_legs + len(NAMES) * c
-            own = camera == c
-            rows[own, :, 2 * k : 2 * k + 2, first : first + len(NAMES)] = (
-                by_numbers * unit[..., None]
-            )[own]
-        rows[:, legs, 2 * k + 1, legs] = towards / session.radius
-    rows[~session.seen[session.view]] = 0.0
-    return rows
-
-
-def _changes(session: Session, across: Across, orientation: Array) -> tuple[Array, Array]:
-    """Return what a pixel more of each number does, both (n_images, n_legs, 4).
-
-    How far it moves the axis across the leg [m/px], and how much wider it makes the leg [1/px].
-    """
-    R = orientation[session.view]
-    at = (across.point - session.camera[session.view][:, None]) @ R  # in the camera frame
-    lateral = across.gradient[:, :, 0] @ R
-    lateral /= np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)[..., None]
-    focal = session.focal[session.view][:, None, None]
-    depth = np.maximum(at[..., 2:], 1e-6)
-    xy = at[..., :2] / depth
-    u = session.u[session.pose] @ R
-    along, imaged = (focal / depth * (d[..., :2] - d[..., 2:] * xy) for d in (u, lateral))  # px/m
-    normal = np.stack([-along[..., 1], along[..., 0]], axis=2)
-    normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-300)
-    by_metre = np.sum(normal * imaged, axis=2, keepdims=True)
-    aside = np.concatenate([normal * xy, normal], axis=2) / np.where(by_metre, by_metre, 1.0)
-    wider = np.concatenate([normal**2 / focal, np.zeros_like(normal)], axis=2)
-    return aside, wider
-
-
-def _scales(session: Session, across: Across) -> tuple[Array, Array]:
-    """Return, both (n_images, n_legs), what weighs such changes.
-
-    The standard deviation of the axis across the leg [m], and by how many standard deviations a leg
-    as wide again looks nearer, as what is seen towards the camera counts it.
-    """
-    lateral, depth = across.gradient[:, :, 0], across.gradient[:, :, 1]
-    ray = across.point - session.camera[session.view][:, None]
-    sigma = 1.0 / np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)
-    away = np.sign(np.sum(depth * ray, axis=2))
-    return sigma, -away * np.linalg.norm(ray, axis=2) * np.linalg.norm(depth, axis=2)
-
-
-_CAMERA = 6  # unknowns of its pose
-_MOST_VIEWS = 4
-_MOST_WINDOWS = 12  # views of one size that are tried; of more legs, evenly around the base
-
-
-@dataclass(frozen=True)
-class Recommendation:
-    """A set of views that satisfies the paper's conditions and the ranks.
-
-    Attributes
-    ----------
-    views : tuple of tuples of str
-        The legs that each camera position shows: neighbours around the base.
-    legs_a_view : int
-        How many these are.
-    platform_sigma : PlatformError or None
-        Standard deviation of the platform to expect; None where the motors do not
-        determine its pose.
-    """
-
-    views: tuple[tuple[str, ...], ...]
-    legs_a_view: int
-    platform_sigma: PlatformError | None
-
-
-def recommend(
-    mechanism: Mechanism, images: int, *, board: bool = False
-) -> tuple[Recommendation, ...]:
-    """Return the smallest sets of views that suffice, fewest camera positions first.
-
-    For each number of camera positions the fewest legs a view; of all sets of that size the
-    one with the smallest standard deviation of the platform. More positions are listed only
-    where fewer legs a view suffice then: which legs one camera can see, the user knows.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The nominal model.
-    images : int
-        Images a view.
-    board : bool
-        Whether a calibration board on the base ties the cameras to each other.
-
-    Returns
-    -------
-    tuple of Recommendation
-        Empty where no set was found.
-    """
-    found = list[Recommendation]()
-    candidates = _Candidates(mechanism, images, board=board)
-    most = mechanism.n_legs + 1
-    for n_views in range(1, _MOST_VIEWS + 1):
-        for size in range(1, most):
-            best = candidates.best(n_views, size)
-            if best is not None:
-                found.append(best)
-                most = size
-                break
-    return tuple(found)
-
-
-class _Candidates:
-    """Views of neighbouring legs, and what each says."""
-
-    def __init__(self, mechanism: Mechanism, images: int, *, board: bool) -> None:
-        self.mechanism, self.images = mechanism, images
-        self.session = planned_session(mechanism, [range(mechanism.n_legs)], images, board=board)
-        self.every = Analysis(self.session)
-        self.motion = self.every.motion
-        self.ring = legs_around(self.session)
-        self.of_size: dict[int, list[Analysis]] = {}
-
-    def best(self, n_views: int, size: int) -> Recommendation | None:
-        """Return the best set of so many views of so many legs, or None if none suffices."""
-        windows = self.windows(size)
-        best: tuple[float, Recommendation] | None = None
-        for which in combinations(range(len(windows)), n_views):
-            views = [windows[k] for k in which]
-            if not self.counts_hold(views):
-                continue
-            chosen = [self.analyses(size)[k] for k in which]
-            information = self.together(chosen)
-            if not self.suffices(chosen, information):
-                continue
-            sigma = self.motion.sigma(information)
-            worst = float(np.linalg.svd(information, compute_uv=False)[-1])
-            rank = 1.0 / worst if sigma is None else sigma.dX_m
-            if best is None or rank < best[0]:
-                names = tuple(tuple(self.session.leg_names[j] for j in legs) for legs in views)
-                best = (rank, Recommendation(names, size, sigma))
-        return None if best is None else best[1]
-
-    def windows(self, size: int) -> list[tuple[int, ...]]:
-        """Return neighbours around the base; several cameras where all legs are neighbours."""
-        if size >= self.mechanism.n_legs:
-            return [tuple(range(self.mechanism.n_legs))] * _MOST_VIEWS
-        views = neighbours(self.ring, size)
-        return views[:: -(-len(views) // _MOST_WINDOWS)]
-
-    def counts_hold(self, views: Sequence[Sequence[int]]) -> bool:
-        """Say whether the paper's counts hold."""
-        s = self.session
-        counts = count_conditions(
-            views,
-            s.n_legs,
-            spatial=s.spatial,
-            revolute=[j for j, leg in enumerate(s.legs) if leg.base_joint == "R"],
-            passive=np.flatnonzero(~s.with_length).tolist(),
-            board=bool(s.board.all()),
-        )
-        at_once = three_legs_at_once(views, s.legs, spatial=s.spatial)
-        return not any(c.fails for c in (*counts, at_once))
-
-    def together(self, chosen: Sequence[Analysis]) -> Array:
-        """Return what views say of the parameters at once; a board makes them one camera."""
-        if not self.session.board.all():
-            return compress(np.concatenate([a.information for a in chosen]))
-        rows = np.concatenate([a.of_cameras for a in chosen])
-        return compress(eliminate(rows[None], _CAMERA))
-
-    def base_together(self, chosen: Sequence[Analysis]) -> Array:
-        """Return what views say in step 2."""
-        if not self.session.board.all():
-            return np.concatenate([a.default_steps[0].information for a in chosen])
-        by_view = [base_by_frames(a.session, a.located)[1] for a in chosen]
-        rows = np.concatenate([x.reshape(-1, x.shape[2]) for x in by_view])
-        return eliminate(rows[None], _CAMERA)[:, chosen[0].default_steps[0].columns]
-
-    def analyses(self, size: int) -> list[Analysis]:
-        """Return what each view of so many legs says alone."""
-        if size not in self.of_size:
-            views = self.windows(size)
-            seen = np.zeros((len(views), self.mechanism.n_legs), dtype=np.bool_)
-            for row, legs in zip(seen, views, strict=True):
-                row[list(legs)] = True
-            camera = cameras_for(self.session, views)
-            poses = np.arange(len(self.session.t))
-            self.of_size[size] = [
-                self.every.elsewhere(
-                    replace(self.session, seen=seen[[k]], camera=camera[[k]]), poses
-                )
-                for k in range(len(views))
-            ]
-        return self.of_size[size]
-
-    def suffices(self, chosen: Sequence[Analysis], information: Array) -> bool:
-        """Say whether views determine all that moves the platform, at once and step by step."""
-        session, n_p = self.session, len(self.session.unit)
-        if missing(session, information, self.motion):
-            return False
-        last = np.concatenate([a.default_steps[2].information for a in chosen])
-        for k, rows in ((0, self.base_together(chosen)), (2, last)):
-            step = replace(chosen[0].default_steps[k], information=rows)
-            if missing(session, scattered(step, n_p), self.motion):
-                return False
-        together = (
-            np.concatenate(parts) for parts in zip(*(a.distances for a in chosen), strict=True)
-        )
-        offsets = offsets_from_distances(session, *together)
-        return not missing(session, scattered(offsets, n_p), self.motion)
-
-
-_MOST_OF_A_KIND = 2
-_MOST_TRIED = 8  # of a kind
-_MOST_FIXED = 4  # parameters
-ENOUGH_IMAGES = 15  # a view
-_KNOWN = 1e12  # 1/m
-_ORDINAL = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
-
-
 @dataclass(frozen=True)
 class Remedy:
-    """Something that would help, with the ranks that it gives.
+    """Something that would help, with the ranks that it gives."""
 
-    Attributes
-    ----------
-    remedy : str
-        What to do.
-    staged_rank, full_rank : int
-        The ranks that it gives, of all parameters; what is fixed counts as known.
-    enough : bool
-        Whether it determines everything that moves the platform, step by step and at once.
-    """
-
-    remedy: str
+    remedy: str  # what to do
+    # staged_rank, full_rank: the ranks that it gives, of all parameters; what is fixed counts as
+    # known
     staged_rank: int
     full_rank: int
+    # whether it determines everything that moves the platform, step by step and at once
     enough: bool
 
 
 @dataclass(frozen=True)
 class Replanning:
-    """Other sessions of the same machine.
+    """Other sessions of the same machine."""
 
-    Attributes
-    ----------
-    images : callable
-        Return the session with another number of images a view.
-    views : callable
-        Return the smallest sets of views that suffice.
-    """
-
-    images: Callable[[int], Session]
+    images: Callable[[int], Session]  # return the session with another number of images a view
+    # return the smallest sets of views that suffice
     views: Callable[[], tuple[Recommendation, ...]]
 
 
-def find_remedies(analysis: Analysis, replanning: Replanning | None) -> tuple[Remedy, ...]:
+def find_remedies(
+    analysis: Analysis,  # what is known so far
+    replanning: Replanning | None,  # how to plan the session anew; None for what was recorded
+) -> tuple[Remedy, ...]:
     """Return what would help where directions are not determined.
 
-    Parameters
-    ----------
-    analysis : Analysis
-        What is known so far.
-    replanning : Replanning or None
-        How to plan the session anew; None for what was recorded.
-
-    Returns
-    -------
-    tuple of Remedy
-        Only what raises a rank: what determines everything, else what is enough for the platform,
-        else what helps.
+    Only what raises a rank: what determines everything, else what is enough for the platform, else
+    what helps.
     """
     n_parameters = len(analysis.session.unit)
     before = _score(analysis)
@@ -675,7 +307,7 @@ def _weak_legs(analysis: Analysis) -> list[int]:
 
 
 def _harmful(analysis: Analysis) -> list[WeakDirection]:
-    """Return the directions that move the platform, those of everything at once first."""
+    """Return the directions that move the platform, those of the joint fit first."""
     return [d for d in (*analysis.full.weak, *analysis.staged.weak) if not d.harmless]
 
 

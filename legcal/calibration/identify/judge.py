@@ -1,0 +1,395 @@
+"""Whether planned views, or a dataset, can determine the parameters: ``legcal identify``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from legcal.calibration.identify.information import known_rows
+from legcal.calibration.identify.intrinsics import judge_intrinsics
+from legcal.calibration.identify.planning import (
+    THIN,
+    cameras_of,
+    orientations_of,
+    planned_session,
+    recorded_session,
+)
+from legcal.calibration.identify.ranks import Analysis, Ranks
+from legcal.calibration.identify.recommend import Recommendation, recommend
+from legcal.calibration.identify.remedies import (
+    ENOUGH_IMAGES,
+    Replanning,
+    find_remedies,
+    judge_board,
+)
+from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.identify.session import Session, legs_in_words
+from legcal.calibration.joint_fit import NO_CHOICES, Choices
+from legcal.data import Dataset
+from legcal.errors import NotIdentifiable, UsageError
+from legcal.files import closest
+from legcal.machine import (
+    DATASET_YAML,
+    NEAR,
+    Mechanism,
+    geometries,
+    legs_outside,
+    load_mechanism,
+    singular_note,
+)
+from legcal.paper import Condition, count_conditions, three_legs_at_once, two_directions
+
+MOST_VIEWS = 50
+MOST_IMAGES = 2000  # of a session; more says nothing new and takes minutes
+_IMAGES = 15
+
+
+def answer(
+    # A mechanism as :func:`legcal.machine.load.load_mechanism` takes it, or a dataset folder or its
+    # ``dataset.yaml``
+    source: str,
+    views: Sequence[Sequence[str]],  # legs of each view; none for a dataset
+    images: int | None,  # images a view; None for 15, and for a dataset
+    *,
+    # board, hand_held: whether there is a calibration board, and whether every image has a place of
+    # its own
+    board: bool = False,
+    hand_held: bool = False,
+) -> Identifiability:
+    """Return the report on a model with views, or on a dataset.
+
+    Raises UsageError if any of these is given for a dataset, or does not fit the model.
+    """
+    path = Path(source)
+    if not (path.name == DATASET_YAML or (path / DATASET_YAML).is_file()):
+        return identifiability(
+            load_mechanism(source),
+            views,
+            _IMAGES if images is None else images,
+            board=board,
+            hand_held=hand_held,
+        )
+    given = {
+        "--view": bool(views),
+        "--images": images is not None,
+        "--board": board,
+        "--hand-held": hand_held,
+    }
+    for option in (name for name, is_given in given.items() if is_given):
+        raise UsageError(
+            f"{source}: the dataset could not be judged with {option}: found a dataset, which has "
+            f"its own views and images, needed a model for that; leave {option} out, or name the "
+            "model."
+        )
+    from legcal.data import load_dataset
+
+    return identifiability_of_dataset(load_dataset(path, check_images=False))
+
+
+def identifiability(
+    mechanism: Mechanism,
+    views: Sequence[Sequence[str]] = (),
+    images: int = 15,
+    *,
+    board: bool = False,
+    hand_held: bool = False,
+) -> Identifiability:
+    """Judge what images of some views can tell of a mechanism's parameters.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        The nominal model.
+    views : sequence of sequences of str
+        Names of the legs that each camera position shows; without any, the smallest sets of
+        views that suffice are recommended and the first of them is judged.
+    images : int
+        Images a view, each of another pose.
+    board : bool
+        A calibration board on the base is seen in every image and ties the cameras to each other.
+    hand_held : bool
+        Every image of a view is taken from a place of its own.
+
+    Returns
+    -------
+    Identifiability
+
+    Raises
+    ------
+    UsageError
+        If a view names no leg, an unknown one or one twice, images is not positive, or
+        hand-held images are without a board or without views.
+    DidNotConverge
+        If the machine cannot move inside its travel.
+
+    Notes
+    -----
+    Counts are the paper's. Ranks are those of linearised observations of a machine that is nearly
+    the nominal one, from cameras in default places and at random poses inside the travel: a
+    direction counts as determined if its predicted standard deviation is less than the
+    mean leg length (angles count at that length). Well-determined directions lie below a
+    tenth of it, undetermined ones above a multiple.
+    """
+    legs = read_views(views, mechanism.leg_names, images)
+    if hand_held:
+        return _judge_hand_held(mechanism, legs, images, board=board)
+    recommendation = None
+    if not legs:
+        recommendation = recommend(mechanism, images, board=board)
+        names = recommendation[0].views if recommendation else (mechanism.leg_names,)
+        legs = read_views(names, mechanism.leg_names, images)
+    session = planned_session(mechanism, legs, images, board=board)
+    replanning = Replanning(
+        lambda more: planned_session(mechanism, legs, more, board=board),
+        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
+    )
+    return _judge(mechanism, Analysis(session), recommendation, replanning)
+
+
+def identifiability_of_dataset(
+    # nothing is detected: every view is taken to show the legs that it names, or all
+    dataset: Dataset,
+    # parameters that are fixed or known from elsewhere, and twists that are looked for
+    choices: Choices = NO_CHOICES,
+) -> Identifiability:
+    """Judge what a dataset can tell: its readings, its cameras and the legs of its views.
+
+    Raises DidNotConverge if the readings do not lead to closed poses.
+    """
+    twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
+    session = recorded_session(dataset, twists=twists)
+    analysis = Analysis(session, known=known_rows(session, choices))
+    report = _judge(dataset.mechanism, analysis, None, None)
+    if dataset.axes is None:
+        found = judge_intrinsics(analysis, orientations_of(dataset, session), cameras_of(dataset))
+        report = replace(report, intrinsics=found)
+    if dataset.mechanism.is_determined:
+        return report
+    note = "The readings do not give the poses of the images: random ones stand for them."
+    return replace(report, notes=(*report.notes, note))
+
+
+def check_identifiable(
+    # its views are taken to show the legs that they name, or all: what even then stays open cannot
+    # be found
+    dataset: Dataset,
+    # parameters that are fixed or known from elsewhere: they are no longer open
+    choices: Choices = NO_CHOICES,
+) -> tuple[str, ...]:
+    """Return what a dataset leaves open that does no harm, one sentence each.
+
+    Raises NotIdentifiable if a direction that moves the platform is not determined by everything at
+    once.
+    """
+    report = identifiability_of_dataset(dataset, choices)
+    if not report.identifiable:
+        raise NotIdentifiable(_refusal(dataset, report))
+    notes = []
+    if any(not weak.harmless for weak in report.staged.weak):
+        notes.append(
+            f"The four steps alone leave open {_directions(report.staged, harmless=False)}; the "
+            "joint fit does not."
+        )
+    if report.full.weak:  # what is left is harmless
+        notes.append(
+            "Not determined, and without effect on the platform: "
+            f"{_directions(report.full, harmless=True)}."
+        )
+    return tuple(notes)
+
+
+def _judge_hand_held(
+    mechanism: Mechanism, legs: tuple[tuple[int, ...], ...], images: int, *, board: bool
+) -> Identifiability:
+    """Return the report on images each of which has a place of its own."""
+    if not board or not legs:
+        found = "no board" if not board else "no views"
+        raise UsageError(
+            f"Hand-held images could not be judged: found {found}, needed a calibration board on "
+            "the base in every image, which alone tells where a hand-held camera was, and the legs "
+            "that the images show; give --board and --view."
+        )
+    each = tuple(view for view in legs for _ in range(images))
+    session = planned_session(mechanism, each, 1, board=True)
+    return _judge(mechanism, Analysis(session), None, None)
+
+
+def _judge(
+    mechanism: Mechanism,
+    analysis: Analysis,
+    recommendation: tuple[Recommendation, ...] | None,
+    replanning: Replanning | None,
+) -> Identifiability:
+    """Return the report on a session."""
+    session = analysis.session
+    conditions = conditions_of(mechanism, session)
+    board = judge_board(
+        analysis,
+        *(conditions_of(mechanism, session.with_board(board=b)) for b in (False, True)),
+    )
+    staged, full = analysis.staged, analysis.full
+    enough = staged.complete and full.complete
+    notes = []
+    if analysis.motion.why_not:
+        why = "the machine is singular at poses inside its travel"
+        if not mechanism.is_determined:
+            why = (
+                f"{len(mechanism.motors)} motors do not determine the pose of a platform with "
+                f"mobility {mechanism.mobility}"
+            )
+        notes.append(f"Platform errors are not predicted: {why}.")
+    notes += _machine_notes(mechanism)
+    return Identifiability(
+        spatial=mechanism.spatial,
+        legs=mechanism.leg_names,
+        n=mechanism.n_legs,
+        n_d=len(mechanism.frame_legs),
+        r=sum(leg.base_joint == "R" for leg in mechanism.legs),
+        n_ac=int(session.with_length.sum()),
+        conditions=conditions,
+        staged=staged,
+        full=full,
+        identifiable=full.complete,
+        steps=analysis.step_ranks,
+        views=tuple(tuple(session.leg_names[j] for j in view) for view in session.views),
+        images=tuple(int((session.view == v).sum()) for v in range(session.n_views)),
+        board=board,
+        platform_sigma=analysis.motion.sigma(analysis.information) if full.complete else None,
+        remedies=() if enough else find_remedies(analysis, replanning),
+        recommendation=recommendation,
+        notes=tuple(notes),
+    )
+
+
+def _machine_notes(mechanism: Mechanism) -> list[str]:
+    """Return what is odd about a machine, whatever views show of it."""
+    hidden = [j for j, leg in enumerate(mechanism.legs) if not leg.cylinders]
+    notes = []
+    if hidden:
+        which = legs_in_words(hidden, mechanism.leg_names)
+        notes.append(
+            f"The model has no <visual> cylinder along {which}: they were taken as visible, with "
+            f"{100 * THIN:g} % of the mean leg length as radius; add one to each."
+        )
+    outside = list(legs_outside(mechanism, NEAR))
+    if outside:
+        which = legs_in_words(outside, mechanism.leg_names)
+        stand = "stand outside their" if len(outside) > 1 else "stands outside its"
+        notes.append(
+            f"At home {which} {stand} travel by more than {100 * NEAR:g} % of it: poses between "
+            "home and travel were judged too, which the machine may not reach; correct "
+            "legcal.home or the limits."
+        )
+    singular = singular_note(mechanism)
+    return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
+
+
+def conditions_of(mechanism: Mechanism, session: Session) -> tuple[Condition, ...]:
+    """Return the paper's conditions for a session.
+
+    Counts are those of the views, as printed. Directions of a leg may differ between views that
+    show a board: they are known in one frame.
+    """
+    image, leg = session.seen[session.view].nonzero()
+    counts = count_conditions(
+        session.views,
+        session.n_legs,
+        spatial=session.spatial,
+        revolute=[j for j, x in enumerate(session.legs) if x.base_joint == "R"],
+        passive=[j for j, has in enumerate(session.with_length) if not has],
+        board=bool(session.board.all()),
+    )
+    return (
+        *counts,
+        two_directions(
+            session.frame[session.view[image]],
+            leg,
+            session.u[session.pose[image], leg],
+            session.n_legs,
+        ),
+        three_legs_at_once(session.views, geometries(mechanism), spatial=session.spatial),
+    )
+
+
+def read_views(
+    views: Sequence[Sequence[str]],  # names of the legs that each camera position shows
+    leg_names: Sequence[str],
+    images: int,  # number of images a view
+) -> tuple[tuple[int, ...], ...]:
+    """Return the legs of each view as indices.
+
+    Raises UsageError with one sentence for each thing that is wrong.
+    """
+    problems = []
+    if images < 1:
+        problems.append(
+            f"The views could not be judged: found {images} images a view, needed at least 1; "
+            "pass --images 15 or leave it out."
+        )
+    if len(views) > MOST_VIEWS:
+        raise UsageError(
+            f"The views could not be judged: found {len(views)} of them, needed at most "
+            f"{MOST_VIEWS}; leave out views of the same legs."
+        )
+    if images * max(len(views), 1) > MOST_IMAGES:
+        problems.append(
+            f"The views could not be judged: found {images} images a view, needed at most "
+            f"{MOST_IMAGES} in all views together; pass fewer --images."
+        )
+    for v, view in enumerate(views, start=1):
+        if isinstance(view, str):
+            problems.append(
+                f"View {v} could not be used: found the text '{view}', needed a sequence of leg "
+                "names; pass one list of names a view."
+            )
+            continue
+        unnamed = [name for name in view if not isinstance(name, str)]
+        if unnamed:
+            problems.append(
+                f"View {v} could not be used: found {unnamed[0]!r}, needed names of legs; pass "
+                "texts."
+            )
+            continue
+        names = [name.strip() for name in view]
+        if not any(names):
+            problems.append(
+                f"View {v} could not be used: found no leg, needed at least one; name its legs, "
+                f"such as --view {','.join(leg_names[:3])}."
+            )
+            continue
+        for name in dict.fromkeys(names):
+            if name not in leg_names:
+                problems.append(
+                    f"View {v} could not be used: found '{name}', needed a leg of the model; "
+                    f"{closest(name, leg_names)}"
+                )
+            elif names.count(name) > 1:
+                problems.append(
+                    f"View {v} could not be used: found leg '{name}' {names.count(name)} times, "
+                    "needed every leg at most once; name it once."
+                )
+    if problems:
+        raise UsageError(problems)
+    return tuple(tuple(sorted(leg_names.index(name.strip()) for name in view)) for view in views)
+
+
+def _refusal(dataset: Dataset, report: Identifiability) -> str:
+    """Return why a dataset cannot be calibrated from, and what would mend it."""
+    remedies = [remedy.remedy for remedy in report.remedies if remedy.enough]
+    remedy = remedies[0] if remedies else "add images of other poses, and of more legs at once"
+    return (
+        f"{dataset.folder}: the parameters cannot be identified: found that these views and poses "
+        f"determine {report.full.rank} of {report.full.of} at best and leave open "
+        f"{_directions(report.full, harmless=False)}, needed everything that moves the platform; "
+        f"{remedy}, or state what is known of them with --prior."
+    )
+
+
+def _directions(ranks: Ranks, *, harmless: bool) -> str:
+    """Return the simplest direction that stays open, in words, and how many there are."""
+    words = [weak.direction for weak in ranks.weak if weak.harmless == harmless]
+    simplest = min(words, key=len)
+    if len(words) == 1:
+        return simplest
+    return f"{len(words)} independent changes of them, such as {simplest}"
