@@ -9,7 +9,7 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.machine import (
     KinematicParameters,
-    LegGeometry,
+    Leg,
     Mechanism,
     Parametrization,
     footed,
@@ -39,9 +39,7 @@ def written_with(
     return load_mechanism(folder / "other.yaml")
 
 
-def with_joints(
-    geometry: Sequence[LegGeometry], parameters: KinematicParameters
-) -> tuple[LegGeometry, ...]:
+def with_joints(geometry: Sequence[Leg], parameters: KinematicParameters) -> tuple[Leg, ...]:
     """Return legs with other joint centres and offsets; passive legs keep theirs."""
     joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
     return tuple(

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.machine import LegGeometry, LegKind, linearize
+from legcal.machine import Leg, LegKind, linearize
 
 
-def leg_and_pose(joints: str, seed: int) -> tuple[LegGeometry, Array, Array]:
+def leg_and_pose(joints: str, seed: int) -> tuple[Leg, Array, Array]:
     """Return a random leg that closes at a random pose, R and t."""
     rng = np.random.default_rng(seed)
     R, t = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
@@ -24,7 +24,7 @@ def closed_leg(
     t: Array,
     rng: np.random.Generator,
     kind: LegKind = LegKind.ACTUATED,
-) -> LegGeometry:
+) -> Leg:
     """Return a random leg that closes at a pose; ``joints`` are RR, US, U (fixed) and so on."""
     base, platform = joints[0], joints[1:]
     A, B = rng.normal(size=3), rng.normal(size=3)
@@ -37,7 +37,7 @@ def closed_leg(
         b = R.T @ (np.cross(b, u) / np.linalg.norm(np.cross(b, u)))
     if platform == "":
         b = R.T @ u
-    leg = LegGeometry(
+    leg = Leg(
         base_joint=base,  # type: ignore[arg-type]
         platform_joint=platform,  # type: ignore[arg-type]
         kind=kind,
@@ -51,12 +51,12 @@ def closed_leg(
     return leg if leg.twist is None else replace(leg, twist=twist_of(leg, R, t))
 
 
-def twist_of(leg: LegGeometry, R: Array, t: Array) -> float:
+def twist_of(leg: Leg, R: Array, t: Array) -> float:
     """Return the twist with which a leg without an S joint closes at a pose.
 
     Parameters
     ----------
-    leg : LegGeometry
+    leg : Leg
         The leg; its own twist does not matter.
     R, t : (3, 3) and (3,) array
         Rotation and position [m] of the platform's frame in that of the base.
@@ -81,7 +81,7 @@ def turned(vector: Array | None, axis: Array | None, angles: Array) -> Array | N
     return Rotation.from_rotvec(angles @ normal_basis(axis)).apply(vector)
 
 
-def changed(leg: LegGeometry, local: Array) -> LegGeometry:
+def changed(leg: Leg, local: Array) -> Leg:
     """Return a leg with A, B, length, axes and twist changed, as derivatives count them."""
     return replace(
         leg,

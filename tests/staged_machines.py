@@ -12,7 +12,7 @@ from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine import LegGeometry, LegKind, moved_legs
+from legcal.machine import Leg, LegKind, moved_legs
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.paper.leg_directions import (
@@ -31,7 +31,7 @@ class Observed:
     nominal: NominalMechanism
     axes: LegAxes
     measurements: Measurements
-    true_legs: tuple[LegGeometry, ...]
+    true_legs: tuple[Leg, ...]
     T_camera_Rb: tuple[RigidTransform, ...]
 
     @property
@@ -143,9 +143,9 @@ def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMechanism:
     """Return a mechanism of RPS legs, or SPS where the axis is NaN, with R_b on joints 1, 2, 3."""
     up = np.array([0.0, 0.0, 1.0])
     legs = tuple(
-        LegGeometry("R", "S", LegKind.ACTUATED, A, A + up, 0.5, v)
+        Leg("R", "S", LegKind.ACTUATED, A, A + up, 0.5, v)
         if np.isfinite(v[0])
-        else LegGeometry("S", "S", LegKind.ACTUATED, A, A + up, 0.5)
+        else Leg("S", "S", LegKind.ACTUATED, A, A + up, 0.5)
         for A, v in zip(A_Rb, v_Rb, strict=True)
     )
     names = tuple(f"leg{j + 1}" for j in range(len(legs)))

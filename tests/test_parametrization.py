@@ -14,7 +14,7 @@ from legcal import load_mechanism
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     LegKind,
     Parametrization,
     geometries,
@@ -34,7 +34,7 @@ ACTUATED, PASSIVE, CONSTANT = LegKind.ACTUATED, LegKind.PASSIVE, LegKind.CONSTAN
 
 def legs_of(
     types: Sequence[str], seed: int, kinds: Sequence[LegKind] | None = None
-) -> tuple[list[LegGeometry], Array, Array]:
+) -> tuple[list[Leg], Array, Array]:
     """Return legs that close at one pose, in frames that are not those on the joints."""
     rng = np.random.default_rng(seed)
     R, t = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
@@ -43,7 +43,7 @@ def legs_of(
 
 
 def parametrized(
-    legs: Sequence[LegGeometry], *, twists: bool = False, frame: Sequence[int] = (0, 1, 2)
+    legs: Sequence[Leg], *, twists: bool = False, frame: Sequence[int] = (0, 1, 2)
 ) -> Parametrization:
     names = [f"leg{j + 1}" for j in range(len(legs))]
     return parametrize(names, legs, frame, twists=twists)
@@ -162,7 +162,7 @@ def test_the_platform_goes_where_the_equations_are_met_again(
     np.testing.assert_allclose(np.concatenate([turn, p - t]), predicted, atol=1e-3 * size)
 
 
-def _residual(legs: Sequence[LegGeometry], readings: Sequence[float], R: Array, t: Array) -> Array:
+def _residual(legs: Sequence[Leg], readings: Sequence[float], R: Array, t: Array) -> Array:
     """Return how far a pose is from readings and demands, rows as in ``pose_equations``."""
     rows = []
     for leg, reading in zip(legs, readings, strict=True):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.machine import Demand, LegGeometry, LegKind, linearize
+from legcal.machine import Demand, Leg, LegKind, linearize
 from legcal.paper.leg_demands import (
     closure_of_leg,
     fixed_on_platform,
@@ -103,11 +103,11 @@ def test_a_fixed_direction_is_the_mean_and_needs_a_pose() -> None:
         fixed_direction("centre", u[:0])
 
 
-def a_leg(base: str, platform: str, rng: np.random.Generator) -> LegGeometry:
+def a_leg(base: str, platform: str, rng: np.random.Generator) -> Leg:
     """Return a leg with any axes and a twist that nothing meets."""
     assert base in ("R", "U")
     assert platform in ("R", "U", "")
-    return LegGeometry(
+    return Leg(
         "R" if base == "R" else "U",
         "R" if platform == "R" else "U" if platform == "U" else "",
         LegKind.ACTUATED,
@@ -124,7 +124,7 @@ def frame_of(v: Array) -> Array:
     return np.asarray(axis_frames(v[None])[0])
 
 
-def known_of(leg: LegGeometry, R: Array, t: Array) -> tuple[Array, Array, Array, Array]:
+def known_of(leg: Leg, R: Array, t: Array) -> tuple[Array, Array, Array, Array]:
     return np.array([0.0, 0.0, leg.B[2]]), R, t, leg.A
 
 
@@ -196,7 +196,7 @@ def test_the_twist_follows_all_its_unknowns_as_by_differences(joints: tuple[str,
 def test_turned_axes_inside_problems_are_those_of_results() -> None:
     rng = np.random.default_rng(5)
     v, turns = unit(rng.standard_normal(3)), np.array([0.3, -0.2])
-    leg = LegGeometry("S", "R", LegKind.ACTUATED, np.zeros(3), np.array([0.0, 0.0, 0.4]), 0.0)
+    leg = Leg("S", "R", LegKind.ACTUATED, np.zeros(3), np.array([0.0, 0.0, 0.4]), 0.0)
     local = np.concatenate([leg.B, np.zeros(6), turns])
     known = (np.zeros(3), np.eye(3), np.zeros(3), leg.A)
     value = float(revolute_on_platform()(local, *known, frame_of(v), 1.0))

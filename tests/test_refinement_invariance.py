@@ -11,7 +11,7 @@ from thinned import thinned
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.state import FittedLegs, Start
-from legcal.machine import LegGeometry, moved_legs
+from legcal.machine import Leg, moved_legs
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")
 SCALE = 2.5
@@ -109,5 +109,5 @@ def scaled(session: MachineSession) -> MachineSession:
     )
 
 
-def larger(legs: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
+def larger(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     return tuple(replace(leg, A=SCALE * leg.A, B=SCALE * leg.B, q0=SCALE * leg.q0) for leg in legs)

@@ -13,7 +13,7 @@ from legcal.data.measurements import Measurements, View
 from legcal.errors import NotIdentifiable
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array, BoolArray
-from legcal.machine import LegGeometry, LegKind
+from legcal.machine import Leg, LegKind
 from legcal.paper.camera_poses import camera_poses
 from legcal.paper.joints_in_base import (
     BaseUnknowns,
@@ -259,7 +259,7 @@ def plane_with_joints_on_a_line(A: Array, B: Array, nominal_A: Array) -> Observe
     M = np.array([T[v].apply(p) for v, p in zip(view, M, strict=True)]).reshape(-1, 3)
     covariance = np.tile(np.diag([1e-6, 1e-6, 1e-8, 1e-8]), (36, 1, 1))
     nominal, true = (
-        tuple(LegGeometry("R", "R", LegKind.ACTUATED, a, b, 0.1) for a, b in zip(P, B, strict=True))
+        tuple(Leg("R", "R", LegKind.ACTUATED, a, b, 0.1) for a, b in zip(P, B, strict=True))
         for P in (nominal_A, A)
     )
     return Observed(

@@ -18,7 +18,7 @@ from scipy.special import fdtrc
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, frame_on_points, normal_basis
-from legcal.machine import LegGeometry, LegKind, Parametrization, twist_after, vector_of
+from legcal.machine import Leg, LegKind, Parametrization, twist_after, vector_of
 
 _STEP = 1e-6  # [m or rad]
 
@@ -154,7 +154,7 @@ def _p_value(statistic: float, dof: int, noise_dof: int) -> float:
 
 def possible_changes(
     names: Sequence[str],
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     frame_legs: Sequence[int],
     parametrization: Parametrization,
 ) -> tuple[tuple[Change, ...], ...]:
@@ -186,10 +186,10 @@ def possible_changes(
     return tuple(single), tuple(of_joints), tuple(of_legs)
 
 
-_Moved = Callable[[int, float], LegGeometry]  # a leg, one number of which has moved by a step
+_Moved = Callable[[int, float], Leg]  # a leg, one number of which has moved by a step
 
 
-def _of_leg(name: str, leg: LegGeometry) -> list[tuple[str, tuple[str, ...], str, _Moved]]:
+def _of_leg(name: str, leg: Leg) -> list[tuple[str, tuple[str, ...], str, _Moved]]:
     """Return what may change at one leg: in words, its numbers, their unit, and how."""
     found: list[tuple[str, tuple[str, ...], str, _Moved]] = []
     eye, xyz = np.eye(3), ("x", "y", "z")
@@ -210,13 +210,13 @@ def _of_leg(name: str, leg: LegGeometry) -> list[tuple[str, tuple[str, ...], str
     a, b = leg.base_axis, leg.platform_axis
     if a is not None:
 
-        def base_turned(k: int, step: float) -> LegGeometry:
+        def base_turned(k: int, step: float) -> Leg:
             return replace(leg, base_axis=_about(a, k, step).apply(a))
 
         found.append((f"base axis of {name}", ("1", "2"), "rad", base_turned))
     if b is not None:
 
-        def platform_turned(k: int, step: float) -> LegGeometry:
+        def platform_turned(k: int, step: float) -> Leg:
             turn = _about(b, k, step)
             return replace(leg, platform_axis=turn.apply(b), twist=twist_after(leg, turn))
 
@@ -229,9 +229,7 @@ def _about(axis: Array, k: int, step: float) -> Rotation:
     return Rotation.from_rotvec(step * normal_basis(axis)[k])
 
 
-def _in_own_frames(
-    legs: Sequence[LegGeometry], frame_legs: Sequence[int]
-) -> tuple[LegGeometry, ...]:
+def _in_own_frames(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg, ...]:
     """Return legs in the frames R_b and R_e that their own joint centres define."""
     frames = list(frame_legs)
     base = frame_on_points(np.array([leg.A for leg in legs])[frames]).inv()

@@ -14,7 +14,7 @@ from legcal.calibration.result import MODEL_NAME, RESULT_NAME, ParameterRow, Res
 from legcal.errors import DatasetError, ModelError, OutOfClass
 from legcal.geometry import Array
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     Mechanism,
     calibrated_axis,
     geometries,
@@ -102,10 +102,10 @@ def read_result(given: str | Path) -> EarlierResult:
 
 def _with_nominal_axes(
     names: Sequence[str],
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     document: Result,
     values: Mapping[str, float],
-) -> tuple[LegGeometry, ...]:
+) -> tuple[Leg, ...]:
     """Return legs with the axes and twists that the parameters of a document count from."""
     base, platform = (
         {name: np.array(axis) for name, axis in document.nominal_axes.get(side, {}).items()}
@@ -171,7 +171,7 @@ def _check_same_model(
     document: Result,
     values: Mapping[str, float],
     mechanism: Mechanism,
-    nominal_legs: Sequence[LegGeometry],
+    nominal_legs: Sequence[Leg],
 ) -> None:
     """Refuse a document whose parameters are not those of the model beside it."""
     legs, known = geometries(mechanism), parametrization_of(mechanism, twists=True)

@@ -37,7 +37,7 @@ from legcal.files import (
     validate,
 )
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     LegKind,
     describe_direction,
     geometries,
@@ -359,7 +359,7 @@ def result_of(calibration: Calibration) -> Result:
     )
 
 
-def _legs(names: Sequence[str], legs: Sequence[LegGeometry]) -> dict[str, Any]:
+def _legs(names: Sequence[str], legs: Sequence[Leg]) -> dict[str, Any]:
     """Return the fields of :class:`Legs`."""
     named = list(zip(names, legs, strict=True))
     return {
@@ -527,7 +527,7 @@ def write_result(calibration: Calibration, destination: Path) -> None:
             write_corners(folder / CORNERS_NAME, calibration.corners, dataset.measurements)
 
 
-def _check_written(yaml: Path, legs: Sequence[LegGeometry]) -> None:
+def _check_written(yaml: Path, legs: Sequence[Leg]) -> None:
     """Load what was written; it must be the model that was computed, and close."""
     written = reload_and_check(yaml)
     found = parametrization_of(written, twists=True)

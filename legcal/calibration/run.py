@@ -39,7 +39,7 @@ from legcal.data import (
 from legcal.errors import DatasetError
 from legcal.geometry import Array, IntArray, components
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     Mechanism,
     followed_poses,
     geometries,
@@ -122,7 +122,7 @@ class CalibrationRun:
             "which the fit started."
         ]
 
-    def poses_by(self, legs: Sequence[LegGeometry]) -> tuple[RigidTransform, ...]:
+    def poses_by(self, legs: Sequence[Leg]) -> tuple[RigidTransform, ...]:
         """Return T_Rb_Re of every pose by the readings and other legs, in R_b and R_e."""
         return start_from(legs, self.measurements, self.fitted_legs, (), self.T_Rb_Re, "").T_Rb_Re
 

@@ -17,7 +17,7 @@ from legcal.calibration.joint_fit import (
     platform_accuracy,
 )
 from legcal.data import Corners, Dataset, Order, inverse
-from legcal.machine import LegGeometry
+from legcal.machine import Leg
 
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
 
@@ -26,7 +26,7 @@ TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its sta
 class Steps:
     """What the four steps give by themselves."""
 
-    legs: tuple[LegGeometry, ...] | None  # in R_b and R_e; None if they did not reach the end
+    legs: tuple[Leg, ...] | None  # in R_b and R_e; None if they did not reach the end
     T_Rb_camera: tuple[RigidTransform | None, ...] | None  # of step 2; None if that failed
     failure: str  # why they failed; "" if they did not
     diagnostics: tuple[str, ...] = ()  # what they left out or at nominal, and why

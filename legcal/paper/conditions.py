@@ -14,7 +14,7 @@ from math import comb
 import numpy as np
 
 from legcal.geometry import Array, IntArray
-from legcal.machine import LegGeometry, LegKind, n_frame_legs
+from legcal.machine import Leg, LegKind, n_frame_legs
 
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
 _AT_ONCE = 3  # legs that give the pose of the platform in the camera frame, eq (18)
@@ -85,7 +85,7 @@ def two_directions(view: IntArray, leg: IntArray, u: Array, n_legs: int) -> Cond
 
 
 def three_legs_at_once(
-    views: Sequence[Collection[int]], legs: Sequence[LegGeometry], *, spatial: bool = True
+    views: Sequence[Collection[int]], legs: Sequence[Leg], *, spatial: bool = True
 ) -> Condition:
     """Return whether the legs of which (18) or (19) speaks are seen with enough others at once.
 

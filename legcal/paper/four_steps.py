@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.data import LegAxes, Measurements
-from legcal.machine import KinematicParameters, LegGeometry
+from legcal.machine import KinematicParameters, Leg
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.paper.leg_directions import (
@@ -38,7 +38,7 @@ class BaseSteps:
 class StagedResult:
     """What the four steps give."""
 
-    legs: tuple[LegGeometry, ...]  # identified, in R_b and R_e
+    legs: tuple[Leg, ...]  # identified, in R_b and R_e
     T_Rb_camera: tuple[RigidTransform | None, ...]  # as of :class:`BaseSteps`
     joints_in_camera: JointsInCamera
     joints_in_base: JointsInBase

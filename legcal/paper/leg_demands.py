@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 
 from legcal.geometry import BoolArray
-from legcal.machine import LegGeometry
+from legcal.machine import Leg
 from legcal.paper.motions import moved_points, turned_frame, turned_points
 
 
-def twisting_legs(legs: tuple[LegGeometry, ...]) -> dict[tuple[str, str], BoolArray]:
+def twisting_legs(legs: tuple[Leg, ...]) -> dict[tuple[str, str], BoolArray]:
     """Return which legs have a twist, (n_legs,), by their joints on base and platform."""
     kinds = {(g.base_joint, g.platform_joint): g for g in legs if g.twist is not None}
     return {

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from legcal.geometry import Array, BoolArray
 from legcal.machine import (
     KinematicParameters,
-    LegGeometry,
+    Leg,
     LegKind,
     Mechanism,
     geometries,
@@ -29,7 +29,7 @@ class NominalMechanism:
     """The nominal legs of a mechanism: where the steps start, and which unknowns they have."""
 
     leg_names: tuple[str, ...]
-    legs: tuple[LegGeometry, ...]  # what belongs to the base in R_b, to the platform in R_e
+    legs: tuple[Leg, ...]  # what belongs to the base in R_b, to the platform in R_e
     sign: NDArray[Any]  # (n_legs,), of q in the leg length L = sign q + q0
     frame_legs: tuple[int, ...]  # their joints define R_b and R_e: three in space, two in a plane
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Demand, LegGeometry, LegKind, linearize
+from legcal.machine import Demand, Leg, LegKind, linearize
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.joints_in_camera import JointsInCamera
 from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
@@ -79,7 +79,7 @@ class PlatformJoints:
 
     # A and revolute axes at the base as step 2 found them; offsets of step 3, improved by the
     # default criterion; B, axes on the platform, universal axes at the base, twists
-    legs: tuple[LegGeometry, ...]
+    legs: tuple[Leg, ...]
     solution: Solution  # free coordinates of B in R_e first
     diagnostics: tuple[str, ...] = ()  # what was left at nominal, and why
 

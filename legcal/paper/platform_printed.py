@@ -17,7 +17,7 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
-from legcal.machine import LegGeometry, LegKind, tied_twist, twist_after
+from legcal.machine import Leg, LegKind, tied_twist, twist_after
 from legcal.paper.joints_in_base import JointsInBase, distance_of_joints
 from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
 from legcal.paper.leg_demands import closure_of_leg, twisting_legs
@@ -53,7 +53,7 @@ def platform_as_printed(
     base: JointsInBase,
     directions: LegDirections,
     transformation: Transformation,
-) -> tuple[tuple[LegGeometry, ...], Solution, tuple[str, ...]]:
+) -> tuple[tuple[Leg, ...], Solution, tuple[str, ...]]:
     """Identify joints and axes on the platform by (16) to (19).
 
     ``known`` has what steps 2 and 3 found; directions are in the frames of the cameras. Returns
@@ -148,10 +148,10 @@ def _with_axis_and_end(
     known: NominalMechanism,
     unknowns: PlatformUnknowns,
     j: int,
-    leg: LegGeometry,
+    leg: Leg,
     directions: LegDirections,
     poses: PlatformPoses,
-) -> LegGeometry:
+) -> Leg:
     """Return leg *j* with its axis on the platform, (7), and its end if it is passive, (19)."""
     name, nominal = known.leg_names[j], leg.platform_axis
     here = np.flatnonzero((directions.leg == j) & (poses.pose >= 0))
@@ -244,11 +244,11 @@ def locate_passive_end(
 def _close_legs(
     known: NominalMechanism,
     unknowns: PlatformUnknowns,
-    legs: tuple[LegGeometry, ...],
+    legs: tuple[Leg, ...],
     directions: LegDirections,
     poses: PlatformPoses,
     in_base: BoolArray,
-) -> tuple[tuple[LegGeometry, ...], tuple[str, ...]]:
+) -> tuple[tuple[Leg, ...], tuple[str, ...]]:
     """Identify universal axes and twists by the closure, what the poses leave open at nominal.
 
     ``legs`` have all else as it was found. Returns them, and what was left at nominal, in words.
@@ -283,7 +283,7 @@ def _close_legs(
 def _build_closure(
     unknowns: PlatformUnknowns,
     wanted: IntArray,
-    legs: tuple[LegGeometry, ...],
+    legs: tuple[Leg, ...],
     directions: LegDirections,
     poses: PlatformPoses,
     in_base: BoolArray,
@@ -315,8 +315,8 @@ def _build_closure(
 
 
 def _closed(
-    unknowns: PlatformUnknowns, legs: tuple[LegGeometry, ...], wanted: IntArray, x: Array
-) -> tuple[LegGeometry, ...]:
+    unknowns: PlatformUnknowns, legs: tuple[Leg, ...], wanted: IntArray, x: Array
+) -> tuple[Leg, ...]:
     """Return legs with universal axes turned from the nominal ones, and twists changed."""
     values = np.zeros(len(unknowns) + 1)
     values[wanted] = x
@@ -333,9 +333,7 @@ def _closed(
     )
 
 
-def _in_own_frame(
-    known: NominalMechanism, legs: tuple[LegGeometry, ...]
-) -> tuple[LegGeometry, ...]:
+def _in_own_frame(known: NominalMechanism, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     """Return legs with the platform in R_e, where passive legs among the frame legs were moved."""
     frame = list(known.frame_legs)
     if all(legs[j].kind is not LegKind.PASSIVE for j in frame):

@@ -19,7 +19,7 @@ from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.machine import (
     N_LOCAL,
     SHOWN,
-    LegGeometry,
+    Leg,
     Parametrization,
     describe_direction,
     parametrize,
@@ -51,7 +51,7 @@ class PlatformUnknowns:
     # (n,), rising, which of them: free coordinates of B [m], offsets and lengths [m], turns of
     # universal axes at the base and of axes at the platform, changes of twists [rad]
     parameters: IntArray
-    nominal: tuple[LegGeometry, ...]  # what turns of axes and changes of twists count from
+    nominal: tuple[Leg, ...]  # what turns of axes and changes of twists count from
 
     @classmethod
     def of(cls, mechanism: NominalMechanism, *, free_twists: bool = False) -> PlatformUnknowns:
@@ -99,7 +99,7 @@ class PlatformUnknowns:
         B = np.array([leg.B for leg in self.nominal])
         return np.where(self.place[:, OF_B] < 0, B, 0.0)
 
-    def vector(self, legs: Sequence[LegGeometry]) -> Array:
+    def vector(self, legs: Sequence[Leg]) -> Array:
         """Return the unknowns of legs, (n,)."""
         local = np.zeros(self.place.shape)
         for row, leg, nominal in zip(local, legs, self.nominal, strict=True):
@@ -114,7 +114,7 @@ class PlatformUnknowns:
         x[self.place[self.place >= 0]] = local[self.place >= 0]
         return x
 
-    def legs(self, x: Array, legs: Sequence[LegGeometry]) -> tuple[LegGeometry, ...]:
+    def legs(self, x: Array, legs: Sequence[Leg]) -> tuple[Leg, ...]:
         """Return legs with the unknowns at values x (n,)."""
         padded = np.append(x, 0.0)
         found = []
@@ -156,7 +156,7 @@ def held_at_nominal(
     mechanism: NominalMechanism,
     unknowns: PlatformUnknowns,
     information: Array,
-    legs: tuple[LegGeometry, ...],
+    legs: tuple[Leg, ...],
     poses: tuple[Array, Array],
     nominal: Array,
     wanted: IntArray | None = None,
@@ -200,7 +200,7 @@ def _projection(n: int) -> ca.Function:
     return ca.Function("projection", [x, row, target], [ca.dot(row, x) - target])
 
 
-def _mean_length(legs: Sequence[LegGeometry], poses: tuple[Array, Array]) -> float:
+def _mean_length(legs: Sequence[Leg], poses: tuple[Array, Array]) -> float:
     """Return the mean leg length [m] over poses in R_b, that of the offsets without any."""
     R, t = poses
     if not len(R):
@@ -213,7 +213,7 @@ def _mean_length(legs: Sequence[LegGeometry], poses: tuple[Array, Array]) -> flo
 def _motion(
     mechanism: NominalMechanism,
     unknowns: PlatformUnknowns,
-    legs: tuple[LegGeometry, ...],
+    legs: tuple[Leg, ...],
     poses: tuple[Array, Array],
 ) -> Array | None:
     """Return how the platform moves with each unknown, (k, 6, n); None if unknown."""

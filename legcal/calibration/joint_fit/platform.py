@@ -18,7 +18,7 @@ from legcal.errors import DidNotConverge
 from legcal.estimation import Frames
 from legcal.geometry import Array
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     LegKind,
     Mechanism,
     Parametrization,
@@ -66,7 +66,7 @@ class PlatformError:
 
 
 def predict_platform_error(
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     parametrization: Parametrization,
     covariance: Array,
     frame_legs: Sequence[int],
@@ -84,7 +84,7 @@ def predict_platform_error(
 
 
 def platform_by_parameters(
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     parametrization: Parametrization,
     frame_legs: Sequence[int],
     T_Rb_Re: Sequence[RigidTransform],
@@ -145,7 +145,7 @@ class PlatformAccuracy:
 
 def platform_accuracy(
     mechanism: Mechanism,
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     parametrization: Parametrization,
     covariance: Array,
     q: Array,
@@ -179,9 +179,7 @@ def platform_accuracy(
     )
 
 
-def _workspace_poses(
-    mechanism: Mechanism, legs: Sequence[LegGeometry]
-) -> Sequence[RigidTransform] | None:
+def _workspace_poses(mechanism: Mechanism, legs: Sequence[Leg]) -> Sequence[RigidTransform] | None:
     """Return where calibrated legs put the platform at readings all over the travel."""
     try:
         drawn = workspace(mechanism)
@@ -196,7 +194,7 @@ def _workspace_poses(
 
 
 def _is_reached(
-    mechanism: Mechanism, legs: Sequence[LegGeometry], q: Array, T_Rb_Re: RigidTransform
+    mechanism: Mechanism, legs: Sequence[Leg], q: Array, T_Rb_Re: RigidTransform
 ) -> bool:
     """Say whether legs have the lengths of readings (n_legs,) at a pose: some have them nowhere."""
     return all(
@@ -208,7 +206,7 @@ def _is_reached(
 
 def poses_at_readings(
     mechanism: Mechanism,
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     q: Array,
     nearby: Sequence[RigidTransform],
 ) -> tuple[RigidTransform, ...]:

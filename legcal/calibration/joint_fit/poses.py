@@ -20,7 +20,7 @@ from legcal.errors import DatasetError, DidNotConverge
 from legcal.estimation import Frames, Problem, Tangent
 from legcal.geometry import Array
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     PoseEquations,
     freedoms,
     n_bonds,
@@ -33,7 +33,7 @@ _RANK = 1e-7  # of the largest singular value
 _AT_REST = 1e-6  # [m, rad], the last step where demands cannot all be met to rounding
 
 
-def _binding(legs: Sequence[LegGeometry], poses: Frames) -> PoseEquations:
+def _binding(legs: Sequence[Leg], poses: Frames) -> PoseEquations:
     """Return the equations that hold without a reading."""
     rows = pose_equations(legs, *poses)
     return rows.of(~rows.measured)
@@ -106,7 +106,7 @@ class LegConstraints:
 
 
 def start_from(
-    geometry: Sequence[LegGeometry],
+    geometry: Sequence[Leg],
     measurements: Measurements,
     legs: FittedLegs,
     T_camera_Rb: Sequence[RigidTransform],
@@ -148,7 +148,7 @@ def cameras_from_hints(
 
 
 def platform_poses(
-    geometry: Sequence[LegGeometry],
+    geometry: Sequence[Leg],
     lengths: Array,
     T_Rb_Re: Sequence[RigidTransform],
     frame_legs: Sequence[int],
@@ -160,7 +160,7 @@ def platform_poses(
 
     Parameters
     ----------
-    geometry : sequence of LegGeometry
+    geometry : sequence of Leg
         The legs in R_b and R_e.
     lengths : (n_poses, n_legs) array
         Leg lengths [m] of actuated legs; NaN where unknown. Others are not looked at.

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     Mechanism,
     Parametrization,
     geometries,
@@ -53,7 +53,7 @@ DEFAULT_SETTINGS = RefinementSettings()
 class Start:
     """Where a fit begins."""
 
-    legs: tuple[LegGeometry, ...]  # in R_b and R_e
+    legs: tuple[Leg, ...]  # in R_b and R_e
     T_camera_Rb: tuple[RigidTransform, ...]  # one a view
     T_Rb_Re: tuple[RigidTransform, ...]  # one a pose
     label: str  # where it comes from: ``nominal`` or ``staged``
@@ -64,7 +64,7 @@ class Start:
 class State:
     """Values of all blocks of variables of the joint fit, by their names."""
 
-    legs: tuple[LegGeometry, ...]  # in R_b and R_e
+    legs: tuple[Leg, ...]  # in R_b and R_e
     radii: Array  # (n_radii,) of the parts of legs [m]
     cameras: tuple[Camera, ...]  # with the intrinsics of each view
     board_scale: Array  # (1,) factor on the dimensions of the calibration board
@@ -105,7 +105,7 @@ class FittedLegs:
     """The legs of a mechanism as the joint fit sees them."""
 
     names: tuple[str, ...]
-    nominal: tuple[LegGeometry, ...]  # in R_b and R_e: what axes count from, what fixed ones keep
+    nominal: tuple[Leg, ...]  # in R_b and R_e: what axes count from, what fixed ones keep
     sign: IntArray  # (n_legs,) L = sign q + q0
     frame_legs: tuple[int, ...]  # whose joint centres define R_b and R_e: three, two in a plane
     radii: dict[tuple[int, str], float]  # of the model [m], for each (leg index, part)
@@ -125,7 +125,7 @@ class FittedLegs:
         """The kinematic parameters, twists among them."""
         return parametrize(self.names, self.nominal, self.frame_legs, twists=True)
 
-    def vector(self, legs: tuple[LegGeometry, ...]) -> Array:
+    def vector(self, legs: tuple[Leg, ...]) -> Array:
         """Return the kinematic parameters of legs [m, rad]; axes count from the nominal ones."""
         return vector_of(self.parametrization, legs, self.nominal)
 
@@ -184,16 +184,16 @@ class LegParameters:
                     found[number] = self.fixed[number]
         return found
 
-    def at_fixed(self, geometry: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
+    def at_fixed(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
         """Return legs with everything that is fixed at its value."""
         return self.tied(with_values(geometry, self.legs, self.fixed))
 
-    def retract(self, geometry: tuple[LegGeometry, ...], change: Array) -> tuple[LegGeometry, ...]:
+    def retract(self, geometry: tuple[Leg, ...], change: Array) -> tuple[Leg, ...]:
         """Return legs after a change (n_legs, 12) of their numbers."""
         place = np.arange(change.size, dtype=np.intp).reshape(change.shape)
         return self.tied(moved_legs(geometry, place, change.ravel()))
 
-    def tied(self, geometry: tuple[LegGeometry, ...]) -> tuple[LegGeometry, ...]:
+    def tied(self, geometry: tuple[Leg, ...]) -> tuple[Leg, ...]:
         """Return legs whose fixed angles are where they are fixed, whatever turned the axes.
 
         Turning an axis away and back on another way leaves what is tied to it turned about it, and
@@ -213,11 +213,11 @@ class LegParameters:
             )
         )
 
-    def coordinates(self, geometry: tuple[LegGeometry, ...]) -> Array:
+    def coordinates(self, geometry: tuple[Leg, ...]) -> Array:
         """Return the values of the unknowns [m, rad]; axes as angles from the nominal ones."""
         return np.asarray(self.legs.vector(geometry)[self.free])
 
-    def jacobian(self, geometry: tuple[LegGeometry, ...]) -> Array:
+    def jacobian(self, geometry: tuple[Leg, ...]) -> Array:
         """Return their derivative by steps (p_free, p_free): one but for axes."""
         J = np.eye(int(self.free.sum()))
         for leg, nominal, unknown, number in zip(
@@ -238,8 +238,8 @@ class LegParameters:
 
 
 def with_values(
-    geometry: tuple[LegGeometry, ...], legs: FittedLegs, values: Mapping[int, float]
-) -> tuple[LegGeometry, ...]:
+    geometry: tuple[Leg, ...], legs: FittedLegs, values: Mapping[int, float]
+) -> tuple[Leg, ...]:
     """Return legs some of whose parameters, by their number, have given values [m, rad]."""
     wanted = np.append(legs.vector(tuple(geometry)), 0.0)
     wanted[list(values)] = list(values.values())
