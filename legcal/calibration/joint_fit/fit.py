@@ -99,16 +99,6 @@ def refine(
     problem = build_fit(
         legs, measurements, outlines, settings, axes=axes, board=board, choices=choices
     )
-    return solve_fit(problem, outlines, start, settings)
-
-
-def solve_fit(
-    problem: FitProblem,
-    outlines: Outlines,
-    start: Start,
-    settings: RefinementSettings = DEFAULT_SETTINGS,
-) -> Solution:
-    """Solve a fit that :func:`build_fit` built; otherwise the same as :func:`refine`."""
     minimum, _ = _first(problem, start, settings)
     return _refined(problem, outlines, start, minimum, settings)
 

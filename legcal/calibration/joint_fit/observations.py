@@ -70,29 +70,29 @@ def known_gammas(outlines: Outlines, measurements: Measurements) -> dict[str, fl
 class ObservedOutlines:
     """The outlines that enter the fit, n of them."""
 
-    index: IntArray  # (n,) Rows of the table of outlines
-    leg: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
-    view: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
-    pose: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
-    radius: IntArray  # (n,) Indices; ``radius`` counts in ``parts``
-    # (n, 2, 2) Points of the measured outline at both ends of the used piece, on the sensor plane
+    index: IntArray  # (n,) rows of the table of outlines
+    leg: IntArray  # (n,)
+    view: IntArray  # (n,)
+    pose: IntArray  # (n,)
+    radius: IntArray  # (n,) in ``parts``
+    # (n, 2, 2) points of the measured outline at both ends of the used piece, on the sensor plane
     feet: Array
-    pixels: Array  # (n, 2, 2) The same points in the image [px]
-    # (n, 9) What the residual needs besides: the inverse transposed derivative of pixels at these
+    pixels: Array  # (n, 2, 2) the same points in the image [px]
+    # (n, 9) what the residual needs besides: the inverse transposed derivative of pixels at these
     # points [1/px], column by column, and epsilon of eq (5)
     constants: Array
-    covariance: Array  # (n, 2, 2) Claimed covariance of the offsets at both ends [px^2]
-    parts: tuple[tuple[int, str], ...]  # Leg index and part of each radius, sorted by leg and name
-    views: tuple[str, ...]  # Names of the views
-    # (n_views,) The view that stands for each: the first of those that show one image each with the
+    covariance: Array  # (n, 2, 2) claimed covariance of the offsets at both ends [px^2]
+    parts: tuple[tuple[int, str], ...]  # leg index and part of each radius, sorted by leg and name
+    views: tuple[str, ...]  # names of the views
+    # (n_views,) the view that stands for each: the first of those that show one image each with the
     # same camera, as one that is held in the hand does; else itself
     series: IntArray
-    cameras: tuple[str, ...]  # The view that stands for the camera of each view
-    # (n,) How far each moves towards the inside with the logarithm of the gamma of its camera [px];
+    cameras: tuple[str, ...]  # the view that stands for the camera of each view
+    # (n,) how far each moves towards the inside with the logarithm of the gamma of its camera [px];
     # zero where that gamma is told, or nothing is known of it
     by_gamma: Array
-    bias_index: IntArray  # (n, c) The shared shifts that each outline has a part in
-    bias_shift: Array  # (n, c, 2) How far one pixel of each shifts both ends [px]
+    bias_index: IntArray  # (n, c) the shared shifts that each outline has a part in
+    bias_shift: Array  # (n, c, 2) how far one pixel of each shifts both ends [px]
 
     @property
     def epsilon(self) -> Array:
@@ -107,10 +107,10 @@ class ObservedOutlines:
 class Readings:
     """The encoder readings that enter the fit, n of them."""
 
-    leg: IntArray  # (n,) Indices
-    pose: IntArray  # (n,) Indices
+    leg: IntArray  # (n,) indices
+    pose: IntArray  # (n,) indices
     length: Array  # (n,) sign * q: the leg length without its offset [m]
-    sigma: float  # Standard deviation [m]
+    sigma: float  # standard deviation [m]
 
     def __len__(self) -> int:
         return len(self.leg)
@@ -246,11 +246,11 @@ def _bad_covariances(
 class ObservedAxes:
     """The axes that enter the fit, n of them."""
 
-    leg: IntArray  # (n,) Indices
-    view: IntArray  # (n,) Indices
-    pose: IntArray  # (n,) Indices
-    M: Array  # (n, 3) A point of each axis in the camera frame [m]
-    basis: Array  # (n, 2, 3) Unit vectors e1, e2 normal to the axis; its direction is e1 x e2
+    leg: IntArray  # (n,) indices
+    view: IntArray  # (n,) indices
+    pose: IntArray  # (n,) indices
+    M: Array  # (n, 3) a point of each axis in the camera frame [m]
+    basis: Array  # (n, 2, 3) unit vectors e1, e2 normal to the axis; its direction is e1 x e2
     # (n, 4, 4) Lower triangular T with T C T^T = 1, C being the claimed covariance of (alpha1,
     # alpha2, beta1, beta2) [1/rad, 1/m]
     whitening: Array
@@ -302,15 +302,15 @@ def observed_axes(
 class ObservedBoard:
     """The corners of a board that enter the fit, n of them."""
 
-    view: IntArray  # (n,) Index of the view
-    corner: IntArray  # (n,) Number of the corner
-    point: Array  # (n, 3) The corners in the frame of the board [m]
-    feet: Array  # (n, 2) Where they were measured, on the sensor plane
-    pixels: Array  # (n, 2) The same in the image [px]
-    # (n, 4) What the residual needs besides: the derivative of pixels at these points [px], column
+    view: IntArray  # (n,) index of the view
+    corner: IntArray  # (n,) number of the corner
+    point: Array  # (n, 3) the corners in the frame of the board [m]
+    feet: Array  # (n, 2) where they were measured, on the sensor plane
+    pixels: Array  # (n, 2) the same in the image [px]
+    # (n, 4) what the residual needs besides: the derivative of pixels at these points [px], column
     # by column
     constants: Array
-    sigma: Array  # (n,) Standard deviation of both coordinates [px]
+    sigma: Array  # (n,) standard deviation of both coordinates [px]
 
     @property
     def pixels_per_unit(self) -> Array:
@@ -337,8 +337,8 @@ class ObservedBoard:
 class SeenBoard:
     """A calibration board that stands still on the base, and what images show of it."""
 
-    board: Board  # Where its corners are, in its own frame
-    corners: Corners  # Where images show them; only the used ones count
+    board: Board  # where its corners are, in its own frame
+    corners: Corners  # where images show them; only the used ones count
 
 
 def no_board() -> ObservedBoard:

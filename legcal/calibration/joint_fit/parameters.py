@@ -79,12 +79,12 @@ _COEFFICIENT = 1e3  # of distortion; far more than any lens has
 class KnownParameter:
     """A parameter and what values make sense for it."""
 
-    nominal: float  # Its value in the model or camera file [unit]
-    unit: str  # Its unit; "" for coefficients of distortion and for the size of a board
-    kind: Kind  # What it belongs to
-    least: float  # Between these a stated value is believed [unit]
-    most: float  # Between these a stated value is believed [unit]
-    # What its camera file says of its uncertainty, one standard deviation [unit]
+    nominal: float  # its value in the model or camera file [unit]
+    unit: str  # its unit; "" for coefficients of distortion and for the size of a board
+    kind: Kind  # what it belongs to
+    least: float  # between these a stated value is believed [unit]
+    most: float  # between these a stated value is believed [unit]
+    # what its camera file says of its uncertainty, one standard deviation [unit]
     sigma: float | None = None
 
 
@@ -92,12 +92,12 @@ class KnownParameter:
 class KnownParameters:
     """The parameters of a machine and of the cameras that look at it."""
 
-    # The parameters, in the order kinematic ones with twists, radii, intrinsics, the size of the
+    # the parameters, in the order kinematic ones with twists, radii, intrinsics, the size of the
     # calibration board
     by_name: Mapping[str, KnownParameter]
-    # Names that look like parameters and are none, and why: the end of a sentence
+    # names that look like parameters and are none, and why: the end of a sentence
     others: Mapping[str, str]
-    # Other names of intrinsics, and the one that counts: views of one camera share them
+    # other names of intrinsics, and the one that counts: views of one camera share them
     synonyms: Mapping[str, str]
 
     @property
@@ -235,10 +235,27 @@ def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
         raise UsageError([*problems, *its_problems])
     if its_problems:
         raise DatasetError(its_problems)
+    decisions = in_file | asked
+    for name, decision in decisions.items():
+        parameter = known.by_name[name]
+        if decision.action == "free" and parameter.sigma is not None:  # the camera file knows it
+            decisions[name] = _Decision("prior", parameter.nominal, parameter.sigma)
     given_way = [name for name in in_file if asked.get(name, in_file[name]) != in_file[name]]
-    decisions = {name: _known(d, known.by_name[name]) for name, d in (in_file | asked).items()}
-    choices = _choices(decisions, given_way)
-    _refuse_all_fixed(choices, known)
+    note = f"What the dataset says of {', '.join(given_way)} gave way to what this run asks for."
+    stated = {name: (d.value, d.sigma) for name, d in decisions.items() if d.value is not None}
+    choices = Choices(
+        frozenset(name for name, d in decisions.items() if d.action == "fixed"),
+        frozenset(name for name, d in decisions.items() if d.action == "free"),
+        {name: Prior(value, sigma) for name, (value, sigma) in stated.items() if sigma is not None},
+        {name: value for name, (value, sigma) in stated.items() if sigma is None},
+        (note,) if given_way else (),
+    )
+    names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
+    if all(choices.holds(name, by_default=name.endswith(".twist")) for name in names):
+        raise UsageError(
+            "The mechanism could not be calibrated: found all of its parameters fixed, needed one "
+            "at least that is not; fix fewer of them."
+        )
     return choices
 
 
@@ -249,26 +266,6 @@ class _Decision:
     action: Action
     value: float | None = None
     sigma: float | None = None
-
-
-def _known(decision: _Decision, parameter: KnownParameter) -> _Decision:
-    """Return what a decision comes to where the camera file says how uncertain a number is."""
-    if decision.action != "free" or parameter.sigma is None:
-        return decision
-    return _Decision("prior", parameter.nominal, parameter.sigma)
-
-
-def _choices(decisions: Mapping[str, _Decision], given_way: Sequence[str]) -> Choices:
-    """Return decisions sorted by what they are."""
-    stated = {name: (d.value, d.sigma) for name, d in decisions.items() if d.value is not None}
-    note = f"What the dataset says of {', '.join(given_way)} gave way to what this run asks for."
-    return Choices(
-        frozenset(name for name, d in decisions.items() if d.action == "fixed"),
-        frozenset(name for name, d in decisions.items() if d.action == "free"),
-        {name: Prior(value, sigma) for name, (value, sigma) in stated.items() if sigma is not None},
-        {name: value for name, (value, sigma) in stated.items() if sigma is None},
-        (note,) if given_way else (),
-    )
 
 
 def _decisions(
@@ -291,7 +288,12 @@ def _decisions(
     problems += [
         p for name, several in found.items() if (p := _contradiction(name, several, known))
     ]
-    return {name: _strongest([d for _, d in several]) for name, several in found.items()}, problems
+    # Of several that agree one that states a value says most.
+    strongest = {
+        name: next((d for _, d in several if d.value is not None), several[0][1])
+        for name, several in found.items()
+    }
+    return strongest, problems
 
 
 def _matches(override: Override, known: KnownParameters) -> tuple[str, ...]:
@@ -372,21 +374,6 @@ def _contradiction(
         f"{name}{also} could not be {done}: found {_quoted(pair[0])} and {_quoted(pair[1])}, "
         "needed one of them; remove the other."
     )
-
-
-def _strongest(decisions: Sequence[_Decision]) -> _Decision:
-    """Return what several decisions that agree come to: one that states a value says most."""
-    return next((d for d in decisions if d.value is not None), decisions[0])
-
-
-def _refuse_all_fixed(choices: Choices, known: KnownParameters) -> None:
-    """Raise UsageError if nothing of the mechanism is left to be found."""
-    names = [name for name, p in known.by_name.items() if p.kind == "kinematic"]
-    if all(choices.holds(name, by_default=name.endswith(".twist")) for name in names):
-        raise UsageError(
-            "The mechanism could not be calibrated: found all of its parameters fixed, needed one "
-            "at least that is not; fix fewer of them."
-        )
 
 
 def _quoted(override: Override) -> str:

@@ -42,7 +42,7 @@ class PlatformError:
 
     # (n_poses,) Displacement of the origin of R_e, the platform joint of the first frame leg [m]
     displacement: Array
-    rotation: Array  # (n_poses,) Angle of rotation [rad]
+    rotation: Array  # (n_poses,) angle of rotation [rad]
 
     @property
     def mean_displacement(self) -> float:
@@ -125,7 +125,7 @@ _REACHED = 1e-8  # [m]
 class Effect:
     """What a mistake in something that counts as known would do to the platform."""
 
-    what: str  # The mistake: ``a focal length 1 % longer``
+    what: str  # the mistake: ``a focal length 1 % longer``
     # How far the platform would move, over the workspace; at the readings of the dataset where that
     # is not known
     error: PlatformError
@@ -140,7 +140,7 @@ class PlatformAccuracy:
     sigma: PlatformError  # Predicted error of the calibrated platform there, one standard deviation
     # The same at poses all over the travel; None where the model cannot reach them
     workspace: PlatformError | None
-    effects: tuple[Effect, ...]  # What mistakes in what counts as known would do
+    effects: tuple[Effect, ...]  # what mistakes in what counts as known would do
 
 
 def platform_accuracy(
