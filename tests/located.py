@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.location.model import Frames, PosePairs, ToolPoses, predicted
+from legcal.calibration.location.frames import Frames, PosePairs, predicted
+from legcal.calibration.location.result import ToolPoses
 from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array
 from legcal.machine import (

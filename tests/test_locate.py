@@ -18,7 +18,7 @@ from located import (
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import locate
-from legcal.calibration.location.model import ToolPoses
+from legcal.calibration.location.result import ToolPoses
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array

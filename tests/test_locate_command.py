@@ -13,7 +13,8 @@ from located import BASE, TOOL, Located, located, machine, motion_error, write_p
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Location, cli, load_location, load_mechanism, locate, write_location
-from legcal.calibration.location.document import location_document, with_frames, write_located_model
+from legcal.calibration.location.document import location_document
+from legcal.calibration.location.urdf import with_frames, write_located_model
 from legcal.errors import DatasetError, ModelError, UsageError
 from legcal.machine import platform_pose
 

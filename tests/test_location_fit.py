@@ -20,9 +20,9 @@ from located import (
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.location import fit as closed_form
-from legcal.calibration.location.fit import Fit, fit, search
-from legcal.calibration.location.model import (
+from legcal.calibration.location import search as closed_form
+from legcal.calibration.location.fit import Fit, fit
+from legcal.calibration.location.frames import (
     Frames,
     Noise,
     PosePairs,
@@ -31,6 +31,7 @@ from legcal.calibration.location.model import (
     residuals,
 )
 from legcal.calibration.location.problem import PlatformMotions, motions_by_readings
+from legcal.calibration.location.search import search
 from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array
 from legcal.machine import forward_kinematics

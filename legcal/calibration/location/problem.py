@@ -1,4 +1,10 @@
-"""What is to be located, put together: measured poses, platform poses, errors of the model."""
+"""What is to be located, put together: measured poses, platform poses, errors of the model.
+
+The errors of a row are those of the measurement, the same in all directions: one standard
+deviation for positions and one for orientations, times a factor that may be unknown; those of the
+readings, which move position and orientation together; and those of a calibrated model, which all
+rows share.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +17,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.earlier import EarlierResult, read_result
-from legcal.calibration.location.model import Frames, Noise, PosePairs, ToolPoses
+from legcal.calibration.location.frames import Frames, Noise, PosePairs
+from legcal.calibration.location.result import ToolPoses
 from legcal.calibration.result import MODEL_NAME, RESULT_NAME
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import Array, BoolArray, IntArray, cross_matrices
@@ -28,102 +35,6 @@ from legcal.machine import (
 )
 
 _NEGLIGIBLE = 1e-12  # of the largest eigenvalue of the covariance
-
-
-@dataclass(frozen=True, eq=False)
-class PlatformMotions:
-    """How independent errors, each one standard deviation large, move the platform link.
-
-    Attributes
-    ----------
-    turn, shift : (n, 3, k) array
-        Rotation vector [rad] and displacement of the link's origin [m], in the base link.
-    """
-
-    turn: Array
-    shift: Array
-
-    def of(self, rows: BoolArray | IntArray) -> PlatformMotions:
-        """Return those of some rows."""
-        return PlatformMotions(self.turn[rows], self.shift[rows])
-
-    def of_tool(self, frames: Frames, pairs: PosePairs) -> Array:
-        """Return how they move the tool in the world, (n, 6, k): displacement, rotation."""
-        arm = cross_matrices(pairs.R @ frames.t_tool)
-        shift = frames.R_base @ (self.shift - arm @ self.turn)
-        turn = frames.R_base @ self.turn * pairs.oriented[:, None, None]
-        return np.concatenate([shift, turn], axis=1)
-
-
-def motions_by_parameters(
-    mechanism: Mechanism,
-    poses: Sequence[RigidTransform],
-    names: Sequence[str],
-    covariance: Array,
-) -> PlatformMotions:
-    """Return what the errors of a calibrated model do to the platform at some poses.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The calibrated model.
-    poses : sequence of RigidTransform
-        T_base_platform of every row.
-    names : sequence of str, length p
-        Parameters of :func:`legcal.machine.parameters.parametrization_of` with twists.
-    covariance : (p, p) array
-        Their covariance [m, rad].
-    """
-    known = parametrization_of(mechanism, twists=True)
-    R, t = _joint_frames(mechanism, poses)
-    by_parameters = pose_sensitivity(geometries(mechanism), known, mechanism.frame_legs, R, t)
-    values, vectors = np.linalg.eigh(covariance)
-    kept = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
-    root = vectors[:, kept] * np.sqrt(values[kept])
-    columns = [known.names.index(name) for name in names]
-    return _of_link(mechanism, poses, by_parameters[:, :, columns] @ root)
-
-
-def motions_by_readings(
-    mechanism: Mechanism, poses: Sequence[RigidTransform], sigma_q: float
-) -> PlatformMotions:
-    """Return what an error of each reading does to the platform at some poses.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-    poses : sequence of RigidTransform
-        T_base_platform of every row.
-    sigma_q : float
-        Standard deviation of a reading [m].
-    """
-    R, t = _joint_frames(mechanism, poses)
-    equations = pose_equations(geometries(mechanism), R, t)
-    columns = list(freedoms(mechanism.frame_legs))
-    inverse = np.linalg.pinv(equations.by_pose[:, :, columns])[:, :, equations.measured]
-    moved = np.zeros((len(poses), 6, inverse.shape[2]))
-    moved[:, columns] = sigma_q * inverse  # the sign of a reading does not matter
-    return _of_link(mechanism, poses, moved)
-
-
-def _joint_frames(mechanism: Mechanism, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
-    """Return rotations and positions of R_e in R_b."""
-    matrices = np.array([platform_in_base(mechanism, T).as_matrix() for T in poses])
-    return matrices[:, :3, :3], matrices[:, :3, 3]
-
-
-def _of_link(
-    mechanism: Mechanism, poses: Sequence[RigidTransform], moved: Array
-) -> PlatformMotions:
-    """Return motions of R_e in R_b (n, 6, k) as those of the platform link in the base link."""
-    to_base = mechanism.T_base_Rb.rotation.as_matrix()
-    turn = to_base @ moved[:, :3]
-    origin = mechanism.T_platform_Re.translation
-    arms = cross_matrices(np.array([T.rotation.apply(-origin) for T in poses]))
-    return PlatformMotions(turn, to_base @ moved[:, 3:] - arms @ turn)
-
-
 FEWEST = 3  # poses, where orientations are measured
 FEWEST_POSITIONS = 4
 SIZE = 0.25  # of a leg length: what a radian is compared with
@@ -132,40 +43,20 @@ _START_FACTOR = 1e-2  # of the length, and [rad]: where unknown scatter starts
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Measured poses with all that is known of their errors.
+    """Measured poses with all that is known of their errors."""
 
-    Attributes
-    ----------
-    mechanism : Mechanism
-        The machine.
-    poses : ToolPoses
-        As measured.
-    T_base_platform : tuple of RigidTransform
-        At the readings.
-    pairs : PosePairs
-        Both as arrays.
-    noise : Noise
-        Of the measurement.
-    encoder_sigma : float
-        Of a reading [m]; zero if none was stated.
-    by_readings, by_model : PlatformMotions or None
-        What errors of readings and of the calibrated model do; None if nothing is known of them.
-    result : EarlierResult or None
-        The calibration that the covariance of the model comes from.
-    fewest : int
-        Poses that can determine the frames.
-    """
-
-    mechanism: Mechanism
-    poses: ToolPoses
-    T_base_platform: tuple[RigidTransform, ...]
-    pairs: PosePairs
-    noise: Noise
-    encoder_sigma: float
+    mechanism: Mechanism  # the machine
+    poses: ToolPoses  # as measured
+    T_base_platform: tuple[RigidTransform, ...]  # at the readings
+    pairs: PosePairs  # both as arrays
+    noise: Noise  # of the measurement
+    encoder_sigma: float  # of a reading [m]; zero if none was stated
+    # by_readings, by_model: what errors of readings and of the calibrated model do; None if nothing
+    # is known of them
     by_readings: PlatformMotions | None
     by_model: PlatformMotions | None
-    result: EarlierResult | None
-    fewest: int
+    result: EarlierResult | None  # the calibration that the covariance of the model comes from
+    fewest: int  # poses that can determine the frames
 
     def of(self, rows: BoolArray) -> Problem:
         """Return the problem of some rows, with the measurements as they were."""
@@ -193,35 +84,19 @@ class Problem:
 def build_problem(
     mechanism: Mechanism,
     poses: ToolPoses,
-    name: str,
+    name: str,  # what they are called in messages
     *,
+    # position_sigma, angle_sigma: standard deviations of all rows [m], [rad]; None where the table
+    # or the residuals tell
     position_sigma: float | None,
     angle_sigma: float | None,
     encoder_sigma: float,
 ) -> Problem:
     """Return what is to be located.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-        The machine.
-    poses : ToolPoses
-        The measured poses.
-    name : str
-        What they are called in messages.
-    position_sigma, angle_sigma : float or None
-        Standard deviations of all rows [m], [rad]; None where the table or the residuals tell.
-    encoder_sigma : float
-        Of a reading [m].
-
-    Raises
-    ------
-    NotIdentifiable
-        If there are too few poses, or the motors do not determine the pose.
-    DidNotConverge
-        If the machine cannot have some readings.
-    UsageError
-        If a standard deviation is stated twice.
+    Raises NotIdentifiable if there are too few poses, or the motors do not determine the pose;
+    DidNotConverge if the machine cannot have some readings; UsageError if a standard deviation is
+    stated twice.
     """
     oriented = bool(poses.oriented.any())
     fewest = FEWEST if oriented else FEWEST_POSITIONS
@@ -315,3 +190,74 @@ def _calibration_of(mechanism: Mechanism) -> EarlierResult | None:
         raise DatasetError(
             [f"The covariance of the model could not be used: {p}" for p in error.problems]
         ) from error
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformMotions:
+    """How independent errors, each one standard deviation large, move the platform link."""
+
+    # turn, shift: (n, 3, k): rotation vector [rad] and displacement of the link's origin [m], in
+    # the base link
+    turn: Array
+    shift: Array
+
+    def of(self, rows: BoolArray | IntArray) -> PlatformMotions:
+        """Return those of some rows."""
+        return PlatformMotions(self.turn[rows], self.shift[rows])
+
+    def of_tool(self, frames: Frames, pairs: PosePairs) -> Array:
+        """Return how they move the tool in the world, (n, 6, k): displacement, rotation."""
+        arm = cross_matrices(pairs.R @ frames.t_tool)
+        shift = frames.R_base @ (self.shift - arm @ self.turn)
+        turn = frames.R_base @ self.turn * pairs.oriented[:, None, None]
+        return np.concatenate([shift, turn], axis=1)
+
+
+def motions_by_parameters(
+    mechanism: Mechanism,
+    poses: Sequence[RigidTransform],
+    # (p): parameters of :func:`legcal.machine.parameters.parametrization_of` with twists
+    names: Sequence[str],
+    covariance: Array,  # (p, p): their covariance [m, rad]
+) -> PlatformMotions:
+    """Return what the errors of a calibrated model do to the platform at some poses."""
+    known = parametrization_of(mechanism, twists=True)
+    R, t = _joint_frames(mechanism, poses)
+    by_parameters = pose_sensitivity(geometries(mechanism), known, mechanism.frame_legs, R, t)
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
+    root = vectors[:, kept] * np.sqrt(values[kept])
+    columns = [known.names.index(name) for name in names]
+    return _of_link(mechanism, poses, by_parameters[:, :, columns] @ root)
+
+
+def motions_by_readings(
+    mechanism: Mechanism,
+    poses: Sequence[RigidTransform],
+    sigma_q: float,  # standard deviation of a reading [m]
+) -> PlatformMotions:
+    """Return what an error of each reading does to the platform at some poses."""
+    R, t = _joint_frames(mechanism, poses)
+    equations = pose_equations(geometries(mechanism), R, t)
+    columns = list(freedoms(mechanism.frame_legs))
+    inverse = np.linalg.pinv(equations.by_pose[:, :, columns])[:, :, equations.measured]
+    moved = np.zeros((len(poses), 6, inverse.shape[2]))
+    moved[:, columns] = sigma_q * inverse  # the sign of a reading does not matter
+    return _of_link(mechanism, poses, moved)
+
+
+def _joint_frames(mechanism: Mechanism, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
+    """Return rotations and positions of R_e in R_b."""
+    matrices = np.array([platform_in_base(mechanism, T).as_matrix() for T in poses])
+    return matrices[:, :3, :3], matrices[:, :3, 3]
+
+
+def _of_link(
+    mechanism: Mechanism, poses: Sequence[RigidTransform], moved: Array
+) -> PlatformMotions:
+    """Return motions of R_e in R_b (n, 6, k) as those of the platform link in the base link."""
+    to_base = mechanism.T_base_Rb.rotation.as_matrix()
+    turn = to_base @ moved[:, :3]
+    origin = mechanism.T_platform_Re.translation
+    arms = cross_matrices(np.array([T.rotation.apply(-origin) for T in poses]))
+    return PlatformMotions(turn, to_base @ moved[:, 3:] - arms @ turn)

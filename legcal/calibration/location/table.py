@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.calibration.location.model import SMALLEST, ToolPoses
+from legcal.calibration.location.frames import SMALLEST
+from legcal.calibration.location.result import ToolPoses
 from legcal.data import reading_columns, readings_in
 from legcal.files import QUATERNION_TOLERANCE, Column, Table, read_table
 from legcal.geometry import Array, BoolArray
@@ -25,7 +26,6 @@ SIGMAS = ("position_sigma", "angle_sigma")
 MOST = 1e6  # [m]; squares of far larger positions overflow
 LARGEST_ANGLE = 0.2  # [rad]; a larger standard deviation is none of a measured orientation
 _ROUNDED = 1e-5  # of the norm of a quaternion: not worth a note
-
 COLUMNS = (
     Column("name", "text", required=False),
     *(
@@ -63,7 +63,6 @@ COLUMNS = (
         blank=True,
     ),
 )
-
 _ANGLES = re.compile(r"[rw][xyz]|[abc]|roll|pitch|yaw|phi|theta|psi", re.IGNORECASE)
 
 

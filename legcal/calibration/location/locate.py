@@ -1,4 +1,4 @@
-"""Locating base and tool: search, rows that agree, maximum likelihood, what stays open."""
+"""Locating base and tool: search, rows that agree, most likely frames, what stays open."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.location.fit import Agreement, Candidates, Fit, find_agreement, fit, search
-from legcal.calibration.location.judgement import (
-    Determinacy,
-    determine,
-    hold,
-    judge,
-    likely_mistake,
-)
-from legcal.calibration.location.model import SMALLEST, Frames, Location, ToolPoses
+from legcal.calibration.location.agreement import Agreement, find_agreement
+from legcal.calibration.location.fit import Fit, fit
+from legcal.calibration.location.frames import SMALLEST, Frames
+from legcal.calibration.location.judgement import judge
+from legcal.calibration.location.mistakes import likely_mistake
+from legcal.calibration.location.open import Determinacy, determine, hold
 from legcal.calibration.location.problem import Problem, build_problem
+from legcal.calibration.location.result import Location, ToolPoses
+from legcal.calibration.location.search import Candidates, search
 from legcal.calibration.location.table import LARGEST_ANGLE, read_tool_poses
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import describe

@@ -1,0 +1,311 @@
+"""What the poses leave open: refused where other poses of the machine would show it, else held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from legcal.calibration.location.fit import (
+    SINGULAR,
+    Fit,
+    covariance_with,
+    finished,
+    frame_design,
+    hold_tool,
+    is_resolved_by_the_tool,
+    system,
+)
+from legcal.calibration.location.frames import N_FRAME, Frames, PosePairs, jacobian
+from legcal.calibration.location.problem import Problem
+from legcal.calibration.location.result import (
+    Frame,
+    Kind,
+    OpenPart,
+    direction_of,
+    direction_words,
+    joined,
+)
+from legcal.errors import NotIdentifiable
+from legcal.geometry import Array, BoolArray
+from legcal.machine import random_configurations
+
+OPEN = 0.1  # [rad], and of the length of the machine
+HARDLY = 2e-3  # of the best seen direction: what no pose of a machine shows better is its own
+_PART = 0.03  # of a unit direction: what is less is not named
+_SAME_AXIS = 0.02  # of the largest rotations: what is less is about the same axis
+BLOCKS: tuple[tuple[slice, Frame, Kind], ...] = (
+    (slice(0, 3), "base", "position"),
+    (slice(3, 6), "base", "orientation"),
+    (slice(6, 9), "tool", "position"),
+    (slice(9, 12), "tool", "orientation"),
+)  # of a step
+WORKSPACE = 30  # poses
+SEED = 1
+WEAK = 25.0  # times worse known than one measured pose would tell
+
+
+@dataclass(frozen=True, eq=False)
+class Determinacy:
+    """Frames at rest, and how well each part of them is known."""
+
+    fit: Fit  # at the frames, the open part held
+    # (12, 12): of a step: displacement and rotation of the base about world axes, of the tool about
+    # platform axes [m, rad]; zero along what is held
+    covariance: Array
+    held: tuple[OpenPart, ...]  # what no pose of the machine tells
+    words: str  # the same for people; "" where everything is determined
+    weak: tuple[str, ...]  # what is known badly, one sentence each
+
+
+def determine(
+    problem: Problem,
+    found: Fit,
+    # (3,): where the tool is taken in the platform where the machine leaves that open [m]
+    tool_position: Array,
+    name: str,  # what the poses are called in messages
+) -> Determinacy:
+    """Return what a fit determines.
+
+    Raises NotIdentifiable if other poses of the machine would tell what these leave open, or if
+    more than the tool would have to be held.
+    """
+    pairs, oriented = problem.pairs, problem.is_oriented
+    basis = open_directions(found.frame_design, oriented=oriented)
+    parts: list[OpenPart] = []
+    words = ""
+    if basis.shape[1]:
+        workspace = _workspace(problem)
+        _check_machine(problem, found, basis, workspace, name)
+        found = hold(problem, found, tool_position)
+        basis = _open_at(problem, found, basis.shape[1], found.frames)
+        parts = open_parts(basis, found.frames)
+        words = _held_words(parts, workspace, tool_position)
+    scale = pairs.scale
+    unit = covariance_with(found.information, basis, oriented=oriented)
+    covariance = unit * np.outer(scale, scale)
+    return Determinacy(
+        found, covariance, tuple(parts), words, _weak(covariance, found, pairs, oriented=oriented)
+    )
+
+
+def hold(problem: Problem, found: Fit, tool_position: Array) -> Fit:
+    """Return a fit moved along what it leaves open until the tool is where it is held."""
+    k = open_directions(found.frame_design, oriented=problem.is_oriented).shape[1]
+    if k == 0:
+        return found
+    frames = hold_tool(
+        found.frames,
+        problem.pairs,
+        lambda frames: _open_at(problem, found, k, frames),
+        lambda frames: system(problem.pairs, frames, found.noise, problem.by_model),
+        tool_position,
+    )
+    return finished(problem.pairs, frames, found.noise, problem.by_model)
+
+
+def open_directions(
+    # (m, 12): whitened derivatives by a step in units of the machine's length and radians
+    design: Array,
+    *,
+    # whether orientations of the tool were measured at all; without, that of the tool in the
+    # platform is not looked for
+    oriented: bool,
+) -> Array:
+    """Return an orthonormal basis (12, k) of the directions that a design leaves open."""
+    return _unseen(design, oriented, lambda s: (s < SINGULAR * s[0]) | (s * OPEN < 1.0))
+
+
+def beyond_the_machine(
+    basis: Array,  # (12, k): what the measured poses leave open
+    # (m, 12): derivatives of poses all over the workspace by a step, both in units of the machine's
+    # length and radians: geometry alone, whatever the noise
+    jacobian: Array,
+    *,
+    oriented: bool,
+) -> Array:
+    """Return those open directions (12, k) that the machine's workspace would show."""
+    own = _unseen(jacobian, oriented, lambda s: s < HARDLY * s[0])
+    U, s, _ = np.linalg.svd(basis - own @ (own.T @ basis), full_matrices=False)
+    return np.asarray(U[:, s > 0.5])
+
+
+def _unseen(design: Array, oriented: bool, is_open: Callable[[Array], BoolArray]) -> Array:
+    """Return the right singular vectors (12, k) whose singular values are too small."""
+    n = 12 if oriented else 9
+    _, s, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
+    s = np.concatenate([s, np.zeros(n - len(s))])
+    chosen = is_open(s)
+    basis = np.zeros((12, int(chosen.sum())))
+    basis[:n] = Vt[chosen].T
+    return basis
+
+
+def open_parts(basis: Array, frames: Frames) -> list[OpenPart]:
+    """Return which parts of the frames some open directions (12, k) move."""
+    parts = []
+    for block, frame, kind in BLOCKS:
+        rows = basis[block]
+        if frame == "base":
+            rows = frames.R_base.T @ rows
+        U, s, _ = np.linalg.svd(rows, full_matrices=False)
+        found = [direction_of(u) for u in U[:, s > _PART].T]
+        if found:
+            parts.append(OpenPart(frame, kind, tuple(found)))
+    return parts
+
+
+@dataclass(frozen=True, eq=False)
+class Variety:
+    """How platform poses differ."""
+
+    # (r, 3): independent axes that they are turned about, in the base link, the first ones first
+    axes: Array
+    n_shifts: int  # independent directions in which they are displaced
+
+    @property
+    def words(self) -> str:
+        """How they differ, after "poses that"."""
+        turns = (
+            "do not turn",
+            f"all turn about one axis, {direction_words(self.axes[0])} of the base"
+            if len(self.axes)
+            else "",
+            "turn about two axes",
+            "turn about all axes",
+        )[len(self.axes)]
+        shifts = ("stay in place", "move along a line", "move in a plane", "move in space")
+        return f"{turns} and {shifts[self.n_shifts]}"
+
+
+def variety(R: Array, t: Array, length: float) -> Variety:
+    """Return how poses R (n, 3, 3), t (n, 3) [m] differ; a length makes rotations comparable."""
+    turns = (Rotation.from_matrix(R) * Rotation.from_matrix(R).mean().inv()).as_rotvec()
+    _, s, Vt = np.linalg.svd(turns, full_matrices=False)
+    size = np.sqrt(len(t))
+    axes = Vt[(s > _SAME_AXIS * s[0]) & (s / size > 1e-6)]
+    moves = np.linalg.svd(t - t.mean(axis=0), compute_uv=False)
+    n_shifts = int(np.sum((moves > _SAME_AXIS * moves[0]) & (moves / size > 1e-6 * length)))
+    return Variety(axes, n_shifts)
+
+
+def needed_words(found: Variety, possible: Variety, scatter: str) -> str:
+    """Return how the poses scatter if that matters, what they need and what to do."""
+    if len(found.axes) < min(2, len(possible.axes)):
+        several = "two axes" if len(possible.axes) > 1 else "an axis"
+        more = "tilted about another axis too" if len(found.axes) else "turned against each other"
+        return f", needed rotations about {several}; add poses that are {more}"
+    if found.n_shifts < possible.n_shifts:
+        return (
+            f", needed displacements in {possible.n_shifts} directions; add poses that are "
+            "displaced in another direction too"
+        )
+    return (
+        f", with a scatter of {scatter}, needed more or better ones, further apart; add some from "
+        "all over the workspace"
+    )
+
+
+def _open_at(problem: Problem, found: Fit, k: int, frames: Frames) -> Array:
+    """Return the k directions (12, k) that are known least at some frames."""
+    n = 12 if problem.is_oriented else 9
+    design = system(problem.pairs, frames, found.noise, problem.by_model)[1]
+    _, _, Vt = np.linalg.svd(frame_design(design)[:, :n], full_matrices=True)
+    basis = np.zeros((12, k))
+    basis[:n] = Vt[n - k :].T
+    return basis
+
+
+def _workspace(problem: Problem) -> PosePairs:
+    """Return poses all over the workspace, as if each had been measured."""
+    drawn = random_configurations(problem.mechanism, WORKSPACE, SEED)
+    matrices = np.array([T.as_matrix() for T in drawn.poses])
+    return PosePairs(
+        R=matrices[:, :3, :3],
+        t=matrices[:, :3, 3],
+        M=np.tile(np.eye(3), (WORKSPACE, 1, 1)),
+        p=np.zeros((WORKSPACE, 3)),
+        oriented=np.full(WORKSPACE, problem.is_oriented),
+        length=problem.pairs.length,
+    )
+
+
+def _check_machine(
+    problem: Problem, found: Fit, basis: Array, workspace: PosePairs, name: str
+) -> None:
+    """Refuse what other poses would tell, and what holding the tool does not close."""
+    pairs = problem.pairs
+    units = np.repeat([1.0 / pairs.length, 1.0], 3)[:, None]
+    seen = (jacobian(found.frames, workspace) * units * pairs.scale).reshape(-1, N_FRAME)
+    beyond = beyond_the_machine(basis, seen, oriented=problem.is_oriented)
+    here = variety(pairs.R, pairs.t, pairs.length)
+    there = variety(workspace.R, workspace.t, pairs.length)
+    start = f"{name}: base and tool could not be located, because"
+    if beyond.shape[1]:
+        raise NotIdentifiable(
+            f"{start} {joined(open_parts(beyond, found.frames))} cannot be told from the poses: "
+            f"found {len(pairs)} poses that {here.words}"
+            f"{needed_words(here, there, _scatter(problem, found))}."
+        )
+    if not is_resolved_by_the_tool(basis):
+        raise NotIdentifiable(
+            f"{start} no pose of this machine tells {joined(open_parts(basis, found.frames))}: "
+            f"found a platform whose poses {there.words}, needed a part that holding the tool in "
+            "the platform closes; measure orientations too, or the base itself."
+        )
+
+
+def _scatter(problem: Problem, found: Fit) -> str:
+    """Return the standard deviations of a measured component."""
+    sigma = found.noise.factor * np.sqrt((found.noise.sigma**2).mean(axis=0))
+    turn = f" and {np.degrees(sigma[1]):.2g} deg" if problem.is_oriented else ""
+    return f"{1e3 * sigma[0]:.2g} mm{turn}"
+
+
+def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Array) -> str:
+    """Return what is held and why."""
+    tool = [part for part in parts if part.frame == "tool"]
+    base = [part for part in parts if part.frame == "base"]
+    machine = variety(workspace.R, workspace.t, workspace.length)
+    if len(machine.axes) == 0:
+        why = "the platform of this machine does not turn"
+    elif len(machine.axes) == 1:
+        axis = direction_words(machine.axes[0])
+        why = f"the platform of this machine turns about one axis only, {axis} of the base"
+    else:
+        why = f"the platform of this machine takes poses that {machine.words}"
+    at = ", ".join(f"{x:g}" for x in tool_position)
+    with_it = f" from {joined(base)}" if base else ""
+    taken = [
+        f"the tool is taken at ({at}) m in the platform"
+        if part.kind == "position"
+        else "the tool is taken along the axes of the platform"
+        for part in tool
+    ]
+    return (
+        f"No pose tells {joined(tool)} apart{with_it}, because {why}: {' and '.join(taken)} there, "
+        "and the base follows; where the tool is in the world does not depend on it."
+    )
+
+
+def _weak(covariance: Array, found: Fit, pairs: PosePairs, *, oriented: bool) -> tuple[str, ...]:
+    """Return which directions are known badly, one sentence for each part of the frames."""
+    position, angle = found.noise.factor * np.sqrt((found.noise.sigma**2).mean(axis=0))
+    one = max(float(position), float(angle) * pairs.length if oriented else 0.0)
+    sentences = []
+    for block, frame, kind in BLOCKS:
+        values, vectors = np.linalg.eigh(covariance[block, block])
+        sigma = float(np.sqrt(max(values[-1], 0.0)))
+        limit = WEAK * (one if kind == "position" else one / pairs.length)
+        if sigma <= limit:
+            continue
+        v = vectors[:, -1] if frame == "tool" else found.frames.R_base.T @ vectors[:, -1]
+        part = OpenPart(frame, kind, (direction_of(v),))
+        known = f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
+        sentences.append(
+            f"Known badly is {part.words}: {known} (1 sigma); poses that differ more, above all in "
+            "rotations about several axes, would tell it better."
+        )
+    return tuple(sentences)

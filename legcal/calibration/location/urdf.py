@@ -1,0 +1,170 @@
+"""World and tool in the URDF: two links, held by fixed joints; all else stays.
+
+A ``world`` link above the root carries the machine, a ``tool`` link hangs on the platform. Where
+they are there already, as an earlier location leaves them, their origins are changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration.location.result import Location
+from legcal.errors import ModelError, UsageError
+from legcal.files import existing_parent, is_plain_name, temporary_folder
+from legcal.geometry import roll_pitch_yaw
+from legcal.machine import Mechanism, Urdf, UrdfPatch, load_mechanism, write_model
+
+WORLD = "world"
+TOOL = "tool"
+_SAME = 1e-12  # [m, rad]: rounding of the analysis
+
+
+def write_located_model(
+    mechanism: Mechanism,  # the machine that was located
+    location: Location,
+    folder: Path,  # gets ``models`` and ``urdf``; nothing there is replaced
+    *,
+    world: str = WORLD,
+    tool: str = TOOL,
+) -> tuple[Path, Path]:
+    """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` with the located frames in the URDF.
+
+    Returns tuple of Path: The YAML and the URDF.
+
+    Raises UsageError if files of these names are there, or the links have another meaning in the
+    URDF; ModelError if the URDF does not let a link carry the machine.
+    """
+    content = with_frames(mechanism, location, world=world, tool=tool)
+    located = replace(mechanism, urdf=replace(mechanism.urdf, content=content))
+    with temporary_folder(existing_parent(folder / "x"), "located") as temporary:
+        written, _ = write_model(located, temporary)
+        check_same(mechanism, load_mechanism(written))
+    return write_model(located, folder)
+
+
+def with_frames(
+    mechanism: Mechanism, location: Location, *, world: str = WORLD, tool: str = TOOL
+) -> bytes:
+    """Return the URDF of a mechanism with the located frames in it."""
+    for name in (world, tool):
+        if not is_plain_name(name):
+            raise UsageError(
+                f"The frames could not be written: found the link name {name!r}, needed letters, "
+                "digits, '-', '_' and '.'; give another one."
+            )
+    if world == tool:
+        raise UsageError(
+            f"The frames could not be written: found '{world}' for world and tool, needed two "
+            "names; give another one."
+        )
+    urdf = mechanism.urdf
+    T_root_base = _from_root(urdf, mechanism.base)
+    patch = UrdfPatch(urdf.content)
+
+    def place(joint: str, T: RigidTransform) -> None:
+        patch.set_origin(joint, np.asarray(T.translation), roll_pitch_yaw(T.rotation.as_matrix()))
+
+    if world in urdf.links:
+        joint = _joint_of_world(mechanism, world)
+        T_child_base = urdf.joints[joint].T_parent_origin.inv() * T_root_base
+        place(joint, location.T_world_base * T_child_base.inv())
+    else:
+        T_world_root = location.T_world_base * T_root_base.inv()
+        patch.add_frame(
+            world, urdf.root, world, _unused_joint(urdf, world, urdf.root), T_world_root
+        )
+    if tool in urdf.links:
+        place(_joint_of_tool(mechanism, tool), location.T_platform_tool)
+    else:
+        joint = _unused_joint(urdf, mechanism.platform, tool)
+        patch.add_frame(mechanism.platform, tool, tool, joint, location.T_platform_tool)
+    return patch.content()
+
+
+def _from_root(urdf: Urdf, base: str) -> RigidTransform:
+    """Return T_root_base, refused where a joint between them moves."""
+    above = {joint.child: joint for joint in urdf.joints.values()}
+    T, link = RigidTransform.identity(), base
+    while link != urdf.root:
+        joint = above[link]
+        if joint.moves:
+            raise ModelError(
+                f"{urdf.path}: the world could not be written: found the base '{base}' below the "
+                f"joint '{joint.name}', which moves, needed fixed joints between it and the root "
+                f"'{urdf.root}'; hang the platform from the base."
+            )
+        T, link = joint.T_parent_origin * T, joint.parent
+    return T
+
+
+def _joint_of_world(mechanism: Mechanism, world: str) -> str:
+    """Return the fixed joint below a world link that carries all the rest."""
+    urdf = mechanism.urdf
+    below = [joint for joint in urdf.joints.values() if joint.parent == world]
+    if world == urdf.root != mechanism.base and len(below) == 1 and not below[0].moves:
+        return below[0].name
+    raise UsageError(
+        f"{urdf.path}: the world could not be written: found a link '{world}' that is not a root "
+        "with the machine on one fixed joint below it, needed such a link or a free name; give "
+        "another name (--world-link)."
+    )
+
+
+def _joint_of_tool(mechanism: Mechanism, tool: str) -> str:
+    """Return the fixed joint between the platform and a tool link that carries nothing."""
+    urdf = mechanism.urdf
+    joint = next((joint for joint in urdf.joints.values() if joint.child == tool), None)
+    frames = {name for c in mechanism.chain.closures for name in (c.frame_1, c.frame_2)}
+    carries = any(other.parent == tool for other in urdf.joints.values())
+    if (
+        joint is not None
+        and not joint.moves
+        and joint.parent == mechanism.platform
+        and not carries
+        and frames.isdisjoint((tool, joint.name))
+    ):
+        return joint.name
+    raise UsageError(
+        f"{urdf.path}: the tool could not be written: found a link '{tool}' that is not at the end "
+        f"of a fixed joint on the platform '{mechanism.platform}', needed such a link or a free "
+        "name; give another name (--tool-link)."
+    )
+
+
+def _unused_joint(urdf: Urdf, parent: str, child: str) -> str:
+    """Return a free name of a fixed joint between two links."""
+    joint = f"{parent}_{child}_frame"
+    while joint in urdf.links or joint in urdf.joints:
+        joint += "_"
+    return joint
+
+
+def check_same(before: Mechanism, after: Mechanism) -> None:
+    """Check that a model with frames is the same machine.
+
+    Raises ModelError if its analysis differs by more than rounding.
+    """
+    same = (
+        before.leg_names == after.leg_names
+        and before.motors == after.motors
+        and before.mobility == after.mobility
+        and before.frame_legs == after.frame_legs
+        and all(
+            np.abs(one - other).max() <= _SAME
+            for one, other in (
+                (before.A_base, after.A_base),
+                (before.B_platform, after.B_platform),
+                (before.q0, after.q0),
+                (before.home.as_matrix(), after.home.as_matrix()),
+            )
+        )
+    )
+    if not same:
+        raise ModelError(
+            f"{before.urdf_path}: the frames could not be written: found another machine after "
+            "it, needed the same one; give other names (--world-link, --tool-link)."
+        )
