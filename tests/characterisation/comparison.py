@@ -106,6 +106,8 @@ def _of_mappings(
 ) -> list[str]:
     lost, new = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
     told = [f"{path}.{name}: lost" for name in lost] + [f"{path}.{name}: new" for name in new]
+    if "correlation" in expected and "correlation" in found:
+        expected, found = _of_variables(expected), _of_variables(found)
     sigma = expected.get("sigma")
     if not isinstance(sigma, float) or not sigma:
         sigma = scale.sigma.get(str(expected.get("name")), 0.0)
@@ -119,6 +121,15 @@ def _of_mappings(
             continue
         told += differences(one, other, scale, here)
     return told
+
+
+def _of_variables(covariance: dict[str, Any]) -> dict[str, Any]:
+    """Return a covariance without the correlations of what is held: its sigma is rounding."""
+    held = np.array(covariance["sigma"]) < ROUNDING**1.5
+    row, column = np.tril_indices(len(held), -1)
+    correlation = np.where(held[row] | held[column], 0.0, covariance["correlation"])
+    sigma = [0.0 if h else s for h, s in zip(held, covariance["sigma"], strict=True)]
+    return covariance | {"sigma": sigma, "correlation": correlation.tolist()}
 
 
 def _tolerance(path: str, expected: float, scale: Scale) -> float:
