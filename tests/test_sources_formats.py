@@ -43,7 +43,7 @@ def assert_same_analysis(found: Mechanism, expected: Mechanism) -> None:
         assert (leg.type, leg.kind, leg.sign) == (wanted.type, wanted.kind, wanted.sign)
         assert leg.prismatic == wanted.prismatic
         assert _difference(np.array(leg.travel), np.array(wanted.travel)) == 0.0
-        for key in ("A_base", "B_platform", "q0", "base_axis", "platform_axis", "twist"):
+        for key in ("A", "B", "q0", "base_axis", "platform_axis", "twist"):
             assert _difference(getattr(leg, key), getattr(wanted, key)) < 1e-9, key
         radii = [[c.radius for c in one.cylinders] for one in (leg, wanted)]
         assert radii[0] == radii[1]
