@@ -53,5 +53,6 @@ from .repeatability import Spread as Spread
 from .result import Holdout as Holdout
 from .result import PlatformBlock as PlatformBlock
 from .result import Result as Result
+from .result import WorkspaceAccuracy as WorkspaceAccuracy
 from .result import result_of as result_of
 from .verdict import Calibration as Calibration

@@ -17,6 +17,7 @@ from legcal.calibration import (
     Holdout,
     PlatformBlock,
     Result,
+    WorkspaceAccuracy,
     poses_at_readings,
     result_of,
 )
@@ -162,24 +163,22 @@ def _direction_lines(result: Result) -> list[str]:
 
 def _platform_lines(found: PlatformBlock) -> list[str]:
     """Return the predicted error of the platform, and what would add to it."""
-
-    def words(dX_m: float, dE_rad: float, dX_max_m: float, dE_max_rad: float) -> str:
-        return f"{_mm_deg(dX_m, dE_rad)}, at most {_mm_deg(dX_max_m, dE_max_rad)}"
-
-    places = [(f"at the {found.poses} poses", found)]
-    parts = [
-        f"{where} " + words(at.sigma_dX_m, at.sigma_dE_rad, at.sigma_dX_max_m, at.sigma_dE_max_rad)
-        for where, at in (*places, ("over the workspace", found.workspace))
-        if at is not None
-    ]
+    parts = [f"at the {found.poses} poses {_predicted(found)}"]
+    if found.workspace is not None:
+        parts.append(f"over the workspace {_predicted(found.workspace)}")
     return [
         f"Predicted error of the platform (1 sigma): {'; '.join(parts)}.",
         *(
-            f"{one.what.capitalize()} would move the platform by "
-            f"{words(one.dX_m, one.dE_rad, one.dX_max_m, one.dE_max_rad)}."
+            f"{one.what.capitalize()} would move the platform by {_mm_deg(one.dX_m, one.dE_rad)}, "
+            f"at most {_mm_deg(one.dX_max_m, one.dE_max_rad)}."
             for one in found.sensitivities
         ),
     ]
+
+
+def _predicted(at: PlatformBlock | WorkspaceAccuracy) -> str:
+    mean, most = (at.sigma_dX_m, at.sigma_dE_rad), (at.sigma_dX_max_m, at.sigma_dE_max_rad)
+    return f"{_mm_deg(*mean)}, at most {_mm_deg(*most)}"
 
 
 def _holdout_lines(found: Holdout) -> list[str]:
