@@ -168,8 +168,8 @@ def test_all_problems_of_a_table_are_told_at_once(tmp_path: Path) -> None:
         ("{h}\n{r}\n,1,2,3,4\n", "mm", r"types.1 could not be used: found the leg type nothing"),
         ("{h},travel_low\n{r},0\n{r},0\n", "mm", r"travel could not be used"),
         ("{h}\nRPS,nan,2,3,4\n{r}\n", "mm", r"line 2\), column base_x: .* found 'nan'"),
-        ("type;base_x\nRPS;1\n", "mm", r"found 'type;base_x' in one column, needed commas"),
-        ("type\tbase_x\nRPS\t1\n", "mm", r"found '.*' in one column, needed commas"),
+        ("type;base_x\nRPS;1\n", "mm", r"found ';' between columns, needed ','"),
+        ("type\tbase_x\nRPS\t1\n", "mm", r"found .* between columns, needed ','"),
         (
             "{h},radius,rod\n{r},9,8\n",
             "mm",

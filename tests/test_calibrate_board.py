@@ -18,6 +18,7 @@ from legcal.calibration.joint_fit.parameters import BOARD_SCALE
 from legcal.calibration.verdict import Calibration
 from legcal.data.corners import found_corners
 from legcal.data.measurements import Measurements, View
+from legcal.data.rows import Order
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
 from legcal.machine import geometries, vector_of
 from legcal.simulation.request import Level
@@ -215,7 +216,7 @@ def test_only_views_in_the_hand_need_the_board() -> None:
     corners = found_corners(np.zeros(n, dtype=np.intp), np.arange(n), px, np.full(n, 0.05))
     views = (camera, replace(camera, name="c2"))
     m = Measurements(views, ("a.png", "b.png"), rows, rows, np.zeros((2, 1)), 1e-6)
-    order = SimpleNamespace(rows=rows, legs=rows[:1], views=rows)
+    order = Order(rows=rows, legs=rows[:1], views=rows)
     dataset = SimpleNamespace(board=board, corners=corners, yaml_path="dataset.yaml")
     work: Any = SimpleNamespace(dataset=dataset, measurements=m, order=order)
     found = observe_board(work)

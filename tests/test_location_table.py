@@ -136,7 +136,7 @@ def test_what_is_wrong_with_a_table_is_told_by_row_and_column(
     [
         ("", "found no header and no row"),
         ("x,y,z\n", "found a header and no row"),
-        ("x;y;z\n1;2;3\n", "needed commas between columns"),
+        ("x;y;z\n1;2;3\n", "between columns, needed ','"),
         ("x,x,y,z\n1,2,3,4\n", "found the column 'x' 2 times"),
     ],
 )

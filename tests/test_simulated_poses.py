@@ -298,7 +298,7 @@ HEAD = "leg1_prismatic,leg2_prismatic,leg3_prismatic\n"
     [
         ("", "found no header and no row"),
         (HEAD, "found a header and no row"),
-        (HEAD.replace(",", ";") + "0;0;0\n", "needed commas between columns"),
+        (HEAD.replace(",", ";") + "0;0;0\n", "between columns, needed ','"),
         (HEAD.replace("leg2", "leg9") + "0,0,0\n", "unknown column 'leg9_prismatic'"),
         (HEAD.replace("leg2", "leg9") + "0,0,0\n", "no column 'leg2_prismatic'"),
         (HEAD.replace("leg2", "leg1") + "0,0,0\n", "'leg1_prismatic' 2 times"),

@@ -206,10 +206,11 @@ def read_table(
             f"row, needed {needed}."
         )
     header = lines[0][1] if lines else []
-    if len(header) == 1 and re.search(r"[;\t]", header[0]):
+    other = re.search(r"[;\t]", header[0]) if len(header) == 1 else None
+    if other:
         raise DatasetError(
-            f"{path}, header: the columns could not be used: found '{header[0]}' in one column, "
-            "needed commas between columns; save as CSV."
+            f"{path}, header: the columns could not be used: found {other[0]!r} between columns, "
+            "needed ',' there and '.' in numbers; save it again as comma-separated text."
         )
     header = [name.lower() for name in header] if fold else header
     start = f"{path}, header: the columns could not be used: found"
