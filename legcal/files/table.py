@@ -210,7 +210,7 @@ def read_table(
     if other:
         raise DatasetError(
             f"{path}, header: the columns could not be used: found {other[0]!r} between columns, "
-            "needed ',' there and '.' in numbers; save it again as comma-separated text."
+            "needed ',' there and '.' in numbers; save it again with commas (CSV)."
         )
     header = [name.lower() for name in header] if fold else header
     start = f"{path}, header: the columns could not be used: found"
