@@ -1,0 +1,339 @@
+"""Which of the seeded defects of defects.yaml a test suite catches.
+
+    python benchmarks/defects.py --check
+    OMP_NUM_THREADS=1 python benchmarks/defects.py --suite old [--only ID ...] [--concern NAME ...]
+    OMP_NUM_THREADS=1 python benchmarks/defects.py --suite tests/characterisation [-k WORDS]
+    python benchmarks/defects.py --compare old new
+
+A defect replaces a snippet of the package by another one that is as plausible: a sign, a factor, a
+weight, a frame, a refusal. The snippet is looked up in the whole package, whatever file it is in,
+and however its lines are broken and indented; it must be there once (``--check``). One defect at a
+time is put into a copy of the tree, and pytest runs there until the first failure. ``--suite old``
+runs the files that are named at each defect (``tests``), any other suite is a path of tests.
+
+One line for each defect is appended to defects_SUITE.jsonl beside this file, so that a run
+continues where it stopped; ``--again`` repeats what is there. A suite must pass without a defect:
+files that fail then are named, and catch nothing.
+"""
+
+import argparse
+import ast
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import yaml
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+DEFECTS = HERE / "defects.yaml"
+OLD = "old"
+CAUGHT, SURVIVED, TIMEOUT = "caught", "survived", "timeout"
+COPIED = ("legcal", "tests", "benchmarks")  # the rest of the tree is linked
+FAILED, NOTHING_RUN = 1, 5  # exit codes of pytest
+_TOKEN, _WORD = re.compile(r"\w+|[^\w\s]"), re.compile(r"\w+")
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A snippet of the package and what it is replaced by."""
+
+    id: str
+    concern: str
+    what: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the snippet of a defect is."""
+
+    path: Path
+    start: int
+    end: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What pytest said: caught, survived or timeout, the first failing test, and the seconds."""
+
+    found: str
+    by: str
+    seconds: float
+
+
+def read_defects(path: Path = DEFECTS) -> list[Defect]:
+    """Return the defects of the data file."""
+    entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return [Defect(**{**entry, "tests": tuple(entry["tests"])}) for entry in entries]
+
+
+def pattern_of(snippet: str) -> re.Pattern[str]:
+    """Return what finds a snippet, however its lines are broken and indented."""
+    tokens = _TOKEN.findall(snippet)
+    parts = [re.escape(tokens[0])]
+    for before, token in pairwise(tokens):
+        needs_space = before[-1].isidentifier() and (token[0] + "a").isidentifier()
+        comma = r",?" if token in ")]}" and before != "," else ""
+        parts.append(comma + (r"\s+" if needs_space else r"\s*") + re.escape(token))
+    start = r"(?<!\w)" if re.match(r"\w", tokens[0]) else ""
+    end = r"(?!\w)" if re.match(r"\w", tokens[-1][-1]) else ""
+    return re.compile(start + "".join(parts) + end)
+
+
+def places(defect: Defect, sources: dict[Path, str]) -> list[Place]:
+    """Return everywhere that the snippet of a defect is in the package."""
+    pattern, words = pattern_of(defect.old), set(_WORD.findall(defect.old))
+    return [
+        Place(path, match.start(), match.end())
+        for path, text in sources.items()
+        if all(word in text for word in words)  # quicker than the pattern
+        for match in pattern.finditer(text)
+    ]
+
+
+def replaced(text: str, place: Place, new: str) -> str:
+    """Return a module with the snippet replaced; further lines get the first one's indentation."""
+    line = text[text.rfind("\n", 0, place.start) + 1 :]
+    indent = line[: len(line) - len(line.lstrip())]
+    return text[: place.start] + new.replace("\n", f"\n{indent}") + text[place.end :]
+
+
+def read_package(root: Path) -> dict[Path, str]:
+    """Return the modules of the package by their paths in the tree."""
+    return {
+        path.relative_to(root): path.read_text(encoding="utf-8")
+        for path in sorted((root / "legcal").rglob("*.py"))
+    }
+
+
+def problems(defects: Sequence[Defect], sources: dict[Path, str], root: Path) -> list[str]:
+    """Return what is wrong with the data file at the present package."""
+    found = [
+        f"{name}: the id is there {count} times"
+        for name, count in Counter(defect.id for defect in defects).items()
+        if count > 1
+    ]
+    for defect in defects:
+        at = places(defect, sources)
+        if len(at) != 1:
+            where = ", ".join(str(place.path) for place in at[:4])
+            found.append(f"{defect.id}: the snippet is there {len(at)} times {where}".rstrip())
+            continue
+        before = sources[at[0].path]
+        try:
+            after = ast.dump(ast.parse(replaced(before, at[0], defect.new)))
+        except SyntaxError as error:
+            found.append(f"{defect.id}: what replaces the snippet is no Python: {error}")
+            continue
+        if after == ast.dump(ast.parse(before)):
+            found.append(f"{defect.id}: nothing changes")
+    names = {name.split("::")[0] for defect in defects for name in defect.tests}
+    missing = sorted(name for name in names if not (root / "tests" / name).is_file())
+    return found + [f"tests/{name}: there is no such file" for name in missing]
+
+
+class Tree:
+    """A copy of the tree in which one defect at a time is put."""
+
+    def __init__(self, root: Path, folder: Path) -> None:
+        self.folder = folder
+        self.sources = read_package(root)
+        self._clock = time.time()
+        for path in root.iterdir():
+            if path.name in COPIED:
+                ignored = shutil.ignore_patterns("__pycache__")
+                shutil.copytree(path, folder / path.name, ignore=ignored)
+            elif path.name != ".git":
+                (folder / path.name).symlink_to(path)
+
+    @contextlib.contextmanager
+    def with_defect(self, defect: Defect) -> Iterator[None]:
+        """Put a defect into the copy, and take it out at the end."""
+        (place,) = places(defect, self.sources)
+        before = self.sources[place.path]
+        self._write(place.path, replaced(before, place, defect.new))
+        try:
+            yield
+        finally:
+            self._write(place.path, before)
+
+    def run(self, command: Sequence[str], limit: float) -> Outcome:
+        """Run pytest in the copy until the first failure."""
+        begin = time.perf_counter()
+        options = ("-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE")
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pytest", *options, *command],
+            cwd=self.folder,
+            env={**os.environ, "PYTHONPATH": str(self.folder)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,  # so that the processes of the tests end with it
+        )
+        try:
+            said, _ = process.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+            return Outcome(TIMEOUT, "", time.perf_counter() - begin)
+        seconds = time.perf_counter() - begin
+        if process.returncode == 0:
+            return Outcome(SURVIVED, "", seconds)
+        if process.returncode != FAILED and "rror" not in said:
+            raise SystemExit(f"pytest could not be run: {said[-2000:]}")
+        by = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", said, re.MULTILINE)
+        return Outcome(CAUGHT, by[1] if by else said.strip().splitlines()[-1], seconds)
+
+    def _write(self, path: Path, text: str) -> None:
+        """Write a module with a time of its own, so that no compiled one is taken for it."""
+        self._clock += 2.0
+        (self.folder / path).write_text(text, encoding="utf-8")
+        os.utime(self.folder / path, (self._clock, self._clock))
+
+
+def checkpoint_of(suite: str) -> Path:
+    """Return the file of the outcomes of a suite."""
+    name = OLD if suite == OLD else Path(suite).name
+    return HERE / f"defects_{name}.jsonl"
+
+
+def read_outcomes(path: Path) -> dict[str, dict[str, object]]:
+    """Return the last outcome of every defect, in the order of the file."""
+    if not path.is_file():
+        return {}
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return {str(line["id"]): line for line in lines}
+
+
+def commands(defect: Defect, suite: str, words: str | None) -> list[list[str]]:
+    """Return what pytest runs for a defect, one after the other until it is caught."""
+    if suite == OLD:
+        return [[f"tests/{name}" for name in defect.tests]]
+    return [[suite, "-k", words], [suite]] if words else [[suite]]
+
+
+def sound(tree: Tree, suite: str, defects: Sequence[Defect], limit: float) -> set[str]:
+    """Return the targets that pass without a defect, and say which do not."""
+    targets = [suite]
+    if suite == OLD:
+        targets = sorted({f"tests/{name}" for defect in defects for name in defect.tests})
+    good = set()
+    for target in targets:
+        outcome = tree.run([target], limit)
+        print(f"{outcome.found:9}{outcome.seconds:7.1f} s  without a defect: {target}", flush=True)
+        if outcome.found == SURVIVED:
+            good.add(target)
+    return good
+
+
+def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
+    """Run a suite on the defects that have no outcome yet."""
+    path = checkpoint_of(arguments.suite)
+    done = {} if arguments.again else read_outcomes(path)
+    todo = [defect for defect in defects if defect.id not in done]
+    end = time.perf_counter() + 60.0 * arguments.minutes
+    with TemporaryDirectory(prefix="legcal-defects-") as folder:
+        tree = Tree(ROOT, Path(folder))
+        if arguments.baseline and not sound(tree, arguments.suite, todo, arguments.limit):
+            raise SystemExit("the suite does not pass without a defect")
+        for defect in todo:
+            if time.perf_counter() > end:
+                print("the time is over; start again to continue")
+                break
+            outcome, seconds = Outcome(SURVIVED, "", 0.0), 0.0
+            with tree.with_defect(defect):
+                for command in commands(defect, arguments.suite, arguments.k):
+                    outcome = tree.run(command, arguments.limit)
+                    seconds += outcome.seconds
+                    if outcome.found != SURVIVED:
+                        break
+            line = {
+                "id": defect.id,
+                "found": outcome.found,
+                "by": outcome.by,
+                "seconds": round(seconds, 1),
+            }
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
+            print(f"{outcome.found:9}{seconds:7.1f} s  {defect.id:34}{outcome.by}", flush=True)
+    table(defects, read_outcomes(path))
+
+
+def table(defects: Sequence[Defect], outcomes: dict[str, dict[str, object]]) -> None:
+    """Print the counts by concern."""
+    columns = (CAUGHT, SURVIVED, TIMEOUT)
+    counts: dict[str, Counter[str]] = {}
+    for defect in defects:
+        found = str(outcomes.get(defect.id, {}).get("found", ""))
+        counts.setdefault(defect.concern, Counter())[found] += 1
+    print(f"{'':20}{'defects':>9}" + "".join(f"{name:>10}" for name in columns))
+    total = sum(counts.values(), Counter[str]())
+    for name, count in [*counts.items(), ("all", total)]:
+        print(f"{name:20}{count.total():9}" + "".join(f"{count[found]:10}" for found in columns))
+
+
+def compare(defects: Sequence[Defect], one: str, other: str) -> bool:
+    """Print what one suite catches and another one does not; say whether there is nothing."""
+    first, second = (read_outcomes(checkpoint_of(suite)) for suite in (one, other))
+    lost = []
+    for defect in defects:
+        found = [
+            outcomes.get(defect.id, {}).get("found", "not run") for outcomes in (first, second)
+        ]
+        if found[0] in (CAUGHT, TIMEOUT) and found[1] not in (CAUGHT, TIMEOUT):
+            lost.append(defect)
+            print(f"{defect.id:34}{found[1]:10}{defect.what}")
+    print(f"{len(lost)} of {len(defects)} are caught by {one} and not by {other}")
+    return not lost
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="are all snippets there once?")
+    parser.add_argument("--suite", help="old, or a path of tests")
+    parser.add_argument("--compare", nargs=2, metavar="SUITE")
+    parser.add_argument("--only", nargs="+", default=[], metavar="ID")
+    parser.add_argument("--concern", nargs="+", default=[])
+    parser.add_argument("-k", metavar="WORDS", help="tests of the suite that are run first")
+    parser.add_argument("--again", action="store_true", help="repeat what has an outcome")
+    parser.add_argument("--baseline", action="store_true", help="first without any defect")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds of a run of pytest")
+    parser.add_argument("--minutes", type=float, default=1e9, help="of all; then stop")
+    arguments = parser.parse_args()
+    defects = read_defects()
+    found = problems(defects, read_package(ROOT), ROOT)
+    if found:
+        raise SystemExit("\n".join([*found, f"{len(found)} problems"]))
+    chosen = [
+        defect
+        for defect in defects
+        if (not arguments.only or defect.id in arguments.only)
+        and (not arguments.concern or defect.concern in arguments.concern)
+    ]
+    if arguments.check:
+        print(f"{len(defects)} defects, each of them there once")
+    elif arguments.compare:
+        raise SystemExit(0 if compare(chosen, *arguments.compare) else 1)
+    elif arguments.suite:
+        run(arguments, chosen)
+    else:
+        parser.print_help()
+
+
+if __name__ == "__main__":
+    main()
