@@ -3,17 +3,18 @@
     python benchmarks/defects.py --check
     OMP_NUM_THREADS=1 python benchmarks/defects.py --suite old [--only ID ...] [--concern NAME ...]
     OMP_NUM_THREADS=1 python benchmarks/defects.py --suite tests/characterisation [-k WORDS]
-    python benchmarks/defects.py --compare old new
+    python benchmarks/defects.py --compare old tests/characterisation
 
 A defect replaces a snippet of the package by another one that is as plausible: a sign, a factor, a
 weight, a frame, a refusal. The snippet is looked up in the whole package, whatever file it is in,
 and however its lines are broken and indented; it must be there once (``--check``). One defect at a
 time is put into a copy of the tree, and pytest runs there until the first failure. ``--suite old``
-runs the files that are named at each defect (``tests``), any other suite is a path of tests.
+runs the files that are named at each defect (``tests``); any other suite is a path of tests, of
+which those go first that the data file names (``cases``, or -k), and with --subset no others run.
 
 One line for each defect is appended to defects_SUITE.jsonl beside this file, so that a run
-continues where it stopped; ``--again`` repeats what is there. A suite must pass without a defect:
-files that fail then are named, and catch nothing.
+continues where it stopped; ``--again`` repeats what is there. ``--confirm`` runs the tests that
+caught something without any defect: they must pass.
 """
 
 import argparse
@@ -55,7 +56,8 @@ class Defect:
     what: str
     old: str
     new: str
-    tests: tuple[str, ...]
+    tests: tuple[str, ...]  # of the old suite
+    cases: str  # words for pytest -k, of any other suite
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,12 @@ class Outcome:
 
 def read_defects(path: Path = DEFECTS) -> list[Defect]:
     """Return the defects of the data file."""
-    entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    return [Defect(**{**entry, "tests": tuple(entry["tests"])}) for entry in entries]
+    document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    cases: dict[str, str] = document["cases"]
+    return [
+        Defect(**{"cases": cases[entry["concern"]], **entry, "tests": tuple(entry["tests"])})
+        for entry in document["defects"]
+    ]
 
 
 def pattern_of(snippet: str) -> re.Pattern[str]:
@@ -192,6 +198,8 @@ class Tree:
             process.communicate()
             return Outcome(TIMEOUT, "", time.perf_counter() - begin)
         seconds = time.perf_counter() - begin
+        if process.returncode == NOTHING_RUN:
+            raise SystemExit(f"there are no such tests: {' '.join(command)}")
         if process.returncode == 0:
             return Outcome(SURVIVED, "", seconds)
         if process.returncode != FAILED and "rror" not in said:
@@ -220,25 +228,27 @@ def read_outcomes(path: Path) -> dict[str, dict[str, object]]:
     return {str(line["id"]): line for line in lines}
 
 
-def commands(defect: Defect, suite: str, words: str | None) -> list[list[str]]:
+def commands(defect: Defect, arguments: argparse.Namespace) -> list[list[str]]:
     """Return what pytest runs for a defect, one after the other until it is caught."""
-    if suite == OLD:
+    if arguments.suite == OLD:
         return [[f"tests/{name}" for name in defect.tests]]
-    return [[suite, "-k", words], [suite]] if words else [[suite]]
+    first = [arguments.suite, "-k", arguments.k or defect.cases]
+    return [first] if arguments.subset else [first, [arguments.suite]]
 
 
-def sound(tree: Tree, suite: str, defects: Sequence[Defect], limit: float) -> set[str]:
-    """Return the targets that pass without a defect, and say which do not."""
-    targets = [suite]
-    if suite == OLD:
-        targets = sorted({f"tests/{name}" for defect in defects for name in defect.tests})
-    good = set()
-    for target in targets:
-        outcome = tree.run([target], limit)
-        print(f"{outcome.found:9}{outcome.seconds:7.1f} s  without a defect: {target}", flush=True)
-        if outcome.found == SURVIVED:
-            good.add(target)
-    return good
+def confirm(tree: Tree, outcomes: dict[str, dict[str, object]], limit: float) -> None:
+    """Run all tests that caught a defect without any, since they would catch nothing if they fail.
+
+    Raises
+    ------
+    SystemExit
+        If one of them fails.
+    """
+    tests = {str(line["by"]).split("[")[0] for line in outcomes.values() if line["by"]}
+    outcome = tree.run(sorted(tests), limit)
+    if outcome.found != SURVIVED:
+        raise SystemExit(f"without a defect: {outcome.found} {outcome.by}")
+    print(f"the {len(tests)} tests that catch defects pass without ({outcome.seconds:.0f} s)")
 
 
 def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
@@ -249,15 +259,16 @@ def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
     end = time.perf_counter() + 60.0 * arguments.minutes
     with TemporaryDirectory(prefix="legcal-defects-") as folder:
         tree = Tree(ROOT, Path(folder))
-        if arguments.baseline and not sound(tree, arguments.suite, todo, arguments.limit):
-            raise SystemExit("the suite does not pass without a defect")
+        if arguments.confirm:
+            confirm(tree, read_outcomes(path), 3600.0)
+            return
         for defect in todo:
             if time.perf_counter() > end:
                 print("the time is over; start again to continue")
                 break
             outcome, seconds = Outcome(SURVIVED, "", 0.0), 0.0
             with tree.with_defect(defect):
-                for command in commands(defect, arguments.suite, arguments.k):
+                for command in commands(defect, arguments):
                     outcome = tree.run(command, arguments.limit)
                     seconds += outcome.seconds
                     if outcome.found != SURVIVED:
@@ -310,8 +321,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="ID")
     parser.add_argument("--concern", nargs="+", default=[])
     parser.add_argument("-k", metavar="WORDS", help="tests of the suite that are run first")
+    parser.add_argument("--subset", action="store_true", help="run no other tests than those")
     parser.add_argument("--again", action="store_true", help="repeat what has an outcome")
-    parser.add_argument("--baseline", action="store_true", help="first without any defect")
+    parser.add_argument("--confirm", action="store_true", help="do those that catch pass without?")
     parser.add_argument("--limit", type=float, default=300.0, help="seconds of a run of pytest")
     parser.add_argument("--minutes", type=float, default=1e9, help="of all; then stop")
     arguments = parser.parse_args()
