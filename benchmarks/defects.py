@@ -25,16 +25,19 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NoReturn
 
+import pytest
 import yaml
 
 HERE = Path(__file__).parent
@@ -42,6 +45,23 @@ ROOT = HERE.parent
 DEFECTS = HERE / "defects.yaml"
 OLD = "old"
 CAUGHT, SURVIVED, TIMEOUT = "caught", "survived", "timeout"
+LIBRARIES = (
+    "casadi",
+    "cv2",
+    "lxml.etree",
+    "numpy",
+    "pinocchio",
+    "pydantic",
+    "rich.console",
+    "scipy.interpolate",
+    "scipy.optimize",
+    "scipy.sparse",
+    "scipy.spatial.transform",
+    "scipy.stats",
+    "trimesh",
+    "typer",
+    "yourdfpy",
+)
 COPIED = ("legcal", "tests", "benchmarks")  # the rest of the tree is linked
 FAILED, NOTHING_RUN = 1, 5  # exit codes of pytest
 _TOKEN, _WORD = re.compile(r"\w+|[^\w\s]"), re.compile(r"\w+")
@@ -179,39 +199,69 @@ class Tree:
             self._write(place.path, before)
 
     def run(self, command: Sequence[str], limit: float) -> Outcome:
-        """Run pytest in the copy until the first failure."""
+        """Run pytest in the copy until the first failure, in a process of its own."""
         begin = time.perf_counter()
-        options = ("-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE")
-        process = subprocess.Popen(
-            [sys.executable, "-m", "pytest", *options, *command],
-            cwd=self.folder,
-            env={**os.environ, "PYTHONPATH": str(self.folder)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,  # so that the processes of the tests end with it
-        )
-        try:
-            said, _ = process.communicate(timeout=limit)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-            return Outcome(TIMEOUT, "", time.perf_counter() - begin)
+        said = self.folder / "said.txt"
+        child = os.fork()
+        if child == 0:
+            self._be_pytest(command, said)
+        status = _ended(child, begin + limit)
         seconds = time.perf_counter() - begin
-        if process.returncode == NOTHING_RUN:
+        if status is None:
+            return Outcome(TIMEOUT, "", seconds)
+        code, text = os.waitstatus_to_exitcode(status), said.read_text(encoding="utf-8")
+        if code == NOTHING_RUN:
             raise SystemExit(f"there are no such tests: {' '.join(command)}")
-        if process.returncode == 0:
+        if code == 0:
             return Outcome(SURVIVED, "", seconds)
-        if process.returncode != FAILED and "rror" not in said:
-            raise SystemExit(f"pytest could not be run: {said[-2000:]}")
-        by = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", said, re.MULTILINE)
-        return Outcome(CAUGHT, by[1] if by else said.strip().splitlines()[-1], seconds)
+        if code != FAILED and "rror" not in text:
+            raise SystemExit(f"pytest could not be run: {text[-2000:]}")
+        by = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", text, re.MULTILINE)
+        return Outcome(CAUGHT, by[1] if by else text.strip().splitlines()[-1], seconds)
+
+    def _be_pytest(self, command: Sequence[str], said: Path) -> NoReturn:
+        """Make this process one that runs pytest, and end it."""
+        code = 3  # of pytest: an internal error
+        try:
+            os.setsid()  # so that the processes of the tests end with it
+            with said.open("w", encoding="utf-8") as file:
+                os.dup2(file.fileno(), 1)
+                os.dup2(file.fileno(), 2)
+            os.chdir(self.folder)
+            os.environ["PYTHONPATH"] = str(self.folder)
+            sys.path[0] = str(self.folder)
+            options = ("-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE")
+            code = int(pytest.main([*options, *command]))
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
 
     def _write(self, path: Path, text: str) -> None:
         """Write a module with a time of its own, so that no compiled one is taken for it."""
         self._clock += 2.0
         (self.folder / path).write_text(text, encoding="utf-8")
         os.utime(self.folder / path, (self._clock, self._clock))
+
+
+def _ended(child: int, end: float) -> int | None:
+    """Return the status of a process that ends before a time, None after killing it otherwise."""
+    while time.perf_counter() < end:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            return status
+        time.sleep(0.05)
+    os.killpg(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return None
+
+
+def load_libraries() -> None:
+    """Import what every test needs and takes seconds, for all processes that run tests."""
+    for name in LIBRARIES:
+        import_module(name)
 
 
 def checkpoint_of(suite: str) -> Path:
@@ -232,7 +282,7 @@ def commands(defect: Defect, arguments: argparse.Namespace) -> list[list[str]]:
     """Return what pytest runs for a defect, one after the other until it is caught."""
     if arguments.suite == OLD:
         return [[f"tests/{name}" for name in defect.tests]]
-    first = [arguments.suite, "-k", arguments.k or defect.cases]
+    first = [arguments.suite, "-k", arguments.k or defect.cases, "-m", ""]  # slow ones too
     return [first] if arguments.subset else [first, [arguments.suite]]
 
 
@@ -257,6 +307,7 @@ def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
     done = {} if arguments.again else read_outcomes(path)
     todo = [defect for defect in defects if defect.id not in done]
     end = time.perf_counter() + 60.0 * arguments.minutes
+    load_libraries()
     with TemporaryDirectory(prefix="legcal-defects-") as folder:
         tree = Tree(ROOT, Path(folder))
         if arguments.confirm:
