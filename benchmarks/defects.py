@@ -147,30 +147,34 @@ def read_package(root: Path) -> dict[Path, str]:
     }
 
 
-def problems(defects: Sequence[Defect], sources: dict[Path, str], root: Path) -> list[str]:
-    """Return what is wrong with the data file at the present package."""
-    found = [
-        f"{name}: the id is there {count} times"
-        for name, count in Counter(defect.id for defect in defects).items()
-        if count > 1
-    ]
+def problem(defect: Defect, sources: dict[Path, str]) -> str:
+    """Return what is wrong with a defect at the present package, an empty text if nothing is."""
+    at = places(defect, sources)
+    if len(at) != 1:
+        where = ", ".join(str(place.path) for place in at[:4])
+        return f"the snippet is there {len(at)} times{where and f': {where}'}"
+    before = sources[at[0].path]
+    try:
+        after = ast.dump(ast.parse(replaced(before, at[0], defect.new)))
+    except SyntaxError as error:
+        return f"what replaces the snippet is no Python: {error}"
+    return "nothing changes" if after == ast.dump(ast.parse(before)) else ""
+
+
+def usable(defects: Sequence[Defect], sources: dict[Path, str]) -> list[Defect]:
+    """Return the defects that can be put into the present package, and name the others."""
+    counts = Counter(defect.id for defect in defects)
+    twice = [name for name, count in counts.items() if count > 1]
+    if twice:
+        raise SystemExit(f"these ids are there more than once: {', '.join(twice)}")
+    found = []
     for defect in defects:
-        at = places(defect, sources)
-        if len(at) != 1:
-            where = ", ".join(str(place.path) for place in at[:4])
-            found.append(f"{defect.id}: the snippet is there {len(at)} times {where}".rstrip())
-            continue
-        before = sources[at[0].path]
-        try:
-            after = ast.dump(ast.parse(replaced(before, at[0], defect.new)))
-        except SyntaxError as error:
-            found.append(f"{defect.id}: what replaces the snippet is no Python: {error}")
-            continue
-        if after == ast.dump(ast.parse(before)):
-            found.append(f"{defect.id}: nothing changes")
-    names = {name.split("::")[0] for defect in defects for name in defect.tests}
-    missing = sorted(name for name in names if not (root / "tests" / name).is_file())
-    return found + [f"tests/{name}: there is no such file" for name in missing]
+        wrong = problem(defect, sources)
+        if wrong:
+            print(f"{defect.id}: {wrong}")
+        else:
+            found.append(defect)
+    return found
 
 
 class Tree:
@@ -281,7 +285,8 @@ def read_outcomes(path: Path) -> dict[str, dict[str, object]]:
 def commands(defect: Defect, arguments: argparse.Namespace) -> list[list[str]]:
     """Return what pytest runs for a defect, one after the other until it is caught."""
     if arguments.suite == OLD:
-        return [[f"tests/{name}" for name in defect.tests]]
+        there = [name for name in defect.tests if (ROOT / "tests" / name).is_file()]
+        return [[f"tests/{name}" for name in there]] if there else []
     first = [arguments.suite, "-k", arguments.k or defect.cases, "-m", ""]  # slow ones too
     return [first] if arguments.subset else [first, [arguments.suite]]
 
@@ -305,7 +310,7 @@ def run(arguments: argparse.Namespace, defects: Sequence[Defect]) -> None:
     """Run a suite on the defects that have no outcome yet."""
     path = checkpoint_of(arguments.suite)
     done = {} if arguments.again else read_outcomes(path)
-    todo = [defect for defect in defects if defect.id not in done]
+    todo = [defect for defect in defects if defect.id not in done and commands(defect, arguments)]
     end = time.perf_counter() + 60.0 * arguments.minutes
     load_libraries()
     with TemporaryDirectory(prefix="legcal-defects-") as folder:
@@ -378,24 +383,20 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=300.0, help="seconds of a run of pytest")
     parser.add_argument("--minutes", type=float, default=1e9, help="of all; then stop")
     arguments = parser.parse_args()
-    defects = read_defects()
-    found = problems(defects, read_package(ROOT), ROOT)
-    if found:
-        raise SystemExit("\n".join([*found, f"{len(found)} problems"]))
+    every = read_defects()
     chosen = [
         defect
-        for defect in defects
+        for defect in every
         if (not arguments.only or defect.id in arguments.only)
         and (not arguments.concern or defect.concern in arguments.concern)
     ]
-    if arguments.check:
-        print(f"{len(defects)} defects, each of them there once")
-    elif arguments.compare:
+    if arguments.compare:
         raise SystemExit(0 if compare(chosen, *arguments.compare) else 1)
-    elif arguments.suite:
-        run(arguments, chosen)
-    else:
-        parser.print_help()
+    defects = usable(chosen, read_package(ROOT))
+    if arguments.suite:
+        run(arguments, defects)
+    print(f"{len(defects)} of {len(chosen)} defects can be put into the package")
+    raise SystemExit(0 if len(defects) == len(chosen) else 1)
 
 
 if __name__ == "__main__":
