@@ -362,7 +362,7 @@ def compare(defects: Sequence[Defect], one: str, other: str) -> bool:
         found = [
             outcomes.get(defect.id, {}).get("found", "not run") for outcomes in (first, second)
         ]
-        if found[0] in (CAUGHT, TIMEOUT) and found[1] not in (CAUGHT, TIMEOUT):
+        if found[0] == CAUGHT != found[1]:
             lost.append(defect)
             print(f"{defect.id:34}{found[1]:10}{defect.what}")
     print(f"{len(lost)} of {len(defects)} are caught by {one} and not by {other}")
