@@ -52,7 +52,7 @@ from rich.text import Text
 from legcal.calibration import Choices, Solution, Start, refine
 from legcal.errors import DidNotConverge, LegcalError
 from legcal.geometry import components
-from legcal.machine import LegGeometry, radius_name, vector_of
+from legcal.machine import Leg, radius_name, vector_of
 from legcal.paper import Criteria
 from legcal.simulation import Record, failure_of, has_keys, is_failure, is_number
 
@@ -125,7 +125,7 @@ class ClassesStudy(OutlineStudy):
         return {"classes.md": page(machines, self.readings).encode()}
 
 
-def _platform(design: Design, legs: Sequence[LegGeometry]) -> Record:
+def _platform(design: Design, legs: Sequence[Leg]) -> Record:
     """Return mean errors of the platform [m], [rad]."""
     shift, turn = platform_errors(design, legs)
     return {"dX": float(shift.mean()), "dE": float(turn.mean())}

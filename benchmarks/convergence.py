@@ -31,7 +31,7 @@ from outline_study import (
 from rich.console import RenderableType
 
 from legcal.calibration import Solution
-from legcal.machine import LegGeometry, pose_sensitivity
+from legcal.machine import Leg, pose_sensitivity
 from legcal.simulation import Record, has_keys, is_failure, is_number
 
 FAR = 5.0  # standard deviations
@@ -112,7 +112,7 @@ class ConvergenceStudy(OutlineStudy):
         return printed(_COLUMNS, [_cells(found) for found in machines], notes)
 
 
-def _misses(design: Design, legs: Sequence[LegGeometry]) -> list[float]:
+def _misses(design: Design, legs: Sequence[Leg]) -> list[float]:
     """Return displacement [m] and rotation [rad] of the platform, root mean squares over poses."""
     return [float(np.sqrt(np.mean(error**2))) for error in platform_errors(design, legs)]
 

@@ -18,7 +18,7 @@ from scipy.stats import chi2, norm
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array
-from legcal.machine import LegGeometry, freedoms, moved_legs, pose_equations
+from legcal.machine import Leg, freedoms, moved_legs, pose_equations
 from legcal.simulation import silhouette
 
 _STEP = 1e-6  # [m] or [rad] of differences
@@ -111,7 +111,7 @@ def _without(own: Array, shared: Array) -> Array:
 class _Numbers:
     """All that decides what images show."""
 
-    legs: Sequence[LegGeometry]
+    legs: Sequence[Leg]
     R: Array
     t: Array
     T_Rb_camera: Sequence[RigidTransform]

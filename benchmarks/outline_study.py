@@ -40,7 +40,7 @@ from legcal.data import Measurements, Outlines, View, axes_from_outlines
 from legcal.errors import DidNotConverge, LegcalError, UsageError
 from legcal.geometry import Array, IntArray
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     LegKind,
     Mechanism,
     Parametrization,
@@ -216,7 +216,7 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
 
 
 def closed_poses(
-    legs: Sequence[LegGeometry], frame_legs: Sequence[int], R: Array, t: Array
+    legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array
 ) -> tuple[Array, Array]:
     """Return the nearest poses at which everything holds that legs demand without a reading."""
     if len(frame_legs) < 3:  # turned and lifted into the plane of motion
@@ -344,7 +344,7 @@ def nominal_start(session: OutlineSession) -> Start:
     return start_from(legs.nominal, measurements, legs, cameras, home, "nominal")
 
 
-def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[LegGeometry, ...]:
+def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[Leg, ...]:
     """Return the legs that the four steps find from the axes which the outlines give."""
     legs = session.legs
     radii = {part: radius for (_, part), radius in legs.radii.items()}
@@ -353,7 +353,7 @@ def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[LegGeometr
     return run_steps(mechanism, axes, session.measurements, criteria=criteria).legs
 
 
-def platform_errors(design: Design, legs: Sequence[LegGeometry]) -> tuple[Array, Array]:
+def platform_errors(design: Design, legs: Sequence[Leg]) -> tuple[Array, Array]:
     """Return displacement [m] and angle [rad] of R_e that legs cause at exact readings, (n_poses,).
 
     Where legs cannot have these readings, the platform stands where it misses them least.

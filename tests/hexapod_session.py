@@ -11,7 +11,7 @@ from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
 from legcal.machine import (
     KinematicParameters,
-    LegGeometry,
+    Leg,
     LegKind,
     free_coordinates,
     from_vector,
@@ -112,11 +112,11 @@ def simulate(
     return Session(legs, measurements, outlines, TRUTH, T_cameras, tuple(poses))
 
 
-def geometry_of(parameters: KinematicParameters) -> tuple[LegGeometry, ...]:
+def geometry_of(parameters: KinematicParameters) -> tuple[Leg, ...]:
     """Return legs with point-like joints."""
     joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
     return tuple(
-        LegGeometry("S", "S", LegKind.ACTUATED, A, B, float(q0))
+        Leg("S", "S", LegKind.ACTUATED, A, B, float(q0))
         for (A, B), q0 in zip(joints, parameters.offsets, strict=True)
     )
 

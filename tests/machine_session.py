@@ -17,7 +17,7 @@ from legcal.data.outlines import Outlines
 from legcal.geometry import components, motions_of
 from legcal.geometry.types import Array
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     LegKind,
     Mechanism,
     geometries,
@@ -151,7 +151,7 @@ def machine_session(
 
 
 def _poses(
-    mechanism: Mechanism, legs: tuple[LegGeometry, ...], n: int, rng: np.random.Generator
+    mechanism: Mechanism, legs: tuple[Leg, ...], n: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return poses around home at which the legs close."""
     R, t = components((platform_in_base(mechanism, mechanism.home),) * n)
@@ -160,7 +160,7 @@ def _poses(
     return closed_poses(legs, mechanism.frame_legs, *moved_poses(R, t, step))
 
 
-def _readings(mechanism: Mechanism, legs: tuple[LegGeometry, ...], R: Array, t: Array) -> Array:
+def _readings(mechanism: Mechanism, legs: tuple[Leg, ...], R: Array, t: Array) -> Array:
     q = np.full((len(t), len(legs)), np.nan)
     for j, leg in enumerate(legs):
         if leg.kind is LegKind.ACTUATED:
@@ -170,7 +170,7 @@ def _readings(mechanism: Mechanism, legs: tuple[LegGeometry, ...], R: Array, t: 
 
 
 def _cameras(
-    mechanism: Mechanism, legs: tuple[LegGeometry, ...], n_views: int, camera: Camera
+    mechanism: Mechanism, legs: tuple[Leg, ...], n_views: int, camera: Camera
 ) -> tuple[RigidTransform, ...]:
     """Return T_camera_Rb of cameras around the middle of the machine."""
     home = platform_in_base(mechanism, mechanism.home)
@@ -207,11 +207,11 @@ def shown_outlines(
 
 def _wrong(
     fitted: FittedLegs,
-    legs: tuple[LegGeometry, ...],
+    legs: tuple[Leg, ...],
     length: float,
     angle: float,
     rng: np.random.Generator,
-) -> tuple[LegGeometry, ...]:
+) -> tuple[Leg, ...]:
     """Return legs every number of which is wrong by as much, up or down; twists are right."""
     parametrization = fitted.parametrization
     size = np.where(np.array(parametrization.units) == "m", length, angle / np.sqrt(2.0))

@@ -25,7 +25,7 @@ from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.estimation.noise import NoiseModel
 from legcal.geometry import motions_of
-from legcal.machine import LegGeometry
+from legcal.machine import Leg
 
 MACHINES = ("6-spu-coplanar", "3-upu-tilted", "3-rpr")
 
@@ -39,7 +39,7 @@ class Truth:
     posterior: Posterior
     poses: tuple[RigidTransform, ...]
 
-    def with_legs(self, legs: tuple[LegGeometry, ...]) -> Posterior:
+    def with_legs(self, legs: tuple[Leg, ...]) -> Posterior:
         """Return the same with other legs."""
         return replace(self.posterior, state=replace(self.posterior.state, legs=legs))
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from random_legs import closed_leg
 from staged_hexapods import exact_session
 
-from legcal.machine import LegGeometry, LegKind
+from legcal.machine import Leg, LegKind
 from legcal.paper.conditions import count_conditions, three_legs_at_once, two_directions
 from legcal.simulation.hexapod import PAPER_VIEWS
 
@@ -109,7 +109,7 @@ def test_counts_equal_the_equations_written_out(data: st.DataObject, spatial: bo
         assert c.ok == (c.equations >= c.unknowns)
 
 
-def legs_of(types: str, passive: tuple[int, ...] = ()) -> list[LegGeometry]:
+def legs_of(types: str, passive: tuple[int, ...] = ()) -> list[Leg]:
     """Return legs of types such as ``SS UU RS U``, some of them passive."""
     rng = np.random.default_rng(1)
     kinds = [LegKind.PASSIVE if j in passive else LegKind.ACTUATED for j in range(9)]

@@ -16,7 +16,7 @@ from legcal.calibration.identify.planning import (
 from legcal.errors import DidNotConverge
 from legcal.machine import (
     Demand,
-    LegGeometry,
+    Leg,
     LegKind,
     Mechanism,
     forward_kinematics_many,
@@ -89,7 +89,7 @@ def test_more_motors_than_freedoms_are_followed(tmp_path: Path) -> None:
 def test_the_motors_that_draw_their_lengths_stand_far_from_each_other() -> None:
     angles = [15.0 * j for j in range(24)]
     A, B = ring(angles, 0.3), ring([a + 30.0 * (-1) ** j for j, a in enumerate(angles)], 0.15)
-    legs = [LegGeometry("S", "S", LegKind.ACTUATED, a, b, 0.0) for a, b in zip(A, B, strict=True)]
+    legs = [Leg("S", "S", LegKind.ACTUATED, a, b, 0.0) for a, b in zip(A, B, strict=True)]
     R, t = np.eye(3)[None], np.array([[0.0, 0.0, 0.4]])
     all_of_them = np.linalg.cond(pose_equations(legs, R, t).by_pose[0])
     drive = _Drive(legs, (0, 8, 16), R, t)

@@ -43,7 +43,7 @@ from legcal.calibration import Solution, Start
 from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import components
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     LegKind,
     load_mechanism,
     platform_in_base,
@@ -575,7 +575,7 @@ def test_what_is_no_record_is_told(output: Path) -> None:
 def test_a_step_or_a_fit_that_fails_is_counted_with_its_reason(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def steps_fail(session: OutlineSession, criteria: str) -> tuple[LegGeometry, ...]:
+    def steps_fail(session: OutlineSession, criteria: str) -> tuple[Leg, ...]:
         raise NotIdentifiable(f"Nothing is determined by the {criteria} steps.")
 
     def fit_fails(session: OutlineSession, radius_sigma: float) -> Solution:

@@ -14,7 +14,7 @@ from legcal.calibration.identify.ranks import Analysis, determined
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     LegKind,
     Parametrization,
     load_mechanism,
@@ -57,7 +57,7 @@ def parameters_of(observed: Observed, *, twists: bool = False) -> Parametrizatio
     return parametrize(nominal.leg_names, observed.true_legs, nominal.frame_legs, twists=twists)
 
 
-def off(observed: Observed, legs: tuple[LegGeometry, ...], *, twists: bool = False) -> Array:
+def off(observed: Observed, legs: tuple[Leg, ...], *, twists: bool = False) -> Array:
     """Return by how much legs differ from the truth in every parameter [m, rad]."""
     parametrization, true = parameters_of(observed, twists=twists), observed.true_legs
     return vector_of(parametrization, legs, true) - vector_of(parametrization, true, true)

@@ -20,7 +20,7 @@ from legcal.geometry import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine import (
     Demand,
-    LegGeometry,
+    Leg,
     LegKind,
     Mechanism,
     geometries,
@@ -61,7 +61,7 @@ N = 140  # draws of errors
 ORIGIN = re.compile(rb'(<origin xyz=")[^"]*(" rpy=")[^"]*(")')
 
 
-def _apart(one: LegGeometry, two: LegGeometry) -> float:
+def _apart(one: Leg, two: Leg) -> float:
     """Return the largest difference of two legs [m, rad], axes and twists as those of lines."""
     found = [np.abs(one.A - two.A).max(), np.abs(one.B - two.B).max(), abs(one.q0 - two.q0)]
     for key in ("base_axis", "platform_axis"):
@@ -94,7 +94,7 @@ def _check(nominal: Mechanism, folder: Path, seed: int = 3) -> Mechanism:
     return true
 
 
-def _check_equations(true: Mechanism, legs: tuple[LegGeometry, ...]) -> None:
+def _check_equations(true: Mechanism, legs: tuple[Leg, ...]) -> None:
     """Check the chain's poses and readings against the closed form of the drawn legs."""
     poses = draw_poses(true, 2, np.random.default_rng(0), "workspace")
     for T, readings in zip(poses.poses, poses.readings, strict=True):

@@ -49,7 +49,6 @@ from .leg import Cylinder as Cylinder
 from .leg import Demand as Demand
 from .leg import KinematicParameters as KinematicParameters
 from .leg import Leg as Leg
-from .leg import LegGeometry as LegGeometry
 from .leg import LegKind as LegKind
 from .leg import main_cylinders as main_cylinders
 from .leg import point_like_legs as point_like_legs

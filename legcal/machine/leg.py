@@ -119,9 +119,6 @@ class Leg:
         return tuple(found)
 
 
-LegGeometry = Leg
-
-
 @dataclass(frozen=True, eq=False)
 class KinematicParameters:
     """Joint centres in R_b and R_e and lengths of legs: all parameters if joints are point-like."""

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
 from legcal.machine import (
-    LegGeometry,
+    Leg,
     Mechanism,
     UrdfPatch,
     check_closes,
@@ -50,7 +50,7 @@ FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the t
 
 def draw_errors(
     nominal: Mechanism, errors: ParameterErrors, rng: np.random.Generator
-) -> tuple[LegGeometry, ...]:
+) -> tuple[Leg, ...]:
     """Return the legs of a machine with drawn errors, in R_b and R_e.
 
     Every parameter of the class takes its chance in the same order, however large its error is:
@@ -170,7 +170,7 @@ def write_true_model(
 
 def write_model_with(
     nominal: Mechanism,
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     home: RigidTransform,
     folder: Path,
     radii: Mapping[tuple[str, int], float],

@@ -14,7 +14,6 @@ from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray
 from legcal.machine import (
     Leg,
-    LegGeometry,
     LegKind,
     Mechanism,
     Parametrization,
@@ -229,7 +228,7 @@ def _axis(A: Array, B: Array) -> Array:
 
 def machine_near(
     mechanism: Mechanism, home: RigidTransform
-) -> tuple[tuple[LegGeometry, ...], float, np.random.Generator]:
+) -> tuple[tuple[Leg, ...], float, np.random.Generator]:
     """Return legs near the nominal ones, their mean length at home [m], and a source of chance."""
     rng = np.random.default_rng(_SEED)
     nominal = geometries(mechanism)
@@ -239,11 +238,11 @@ def machine_near(
 
 
 def perturbed(
-    legs: Sequence[LegGeometry],
+    legs: Sequence[Leg],
     parametrization: Parametrization,
     length: float,
     rng: np.random.Generator,
-) -> tuple[LegGeometry, ...]:
+) -> tuple[Leg, ...]:
     """Return legs whose every parameter is slightly elsewhere."""
     units = np.array([length if unit == "m" else 1.0 for unit in parametrization.units])
     step = _PERTURBATION * units * rng.uniform(-1.0, 1.0, len(units))
@@ -260,7 +259,7 @@ def radii(legs: Sequence[Leg], length: float) -> Array:
     )
 
 
-def joints_at(legs: Sequence[LegGeometry], T: RigidTransform) -> tuple[Array, Array]:
+def joints_at(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
     """Return the joint centres A and B at a pose, in R_b."""
     A, B = np.array([leg.A for leg in legs]), np.array([leg.B for leg in legs])
     return A, np.asarray(T.apply(B))

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import N_LOCAL, LegGeometry, LegKind, Parametrization, joined, leg_labels
+from legcal.machine import N_LOCAL, Leg, LegKind, Parametrization, joined, leg_labels
 
 _TIMES = {2: "two", 3: "three", 4: "four"}
 SIGMA_PX = 0.1  # of an outline across a leg, in the image
@@ -25,7 +25,7 @@ class Session:
     """Observations as they will be made, of a machine that is nearly the nominal one."""
 
     leg_names: tuple[str, ...]
-    legs: tuple[LegGeometry, ...]  # in R_b and R_e
+    legs: tuple[Leg, ...]  # in R_b and R_e
     frame_legs: tuple[int, ...]  # those that define R_b and R_e
     parametrization: Parametrization
     radius: Array  # (n_legs,): radius of the cylinder that is seen of each leg [m]

@@ -33,7 +33,7 @@ from legcal.estimation import (
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     KinematicParameters,
-    LegGeometry,
+    Leg,
     LegKind,
     Parametrization,
     footed,
@@ -50,7 +50,7 @@ Status = Literal["estimated", "fixed", "weak"]
 class Solution:
     """A converged joint fit; axes count as angles from the nominal axis."""
 
-    legs: tuple[LegGeometry, ...]  # in R_b and R_e
+    legs: tuple[Leg, ...]  # in R_b and R_e
     T_camera_Rb: tuple[RigidTransform, ...]  # one a view; of the start where it shows nothing
     cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were asked for
     T_Rb_Re: tuple[RigidTransform, ...]  # platform poses
@@ -100,7 +100,7 @@ class Solution:
         return joints_of(self.legs)
 
 
-def joints_of(legs: tuple[LegGeometry, ...]) -> KinematicParameters:
+def joints_of(legs: tuple[Leg, ...]) -> KinematicParameters:
     """Return joint centres, and offsets or constant lengths; NaN for passive legs [m]."""
     lengths = [np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs]
     return KinematicParameters(
