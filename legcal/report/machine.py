@@ -39,8 +39,7 @@ def inspect_table(description: dict[str, Any]) -> RenderableType:
             A_text,
             B_text,
             _length(leg),
-            ", ".join(dict.fromkeys(f"{1e3 * c['radius']:.4g}" for c in leg["cylinders"]))
-            or "none",
+            _radii(leg) or "none",
         )
         for leg, A_text, B_text in zip(legs, A, B, strict=True)
     ]
