@@ -946,7 +946,7 @@ def _new() -> Iterable[Refusal]:
     yield from _spoiled("table", f"new {{in}}/{file} -o {{out}}", "tables", rows)
     head, row = "type,base_x,base_y,platform_x,platform_y", "RPS,1,2,3,4"
     lines: list[tuple[str, str, str, tuple[str, ...]]] = [
-        ("header", "type,base_x\n", "--unit mm", ("1",)),
+        ("header", "type,base_x\n", "--unit mm", ("a header and no row",)),
         ("column", f"{head},bse_z\n{row},0\n", "--unit mm", ("'bse_z'", "'base_z'")),
         ("no-column", "type,base_x\nRPS,1\n", "--unit mm", ("'base_y'",)),
         ("twice", f"{head},type\n{row},RPS\n", "--unit mm", ("'type'",)),
