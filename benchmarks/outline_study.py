@@ -49,6 +49,7 @@ from legcal.machine import (
     moved_legs,
     parametrize,
     platform_in_base,
+    pose_differences,
     radius_name,
     solve_poses,
 )
@@ -361,11 +362,7 @@ def platform_errors(design: Design, legs: Sequence[Leg]) -> tuple[Array, Array]:
     poses = design.poses
     lengths = design.legs.sign * design.q + np.array([leg.q0 for leg in legs])
     there = platform_poses(legs, lengths, poses, design.legs.frame_legs)
-    shift = [T.translation - true.translation for T, true in zip(there, poses, strict=True)]
-    turn = [
-        (true.rotation.inv() * T.rotation).magnitude() for T, true in zip(there, poses, strict=True)
-    ]
-    return np.linalg.norm(shift, axis=1), np.array(turn)
+    return pose_differences(there, poses)
 
 
 # Studies

@@ -3,6 +3,7 @@ from .loss import Huber as Huber
 from .loss import PseudoHuber as PseudoHuber
 from .manifold import Frames as Frames
 from .manifold import add as add
+from .noise import MEDIAN_OF_2 as MEDIAN_OF_2
 from .noise import NoiseModel as NoiseModel
 from .noise import estimate_noise as estimate_noise
 from .noise import noise_of_the_median as noise_of_the_median

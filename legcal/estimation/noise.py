@@ -19,7 +19,7 @@ from legcal.geometry import Array, BoolArray
 _SUM = np.array([1.0, 1.0])
 _DIFFERENCE = np.array([-1.0, 1.0])
 _MEDIAN_OF_1 = 0.454936423119573  # of the square of a unit Gaussian
-_MEDIAN_OF_2 = 2.0 * np.log(2.0)  # of the squared norm of two
+MEDIAN_OF_2 = 2.0 * np.log(2.0)  # of the squared norm of two unit Gaussians
 _SMALLEST_SCALE = 0.1
 _LEAST_GAIN = 12.0  # twice the log-likelihood: of white offsets, one set in 4,000 gains that much
 _MAX_STEPS = 100
@@ -86,7 +86,7 @@ def noise_of_the_median(offsets: Array, claimed: Array) -> NoiseModel:
         return float(np.sqrt(np.median(share) / _MEDIAN_OF_1))
 
     def excess(noise: NoiseModel) -> float:
-        return float(np.median(noise.squared_norms(offsets, claimed)) - _MEDIAN_OF_2)
+        return float(np.median(noise.squared_norms(offsets, claimed)) - MEDIAN_OF_2)
 
     return _balanced(scale_of(_SUM), scale_of(_DIFFERENCE), excess, offsets)
 

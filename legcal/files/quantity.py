@@ -15,12 +15,14 @@ LENGTH: Mapping[str, float] = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "
 ANGLE: Mapping[str, float] = {"deg": math.pi / 180.0, "mrad": 1e-3, "rad": 1.0}
 PIXELS: Mapping[str, float] = {"px": 1.0}
 
-_WRITTEN = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*", re.ASCII)
+_NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
+_VALUE = re.compile(_NUMBER, re.ASCII)
+_PRIOR = re.compile(rf"{_NUMBER}(?:±|\+/?-){_NUMBER}", re.ASCII)
 
 
 def parse_quantity(text: str, units: Mapping[str, float], what: str) -> float:
     """Return a quantity in metres, radians or pixels."""
-    match = _WRITTEN.fullmatch(text)
+    match = _VALUE.fullmatch(text)
     value, unit = (float(match[1]), match[2]) if match else (math.nan, "")
     if not math.isfinite(value) or (unit not in units and (unit or value != 0.0)):
         raise UsageError(
@@ -42,9 +44,6 @@ LARGEST_SIGMA = 1e6  # [m, rad, px]; tells nothing of any parameter
 _DIMENSIONS = {"m": LENGTH, "rad": ANGLE, "px": PIXELS}
 _SIZES = {unit: size for units in _DIMENSIONS.values() for unit, size in units.items()}
 _DIMENSION = {unit: name for name, units in _DIMENSIONS.items() for unit in units}
-_NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)\s*"
-_VALUE = re.compile(_NUMBER, re.ASCII)
-_PRIOR = re.compile(rf"{_NUMBER}(?:±|\+/?-){_NUMBER}", re.ASCII)
 EXAMPLE = "0.4200±0.0001 or 420±0.1 mm"
 
 

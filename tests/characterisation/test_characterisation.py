@@ -126,7 +126,7 @@ def test_python_gives_what_commands_give(tmp_path: Path) -> None:
 
 
 def test_python_simulates_locates_and_judges(tmp_path: Path) -> None:
-    level: Any = "axes"  # names instead of members, as in docs/formats.md
+    level: Any = "axes"  # names instead of members, as in docs/simulate.md
     normal: Any = "normal"
     settings = legcal.SimulationSettings(
         level=level, poses=2, seed=1, views=1,

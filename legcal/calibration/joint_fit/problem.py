@@ -50,6 +50,7 @@ from legcal.calibration.joint_fit.state import (
 from legcal.data import LegAxes, Measurements, Outlines
 from legcal.errors import NotIdentifiable
 from legcal.estimation import (
+    Factor,
     Frames,
     GaussianPrior,
     NoiseModel,
@@ -181,12 +182,7 @@ class FitProblem(Problem[State]):
             board=corners,
             variables=tuple(blocks.get(block.name, block) for block in self.variables),
             eliminated=_poses(measurements.n_poses),
-            factors=(
-                outline_factor(outlines, whitening, self.keys),
-                reading_factor(encoders),
-                axis_factor(lines),
-                corner_factor(corners, self.keys),
-            ),
+            factors=_factors(outlines, whitening, encoders, lines, corners, self.keys),
         )
 
     def with_choices(self, choices: Choices, settings: RefinementSettings) -> FitProblem:
@@ -318,11 +314,13 @@ def _built(
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
         eliminated=_poses(n_poses),
-        factors=(
-            outline_factor(outlines, NoiseModel().whitening(outlines.covariance), keys),
-            reading_factor(encoders),
-            axis_factor(lines),
-            corner_factor(corners, keys),
+        factors=_factors(
+            outlines,
+            NoiseModel().whitening(outlines.covariance),
+            encoders,
+            lines,
+            corners,
+            keys,
         ),
         constraint=LegConstraints(legs),
         name="joint fit",
@@ -341,6 +339,23 @@ def _built(
         first_cameras=cameras,
         first_board_scale=choices.values.get(BOARD_SCALE, 1.0),
         keys=keys,
+    )
+
+
+def _factors(
+    outlines: ObservedOutlines,
+    whitening: Array,
+    readings: Readings,
+    axes: ObservedAxes,
+    board: ObservedBoard,
+    keys: tuple[str, ...],
+) -> tuple[Factor[State], ...]:
+    """Return one factor for each kind of measurement."""
+    return (
+        outline_factor(outlines, whitening, keys),
+        reading_factor(readings),
+        axis_factor(axes),
+        corner_factor(board, keys),
     )
 
 

@@ -23,6 +23,7 @@ from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.state import RefinementSettings, State
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
+    MEDIAN_OF_2,
     GaussianPrior,
     Minimum,
     NoiseModel,
@@ -42,7 +43,6 @@ from legcal.vision import EPSILON
 _NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3
 _NEAR_ENOUGH = 0.005  # of the cost a step: rejecting need not wait for the rest
-_MEDIAN_OF_2 = 2.0 * np.log(2.0)  # of the squared norm of two unit Gaussians
 _LEAST_LEFT = 0.05  # of the equations of corners, beyond what the fit takes up
 _SMALLEST_SCALE = 0.1
 _ROUNDED_PX = 1e-3  # smaller errors of outlines do not matter
@@ -237,7 +237,7 @@ def _with_judged_corners(
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     left = 1.0 - 0.5 * np.einsum("nqq->n", explained_share(problem, linear, normal, "corners"))
     norms = linear["corners"].squared_norms
-    variance = float(np.median(norms)) / _MEDIAN_OF_2 / max(float(np.mean(left)), _LEAST_LEFT)
+    variance = float(np.median(norms)) / MEDIAN_OF_2 / max(float(np.mean(left)), _LEAST_LEFT)
     scale = max(float(np.sqrt(variance)), _SMALLEST_SCALE)
     agrees = norms <= (scale * settings.rejection) ** 2
     wrong = zip(board.view[~agrees].tolist(), board.corner[~agrees].tolist(), strict=True)
