@@ -61,7 +61,7 @@ def gain(model: str, level: Level, seed: int, scratch: Path) -> Gain:
     calibration = calibrate(folder, output=result, use_cache=False)
     seconds = time.perf_counter() - begin
     truth = next((folder / "truth/models").glob("*.yaml"))
-    nominal = load_dataset(folder).mechanism.yaml_path
+    nominal = load_dataset(folder).machine.yaml_path
     before, after = (
         evaluate(path, truth, dataset=folder) for path in (nominal, result / "calibrated.yaml")
     )

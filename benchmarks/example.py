@@ -27,11 +27,11 @@ def platform_error(
     calibration: Calibration, parameters: KinematicParameters, truth: KinematicParameters
 ) -> tuple[float, float]:
     """Return the mean displacement [m] and rotation [rad] between two sets of parameters."""
-    measurements, mechanism = calibration.dataset.measurements, calibration.dataset.mechanism
+    measurements, machine = calibration.dataset.measurements, calibration.dataset.machine
     first_row = np.unique(measurements.pose, return_index=True)[1]
-    driven = mechanism.sign * measurements.q[first_row]
+    driven = machine.sign * measurements.q[first_row]
     near = calibration.solution.T_Rb_Re
-    frame_legs = mechanism.frame_legs
+    frame_legs = machine.frame_legs
     poses, true_poses = (
         platform_poses(point_like_legs(p), driven + p.offsets, near, frame_legs)
         for p in (parameters, truth)
@@ -43,18 +43,18 @@ def platform_error(
 def main() -> None:
     """Print a line an estimate."""
     dataset = load_dataset(ROOT / "examples/hexapod")
-    mechanism, truth = dataset.mechanism, load_mechanism(TRUTH).parameters
+    machine, truth = dataset.machine, load_mechanism(TRUTH).parameters
     calibration = calibrate(dataset, use_cache=False)
     solution = calibration.solution
-    radii = {cylinder.link: cylinder.radius for leg in mechanism.legs for cylinder in leg.cylinders}
+    radii = {cylinder.link: cylinder.radius for leg in machine.legs for cylinder in leg.cylinders}
     axes = axes_from_outlines(solution.outlines, dataset.measurements, radii)
-    nominal = nominal_mechanism(mechanism)
+    nominal = nominal_mechanism(machine)
     steps = {
         criteria: run_steps(nominal, axes, dataset.measurements, criteria=criteria).parameters
         for criteria in ("literal", "default")
     }
     rows = {
-        "nominal model": mechanism.parameters,
+        "nominal model": machine.parameters,
         "four steps, criteria as printed": steps["literal"],
         "four steps, default criteria": steps["default"],
         "fit of everything": solution.parameters,
@@ -66,8 +66,8 @@ def main() -> None:
         sigma = calibration.platform.sigma
         dX, dE = 1e3 * sigma.mean_displacement, np.degrees(sigma.mean_rotation)
         print(f"{'predicted for the fit, 1 sigma':32s} {dX:8.3f} mm {dE:8.4f} deg")
-    error = to_vector(solution.parameters, mechanism.frame_legs) - to_vector(
-        truth, mechanism.frame_legs
+    error = to_vector(solution.parameters, machine.frame_legs) - to_vector(
+        truth, machine.frame_legs
     )
     n = len(error)
     pull = error / solution.sigma[:n]

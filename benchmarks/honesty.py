@@ -25,7 +25,7 @@ from legcal.calibration.joint_fit.edge_biases import KINDS
 from legcal.calibration.verdict import Calibration
 from legcal.geometry import components
 from legcal.geometry.types import Array
-from legcal.machine import Mechanism, geometries, pose_sensitivity, vector_of
+from legcal.machine import Machine, geometries, pose_sensitivity, vector_of
 from legcal.simulation.dataset import simulate
 from legcal.simulation.settings import SimulationSettings
 
@@ -59,17 +59,17 @@ class Honesty:
         )
 
 
-def honesty(name: str, calibration: Calibration, truth: Mechanism) -> Honesty:
+def honesty(name: str, calibration: Calibration, truth: Machine) -> Honesty:
     """Compare a calibration with the true model."""
-    solution, mechanism = calibration.solution, calibration.dataset.mechanism
-    truth = truth.with_leg_order(mechanism.leg_names)
+    solution, machine = calibration.solution, calibration.dataset.machine
+    truth = truth.with_leg_order(machine.leg_names)
     legs, parametrization = solution.legs, solution.parametrization
     step = vector_of(parametrization, geometries(truth), legs)
     step = step - vector_of(parametrization, legs, legs)
     C = solution.kinematic_covariance
     known = np.diagonal(C) > 0.0
     by_pose = pose_sensitivity(
-        legs, parametrization, mechanism.frame_legs, *components(solution.T_Rb_Re)
+        legs, parametrization, machine.frame_legs, *components(solution.T_Rb_Re)
     )[:, 3:]
     away = np.einsum("kia,a->ki", by_pose, step)
     spread = np.einsum("kia,ab,kib->k", by_pose, C, by_pose)

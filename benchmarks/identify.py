@@ -31,12 +31,12 @@ def main(runs: int = 5) -> None:
     """Print a line a model, then a line a command."""
     print(f"{'model':16} {'steps':>9} {'at once':>9} {'worst':>8} {'beyond':>8} {'seconds':>8}")
     for path in sorted((ROOT / "models").glob("*.yaml")):
-        mechanism = legcal.load_mechanism(path)
+        machine = legcal.load_mechanism(path)
         begin = time.perf_counter()
-        report = identifiability(mechanism)
+        report = identifiability(machine)
         seconds = time.perf_counter() - begin
-        views = [[mechanism.leg_names.index(name) for name in view] for view in report.views]
-        session = planned_session(mechanism, views)
+        views = [[machine.leg_names.index(name) for name in view] for view in report.views]
+        session = planned_session(machine, views)
         singular = np.linalg.svd(Analysis(session).information, compute_uv=False)
         sigma = 1.0 / np.maximum(singular, 1e-30) / session.mean_length
         beyond = f"{sigma[sigma >= 1.0].min():8.0f}" if np.any(sigma >= 1.0) else f"{'none':>8}"

@@ -20,7 +20,7 @@ import numpy as np
 from legcal.geometry.types import Array
 from legcal.machine import (
     Follower,
-    Mechanism,
+    Machine,
     forward_kinematics,
     inverse_kinematics,
     load_mechanism,
@@ -32,13 +32,13 @@ MODELS = Path(__file__).parents[1] / "models"
 STEP = 0.01  # of the travel
 
 
-def path_of(mechanism: Mechanism, corners: Array, rows: int) -> Array:
+def path_of(machine: Machine, corners: Array, rows: int) -> Array:
     """Return readings from home towards random ones and back, in even steps, (rows, n_legs)."""
-    home = inverse_kinematics(mechanism, mechanism.home)
-    travel = np.array([upper - lower for lower, upper in (leg.travel for leg in mechanism.legs)])
+    home = inverse_kinematics(machine, machine.home)
+    travel = np.array([upper - lower for lower, upper in (leg.travel for leg in machine.legs)])
     path: list[Array] = []
     for corner in corners:
-        motors = list(mechanism.motors)
+        motors = list(machine.motors)
         share = np.abs((corner - home)[motors] / travel[motors]).max()
         way = np.linspace(0.0, 1.0, max(int(share / STEP), 2))
         out = home + way[:, None] * (corner - home)
@@ -59,24 +59,24 @@ def medians(actions: dict[str, list[Callable[[], object]]]) -> str:
     return "".join(columns)
 
 
-def measure(mechanism: Mechanism, rows: int) -> str:
+def measure(machine: Machine, rows: int) -> str:
     """Return the times of a mechanism as a line of the table."""
-    drawn = random_configurations(mechanism, max(rows // 10, 5), 1)
-    path = path_of(mechanism, drawn.readings, rows)
-    follower, walker = Follower(mechanism), Follower(mechanism)
-    before = [mechanism.home, *(walker.move_to(q) for q in path[:-1])]
+    drawn = random_configurations(machine, max(rows // 10, 5), 1)
+    path = path_of(machine, drawn.readings, rows)
+    follower, walker = Follower(machine), Follower(machine)
+    before = [machine.home, *(walker.move_to(q) for q in path[:-1])]
 
     return medians(
         {
             "follow": [partial(follower.move_to, q) for q in path],
             "warm": [
-                partial(forward_kinematics, mechanism, q, start=T)
+                partial(forward_kinematics, machine, q, start=T)
                 for q, T in zip(path, before, strict=True)
             ],
-            "cold": [partial(forward_kinematics, mechanism, q) for q in drawn.readings],
-            "inverse": [partial(inverse_kinematics, mechanism, T) for T in drawn.poses],
-            "measure": [partial(singularity, mechanism, T) for T in drawn.poses],
-            "draw": [partial(random_configurations, mechanism, 1, i) for i in range(20)],
+            "cold": [partial(forward_kinematics, machine, q) for q in drawn.readings],
+            "inverse": [partial(inverse_kinematics, machine, T) for T in drawn.poses],
+            "measure": [partial(singularity, machine, T) for T in drawn.poses],
+            "draw": [partial(random_configurations, machine, 1, i) for i in range(20)],
         }
     )
 
@@ -86,8 +86,8 @@ def main(rows: int = 300) -> None:
     print("[ms]            " + "".join(f"{w:>9}" for w in ("follow", "warm", "cold")), end="")
     print("".join(f"{w:>9}" for w in ("inverse", "measure", "draw")))
     for path in sorted(MODELS.glob("*.yaml")):
-        mechanism = load_mechanism(path)
-        print(f"{path.stem:16}{measure(mechanism, rows)}")
+        machine = load_mechanism(path)
+        print(f"{path.stem:16}{measure(machine, rows)}")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Location, ToolPoses, load_mechanism, locate
 from legcal.geometry.types import Array
-from legcal.machine import Mechanism, random_configurations
+from legcal.machine import Machine, random_configurations
 
 POSES = 20
 SIGMA_POSITION = 0.02e-3  # [m]
@@ -94,11 +94,11 @@ class Run:
     estimated_error: Array
 
 
-def one_run(mechanism: Mechanism, seed: int) -> Run:
+def one_run(machine: Machine, seed: int) -> Run:
     """Return what a run finds with stated and with estimated sigmas."""
     chance = np.random.default_rng([seed, 20])
     base, tool = random_motion(chance, 3.0), random_motion(chance, 0.2)
-    drawn = random_configurations(mechanism, POSES, chance)
+    drawn = random_configurations(machine, POSES, chance)
     covariance, lost = bound(base, tool, drawn.poses)
     poses = [
         shifted(T, chance.normal(size=6) * np.repeat([SIGMA_POSITION, SIGMA_ANGLE], 3))
@@ -115,13 +115,13 @@ def one_run(mechanism: Mechanism, seed: int) -> Run:
     )
     at = tool.translation.tolist() if lost.shape[1] else None
     stated = locate(
-        mechanism,
+        machine,
         table,
         position_sigma=SIGMA_POSITION,
         angle_sigma=SIGMA_ANGLE,
         tool_position=at,
     )
-    estimated = locate(mechanism, table, tool_position=at)
+    estimated = locate(machine, table, tool_position=at)
     errors = [
         np.concatenate([difference(f.T_world_base, base), difference(f.T_platform_tool, tool)])
         for f in (stated, estimated)
@@ -141,8 +141,8 @@ def normalised(error: Array, covariance: Array) -> tuple[float, int]:
 
 def line(name: str, runs: int) -> str:
     """Return the line of a machine."""
-    mechanism = load_mechanism(name)
-    done = [one_run(mechanism, seed) for seed in range(runs)]
+    machine = load_mechanism(name)
+    done = [one_run(machine, seed) for seed in range(runs)]
     squares = np.mean([r.error**2 for r in done], axis=0)
     best = np.mean([np.diagonal(r.bound) for r in done], axis=0)
     ratio = np.sqrt(squares[best > 1e-24] / best[best > 1e-24])

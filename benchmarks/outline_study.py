@@ -42,7 +42,7 @@ from legcal.geometry import Array, IntArray
 from legcal.machine import (
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     Parametrization,
     geometries,
     load_mechanism,
@@ -53,7 +53,7 @@ from legcal.machine import (
     radius_name,
     solve_poses,
 )
-from legcal.paper import Criteria, NominalMechanism, run_steps
+from legcal.paper import Criteria, NominalMachine, run_steps
 from legcal.processors import processors
 from legcal.simulation import (
     RAISED,
@@ -99,7 +99,7 @@ _CLOSED = 1e-13  # [m]
 # True machines before their cameras
 
 
-def true_mechanism(name: str) -> Mechanism:
+def true_mechanism(name: str) -> Machine:
     """Return a true machine of the studies: one of ``MACHINES``, or a shipped model."""
     if name not in (COPLANAR, NONCOPLANAR):
         return load_mechanism(name)
@@ -158,25 +158,25 @@ class Design:
 @lru_cache(maxsize=32)  # a study goes through all of its machines in every run
 def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
     """Return the design of a machine, the same one in all processes; no two views share a pose."""
-    mechanism = true_mechanism(name)
+    machine = true_mechanism(name)
     rng = np.random.default_rng(_SEED)
     lens = mild_lens()
-    drawn = draw_poses(mechanism, n_views * n_poses, rng)
-    machines = pose_machine(mechanism, dressed(mechanism), drawn)
+    drawn = draw_poses(machine, n_views * n_poses, rng)
+    machines = pose_machine(machine, dressed(machine), drawn)
     cameras = {f"c{v + 1}": lens for v in range(n_views)}
-    views, _ = cameras_around(mechanism, machines, cameras, rng)
+    views, _ = cameras_around(machine, machines, cameras, rng)
     poses_of = [range(v * n_poses, (v + 1) * n_poses) for v in range(n_views)]
-    images = take_images(mechanism.legs, machines, views, poses_of, 1)
-    legs = geometries(mechanism)
-    at = RigidTransform.concatenate([platform_in_base(mechanism, T) for T in drawn.poses])
+    images = take_images(machine.legs, machines, views, poses_of, 1)
+    legs = geometries(machine)
+    at = RigidTransform.concatenate([platform_in_base(machine, T) for T in drawn.poses])
     rotation: Rotation = at.rotation
-    R, t = closed_poses(legs, mechanism.frame_legs, rotation.as_matrix(), at.translation)
+    R, t = closed_poses(legs, machine.frame_legs, rotation.as_matrix(), at.translation)
     # Joint centres stand where the equations of the legs put them, to the last digit.
     B = np.einsum("kij,lj->kli", R, np.array([leg.B for leg in legs])) + t[:, None]
-    B_base = np.array([mechanism.T_base_Rb.apply(points) for points in B])
+    B_base = np.array([machine.T_base_Rb.apply(points) for points in B])
     A_base = np.array([machine.A for machine in machines])
     outlines = outlines_of(Scene(A_base, B_base, views, images), OutlineNoise(sigma_px, None))
-    most = _MOST_LEGS if name in _SIX_LEGS else mechanism.n_legs
+    most = _MOST_LEGS if name in _SIX_LEGS else machine.n_legs
     seen = []
     for v in range(n_views):
         rows = np.flatnonzero(images.view == v)
@@ -190,24 +190,24 @@ def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
         if leg.kind is LegKind.PASSIVE:
             q[:, j] = np.nan
         elif leg.kind is LegKind.ACTUATED:
-            q[:, j] = mechanism.sign[j] * (np.linalg.norm(B[:, j] - leg.A, axis=-1) - leg.q0)
+            q[:, j] = machine.sign[j] * (np.linalg.norm(B[:, j] - leg.A, axis=-1) - leg.q0)
     radii = {
         (j, part): radius
-        for j, leg in enumerate(mechanism.legs)
+        for j, leg in enumerate(machine.legs)
         for part, radius in leg.radius_of_part.items()
     }
     return Design(
         legs=FittedLegs(
-            mechanism.leg_names, legs, mechanism.sign.astype(np.intp), mechanism.frame_legs, radii
+            machine.leg_names, legs, machine.sign.astype(np.intp), machine.frame_legs, radii
         ),
-        home=platform_in_base(mechanism, mechanism.home),
+        home=platform_in_base(machine, machine.home),
         R=R,
         t=t,
         q=q,
         camera=lens,
-        T_Rb_camera=tuple(mechanism.T_base_Rb.inv() * view.T_base_camera for view in views),
+        T_Rb_camera=tuple(machine.T_base_Rb.inv() * view.T_base_camera for view in views),
         seen=tuple(
-            None if len(s) == mechanism.n_legs else tuple(mechanism.leg_names[j] for j in s)
+            None if len(s) == machine.n_legs else tuple(machine.leg_names[j] for j in s)
             for s in seen
         ),
         view=images.view,
@@ -350,8 +350,8 @@ def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[Leg, ...]:
     legs = session.legs
     radii = {part: radius for (_, part), radius in legs.radii.items()}
     axes = axes_from_outlines(session.outlines, session.measurements, radii)
-    mechanism = NominalMechanism(legs.names, legs.nominal, legs.sign, legs.frame_legs)
-    return run_steps(mechanism, axes, session.measurements, criteria=criteria).legs
+    machine = NominalMachine(legs.names, legs.nominal, legs.sign, legs.frame_legs)
+    return run_steps(machine, axes, session.measurements, criteria=criteria).legs
 
 
 def platform_errors(design: Design, legs: Sequence[Leg]) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
-from legcal.machine import Mechanism, load_mechanism, random_configurations
+from legcal.machine import Machine, load_mechanism, random_configurations
 from legcal.simulation.rendering.appearance import Appearance
 from legcal.simulation.rendering.scene import prepare_view
 from legcal.simulation.solids import PlacedSolid, dressed, link_poses, placed
@@ -55,11 +55,11 @@ def seconds(action: Callable[[], object]) -> float:
     return time.process_time() - begin
 
 
-def measure(mechanism: Mechanism, n: int) -> str:
+def measure(machine: Machine, n: int) -> str:
     """Return the times of a mechanism as a line of the table."""
-    configurations: Array = random_configurations(mechanism, n, 1).configurations
-    solids = dressed(mechanism)
-    poses = [placed(solids, link_poses(mechanism, q)) for q in configurations]
+    configurations: Array = random_configurations(machine, n, 1).configurations
+    solids = dressed(machine)
+    poses = [placed(solids, link_poses(machine, q)) for q in configurations]
     T = looking_at(poses[0])
     prepare_view(poses[0], CAMERA, T, Appearance(), np.random.default_rng(0))  # loads and caches
     rng = np.random.default_rng(0)

@@ -15,7 +15,7 @@ from legcal.calibration.run import nominal_poses
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, BoolArray, Image
 from legcal.machine import Cylinder as Visible
-from legcal.machine import LegKind, Mechanism, load_mechanism
+from legcal.machine import LegKind, Machine, load_mechanism
 from legcal.simulation.cameras import look_at
 from legcal.simulation.poses import commanded_poses
 from legcal.simulation.rendering.appearance import Appearance, Light
@@ -227,7 +227,7 @@ def _lens(rng: np.random.Generator, gamma: float) -> Camera:
 
 
 def _viewpoint(
-    truth: Mechanism, machines: tuple[PosedMachine, ...], gamma: float, rng: np.random.Generator
+    truth: Machine, machines: tuple[PosedMachine, ...], gamma: float, rng: np.random.Generator
 ) -> tuple[Camera, RigidTransform, Shown]:
     """Return a camera, a place from which it sees enough legs, and how much of each leg."""
     joints = np.concatenate([np.concatenate([m.A, m.B]) for m in machines])
@@ -256,7 +256,7 @@ def _viewpoint(
 
 
 def _shown(
-    truth: Mechanism, machines: tuple[PosedMachine, ...], camera: Camera, T: RigidTransform
+    truth: Machine, machines: tuple[PosedMachine, ...], camera: Camera, T: RigidTransform
 ) -> Shown:
     """Return what can be seen of every leg in every image."""
     return tuple(legs_in_image(truth.legs, m, camera, T) for m in machines)
@@ -268,7 +268,7 @@ def _shares(shown: Shown) -> Array:
 
 
 def _occluders(
-    truth: Mechanism,
+    truth: Machine,
     machines: tuple[PosedMachine, ...],
     camera: Camera,
     T: RigidTransform,
@@ -344,7 +344,7 @@ def _beside(machine: PosedMachine, solids: tuple[PlacedSolid, ...]) -> PosedMach
 
 
 def _measurements(
-    nominal: Mechanism, camera: Camera, readings: Array, rng: np.random.Generator
+    nominal: Machine, camera: Camera, readings: Array, rng: np.random.Generator
 ) -> Measurements:
     """Return the rows of the images, as a dataset without hints has them."""
     q = readings + 2e-6 * rng.normal(size=readings.shape)
@@ -361,7 +361,7 @@ def _measurements(
     )
 
 
-def _nominal_joints(nominal: Mechanism, measurements: Measurements) -> tuple[Array, Array]:
+def _nominal_joints(nominal: Machine, measurements: Measurements) -> tuple[Array, Array]:
     """Return A and B of every image by the nominal model, (n_images, n_legs, 3) [m]."""
     back = nominal.T_platform_Re.inv()
     reached = nominal_poses(nominal, measurements)[0]

@@ -20,7 +20,7 @@ from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.machine import Mechanism, forward_kinematics
+from legcal.machine import Machine, forward_kinematics
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
 from legcal.perception.recognise import recognise
@@ -33,11 +33,11 @@ VISIBLE = 0.5  # share of a leg above which it ought to be found
 WRONG = 2.0  # an edge this far from the outline is another edge [px]
 
 
-def joint_centres(mechanism: Mechanism, measurements: Measurements) -> tuple[Array, Array]:
+def joint_centres(machine: Machine, measurements: Measurements) -> tuple[Array, Array]:
     """Return A and B of every row by the nominal model, (n_rows, n_legs, 3) [m]."""
-    platforms = [forward_kinematics(mechanism, q) for q in measurements.q]
-    A = np.repeat(mechanism.A_base[None], measurements.n_rows, axis=0)
-    return A, np.array([T.apply(mechanism.B_platform) for T in platforms])
+    platforms = [forward_kinematics(machine, q) for q in measurements.q]
+    A = np.repeat(machine.A_base[None], measurements.n_rows, axis=0)
+    return A, np.array([T.apply(machine.B_platform) for T in platforms])
 
 
 def true_scene(
@@ -115,11 +115,11 @@ def spread(values: Array, centre: float | None = None) -> float:
 def main() -> None:
     """Measure both passes."""
     dataset = load_dataset(DATASET)
-    mechanism, measurements = dataset.mechanism, dataset.measurements
+    machine, measurements = dataset.machine, dataset.measurements
     truth = json.loads(TRUTH.read_text())
-    cylinders = [leg.cylinders for leg in mechanism.legs]
+    cylinders = [leg.cylinders for leg in machine.legs]
     wanted = np.ones((len(measurements.views), len(cylinders)), dtype=np.bool_)
-    names = mechanism.leg_names
+    names = machine.leg_names
 
     def load(row: int) -> Image:
         image = cv2.imread(str(DATASET / measurements.image[row]), cv2.IMREAD_UNCHANGED)
@@ -127,7 +127,7 @@ def main() -> None:
             raise FileNotFoundError(measurements.image[row])
         return np.asarray(image)
 
-    A, B = joint_centres(mechanism, measurements)
+    A, B = joint_centres(machine, measurements)
     rough = [view.T_base_camera for view in measurements.views]
     search, rows = Search(load, measurements, A, B, cylinders, wanted, names), np.arange(len(A))
     for words, hints in (("with", rough), ("without", [None] * len(rough))):

@@ -45,13 +45,13 @@ T = TypeVar("T")
 def sample() -> tuple[Photographs, Placement]:
     """Return the images of the sample and the nominal scene, with rough camera poses."""
     dataset = load_dataset(DATASET)
-    mechanism, measurements = dataset.mechanism, dataset.measurements
-    platforms = [forward_kinematics(mechanism, q) for q in measurements.q]
-    A = np.repeat(mechanism.A_base[None], measurements.n_rows, axis=0)
-    B = np.array([T.apply(mechanism.B_platform) for T in platforms])
+    machine, measurements = dataset.machine, dataset.measurements
+    platforms = [forward_kinematics(machine, q) for q in measurements.q]
+    A = np.repeat(machine.A_base[None], measurements.n_rows, axis=0)
+    B = np.array([T.apply(machine.B_platform) for T in platforms])
     rows = np.arange(measurements.n_rows)
     load = dataset.image_reader(rows.tolist())
-    photographs = Photographs(mechanism, measurements, load, in_turn, rows, no_outlines())
+    photographs = Photographs(machine, measurements, load, in_turn, rows, no_outlines())
     return photographs, Placement(A, B, tuple(view.T_base_camera for view in measurements.views))
 
 

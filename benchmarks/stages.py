@@ -20,7 +20,7 @@ from legcal.machine import KinematicParameters
 from legcal.paper.four_steps import run_steps
 from legcal.paper.nominal import Criteria
 from legcal.simulation.hexapod import (
-    Machine,
+    PaperHexapod,
     cameras_around,
     extreme_poses,
     hexapod,
@@ -114,7 +114,7 @@ def _errors(
     return found
 
 
-def _platform_error(machine: Machine, parameters: KinematicParameters) -> tuple[float, float]:
+def _platform_error(machine: PaperHexapod, parameters: KinematicParameters) -> tuple[float, float]:
     """Return the error of eq (20) over ten extreme poses [mm, deg]."""
     poses = extreme_poses(machine, 10, np.random.default_rng(20020721))
     errors = platform_errors(machine, parameters, poses)

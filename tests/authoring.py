@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legcal.machine import LegKind, Mechanism, main_cylinders
+from legcal.machine import LegKind, Machine, main_cylinders
 from legcal.machine.description import Description
 from legcal.machine.description_table import read_description
 from legcal.machine.new_model import create_model
@@ -40,15 +40,15 @@ def described(folder: Path, **changes: Any) -> Description:
     return read_description(write_table(folder, **changes))
 
 
-def made(folder: Path, **changes: Any) -> Mechanism:
-    return create_model(described(folder, **changes), folder).mechanism
+def made(folder: Path, **changes: Any) -> Machine:
+    return create_model(described(folder, **changes), folder).machine
 
 
-def check_same(mechanism: Mechanism, machine: Description) -> None:
+def check_same(machine: Machine, description: Description) -> None:
     """Compare a loaded model with its description."""
-    assert mechanism.name == machine.name
-    assert mechanism.leg_names == tuple(leg.name for leg in machine.legs)
-    for leg, entry in zip(mechanism.legs, machine.legs, strict=True):
+    assert machine.name == description.name
+    assert machine.leg_names == tuple(leg.name for leg in description.legs)
+    for leg, entry in zip(machine.legs, description.legs, strict=True):
         slider = "P" if entry.type.has_slider else ""
         assert leg.type == f"{entry.type.base}{slider}{entry.type.platform}"
         assert leg.kind is entry.kind

@@ -8,14 +8,20 @@ import numpy as np
 from legcal.data.axes import write_axes
 from legcal.machine import load_mechanism
 from legcal.simulation.folder import write_session
-from legcal.simulation.hexapod import Machine, cameras_around, hexapod, hexapod_session, perturb
+from legcal.simulation.hexapod import (
+    PaperHexapod,
+    cameras_around,
+    hexapod,
+    hexapod_session,
+    perturb,
+)
 from legcal.simulation.observe import TableNoise
 
 ROOT = Path(__file__).parents[1]
 MODEL = ROOT / "models" / "hexapod.yaml"
 
 
-def write_axes_dataset(folder: Path, *, n_poses: int = 10, images: bool = False) -> Machine:
+def write_axes_dataset(folder: Path, *, n_poses: int = 10, images: bool = False) -> PaperHexapod:
     """Write a dataset whose machine is up to 2 mm off its drawing; return that machine.
 
     Parameters

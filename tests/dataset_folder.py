@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from legcal.machine import Mechanism, load_mechanism
+from legcal.machine import Machine, load_mechanism
 
 ROOT = Path(__file__).parents[1]
 HEXAPOD = ROOT / "examples" / "hexapod" / "models" / "hexapod.yaml"
@@ -20,7 +20,7 @@ SIZE = (64, 48)
 
 
 @cache
-def hexapod() -> Mechanism:
+def hexapod() -> Machine:
     """The example hexapod, loaded once."""
     return load_mechanism(HEXAPOD)
 

@@ -41,7 +41,7 @@ class LegSpec:
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class MachineSpec:
     """A machine at home."""
 
     legs: tuple[LegSpec, ...]
@@ -124,26 +124,28 @@ def _origin(T: RigidTransform) -> str:
     return f'<origin xyz="{_numbers(T.translation)}" rpy="{_numbers(rpy)}"/>'
 
 
-def write_machine(folder: Path, machine: Machine, layout: Layout, name: str = "machine") -> Path:
+def write_machine(
+    folder: Path, description: MachineSpec, layout: Layout, name: str = "machine"
+) -> Path:
     """Write a machine in a layout and return its YAML."""
     text = _Text()
     text.link("base")
     text.link("platform")
-    carried = any(layout.of(j).cut == "carry" for j in range(len(machine.legs)))
+    carried = any(layout.of(j).cut == "carry" for j in range(len(description.legs)))
     virtual = None if carried else layout.virtual
     if virtual is not None:
         T = EYE
-        if virtual == "planar" and machine.normal is not None:
-            T = RigidTransform.from_rotation(_toward(machine.normal))
+        if virtual == "planar" and description.normal is not None:
+            T = RigidTransform.from_rotation(_toward(description.normal))
         text.joint("platform_free", virtual, "base", "platform", T, '<axis xyz="0 0 1"/>')
     loops: list[list[str]] = []
     kinds: list[str] = []
-    for j, leg in enumerate(machine.legs):
-        written = _Leg(text, f"leg{j + 1}", leg, layout.of(j), machine.home).write()
+    for j, leg in enumerate(description.legs):
+        written = _Leg(text, f"leg{j + 1}", leg, layout.of(j), description.home).write()
         if written is not None:
             loops.append(written[1:])
             kinds.append(written[0])
-    names = [f"leg{j + 1}" for j in range(len(machine.legs))]
+    names = [f"leg{j + 1}" for j in range(len(description.legs))]
     block = {
         "version": 1,
         "base": "base",
@@ -151,17 +153,17 @@ def write_machine(folder: Path, machine: Machine, layout: Layout, name: str = "m
         "platform_joint": None if virtual is None else "platform_free",
         "legs": {n: text.any_joint(n) for n in names},
     }
-    if len(names) >= len(machine.frame_legs):
-        block["base_frame"] = [names[j] for j in machine.frame_legs]
+    if len(names) >= len(description.frame_legs):
+        block["base_frame"] = [names[j] for j in description.frame_legs]
     if layout.home:
         block["home"] = {
-            "xyz": [float(x) for x in machine.home.translation],
-            "quat_xyzw": [float(x) for x in machine.home.rotation.as_quat()],
+            "xyz": [float(x) for x in description.home.translation],
+            "quat_xyzw": [float(x) for x in description.home.rotation.as_quat()],
         }
     document = {
         "closed_loop": loops,
         "type": kinds,
-        "name_mot": [f"{n}_slider" for n, leg in zip(names, machine.legs, strict=True)
+        "name_mot": [f"{n}_slider" for n, leg in zip(names, description.legs, strict=True)
                      if leg.kind == "actuated"],
         "legcal": block,
     }  # fmt: skip
@@ -314,16 +316,18 @@ def _toward(direction: Array) -> Rotation:
     return Rotation.from_matrix(np.column_stack([e1, e2, direction]))
 
 
-def expected_axes(machine: Machine, j: int) -> tuple[Array | None, Array | None, float | None]:
+def expected_axes(
+    description: MachineSpec, j: int
+) -> tuple[Array | None, Array | None, float | None]:
     """Return base axis, platform axis and twist of a leg, from how it is drawn at home."""
-    leg = machine.legs[j]
+    leg = description.legs[j]
     base, platform = leg.ends
-    if machine.normal is not None:
+    if description.normal is not None:
         return None, None, None
     without_s = "S" not in leg.type
     a = leg.base_axis if base == "R" or (base == "U" and without_s) else None
     b = leg.platform_axis if platform == "R" or (platform == "U" and without_s) else None
-    back = machine.home.rotation.inv()
+    back = description.home.rotation.inv()
     b_platform = back.apply(leg.u) if platform == "" else None
     if b is not None:
         b_platform = _line(np.asarray(back.apply(b)))
@@ -333,7 +337,7 @@ def expected_axes(machine: Machine, j: int) -> tuple[Array | None, Array | None,
     assert b_platform is not None
     p = a if base == "R" else np.cross(a, leg.u)
     if platform == "":
-        w = machine.home.rotation.apply(normal_basis(np.asarray(b_platform))[0])
+        w = description.home.rotation.apply(normal_basis(np.asarray(b_platform))[0])
     else:
         assert b is not None
         w = b if platform == "R" else np.cross(b, leg.u)
@@ -347,10 +351,10 @@ def _line(axis: Array) -> Array:
     return np.asarray(axis * np.sign(axis[np.abs(axis) > 1e-9][-1]))
 
 
-def expected_B(machine: Machine, j: int) -> Array:
+def expected_B(description: MachineSpec, j: int) -> Array:
     """Return the platform joint centre of a leg in the platform link."""
-    leg = machine.legs[j]
+    leg = description.legs[j]
     B = leg.B_home
     if leg.ends[1] == "":
-        B = leg.A + ((np.asarray(machine.home.translation) - leg.A) @ leg.u) * leg.u
-    return np.asarray(machine.home.inv().apply(B))
+        B = leg.A + ((np.asarray(description.home.translation) - leg.A) @ leg.u) * leg.u
+    return np.asarray(description.home.inv().apply(B))

@@ -22,7 +22,7 @@ CYLINDERS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class MachineSpec:
     """Joint centres of a machine on two plates, (n_legs, 3) [m]."""
 
     A: Array
@@ -37,7 +37,7 @@ class Machine:
         return np.asarray(T.apply(self.B))
 
 
-def machine(n_legs: int, rng: np.random.Generator | None = None) -> Machine:
+def machine(n_legs: int, rng: np.random.Generator | None = None) -> MachineSpec:
     """Return a machine whose legs stand around; a symmetric one without chance."""
     turn = 2.0 * np.pi * np.arange(n_legs) / n_legs
     aside = 0.25 * np.where(np.arange(n_legs) % 2, -1.0, 1.0) * (n_legs > 3)
@@ -45,7 +45,7 @@ def machine(n_legs: int, rng: np.random.Generator | None = None) -> Machine:
     B = 0.12 * np.stack([np.cos(turn - aside), np.sin(turn - aside), 0.0 * turn], axis=1)
     if rng is not None:
         A, B = A + rng.uniform(-0.03, 0.03, A.shape), B + rng.uniform(-0.03, 0.03, B.shape)
-    return Machine(A, B)
+    return MachineSpec(A, B)
 
 
 def platform(rng: np.random.Generator | None = None) -> RigidTransform:
@@ -136,7 +136,7 @@ def picture(
 
 
 def pictures(
-    made: Machine,
+    made: MachineSpec,
     T_base_camera: RigidTransform,
     platforms: Sequence[RigidTransform],
     rng: np.random.Generator,
@@ -149,7 +149,7 @@ def pictures(
     """Return pictures of a machine that differs from its model by a joint error [m]."""
     A = made.A + rng.uniform(-joint_error, joint_error, made.A.shape)
     off = rng.uniform(-joint_error, joint_error, made.B.shape)
-    true = Machine(A, made.B + off)
+    true = MachineSpec(A, made.B + off)
     return [
         picture(
             (made.A, made.posed(T)),

@@ -15,7 +15,7 @@ from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array
 from legcal.machine import (
     Configurations,
-    Mechanism,
+    Machine,
     inverse_kinematics,
     load_mechanism,
     random_configurations,
@@ -28,20 +28,20 @@ TOOL = RigidTransform.from_components([0.03, -0.02, 0.11], Rotation.from_rotvec(
 
 
 @cache
-def machine(name: str) -> Mechanism:
+def shipped(name: str) -> Machine:
     return load_mechanism(name)
 
 
 @cache
 def workspace_poses(name: str, n: int, seed: int = 1) -> Configurations:
-    return random_configurations(machine(name), n, seed)
+    return random_configurations(shipped(name), n, seed)
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
     """A machine in the world, and what was measured."""
 
-    mechanism: Mechanism
+    machine: Machine
     base: RigidTransform
     tool: RigidTransform
     platform: Sequence[RigidTransform]
@@ -68,12 +68,12 @@ def located(
     platform: Sequence[RigidTransform] | None = None,
 ) -> Located:
     """Return a machine at BASE with a tool at TOOL, measured at poses of the workspace or these."""
-    mechanism, chance = machine(name), np.random.default_rng(seed)
+    machine, chance = shipped(name), np.random.default_rng(seed)
     if platform is None:
         drawn = workspace_poses(name, n, seed)
         q, platform = drawn.readings, drawn.poses
     else:
-        q = np.array([inverse_kinematics(mechanism, T) for T in platform])
+        q = np.array([inverse_kinematics(machine, T) for T in platform])
     tools = [BASE * T * TOOL for T in platform]
     turn = rotation_matrices(noise * SIGMA_ANGLE * chance.normal(size=(len(tools), 3)))
     poses = ToolPoses(
@@ -86,7 +86,7 @@ def located(
         angle_sigma=None,
         numbers=np.arange(1, len(tools) + 1),
     )
-    return Located(mechanism, BASE, TOOL, platform, poses)
+    return Located(machine, BASE, TOOL, platform, poses)
 
 
 def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> Frames:
@@ -132,10 +132,10 @@ def write_poses(
 ) -> list[dict[str, str]]:
     """Write the table of measured poses and return its rows."""
     poses = machine.poses if poses is None else poses
-    joints = [str(machine.mechanism.legs[j].prismatic) for j in machine.mechanism.motors]
+    joints = [str(machine.machine.legs[j].prismatic) for j in machine.machine.motors]
     rows = []
     for q, p, M in zip(poses.q, poses.position, poses.rotation, strict=True):
-        numbers = dict(zip(joints, q[list(machine.mechanism.motors)], strict=True))
+        numbers = dict(zip(joints, q[list(machine.machine.motors)], strict=True))
         numbers |= dict(zip("xyz", p, strict=True))
         if quaternions:
             quaternion = Rotation.from_matrix(M).as_quat()

@@ -19,7 +19,7 @@ from legcal.geometry.types import Array
 from legcal.machine import (
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     geometries,
     load_mechanism,
     moved_legs,
@@ -123,22 +123,22 @@ def machine_session(
         Of poses and errors.
     """
     rng = np.random.default_rng(seed)
-    mechanism = load_mechanism(name)
-    legs, fitted = geometries(mechanism), fitted_legs(mechanism)
-    R, t = _poses(mechanism, legs, n_views * n_poses, rng)
+    machine = load_mechanism(name)
+    legs, fitted = geometries(machine), fitted_legs(machine)
+    R, t = _poses(machine, legs, n_views * n_poses, rng)
     view = np.repeat(np.arange(n_views), n_poses)
-    T_camera_Rb = _cameras(mechanism, legs, n_views, camera)
+    T_camera_Rb = _cameras(machine, legs, n_views, camera)
     measurements = Measurements(
         tuple(View(f"c{v + 1}", camera) for v in range(n_views)),
         tuple(f"c{v + 1}_{i:03d}.png" for i, v in enumerate(view)),
         view,
         np.arange(len(view)),
-        _readings(mechanism, legs, R, t),
+        _readings(machine, legs, R, t),
         SIGMA_Q,
     )
     truth = Start(legs, T_camera_Rb, motions_of(R, t), "truth")
     away = _wrong(fitted, legs, length, angle, rng)
-    home = (platform_in_base(mechanism, mechanism.home),) * len(t)
+    home = (platform_in_base(machine, machine.home),) * len(t)
     rough = tuple(_shaken(T, camera_shift, camera_turn, rng) for T in T_camera_Rb)
     wrong = replace(fitted, nominal=away)
     return MachineSession(
@@ -151,29 +151,29 @@ def machine_session(
 
 
 def _poses(
-    mechanism: Mechanism, legs: tuple[Leg, ...], n: int, rng: np.random.Generator
+    machine: Machine, legs: tuple[Leg, ...], n: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return poses around home at which the legs close."""
-    R, t = components((platform_in_base(mechanism, mechanism.home),) * n)
+    R, t = components((platform_in_base(machine, machine.home),) * n)
     size = np.mean([np.linalg.norm(R[0] @ leg.B + t[0] - leg.A) for leg in legs])
     step = rng.uniform(-1.0, 1.0, (n, 6)) * np.repeat([_TURN, _SHIFT * size], 3)
-    return closed_poses(legs, mechanism.frame_legs, *moved_poses(R, t, step))
+    return closed_poses(legs, machine.frame_legs, *moved_poses(R, t, step))
 
 
-def _readings(mechanism: Mechanism, legs: tuple[Leg, ...], R: Array, t: Array) -> Array:
+def _readings(machine: Machine, legs: tuple[Leg, ...], R: Array, t: Array) -> Array:
     q = np.full((len(t), len(legs)), np.nan)
     for j, leg in enumerate(legs):
         if leg.kind is LegKind.ACTUATED:
             length = np.linalg.norm(R @ leg.B + t - leg.A, axis=1)
-            q[:, j] = mechanism.sign[j] * (length - leg.q0)
+            q[:, j] = machine.sign[j] * (length - leg.q0)
     return q
 
 
 def _cameras(
-    mechanism: Mechanism, legs: tuple[Leg, ...], n_views: int, camera: Camera
+    machine: Machine, legs: tuple[Leg, ...], n_views: int, camera: Camera
 ) -> tuple[RigidTransform, ...]:
     """Return T_camera_Rb of cameras around the middle of the machine."""
-    home = platform_in_base(mechanism, mechanism.home)
+    home = platform_in_base(machine, machine.home)
     joints = np.array([leg.A for leg in legs] + [home.apply(leg.B) for leg in legs])
     middle = joints.mean(axis=0)
     size = np.linalg.norm(joints - middle, axis=1).max()

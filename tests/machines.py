@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from layouts import LegSpec, Machine
+from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
@@ -26,7 +26,7 @@ def _seven(seed: int = 1) -> tuple[Array, Array]:
     return A, np.asarray(HOME.apply(B))
 
 
-def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) -> Machine:
+def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) -> MachineSpec:
     """Return a machine with legs of these types between general points, general axes."""
     rng = np.random.default_rng(seed)
     A, B = _seven(seed)
@@ -42,13 +42,13 @@ def of_types(types: list[str], kinds: list[str] | None = None, seed: int = 1) ->
                 axis = np.cross(u, axis)
             axes.append(axis / np.linalg.norm(axis))
         legs.append(LegSpec(leg_type, A[j], B[j], kind, axes[0], axes[1]))
-    return Machine(tuple(legs), HOME)
+    return MachineSpec(tuple(legs), HOME)
 
 
 def planar(
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0),
     kinds: tuple[str, ...] = ("actuated",) * 3,
-) -> Machine:
+) -> MachineSpec:
     """Return a planar machine of RPR and RR legs that stand at different heights."""
     n_legs = len(kinds)
     n = np.array(normal) / np.linalg.norm(normal)
@@ -66,10 +66,10 @@ def planar(
         LegSpec("RR", turn.apply(a), turn.apply(b), kind, n, n)
         for a, b, kind in zip(A, B, kinds, strict=True)
     )
-    return Machine(legs, home, frame_legs=(0, 1), normal=n)
+    return MachineSpec(legs, home, frame_legs=(0, 1), normal=n)
 
 
-MACHINES: dict[str, Callable[[], Machine]] = {
+MACHINES: dict[str, Callable[[], MachineSpec]] = {
     "6-UPS": lambda: of_types(["US"] * 6),
     "6-SPS": lambda: of_types(["SS"] * 6),
     "3-RPR": planar,

@@ -8,7 +8,7 @@ import yaml
 from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 from legcal.machine.tree import origin
 from legcal.machine.urdf import UrdfJoint
 
@@ -23,17 +23,17 @@ FORMATS = (
 )
 
 
-def write_format(mechanism: Mechanism, name: str, folder: Path) -> Path:
+def write_format(machine: Machine, name: str, folder: Path) -> Path:
     """Write a mechanism in a format and return the path that means it."""
     folder.mkdir(parents=True, exist_ok=True)
     if name.startswith("mjcf"):
         path = folder / "machine.xml"
-        path.write_text(mjcf(mechanism, name.removeprefix("mjcf ")))
+        path.write_text(mjcf(machine, name.removeprefix("mjcf ")))
         return path
     if name == "gepetto":
-        return _gepetto(mechanism, folder / "machine")
+        return _gepetto(machine, folder / "machine")
     path = folder / "machine.urdf"
-    path.write_text(_with_loops(mechanism, name))
+    path.write_text(_with_loops(machine, name))
     return path
 
 
@@ -47,9 +47,9 @@ def _pose(T: RigidTransform) -> str:
     return f'pos="{numbers(T.translation)}" quat="{numbers(quat)}"'
 
 
-def _cylinders(mechanism: Mechanism) -> dict[str, list[tuple[RigidTransform, str, str]]]:
+def _cylinders(machine: Machine) -> dict[str, list[tuple[RigidTransform, str, str]]]:
     """Return the visual cylinders of every link: pose, radius and length as text."""
-    robot = etree.fromstring(mechanism.urdf.content)
+    robot = etree.fromstring(machine.urdf.content)
     found: dict[str, list[tuple[RigidTransform, str, str]]] = {}
     for visual in robot.iterfind("link/visual"):
         place, cylinder = visual.find("origin"), visual.find("geometry/cylinder")
@@ -63,14 +63,14 @@ def _cylinders(mechanism: Mechanism) -> dict[str, list[tuple[RigidTransform, str
     return found
 
 
-def mjcf(mechanism: Mechanism, style: str) -> str:
+def mjcf(machine: Machine, style: str) -> str:
     """Return a mechanism as MJCF, in its closed home configuration.
 
     ``bodies`` closes it between bodies, ``sites`` between sites; ``defaults`` writes angles in
     radians and takes what it can from default classes.
     """
-    chain, configuration = mechanism.chain, mechanism.home_configuration
-    urdf, cylinders = mechanism.urdf, _cylinders(mechanism)
+    chain, configuration = machine.chain, machine.home_configuration
+    urdf, cylinders = machine.urdf, _cylinders(machine)
     sites = style == "sites"
     frames = {f for c in chain.closures for f in (c.frame_1, c.frame_2)}
     unit = 1.0 if style == "defaults" else 180.0 / np.pi
@@ -122,7 +122,7 @@ def mjcf(mechanism: Mechanism, style: str) -> str:
             ends = f'body1="{closure.frame_1}" body2="{closure.frame_2}"'
             ends += ' anchor="0 0 0"' * (tag == "connect")
         equalities += f"<{tag} {ends}/>\n"
-    motors = "".join(f'<position joint="{mechanism.legs[j].prismatic}"/>' for j in mechanism.motors)
+    motors = "".join(f'<position joint="{machine.legs[j].prismatic}"/>' for j in machine.motors)
     head = ""
     if style == "defaults":
         head = (
@@ -135,11 +135,11 @@ def mjcf(mechanism: Mechanism, style: str) -> str:
     )
 
 
-def _with_loops(mechanism: Mechanism, style: str) -> str:
+def _with_loops(machine: Machine, style: str) -> str:
     """Return the URDF of a mechanism with its closures in it, on the links under the frames."""
-    robot = etree.fromstring(mechanism.urdf.content)
-    below = {j.child: j for j in mechanism.urdf.joints.values() if not j.moves}
-    for i, closure in enumerate(mechanism.chain.closures):
+    robot = etree.fromstring(machine.urdf.content)
+    below = {j.child: j for j in machine.urdf.joints.values() if not j.moves}
+    for i, closure in enumerate(machine.chain.closures):
         kind = "spherical" if closure.kind == "3d" else "fixed"
         ends = [below[frame] for frame in (closure.frame_1, closure.frame_2)]
         places = [etree.fromstring(origin(end.T_parent_origin)) for end in ends]
@@ -159,8 +159,8 @@ def _with_loops(mechanism: Mechanism, style: str) -> str:
                 f'<{second} link="{ends[1].parent}" {attributes[1]}/></loop_joint>'
             )
         robot.append(etree.fromstring(text))
-    for j in mechanism.motors:
-        motor = mechanism.legs[j].prismatic
+    for j in machine.motors:
+        motor = machine.legs[j].prismatic
         text = f'<transmission name="t{j}"><joint name="{motor}"/></transmission>'
         robot.append(etree.fromstring(text))
     return etree.tostring(robot, encoding="unicode")
@@ -172,14 +172,14 @@ def _remove(robot: etree._Element, joint: UrdfJoint) -> None:
             robot.remove(element)
 
 
-def _gepetto(mechanism: Mechanism, folder: Path) -> Path:
+def _gepetto(machine: Machine, folder: Path) -> Path:
     """Write a folder as Gepetto has them: one joint stands for two or three at one point."""
     folder.mkdir(parents=True)
-    robot = etree.fromstring(mechanism.urdf.content)
+    robot = etree.fromstring(machine.urdf.content)
     elements = {(e.tag, e.get("name")): e for e in robot}
     names, types, gone = [], [], set[str]()
-    for first in mechanism.urdf.joints.values():
-        group = _group(mechanism, first)
+    for first in machine.urdf.joints.values():
+        group = _group(machine, first)
         if first.name in gone or len(group) < 2:
             continue
         names.append(first.name)
@@ -193,9 +193,9 @@ def _gepetto(mechanism: Mechanism, folder: Path) -> Path:
             robot.remove(elements["link", before.child])
             robot.remove(elements["joint", joint.name])
     document = {
-        "closed_loop": [[c.frame_1, c.frame_2] for c in mechanism.chain.closures],
-        "type": [c.kind.upper() for c in mechanism.chain.closures],
-        "name_mot": [str(mechanism.legs[j].prismatic) for j in mechanism.motors],
+        "closed_loop": [[c.frame_1, c.frame_2] for c in machine.chain.closures],
+        "type": [c.kind.upper() for c in machine.chain.closures],
+        "name_mot": [str(machine.legs[j].prismatic) for j in machine.motors],
         "joint_name": names,
         "joint_type": types,
     }
@@ -204,11 +204,11 @@ def _gepetto(mechanism: Mechanism, folder: Path) -> Path:
     return folder
 
 
-def _group(mechanism: Mechanism, first: UrdfJoint) -> list[UrdfJoint]:
+def _group(machine: Machine, first: UrdfJoint) -> list[UrdfJoint]:
     """Return the revolutes about x, y or z that follow each other at one point."""
     group = [first]
     while True:
-        after = [j for j in mechanism.urdf.joints.values() if j.parent == group[-1].child]
+        after = [j for j in machine.urdf.joints.values() if j.parent == group[-1].child]
         found = [
             joint
             for joint in after
@@ -226,11 +226,11 @@ def _letter(joint: UrdfJoint) -> str | None:
     return next((k for k, axis in axes.items() if np.allclose(axis, joint.axis)), None)
 
 
-def with_loops_at_joints(mechanism: Mechanism, tag: str) -> str:
+def with_loops_at_joints(machine: Machine, tag: str) -> str:
     """Return the URDF of legs without S, closed by their revolute or universal platform joints."""
-    robot = etree.fromstring(mechanism.urdf.content)
-    above = {j.child: j for j in mechanism.urdf.joints.values()}
-    for i, closure in enumerate(mechanism.chain.closures):
+    robot = etree.fromstring(machine.urdf.content)
+    above = {j.child: j for j in machine.urdf.joints.values()}
+    for i, closure in enumerate(machine.chain.closures):
         end, seat = above[closure.frame_1], above[closure.frame_2]
         joints = [above[end.parent]]
         while above[joints[-1].parent].type == "revolute":

@@ -1,4 +1,4 @@
-"""Mechanism files of one hexapod in many layouts, for tests."""
+"""Model files of one hexapod in many layouts, for tests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

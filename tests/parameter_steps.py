@@ -10,7 +10,7 @@ from legcal.geometry.types import Array
 from legcal.machine import (
     KinematicParameters,
     Leg,
-    Mechanism,
+    Machine,
     Parametrization,
     footed,
     geometries,
@@ -28,8 +28,8 @@ def random_covariance(
 
 
 def written_with(
-    nominal: Mechanism, parametrization: Parametrization, step: Array, folder: Path
-) -> Mechanism:
+    nominal: Machine, parametrization: Parametrization, step: Array, folder: Path
+) -> Machine:
     """Return a mechanism with changed parameters, as loaded from the files written of it."""
     folder.mkdir(exist_ok=True)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)

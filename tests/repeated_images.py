@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.files import motion_to_xyz_quat
 from legcal.geometry.types import Array
-from legcal.machine import Mechanism, load_mechanism, random_configurations
+from legcal.machine import Machine, load_mechanism, random_configurations
 from legcal.simulation.cameras import look_at
 from legcal.vision.camera import Camera
 from legcal.vision.in_view import visible_pieces
@@ -29,7 +29,7 @@ class RepeatedImages:
     """A dataset of one view; tests change rows, entry or pictures before :meth:`write`."""
 
     path: Path
-    mechanism: Mechanism
+    machine: Machine
     entry: dict[str, Any]
     rows: list[dict[str, str]]
     pictures: dict[str, Array] = field(default_factory=dict)  # by image, with noise
@@ -69,24 +69,22 @@ def repeated_images(
     The camera is held so that the image of ``level_leg`` in the first pose is parallel to the image
     x axis.
     """
-    mechanism = load_mechanism(model)
-    drawn = random_configurations(mechanism, n_poses, 3)
-    middle = 0.5 * (
-        mechanism.A_base.mean(axis=0) + mechanism.home.apply(mechanism.B_platform).mean(0)
-    )
-    lengths = np.linalg.norm(mechanism.home.apply(mechanism.B_platform) - mechanism.A_base, axis=1)
-    size = max(float(lengths.max()), float(np.ptp(mechanism.A_base, axis=0).max()))
-    aside = np.array([1.0, 0.45, 0.5]) if mechanism.spatial else np.array([0.15, 0.1, 1.3])
+    machine = load_mechanism(model)
+    drawn = random_configurations(machine, n_poses, 3)
+    middle = 0.5 * (machine.A_base.mean(axis=0) + machine.home.apply(machine.B_platform).mean(0))
+    lengths = np.linalg.norm(machine.home.apply(machine.B_platform) - machine.A_base, axis=1)
+    size = max(float(lengths.max()), float(np.ptp(machine.A_base, axis=0).max()))
+    aside = np.array([1.0, 0.45, 0.5]) if machine.spatial else np.array([0.15, 0.1, 1.3])
     roll = 0.1
     if level_leg is not None:
         T = look_at(middle + 1.7 * size * aside, middle).inv()
-        B_base = drawn.poses[0].apply(mechanism.B_platform[level_leg])
-        normal = np.cross(T.apply(mechanism.A_base[level_leg]), T.apply(B_base))
+        B_base = drawn.poses[0].apply(machine.B_platform[level_leg])
+        normal = np.cross(T.apply(machine.A_base[level_leg]), T.apply(B_base))
         roll = float(np.arctan2(-normal[0], normal[1]))
     T_base_camera = look_at(middle + 1.7 * size * aside, middle, roll=roll)
     entry = {
         "legcal_dataset": 1,
-        "mechanism": str(mechanism.yaml_path),
+        "mechanism": str(machine.yaml_path),
         "measurements": "measurements.csv",
         "encoder_sigma": 2e-6,
         "views": {
@@ -96,14 +94,14 @@ def repeated_images(
             }
         },
     }
-    made = RepeatedImages(path, mechanism, entry, [])
+    made = RepeatedImages(path, machine, entry, [])
     rng = np.random.default_rng(5)
     for p, (q, T) in enumerate(zip(drawn.readings, drawn.poses, strict=True)):
-        clean = _picture(mechanism, T, T_base_camera)
+        clean = _picture(machine, T, T_base_camera)
         for k in range(n_images):
             name = f"images/p{p}_{k}.png"
             made.pictures[name] = clean + NOISE * rng.standard_normal(clean.shape)
-            readings = {str(mechanism.legs[j].prismatic): f"{q[j]:.9f}" for j in mechanism.motors}
+            readings = {str(machine.legs[j].prismatic): f"{q[j]:.9f}" for j in machine.motors}
             made.rows.append({"view": "c1", "image": name, "pose": f"p{p}", **readings})
     return made
 
@@ -114,14 +112,14 @@ def _camera() -> Camera:
 
 
 def _picture(
-    mechanism: Mechanism, T_base_platform: RigidTransform, T_base_camera: RigidTransform
+    machine: Machine, T_base_platform: RigidTransform, T_base_camera: RigidTransform
 ) -> Array:
     """Return a picture of all legs without noise."""
     T = T_base_camera.inv()
-    A, B = T.apply(mechanism.A_base), T.apply(T_base_platform.apply(mechanism.B_platform))
+    A, B = T.apply(machine.A_base), T.apply(T_base_platform.apply(machine.B_platform))
     bars: Sequence[Bar] = [
         Bar(A[j] + piece.start * u, A[j] + piece.end * u, piece.radius)
-        for j, leg in enumerate(mechanism.legs)
+        for j, leg in enumerate(machine.legs)
         for length in [float(np.linalg.norm(B[j] - A[j]))]
         for u in [(B[j] - A[j]) / length]
         for piece in visible_pieces(leg.cylinders, length)

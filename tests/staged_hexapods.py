@@ -10,7 +10,7 @@ from legcal.machine import KinematicParameters, from_vector, to_vector
 from legcal.simulation.hexapod import (
     PAPER_VIEWS,
     HexapodSession,
-    Machine,
+    PaperHexapod,
     cameras_around,
     hexapod,
     hexapod_session,
@@ -46,7 +46,7 @@ def exact_session(
 @cache
 def noisy_session(
     seed: int, noise: OutlineNoise | TableNoise, *, coplanar: bool = False, n_poses: int = 15
-) -> tuple[HexapodSession, Machine]:
+) -> tuple[HexapodSession, PaperHexapod]:
     """Return a session with noise, and a nominal machine up to 2 mm wrong in every parameter."""
     rng = np.random.default_rng(seed)
     machine = perturb(hexapod(), rng, 0.002, coplanar=coplanar)
@@ -62,7 +62,7 @@ def noisy_session(
     return session, nominal
 
 
-def five_millimetres_away(machine: Machine, seed: int = 0) -> Machine:
+def five_millimetres_away(machine: PaperHexapod, seed: int = 0) -> PaperHexapod:
     """Return the machine with every parameter exactly 5 mm wrong, z and offsets included."""
     vector = to_vector(machine.parameters, machine.frame_legs)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(vector))
@@ -70,7 +70,7 @@ def five_millimetres_away(machine: Machine, seed: int = 0) -> Machine:
     return replace(machine, parameters=parameters)
 
 
-def errors(parameters: KinematicParameters, machine: Machine) -> Array:
+def errors(parameters: KinematicParameters, machine: PaperHexapod) -> Array:
     """Return the absolute error of every parameter [m]."""
     difference = to_vector(parameters, machine.frame_legs) - to_vector(
         machine.parameters, machine.frame_legs

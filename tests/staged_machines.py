@@ -20,7 +20,7 @@ from legcal.paper.leg_directions import (
     directions_through_joints,
     observed_directions,
 )
-from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.nominal import Criteria, NominalMachine
 from legcal.paper.offsets import Offsets, identify_offsets
 
 
@@ -28,7 +28,7 @@ from legcal.paper.offsets import Offsets, identify_offsets
 class Observed:
     """What steps 1 to 3 take, and the truth behind it."""
 
-    nominal: NominalMechanism
+    nominal: NominalMachine
     axes: LegAxes
     measurements: Measurements
     true_legs: tuple[Leg, ...]
@@ -95,7 +95,7 @@ def _observed(session: MachineSession) -> Observed:
     legs = session.legs
     radii = {part: radius for (_, part), radius in legs.radii.items()}
     return Observed(
-        NominalMechanism(legs.names, legs.nominal, legs.sign, legs.frame_legs),
+        NominalMachine(legs.names, legs.nominal, legs.sign, legs.frame_legs),
         axes_from_outlines(session.outlines, session.measurements, radii),
         session.measurements,
         session.truth.legs,
@@ -124,7 +124,7 @@ def planned(session: Session, sign: Array) -> Observed:
     step *= np.random.default_rng(0).choice([-1.0, 1.0], len(step))
     away = moved_legs(session.legs, session.parametrization.place, step)
     return Observed(
-        NominalMechanism(session.leg_names, away, sign, session.frame_legs),
+        NominalMachine(session.leg_names, away, sign, session.frame_legs),
         LegAxes(row, leg, u, M, E, covariance),
         Measurements(
             tuple(View(f"c{v + 1}", PINHOLE) for v in range(session.n_views)),
@@ -139,7 +139,7 @@ def planned(session: Session, sign: Array) -> Observed:
     )
 
 
-def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMechanism:
+def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMachine:
     """Return a mechanism of RPS legs, or SPS where the axis is NaN, with R_b on joints 1, 2, 3."""
     up = np.array([0.0, 0.0, 1.0])
     legs = tuple(
@@ -149,7 +149,7 @@ def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMechanism:
         for A, v in zip(A_Rb, v_Rb, strict=True)
     )
     names = tuple(f"leg{j + 1}" for j in range(len(legs)))
-    return NominalMechanism(names, legs, np.ones(len(legs)), (0, 1, 2))
+    return NominalMachine(names, legs, np.ones(len(legs)), (0, 1, 2))
 
 
 def seen_from(

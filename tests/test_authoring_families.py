@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from authoring import check_same
 
-from legcal.machine import Mechanism, singularity
+from legcal.machine import Machine, singularity
 from legcal.machine.assembly import assemble
 from legcal.machine.family import Family, describe_family
 from legcal.machine.new_model import create_model, urdf_text, yaml_text
@@ -15,11 +15,11 @@ from legcal.machine.new_model import create_model, urdf_text, yaml_text
 GOUGH = Family("6-UPS", "mm", 300.0, 150.0, 400.0)
 
 
-def _made(family: Family, folder: Path) -> Mechanism:
-    machine = describe_family(family)
-    mechanism = create_model(machine, folder).mechanism
-    check_same(mechanism, machine)
-    return mechanism
+def _made(family: Family, folder: Path) -> Machine:
+    description = describe_family(family)
+    machine = create_model(description, folder).machine
+    check_same(machine, description)
+    return machine
 
 
 @pytest.mark.parametrize(
@@ -35,21 +35,21 @@ def test_families_load_with_the_mobility_of_their_type(
     tmp_path: Path, family: str, mobility: int
 ) -> None:
     height = None if family == "3-RPR" else 400.0
-    mechanism = _made(replace(GOUGH, family=family, height=height), tmp_path)
-    assert mechanism.mobility == mobility
-    assert mechanism.name == family.lower()
+    machine = _made(replace(GOUGH, family=family, height=height), tmp_path)
+    assert machine.mobility == mobility
+    assert machine.name == family.lower()
     n, kind = family.split("-")
-    assert [leg.type for leg in mechanism.legs] == [kind] * int(n)
-    radii = np.linalg.norm(mechanism.A_base, axis=1), np.linalg.norm(mechanism.B_platform, axis=1)
+    assert [leg.type for leg in machine.legs] == [kind] * int(n)
+    radii = np.linalg.norm(machine.A_base, axis=1), np.linalg.norm(machine.B_platform, axis=1)
     np.testing.assert_allclose(radii[0], 0.3, atol=1e-12)
     np.testing.assert_allclose(radii[1], 0.15, atol=1e-12)
-    if mobility == len(mechanism.motors):
-        assert singularity(mechanism, mechanism.home) > 0.05
+    if mobility == len(machine.motors):
+        assert singularity(machine, machine.home) > 0.05
 
 
 def test_pairs_of_a_gough_platform_stand_as_told(tmp_path: Path) -> None:
-    mechanism = _made(replace(GOUGH, base_spread=20.0, platform_spread=40.0), tmp_path)
-    A, B = mechanism.A_base, mechanism.B_platform
+    machine = _made(replace(GOUGH, base_spread=20.0, platform_spread=40.0), tmp_path)
+    A, B = machine.A_base, machine.B_platform
     angle = np.degrees(np.arctan2(A[:, 1], A[:, 0])) % 360
     np.testing.assert_allclose(angle, [10, 110, 130, 230, 250, 350], atol=1e-9)
     angle = np.degrees(np.arctan2(B[:, 1], B[:, 0])) % 360
@@ -66,18 +66,18 @@ def test_dimensions_are_those_that_were_told(tmp_path: Path) -> None:
     family = replace(
         GOUGH, offset=380.0, travel=(-5.0, 120.0), leg_radius=12.5, turn=10.0, name="mine"
     )
-    mechanism = _made(family, tmp_path)
-    assert mechanism.name == "mine"
-    np.testing.assert_allclose(mechanism.q0, 0.38, atol=1e-12)
-    assert {leg.travel for leg in mechanism.legs} == {(-0.005, 0.12)}
-    assert {c.radius for leg in mechanism.legs for c in leg.cylinders} == {0.0125}
-    np.testing.assert_allclose(mechanism.home.rotation.magnitude(), np.radians(10.0), atol=1e-12)
-    np.testing.assert_allclose(mechanism.home.translation, [0.0, 0.0, 0.4], atol=1e-12)
+    machine = _made(family, tmp_path)
+    assert machine.name == "mine"
+    np.testing.assert_allclose(machine.q0, 0.38, atol=1e-12)
+    assert {leg.travel for leg in machine.legs} == {(-0.005, 0.12)}
+    assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.0125}
+    np.testing.assert_allclose(machine.home.rotation.magnitude(), np.radians(10.0), atol=1e-12)
+    np.testing.assert_allclose(machine.home.translation, [0.0, 0.0, 0.4], atol=1e-12)
 
 
 def test_tilted_universal_joints_rise_on_the_base_and_sink_on_the_platform(tmp_path: Path) -> None:
-    mechanism = _made(replace(GOUGH, family="3-UPU", tilt=15.0), tmp_path)
-    for leg in mechanism.legs:
+    machine = _made(replace(GOUGH, family="3-UPU", tilt=15.0), tmp_path)
+    for leg in machine.legs:
         assert leg.base_axis is not None
         assert leg.platform_axis is not None
         cosine = abs(leg.base_axis @ leg.platform_axis)
@@ -87,9 +87,9 @@ def test_tilted_universal_joints_rise_on_the_base_and_sink_on_the_platform(tmp_p
 
 @pytest.mark.parametrize("kind", ["RPS", "SPR"])
 def test_tilted_revolutes_stay_across_their_leg(tmp_path: Path, kind: str) -> None:
-    mechanism = _made(replace(GOUGH, family=f"3-{kind}", tilt=-20.0), tmp_path)
-    for leg in mechanism.legs:
+    machine = _made(replace(GOUGH, family=f"3-{kind}", tilt=-20.0), tmp_path)
+    for leg in machine.legs:
         axis = leg.base_axis if leg.base_axis is not None else leg.platform_axis
         assert axis is not None
-        assert abs(axis @ (mechanism.home.apply(leg.B) - leg.A)) < 1e-12
+        assert abs(axis @ (machine.home.apply(leg.B) - leg.A)) < 1e-12
         assert abs(axis[2]) > 0.1

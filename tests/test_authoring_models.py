@@ -48,11 +48,11 @@ def test_every_shipped_model_has_a_table_of_its_name() -> None:
 
 @pytest.mark.parametrize("table", [*TABLES, REAL / "table.yaml"], ids=lambda path: path.stem)
 def test_shipped_models_are_what_their_tables_give_byte_for_byte(table: Path) -> None:
-    machine = assemble(read_description(table))
+    description = assemble(read_description(table))
     top = REAL if table.parent == REAL else ROOT
     for path, text in (
-        (top / "models" / f"{machine.name}.yaml", yaml_text(machine)),
-        (top / "urdf" / f"{machine.name}.urdf", urdf_text(machine)),
+        (top / "models" / f"{description.name}.yaml", yaml_text(description)),
+        (top / "urdf" / f"{description.name}.urdf", urdf_text(description)),
     ):
         shipped = path.read_text()
         if shipped != text:  # another processor may round the last digit otherwise
@@ -63,13 +63,13 @@ def test_shipped_models_are_what_their_tables_give_byte_for_byte(table: Path) ->
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda path: path.stem)
 def test_shipped_models_are_as_told_and_far_from_singular(table: Path) -> None:
-    mechanism = load_mechanism(table.stem)
-    check_same(mechanism, read_description(table))
+    machine = load_mechanism(table.stem)
+    check_same(machine, read_description(table))
     types, mobility = EXPECTED[table.stem]
-    assert " ".join(leg.type for leg in mechanism.legs) == types
-    assert mechanism.mobility == mobility == len(mechanism.motors)
-    assert mechanism.spatial is (table.stem != "3-rpr")
-    assert singularity(mechanism, mechanism.home) > 0.05
+    assert " ".join(leg.type for leg in machine.legs) == types
+    assert machine.mobility == mobility == len(machine.motors)
+    assert machine.spatial is (table.stem != "3-rpr")
+    assert singularity(machine, machine.home) > 0.05
 
 
 def test_the_hexapod_is_the_machine_of_the_example() -> None:
@@ -86,9 +86,9 @@ def test_the_hexapod_is_the_machine_of_the_example() -> None:
 
 @pytest.mark.parametrize(("name", "turns"), [("3-upu", False), ("3-upu-tilted", True)])
 def test_a_3upu_turns_only_where_its_axes_are_tilted(name: str, turns: bool) -> None:
-    mechanism = load_mechanism(name)
-    T = forward_kinematics(mechanism, np.array([0.03, 0.07, 0.12]))
-    turned = float((mechanism.home.inv() * T).rotation.magnitude())
+    machine = load_mechanism(name)
+    T = forward_kinematics(machine, np.array([0.03, 0.07, 0.12]))
+    turned = float((machine.home.inv() * T).rotation.magnitude())
     assert (turned > 0.05) if turns else (turned < 1e-9)
 
 
@@ -179,14 +179,14 @@ def random_tables(draw: st.DrawFn) -> dict[str, Any]:
 )
 @given(random_tables())
 def test_a_random_table_comes_back_from_its_files(tmp_path: Path, table: dict[str, Any]) -> None:
-    machine = described(tmp_path, **table)
-    mechanism = create_model(machine, tmp_path, force=True).mechanism
-    check_same(mechanism, machine)
-    assert machine.home is not None
-    T = machine.home.motion()
-    np.testing.assert_allclose(mechanism.home.as_matrix(), T.as_matrix(), atol=1e-9)
-    readings = inverse_kinematics(mechanism, mechanism.home)
-    for leg, reading in zip(mechanism.legs, readings, strict=True):
+    description = described(tmp_path, **table)
+    machine = create_model(description, tmp_path, force=True).machine
+    check_same(machine, description)
+    assert description.home is not None
+    T = description.home.motion()
+    np.testing.assert_allclose(machine.home.as_matrix(), T.as_matrix(), atol=1e-9)
+    readings = inverse_kinematics(machine, machine.home)
+    for leg, reading in zip(machine.legs, readings, strict=True):
         if leg.kind is not LegKind.CONSTANT:
             assert leg.travel[0] <= reading <= leg.travel[1]
 
@@ -205,50 +205,50 @@ def test_millimetres_and_metres_give_the_same_files(tmp_path: Path) -> None:
     }
     texts = []
     for changes in (in_mm, in_m):
-        machine = assemble(described(tmp_path, **changes))
-        texts.append((yaml_text(machine), urdf_text(machine)))
+        description = assemble(described(tmp_path, **changes))
+        texts.append((yaml_text(description), urdf_text(description)))
     assert texts[0] == texts[1]
 
 
 def test_a_home_that_is_not_given_has_the_legs_at_mid_travel(tmp_path: Path) -> None:
-    mechanism = made(tmp_path, home=None)
-    np.testing.assert_allclose(inverse_kinematics(mechanism, mechanism.home), 0.075, atol=1e-9)
-    assert mechanism.home.translation[2] > 0.4
-    assert mechanism.home.rotation.magnitude() < 1e-6
+    machine = made(tmp_path, home=None)
+    np.testing.assert_allclose(inverse_kinematics(machine, machine.home), 0.075, atol=1e-9)
+    assert machine.home.translation[2] > 0.4
+    assert machine.home.rotation.magnitude() < 1e-6
 
 
 def test_a_home_with_few_digits_moves_onto_the_rods(tmp_path: Path) -> None:
-    mechanism = made(
+    machine = made(
         tmp_path,
         type=None,
         types=["SPU", "SPU", "SS"],
         offsets=[380, 380, None],
         lengths=[None, None, 457],
     )
-    assert mechanism.q0[2] == pytest.approx(0.457, abs=1e-12)
-    vector = mechanism.home.apply(mechanism.B_platform[2]) - mechanism.A_base[2]
+    assert machine.q0[2] == pytest.approx(0.457, abs=1e-12)
+    vector = machine.home.apply(machine.B_platform[2]) - machine.A_base[2]
     assert np.linalg.norm(vector) == pytest.approx(0.457, abs=1e-12)
 
 
 def test_a_rod_without_a_length_has_the_one_at_home(tmp_path: Path) -> None:
-    mechanism = made(tmp_path, type=None, types=["SPU", "SPU", "SS"])
-    assert mechanism.q0[2] == pytest.approx(np.hypot(0.44, np.hypot(0.06, 0.104)), abs=1e-12)
-    assert [c.radius for c in mechanism.legs[2].cylinders] == [0.014]
+    machine = made(tmp_path, type=None, types=["SPU", "SPU", "SS"])
+    assert machine.q0[2] == pytest.approx(np.hypot(0.44, np.hypot(0.06, 0.104)), abs=1e-12)
+    assert [c.radius for c in machine.legs[2].cylinders] == [0.014]
 
 
 @pytest.mark.parametrize("travel", [[None, [0, 150], [0, 150]], [0, 150]])
 def test_a_passive_slider_reads_its_length_and_moves_freely(
     tmp_path: Path, travel: list[Any]
 ) -> None:
-    mechanism = made(
+    machine = made(
         tmp_path,
         type="SPS",
         kinds=["passive", None, None],
         offsets=[None, 380, 380],
         travel=travel,
     )
-    leg = mechanism.legs[0]
-    length = float(np.linalg.norm(mechanism.home.apply(leg.B) - leg.A))
+    leg = machine.legs[0]
+    length = float(np.linalg.norm(machine.home.apply(leg.B) - leg.A))
     assert (leg.kind, leg.q0) == (LegKind.PASSIVE, 0.0)
     np.testing.assert_allclose(leg.travel, [0.5 * length, 1.5 * length])
 
@@ -263,7 +263,7 @@ def test_a_planar_machine_in_another_plane_floats(tmp_path: Path) -> None:
 
     base = upright([[400, 0, 0], [-200, 346, 0], [-200, -346, 0]])
     platform = upright([[140, 0, 0], [-70, 121, 0], [-70, -121, 0]])
-    mechanism = made(
+    machine = made(
         tmp_path,
         type="3-RPR",
         base_joints=base,
@@ -273,15 +273,15 @@ def test_a_planar_machine_in_another_plane_floats(tmp_path: Path) -> None:
         offsets=200,
         home={"xyz": [10, 0, 20], "rpy_deg": [0, 30, 0]},
     )
-    assert not mechanism.spatial
-    assert mechanism.urdf.joints["platform_free"].type == "floating"
-    assert len(mechanism.frame_legs) == 2
+    assert not machine.spatial
+    assert machine.urdf.joints["platform_free"].type == "floating"
+    assert len(machine.frame_legs) == 2
 
 
 def test_names_and_frames_of_the_table_are_kept(tmp_path: Path) -> None:
-    mechanism = made(tmp_path, legs=["a", "b", "c"], base_frame=["c", "a", "b"], name="my.tripod")
-    assert mechanism.leg_names == ("a", "b", "c")
-    assert mechanism.frame_legs == (2, 0, 1)
+    machine = made(tmp_path, legs=["a", "b", "c"], base_frame=["c", "a", "b"], name="my.tripod")
+    assert machine.leg_names == ("a", "b", "c")
+    assert machine.frame_legs == (2, 0, 1)
     assert yaml.safe_load((tmp_path / "models" / "my.tripod.yaml").read_text())["name_mot"] == [
         "a_prismatic",
         "b_prismatic",

@@ -267,8 +267,8 @@ def test_settings_model_and_version_change_the_fingerprint(
     assert fingerprint(dataset, {**SETTINGS, "blur": 0.5}) != before
     assert fingerprint(dataset, dict(reversed(SETTINGS.items()))) == before
     urdf = tmp_path / "other.urdf"
-    urdf.write_bytes(dataset.mechanism.urdf_path.read_bytes() + b"\n")
-    other = replace(dataset, mechanism=replace(dataset.mechanism, urdf_path=urdf))
+    urdf.write_bytes(dataset.machine.urdf_path.read_bytes() + b"\n")
+    other = replace(dataset, machine=replace(dataset.machine, urdf_path=urdf))
     assert fingerprint(other, SETTINGS) != before
     monkeypatch.setattr("legcal.data.cache.__version__", "0.0.0")
     assert fingerprint(dataset, SETTINGS) != before
@@ -302,7 +302,7 @@ def test_changed_image_is_detected_again_and_stale_rows_do_not_matter(folder: Fo
 
 def test_given_rows_are_remembered_by_their_image(folder: Folder) -> None:
     dataset = load_dataset(folder.path)
-    names = dataset.mechanism.leg_names
+    names = dataset.machine.leg_names
     path = folder.path / OBSERVATIONS_NAME
     write_observations(path, hexapod_outlines(rows=(0, 2)), dataset.measurements, names)
     dataset = load_dataset(folder.path)
@@ -361,7 +361,7 @@ def test_row_with_outlines_needs_no_image(folder: Folder) -> None:
     dataset = load_dataset(folder.path)
     path = folder.path / OBSERVATIONS_NAME
     write_observations(
-        path, hexapod_outlines(rows=(0, 2)), dataset.measurements, dataset.mechanism.leg_names
+        path, hexapod_outlines(rows=(0, 2)), dataset.measurements, dataset.machine.leg_names
     )
     (folder.path / "images" / "c1_1.png").unlink()
     assert load_dataset(folder.path).measurements.n_rows == 4
@@ -377,7 +377,7 @@ def test_dataset_of_outlines_alone_is_read(folder: Folder) -> None:
     folder.write()
     blank = load_dataset(folder.path, check_images=False)
     path = folder.path / OBSERVATIONS_NAME
-    write_observations(path, hexapod_outlines(), blank.measurements, dataset.mechanism.leg_names)
+    write_observations(path, hexapod_outlines(), blank.measurements, dataset.machine.leg_names)
     again = load_dataset(folder.path)
     plan = plan_dataset(again, fingerprint(again, SETTINGS))
     assert len(plan.detect) == 0

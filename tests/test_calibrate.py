@@ -171,11 +171,11 @@ def _reordered(folder: Path) -> None:
     entry["views"] = dict(reversed(entry["views"].items()))
     _write_entry(folder, entry)
     model = folder / "models/hexapod.yaml"
-    mechanism = yaml.safe_load(model.read_text())
-    mechanism["legcal"]["legs"] = dict(reversed(mechanism["legcal"]["legs"].items()))
+    machine = yaml.safe_load(model.read_text())
+    machine["legcal"]["legs"] = dict(reversed(machine["legcal"]["legs"].items()))
     for key in ("closed_loop", "type", "name_mot"):
-        mechanism[key] = mechanism[key][::-1]
-    model.write_text(yaml.safe_dump(mechanism, sort_keys=False))
+        machine[key] = machine[key][::-1]
+    model.write_text(yaml.safe_dump(machine, sort_keys=False))
 
 
 @pytest.mark.parametrize("shown", thinned(["outlines", "photographs"], ["outlines"]))
@@ -195,8 +195,8 @@ def test_the_order_of_rows_columns_legs_and_views_does_not_matter(
             _reordered(folder)
         results.append(calibrate(folder))
     given, reordered = results
-    names = given.dataset.mechanism.leg_names
-    legs = [reordered.dataset.mechanism.leg_names.index(leg) for leg in names]
+    names = given.dataset.machine.leg_names
+    legs = [reordered.dataset.machine.leg_names.index(leg) for leg in names]
     one, other = given.solution.parameters, reordered.solution.parameters
     assert legs == [5, 4, 3, 2, 1, 0]
     assert np.abs(one.base_joints - other.base_joints[legs]).max() < 1e-12

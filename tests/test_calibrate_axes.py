@@ -19,13 +19,13 @@ from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.machine import to_vector
 from legcal.report import summary
-from legcal.simulation.hexapod import PAPER_VIEWS, Machine
+from legcal.simulation.hexapod import PAPER_VIEWS, PaperHexapod
 
 Rows = list[dict[str, str]]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Machine, Calibration]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PaperHexapod, Calibration]:
     folder = tmp_path_factory.mktemp("axes")
     machine = write_axes_dataset(folder / "set")
     return folder, machine, calibrate(folder / "set", output=folder / "result")
@@ -47,7 +47,7 @@ def _change(path: Path, change: Callable[[Rows], Rows]) -> None:
         writer.writerows(change(rows))
 
 
-def test_the_result_is_right_by_its_own_sigmas(run: tuple[Path, Machine, Calibration]) -> None:
+def test_the_result_is_right_by_its_own_sigmas(run: tuple[Path, PaperHexapod, Calibration]) -> None:
     _, machine, calibration = run
     solution = calibration.solution
     error = to_vector(solution.parameters, machine.frame_legs) - to_vector(
@@ -62,12 +62,12 @@ def test_the_result_is_right_by_its_own_sigmas(run: tuple[Path, Machine, Calibra
     assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(before**2))
 
 
-def test_the_four_steps_run_on_the_axes_too(run: tuple[Path, Machine, Calibration]) -> None:
+def test_the_four_steps_run_on_the_axes_too(run: tuple[Path, PaperHexapod, Calibration]) -> None:
     assert run[2].steps.legs is not None
 
 
 def test_the_result_has_residuals_of_axes_and_no_outlines(
-    run: tuple[Path, Machine, Calibration],
+    run: tuple[Path, PaperHexapod, Calibration],
 ) -> None:
     folder, _, calibration = run
     document = json.loads((folder / "result" / "result.json").read_text())

@@ -99,7 +99,7 @@ def test_a_place_of_the_board_that_cannot_be_is_told(
     right = of_the_hand[0]
     T_Rb_board = right.solution.T_Rb_board
     assert T_Rb_board is not None
-    found = right.dataset.mechanism.T_base_Rb * T_Rb_board
+    found = right.dataset.machine.T_base_Rb * T_Rb_board
 
     def placed(document: dict[str, Any]) -> None:
         document["board"]["T_base_board"] = {

@@ -33,7 +33,7 @@ def test_a_machine_of_any_class_comes_much_nearer_to_its_truth(model: str, tmp_p
     legs = found.steps.legs
     assert legs is not None
     staged = json.loads((tmp_path / "result/result.json").read_text())["stages"]["staged"]
-    names = found.dataset.mechanism.leg_names
+    names = found.dataset.machine.leg_names
     assert staged["twists"] == {
         name: leg.twist for name, leg in zip(names, legs, strict=True) if leg.twist is not None
     }
@@ -54,12 +54,12 @@ def test_the_steps_alone_come_nearer_to_the_truth(model: str, tmp_path: Path) ->
     made = simulate(model, tmp_path / "set", settings(poses=8, views=3))
     found = calibrate(made.folder, transformation="cross_product")
     assert found.steps.failure == ""
-    legs, mechanism = found.steps.legs, found.dataset.mechanism
+    legs, machine = found.steps.legs, found.dataset.machine
     assert legs is not None
     T, q = found.solution.T_Rb_Re, found.dataset.measurements.q
     true, nominal, staged = (
-        poses_at_readings(mechanism, g, q, T)
-        for g in (geometries(load_mechanism(made.truth_path)), geometries(mechanism), legs)
+        poses_at_readings(machine, g, q, T)
+        for g in (geometries(load_mechanism(made.truth_path)), geometries(machine), legs)
     )
     before, after = (pose_differences(poses, true)[0].mean() for poses in (nominal, staged))
     assert before > 1e-3

@@ -283,8 +283,8 @@ def test_what_is_said_of_the_images_is_passed_on(
 
 @pytest.mark.parametrize("model", ["3-upu-tilted", "tricept"])
 def test_covariances_of_turned_axes_are_taken_along(model: str) -> None:
-    mechanism = load_mechanism(model)
-    nominal, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    machine = load_mechanism(model)
+    nominal, found = geometries(machine), parametrization_of(machine, twists=True)
     rng = np.random.default_rng(4)
     is_angle = np.array(found.units) == "rad"
     far = np.where(is_angle, rng.uniform(-0.1, 0.1, len(found)), 0.0)

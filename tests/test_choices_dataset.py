@@ -20,7 +20,7 @@ __all__ = ["folder"]
 def chosen(folder: Folder, block: dict[str, Any], **call: Any) -> Choices:
     folder.entry["parameters"] = block
     dataset = load_dataset(folder.write())
-    known = known_parameters(dataset.mechanism, dataset.measurements.views)
+    known = known_parameters(dataset.machine, dataset.measurements.views)
     return resolve([*dataset.overrides, *overrides_of_call(**call)], known)
 
 

@@ -8,7 +8,7 @@ from simulated import settings
 
 import legcal
 from legcal.errors import DidNotConverge
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 from legcal.simulation import poses as module
 from legcal.simulation.poses import commanded_poses, draw_poses
 from legcal.simulation.request import Sampling
@@ -16,14 +16,14 @@ from legcal.simulation.truth import write_true_model
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Mechanism, Mechanism]:
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Machine, Machine]:
     nominal = legcal.load_mechanism("nategh-agheli")
     folder: Path = tmp_path_factory.mktemp("truth")
     return nominal, write_true_model(nominal, settings().errors, np.random.default_rng(3), folder)
 
 
 def test_the_nominal_model_reaches_every_pose_at_its_readings(
-    pair: tuple[Mechanism, Mechanism],
+    pair: tuple[Machine, Machine],
 ) -> None:
     nominal, truth = pair
     home = legcal.singularity(nominal, nominal.home)
@@ -36,7 +36,7 @@ def test_the_nominal_model_reaches_every_pose_at_its_readings(
 
 
 def test_poses_that_the_nominal_model_does_not_reach_are_drawn_again(
-    pair: tuple[Mechanism, Mechanism], monkeypatch: pytest.MonkeyPatch
+    pair: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nominal, truth = pair
     readings = draw_poses(truth, 3, np.random.default_rng(0)).readings
@@ -47,7 +47,7 @@ def test_poses_that_the_nominal_model_does_not_reach_are_drawn_again(
 
 
 def test_a_machine_far_from_its_model_is_refused(
-    pair: tuple[Mechanism, Mechanism], monkeypatch: pytest.MonkeyPatch
+    pair: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nominal, truth = pair
     monkeypatch.setattr(module, "_reaches", lambda *_: False)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, ModelError
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 
 __all__ = ["folder"]
 
@@ -90,7 +90,7 @@ def test_mechanism_is_a_path_before_it_is_a_shipped_name(
 ) -> None:
     asked: list[Path] = []
 
-    def load(path: Path) -> Mechanism:
+    def load(path: Path) -> Machine:
         asked.append(path)
         return hexapod()
 
@@ -123,7 +123,7 @@ def test_mechanism_is_read_relative_to_the_dataset(
     (folder.path / "urdf").symlink_to(HEXAPOD.parents[1] / "urdf")
     folder.entry["mechanism"] = "models/hexapod.yaml"
     folder.write()
-    assert load_dataset(folder.path).mechanism.leg_names == hexapod().leg_names
+    assert load_dataset(folder.path).machine.leg_names == hexapod().leg_names
 
 
 def test_missing_folder_and_file_are_refused(folder: Folder) -> None:

@@ -18,14 +18,14 @@ from legcal import calibrate, simulate
 from legcal.calibration.joint_fit.parameters import known_parameters
 from legcal.calibration.verdict import Calibration
 from legcal.errors import DatasetError, DidNotConverge, NotVisible
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 
 LINE = [[-300.0, 0.0, 0.0], [0.0, 0.0, 0.0], [300.0, 0.0, 0.0]]
 SHORT_LINE = [[-120.0, 0.0, 0.0], [0.0, 0.0, 0.0], [120.0, 0.0, 0.0]]
 READINGS = np.random.default_rng(7).uniform(0.035, 0.12, (9, 3))
 
 
-def planar(folder: Path, base: Any, platform: Any, home: Any) -> Mechanism:
+def planar(folder: Path, base: Any, platform: Any, home: Any) -> Machine:
     """Return a 3-RPR with given joints."""
     return made(
         folder, name="3-rpr", type="3-RPR", base_joints=base, platform_joints=platform,
@@ -33,7 +33,7 @@ def planar(folder: Path, base: Any, platform: Any, home: Any) -> Mechanism:
     )  # fmt: skip
 
 
-def tripod(folder: Path, platform_radius: float) -> Mechanism:
+def tripod(folder: Path, platform_radius: float) -> Machine:
     """Return a 3-UPU that translates; with a platform as wide as its base it is singular."""
     turns = [Rotation.from_euler("z", a, degrees=True) for a in (0, 120, 240)]
     base, platform = (
@@ -49,7 +49,7 @@ def tripod(folder: Path, platform_radius: float) -> Mechanism:
 def errors(calibration: Calibration, folder: Path, result: Path) -> tuple[float, float]:
     """Return the platform errors of the nominal and the calibrated model, as users ask for them."""
     truth = next((folder / "truth" / "models").glob("*.yaml"))
-    nominal = calibration.dataset.mechanism
+    nominal = calibration.dataset.machine
     before, after = (
         float(legcal.evaluate(model, truth, dataset=folder).displacement.mean())
         for model in (nominal, result / "calibrated.yaml")
@@ -61,9 +61,9 @@ def said(calibration: Calibration) -> str:
     return " ".join(calibration.notes)
 
 
-def with_pose(folder: Path, mechanism: Mechanism, last: Any) -> Path:
+def with_pose(folder: Path, machine: Machine, last: Any) -> Path:
     """Write ordinary readings of a 3-RPR, and another one."""
-    joints = [leg.prismatic for leg in mechanism.legs]
+    joints = [leg.prismatic for leg in machine.legs]
     with (folder / "poses.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerows([joints, *READINGS.tolist(), list(last)])
@@ -118,7 +118,7 @@ def test_a_reading_that_the_nominal_model_does_not_reach_is_used_and_told(tmp_pa
     )  # fmt: skip
     with pytest.raises(DidNotConverge, match="the legs meet no more or the mechanism is singular"):
         legcal.forward_kinematics(short, near)
-    dataset = replace(legcal.load_dataset(made_set.folder), mechanism=short)
+    dataset = replace(legcal.load_dataset(made_set.folder), machine=short)
     calibration = calibrate(dataset, output=tmp_path / "out")
     assert "The nominal model does not reach the readings of view c1, p10: its" in said(calibration)
     assert calibration.verdict.trustworthy
@@ -236,7 +236,7 @@ def test_a_platform_that_only_translates_has_its_determined_part_found(tmp_path:
     spread = solution.held_covariance  # what is held counts in the platform, along itself alone
     rank = np.linalg.matrix_rank(spread, tol=1e-9 * np.abs(spread).max(initial=0.0))
     assert 0 < rank == len(solution.held_basis)
-    known = known_parameters(calibration.dataset.mechanism, calibration.dataset.measurements.views)
+    known = known_parameters(calibration.dataset.machine, calibration.dataset.measurements.views)
     lengths = np.array(solution.parametrization.units) == "m"
     names = solution.parametrization.names
     change = [solution.values[name] - known.by_name[name].nominal for name in names]

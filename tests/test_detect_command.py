@@ -54,7 +54,7 @@ def one_image(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
     del entry["views"]["c2"]
     rows = [dict(row) for row in rendered.rows[:2]]
     pictures = {row["image"]: rendered.pictures[row["image"]] for row in rows}
-    made = RepeatedImages(tmp_path / "set", rendered.mechanism, entry, rows, pictures)
+    made = RepeatedImages(tmp_path / "set", rendered.machine, entry, rows, pictures)
     made.write()
     return made
 
@@ -143,16 +143,16 @@ def test_legs_are_drawn_by_the_radii_that_were_searched_by(
             [replace(c, radius=c.radius * (2.0 + j)) for c in of_leg]
             for j, of_leg in enumerate(photographs.cylinders)
         ]
-        wrong = replace(photographs, mechanism=photographs.mechanism.with_cylinders(cylinders))
+        wrong = replace(photographs, machine=photographs.machine.with_cylinders(cylinders))
         return replace(observe(photographs, *others), photographs=wrong)
 
     monkeypatch.setattr("legcal.calibration.detecting.observe", thicker)
     found = detect(one_image.path)
     legs = {leg.leg: leg for leg in found.predicted(0)}
     assert len(legs) == 6
-    order = canonical_order(found.dataset.measurements, found.dataset.mechanism.leg_names).legs
+    order = canonical_order(found.dataset.measurements, found.dataset.machine.leg_names).legs
     for at, j in enumerate(order.tolist()):
-        nominal = {c.link: c.radius for c in found.dataset.mechanism.legs[j].cylinders}
+        nominal = {c.link: c.radius for c in found.dataset.machine.legs[j].cylinders}
         for piece in legs[j].pieces:
             assert piece.radius == pytest.approx((2.0 + at) * nominal[piece.link])
 
@@ -161,7 +161,7 @@ def test_the_written_table_is_read_as_what_was_found(
     rendered: RepeatedImages, found: Detection, folder: Path
 ) -> None:
     dataset = load_dataset(rendered.path)
-    path, legs = folder / "observations.csv", dataset.mechanism.legs
+    path, legs = folder / "observations.csv", dataset.machine.legs
     assert_same(read_observations(path, legs, dataset.measurements), found.outlines)
     for name in QUALITY:
         assert np.all(np.isfinite(getattr(found.outlines, name)[found.outlines.used]))

@@ -32,7 +32,7 @@ def measured() -> dict[str, list[Any]]:
     dataset = load_dataset(FOLDER)
     m, rows = dataset.measurements, np.arange(6)
     load = dataset.image_reader(rows.tolist())
-    photographs = Photographs(dataset.mechanism, m, load, in_turn, rows, no_outlines())
+    photographs = Photographs(dataset.machine, m, load, in_turn, rows, no_outlines())
     truth = json.loads((FOLDER / "truth.json").read_text(encoding="utf-8"))
     A, B = np.array([truth["A_base"]] * 6), np.array(truth["B_base"])
     poses = [truth["T_base_camera"][view.name] for view in m.views]

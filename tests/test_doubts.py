@@ -353,7 +353,7 @@ def test_a_reading_that_the_outlines_contradict_is_named(
         for is_out, why in zip(out.tolist(), o.reason, strict=True)
     )
     fit = replace(solution, outlines=replace(o, used=o.used & ~out, reason=reason))
-    notes = disagreeing_images(replace(measurements, q=q), dataset.mechanism, fit)
+    notes = disagreeing_images(replace(measurements, q=q), dataset.machine, fit)
     assert list(notes) == [row]
     assert notes[row].startswith("view c1, image images/c1_k02.jpg: ")
     assert re.search(words, notes[row]), notes

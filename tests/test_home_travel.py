@@ -32,14 +32,14 @@ def test_a_home_further_out_than_the_travel_is_refused_with_both_numbers(
 
 
 def test_a_home_between_is_noted_and_identify_says_that_its_poses_go_there(tmp_path: Path) -> None:
-    mechanism = load_mechanism(_with_home(tmp_path, 0.55))
-    assert len(legs_outside(mechanism)) == 6
-    assert sum("outside its travel" in note for note in mechanism.diagnostics) == 6
-    notes = identifiability(mechanism, [mechanism.leg_names], 3).notes
+    machine = load_mechanism(_with_home(tmp_path, 0.55))
+    assert len(legs_outside(machine)) == 6
+    assert sum("outside its travel" in note for note in machine.diagnostics) == 6
+    notes = identifiability(machine, [machine.leg_names], 3).notes
     assert any("outside their travel by more than 5 %" in note for note in notes)
 
 
 def test_a_home_inside_is_not_worth_a_word() -> None:
-    mechanism = load_mechanism("hexapod")
-    assert legs_outside(mechanism) == {}
-    assert not any("outside" in note for note in mechanism.diagnostics)
+    machine = load_mechanism("hexapod")
+    assert legs_outside(machine) == {}
+    assert not any("outside" in note for note in machine.diagnostics)

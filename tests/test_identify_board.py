@@ -19,7 +19,7 @@ from legcal.calibration.identify.report import Identifiability
 from legcal.calibration.identify.steps import locate_joints
 from legcal.data.corners import found_corners
 from legcal.errors import UsageError
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 from legcal.report.identify import identify_table
 from legcal.vision.board import Board
 
@@ -30,7 +30,7 @@ PAPER = [LEGS[:4], LEGS[2:], (*LEGS[:2], *LEGS[4:])]
 
 
 @cache
-def hexapod() -> Mechanism:
+def hexapod() -> Machine:
     return legcal.load_mechanism("hexapod")
 
 

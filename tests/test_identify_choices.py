@@ -20,7 +20,7 @@ def _two_images() -> Dataset:
 
 
 def _names(ending: str) -> list[str]:
-    names = parametrization_of(_two_images().mechanism).names
+    names = parametrization_of(_two_images().machine).names
     return [name for name in names if name.endswith(ending)]
 
 

@@ -24,7 +24,7 @@ from legcal.calibration.identify.planning import recorded_session
 from legcal.calibration.identify.ranks import WeakDirection
 from legcal.data.dataset import load_dataset
 from legcal.errors import UsageError
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 from legcal.machine.family import Family, describe_family
 from legcal.machine.new_model import create_model
 from legcal.report.identify import _hidden, _two_digits
@@ -43,7 +43,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
 
 
 @cache
-def loaded(name: str) -> Mechanism:
+def loaded(name: str) -> Machine:
     return legcal.load_mechanism(name)
 
 
@@ -74,9 +74,9 @@ def test_json_is_one_document_with_the_keys_of_the_contract(
 
 
 def test_the_api_returns_the_same_object() -> None:
-    mechanism = loaded("hexapod")
+    machine = loaded("hexapod")
     views = [view.split(",") for view in PAPER]
-    first, again = (legcal.identifiability(mechanism, views, images=5) for _ in range(2))
+    first, again = (legcal.identifiability(machine, views, images=5) for _ in range(2))
     assert first.document() == again.document()
     assert (first.full.rank, first.conditions_hold, first.images) == (30, True, (5, 5, 5))
     assert first == again
@@ -159,10 +159,10 @@ def test_numbers_beyond_sense_are_told_as_bounds() -> None:
 
 
 def test_all_problems_of_views_are_told_at_once() -> None:
-    mechanism = loaded("hexapod")
+    machine = loaded("hexapod")
     views: list[Any] = [["leg7"], [], ["leg1", "leg1"], ["leg1", 2], "leg1"]
     with pytest.raises(UsageError) as refused:
-        legcal.identifiability(mechanism, views, images=-1)
+        legcal.identifiability(machine, views, images=-1)
     assert len(refused.value.problems) == 6
     assert "View 4 could not be used: found 2, needed names" in refused.value.problems[-2]
     assert "found the text 'leg1'" in refused.value.problems[-1]
@@ -172,9 +172,9 @@ def test_a_dataset_is_judged_by_its_own_readings_cameras_and_legs(tmp_path: Path
     dataset = load_dataset(HEXAPOD, check_images=False)
     session, m = recorded_session(dataset), dataset.measurements
     assert (session.n_views, len(session.view), len(session.t)) == (3, m.n_rows, m.n_poses)
-    q = (session.length - dataset.mechanism.q0) * dataset.mechanism.sign
+    q = (session.length - dataset.machine.q0) * dataset.machine.sign
     np.testing.assert_allclose(q, m.q[m.first_rows], atol=1e-5)
-    to_Rb = dataset.mechanism.T_base_Rb.inv()
+    to_Rb = dataset.machine.T_base_Rb.inv()
     for camera, view in zip(session.camera, m.views, strict=True):
         if view.T_base_camera is not None:
             np.testing.assert_allclose(camera, (to_Rb * view.T_base_camera).translation)
@@ -208,24 +208,24 @@ def test_without_enough_motors_ranks_are_told_and_what_is_not_predicted(tmp_path
     entry["legcal"]["urdf"] = "hexapod.urdf"
     (tmp_path / "hexapod.urdf").write_text(SHIPPED_URDF.read_text())
     (tmp_path / "hexapod.yaml").write_text(yaml.safe_dump(entry))
-    mechanism = legcal.load_mechanism(tmp_path / "hexapod.yaml")
-    found = legcal.identifiability(mechanism, [mechanism.leg_names] * 2)
+    machine = legcal.load_mechanism(tmp_path / "hexapod.yaml")
+    found = legcal.identifiability(machine, [machine.leg_names] * 2)
     assert (found.full.rank, found.full.of, found.n_ac) == (29, 29, 5)
     assert found.platform_sigma is None
     assert "5 motors do not determine the pose" in found.notes[0]
-    few = legcal.identifiability(mechanism, [["leg1", "leg2"]])
+    few = legcal.identifiability(machine, [["leg1", "leg2"]])
     assert few.full.weak[0].dX_m is None
     assert not few.identifiable
 
 
 def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
     asked = Family("6-SPS", "mm", 300.0, 150.0, 400.0, 60.0, 60.0)  # regular hexagons
-    mechanism = create_model(describe_family(asked), tmp_path).mechanism
-    text = mechanism.urdf_path.read_text()
+    machine = create_model(describe_family(asked), tmp_path).machine
+    text = machine.urdf_path.read_text()
     text = re.sub(r'(<link name="leg1_\w+">)<visual>.*</visual>', r"\1", text)
-    mechanism.urdf_path.write_text(text)
+    machine.urdf_path.write_text(text)
     *_, hidden, singular = legcal.identifiability(
-        legcal.load_mechanism(mechanism.yaml_path), [mechanism.leg_names]
+        legcal.load_mechanism(machine.yaml_path), [machine.leg_names]
     ).notes
     assert hidden.startswith("The model has no <visual> cylinder along leg 1:")
     assert singular.startswith("The mechanism is singular at home: the platform moves")
@@ -234,11 +234,11 @@ def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
 @settings(deadline=None, max_examples=10)
 @given(data=st.data())
 def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
-    mechanism = loaded(data.draw(st.sampled_from(MODELS)))
-    view = st.sets(st.sampled_from(mechanism.leg_names), min_size=1).map(sorted)
+    machine = loaded(data.draw(st.sampled_from(MODELS)))
+    view = st.sets(st.sampled_from(machine.leg_names), min_size=1).map(sorted)
     views = data.draw(st.lists(view, min_size=1, max_size=3))
     images = data.draw(st.integers(1, 6))
-    found = legcal.identifiability(mechanism, views, images=images)
+    found = legcal.identifiability(machine, views, images=images)
     document = found.document()
     json.dumps(document, allow_nan=False)
     for ranks in (found.staged, found.full):

@@ -229,7 +229,7 @@ def _with(session: Session, **changes: Any) -> Session:
 
 @pytest.mark.parametrize(("seen", "most"), [(1, 0), (3, 6), (4, 10)])
 def test_one_image_tells_no_more_than_it_measures(seen: int, most: int) -> None:
-    mechanism = load_mechanism("hexapod")  # 4 numbers a leg, 6 readings; 6 for pose and for camera
-    full = identifiability(mechanism, [mechanism.leg_names[:seen]], images=1).full
+    machine = load_mechanism("hexapod")  # 4 numbers a leg, 6 readings; 6 for pose and for camera
+    full = identifiability(machine, [machine.leg_names[:seen]], images=1).full
     assert full.rank == most
     assert full.rank + len(full.weak) == full.of

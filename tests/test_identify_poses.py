@@ -18,7 +18,7 @@ from legcal.machine import (
     Demand,
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     forward_kinematics_many,
     geometries,
     linearize,
@@ -31,7 +31,7 @@ SHIPPED = sorted(path.stem for path in (Path(__file__).parents[1] / "models").gl
 
 
 @cache
-def written(name: str, folder: Path) -> Mechanism:
+def written(name: str, folder: Path) -> Machine:
     return legcal.load_mechanism(write_machine(folder / "m", MACHINES[name](), Layout()))
 
 
@@ -39,10 +39,10 @@ def written(name: str, folder: Path) -> Mechanism:
 def test_poses_close_every_leg_inside_its_travel(
     name: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    mechanism = written(name, tmp_path_factory.getbasetemp() / name.replace(" ", "_"))
-    session = planned_session(mechanism, [range(mechanism.n_legs)], 12)
+    machine = written(name, tmp_path_factory.getbasetemp() / name.replace(" ", "_"))
+    session = planned_session(machine, [range(machine.n_legs)], 12)
     assert len(session.t) == 12
-    for j, (leg, drawn) in enumerate(zip(session.legs, mechanism.legs, strict=True)):
+    for j, (leg, drawn) in enumerate(zip(session.legs, machine.legs, strict=True)):
         found = linearize(leg, session.R, session.t)
         for demand, value in zip(found.demands, found.values.T, strict=True):
             if demand is not Demand.LENGTH or leg.kind is LegKind.CONSTANT:
@@ -57,9 +57,9 @@ def test_poses_close_every_leg_inside_its_travel(
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_legs_close_at_home_in_the_frames_on_their_joints(name: str) -> None:
-    mechanism = legcal.load_mechanism(name)
-    home = mechanism.T_base_Rb.inv() * mechanism.home * mechanism.T_platform_Re
-    for leg in geometries(mechanism):
+    machine = legcal.load_mechanism(name)
+    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+    for leg in geometries(machine):
         found = linearize(leg, home.rotation.as_matrix()[None], home.translation[None])
         np.testing.assert_allclose(found.values[0, 1:], 0.0, atol=1e-9)
 
@@ -69,20 +69,20 @@ def test_poses_are_those_of_forward_kinematics(
     name: str,
 ) -> None:
     """Pinocchio closes the loops of the nominal machine; ours is a micrometre away from it."""
-    mechanism = legcal.load_mechanism(name)
-    session = planned_session(mechanism, [range(mechanism.n_legs)], 4)
-    q = mechanism.sign * (session.length - mechanism.q0)
-    q[:, [leg.kind is LegKind.CONSTANT for leg in mechanism.legs]] = 0.0
-    for T, R, t in zip(forward_kinematics_many(mechanism, q), session.R, session.t, strict=True):
-        T_Rb_Re = mechanism.T_base_Rb.inv() * T * mechanism.T_platform_Re
+    machine = legcal.load_mechanism(name)
+    session = planned_session(machine, [range(machine.n_legs)], 4)
+    q = machine.sign * (session.length - machine.q0)
+    q[:, [leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
+    for T, R, t in zip(forward_kinematics_many(machine, q), session.R, session.t, strict=True):
+        T_Rb_Re = machine.T_base_Rb.inv() * T * machine.T_platform_Re
         np.testing.assert_allclose(T_Rb_Re.translation, t, atol=1e-4)
         np.testing.assert_allclose(T_Rb_Re.rotation.as_matrix(), R, atol=1e-4)
 
 
 def test_more_motors_than_freedoms_are_followed(tmp_path: Path) -> None:
-    mechanism = legcal.load_mechanism(write_machine(tmp_path, of_types(["US"] * 7), Layout()))
-    assert (mechanism.mobility, len(mechanism.motors)) == (6, 7)
-    found = legcal.identifiability(mechanism, [mechanism.leg_names] * 2)
+    machine = legcal.load_mechanism(write_machine(tmp_path, of_types(["US"] * 7), Layout()))
+    assert (machine.mobility, len(machine.motors)) == (6, 7)
+    found = legcal.identifiability(machine, [machine.leg_names] * 2)
     assert (found.full.rank, found.full.of) == (37, 37)
 
 
@@ -98,19 +98,19 @@ def test_the_motors_that_draw_their_lengths_stand_far_from_each_other() -> None:
 
 
 def test_a_machine_that_cannot_reach_its_travel_is_refused() -> None:
-    mechanism = legcal.load_mechanism("hexapod")
-    legs = geometries(mechanism)
-    home = mechanism.T_base_Rb.inv() * mechanism.home * mechanism.T_platform_Re
+    machine = legcal.load_mechanism("hexapod")
+    legs = geometries(machine)
+    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
     away = np.tile([5.0, 5.0], (6, 1))
     away[0] = [0.01, 0.01]
     with pytest.raises(DidNotConverge, match=r"found 0 of 3 random poses .* check the travel"):
-        random_poses(legs, mechanism.frame_legs, home, away, 3, np.random.default_rng(0))
+        random_poses(legs, machine.frame_legs, home, away, 3, np.random.default_rng(0))
 
 
 def test_no_two_cameras_stand_in_one_place_and_all_stand_outside() -> None:
-    mechanism = legcal.load_mechanism("hexapod")
+    machine = legcal.load_mechanism("hexapod")
     views = [(0, 1, 2, 3), (0, 1, 2, 3), (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5), (3,)]
-    session = planned_session(mechanism, views, 3)
+    session = planned_session(machine, views, 3)
     apart = np.linalg.norm(session.camera[:, None] - session.camera, axis=2)
     assert apart[~np.eye(5, dtype=bool)].min() > 0.01
     points = np.concatenate([session.A, (session.arm + session.t[:, None]).reshape(-1, 3)])
@@ -136,5 +136,5 @@ def test_machines_that_reach_few_drawn_poses_get_all_in_the_end(
         "legcal.machine.configurations._Drive.is_regular",
         lambda _self, _R, t: chance.random(len(t)) < 0.75,  # in each of five steps
     )
-    mechanism = legcal.load_mechanism("hexapod")
-    assert len(planned_session(mechanism, [range(6)], 60).t) == 60
+    machine = legcal.load_mechanism("hexapod")
+    assert len(planned_session(machine, [range(6)], 60).t) == 60

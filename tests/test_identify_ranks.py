@@ -14,21 +14,21 @@ from legcal.calibration.identify.judge import identifiability
 from legcal.calibration.identify.planning import planned_session
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))
 WEAK_JOINT = ((0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (4, 5))
 
 
 @cache
-def model(name: str) -> Mechanism:
+def model(name: str) -> Machine:
     return legcal.load_mechanism(name)
 
 
 def report(name: str, views: Sequence[Sequence[int]], images: int = 15) -> Identifiability:
-    mechanism = model(name)
+    machine = model(name)
     return identifiability(
-        mechanism, [[mechanism.leg_names[j] for j in view] for view in views], images
+        machine, [[machine.leg_names[j] for j in view] for view in views], images
     )
 
 
@@ -122,7 +122,7 @@ def test_legs_on_one_platform_joint_have_no_distance(tmp_path: Path) -> None:
     """An octahedral hexapod: three joints on either side, each of two legs."""
     base = [[300, 0, 0], [-150, 260, 0], [-150, -260, 0]]
     platform = [[100, 173, 0], [-200, 0, 0], [100, -173, 0]]
-    mechanism = made(
+    machine = made(
         tmp_path,
         type="6-SPS",
         base_joints=[base[k // 2] for k in range(6)],
@@ -130,7 +130,7 @@ def test_legs_on_one_platform_joint_have_no_distance(tmp_path: Path) -> None:
         offsets=350,
         home={"xyz": [0, 0, 350], "rpy_deg": [0, 0, 0]},
     )
-    found = identifiability(mechanism, [mechanism.leg_names] * 2)
+    found = identifiability(machine, [machine.leg_names] * 2)
     # coplanar joints: the distances do not see the three free heights, nor what separates a pair
     assert rank_of(found, "platform_joints", "literal") == (9, 12)
     assert rank_of(found, "platform_joints", "default") == (12, 12)
@@ -158,8 +158,8 @@ def test_every_shipped_model_is_identifiable_from_what_is_recommended(name: str)
 
 
 def test_what_moves_the_platform_is_judged_at_more_poses_than_one_image_shows() -> None:
-    mechanism = model("hexapod")
-    found = identifiability(mechanism, [mechanism.leg_names], images=1)
+    machine = model("hexapod")
+    found = identifiability(machine, [machine.leg_names], images=1)
     assert not found.identifiable
     assert not any(direction.harmless for direction in found.full.weak)
 
@@ -175,10 +175,10 @@ def test_fewer_camera_positions_have_to_show_more_legs_of_a_hexapod() -> None:
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_determined_and_what_is_not_lie_far_apart(name: str) -> None:
     """The limit of one leg length is no fine line: nothing lies within a factor of two of it."""
-    mechanism = model(name)
-    every = tuple(range(mechanism.n_legs))
+    machine = model(name)
+    every = tuple(range(machine.n_legs))
     for views in ([every] * 3, [every[:3], every[-3:], every]):
-        session = planned_session(mechanism, views)
+        session = planned_session(machine, views)
         singular = np.linalg.svd(Analysis(session).information, compute_uv=False)
         sigma = 1.0 / np.maximum(singular, 1e-30) / session.mean_length
         assert not np.any((sigma > 0.2) & (sigma < 5.0)), sigma

@@ -13,7 +13,7 @@ from legcal.calibration.identify.planning import planned_session
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session
 from legcal.geometry.types import Array
-from legcal.machine import Mechanism, load_mechanism
+from legcal.machine import Machine, load_mechanism
 from legcal.paper import joints_in_base, offsets
 from legcal.paper.joints_in_base import JointsInBase, register_views
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
@@ -22,7 +22,7 @@ from legcal.paper.leg_directions import directions_through_joints
 from legcal.paper.platform import RigidProblem, build_rigid
 from legcal.paper.platform_printed import build_mean_distances
 from legcal.paper.platform_unknowns import PlatformUnknowns
-from legcal.simulation.hexapod import Machine
+from legcal.simulation.hexapod import PaperHexapod
 from legcal.simulation.paper import nominal_of
 
 VIEWS = [
@@ -36,7 +36,7 @@ VIEWS = [
 
 
 @cache
-def hexapod() -> Mechanism:
+def hexapod() -> Machine:
     return load_mechanism(SHIPPED_YAML)
 
 
@@ -59,7 +59,7 @@ def shared_poses(session: Session) -> Session:
     return replace(session, R=session.R[:n], t=session.t[:n], pose=pose)
 
 
-def base_as_drawn(machine: Machine, joints: JointsInCamera) -> JointsInBase:
+def base_as_drawn(machine: PaperHexapod, joints: JointsInCamera) -> JointsInBase:
     """Return the base of a machine of point-like joints as step 2 would, without solving."""
     A_Rb, no_axes = machine.parameters.base_joints, np.full((machine.n_legs, 3), np.nan)
     cameras = register_views(A_Rb, no_axes, joints)

@@ -16,7 +16,7 @@ from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry.types import Array
 from legcal.machine import (
     LegKind,
-    Mechanism,
+    Machine,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
@@ -30,19 +30,19 @@ from legcal.machine.mobility import mobility
 
 
 @pytest.fixture(scope="module")
-def hexapod() -> Mechanism:
+def hexapod() -> Machine:
     return load_mechanism("hexapod")
 
 
-def _sample_readings(mechanism: Mechanism) -> Array:
+def _sample_readings(machine: Machine) -> Array:
     with (ROOT / "examples" / "hexapod" / "measurements.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    return np.array([[float(row[str(leg.prismatic)]) for leg in mechanism.legs] for row in rows])
+    return np.array([[float(row[str(leg.prismatic)]) for leg in machine.legs] for row in rows])
 
 
-def _length_misfit(mechanism: Mechanism, T: RigidTransform, q: Array) -> float:
-    lengths = np.linalg.norm(leg_vectors(mechanism, T), axis=1)
-    return float(np.abs(lengths - (mechanism.sign * q + mechanism.q0)).max())
+def _length_misfit(machine: Machine, T: RigidTransform, q: Array) -> float:
+    lengths = np.linalg.norm(leg_vectors(machine, T), axis=1)
+    return float(np.abs(lengths - (machine.sign * q + machine.q0)).max())
 
 
 @settings(
@@ -50,7 +50,7 @@ def _length_misfit(mechanism: Mechanism, T: RigidTransform, q: Array) -> float:
 )
 @given(xyz=st.tuples(*[st.floats(-0.05, 0.05)] * 3), turn=st.tuples(*[st.floats(-0.25, 0.25)] * 3))
 def test_forward_kinematics_inverts_inverse_kinematics(
-    hexapod: Mechanism, xyz: tuple[float, float, float], turn: tuple[float, float, float]
+    hexapod: Machine, xyz: tuple[float, float, float], turn: tuple[float, float, float]
 ) -> None:
     T = RigidTransform.from_components(
         np.asarray(hexapod.home.translation) + xyz, Rotation.from_rotvec(turn)
@@ -60,7 +60,7 @@ def test_forward_kinematics_inverts_inverse_kinematics(
 
 
 def test_every_random_reading_of_the_travel_closes_in_one_assembly_mode(
-    hexapod: Mechanism,
+    hexapod: Machine,
 ) -> None:
     rng = np.random.default_rng(11)
     lower, upper = np.array([leg.travel for leg in hexapod.legs]).T
@@ -74,7 +74,7 @@ def test_every_random_reading_of_the_travel_closes_in_one_assembly_mode(
         np.testing.assert_allclose(alone.as_matrix(), T.as_matrix(), atol=1e-11)
 
 
-def test_a_path_of_readings_gives_a_continuous_path_of_poses(hexapod: Mechanism) -> None:
+def test_a_path_of_readings_gives_a_continuous_path_of_poses(hexapod: Machine) -> None:
     start, end = np.full(6, 0.0), np.array([0.14, 0.0, 0.14, 0.02, 0.1, 0.03])
     q = start + np.linspace(0.0, 1.0, 60)[:, None] * (end - start)
     poses = forward_kinematics_many(hexapod, q)
@@ -84,7 +84,7 @@ def test_a_path_of_readings_gives_a_continuous_path_of_poses(hexapod: Mechanism)
         assert step.rotation.magnitude() < 0.05
 
 
-def test_the_sample_readings_close_and_row_order_does_not_matter(hexapod: Mechanism) -> None:
+def test_the_sample_readings_close_and_row_order_does_not_matter(hexapod: Machine) -> None:
     q = _sample_readings(hexapod)
     poses = forward_kinematics_many(hexapod, q)
     backwards = forward_kinematics_many(hexapod, q[::-1])[::-1]
@@ -93,7 +93,7 @@ def test_the_sample_readings_close_and_row_order_does_not_matter(hexapod: Mechan
         np.testing.assert_allclose(T.as_matrix(), other.as_matrix(), atol=1e-12)
 
 
-def test_a_warm_start_leads_to_the_same_pose(hexapod: Mechanism) -> None:
+def test_a_warm_start_leads_to_the_same_pose(hexapod: Machine) -> None:
     q = inverse_kinematics(hexapod, hexapod.home)
     q = q + np.array([0.01, -0.02, 0.03, 0.0, 0.02, -0.01])
     cold = forward_kinematics(hexapod, q)
@@ -101,7 +101,7 @@ def test_a_warm_start_leads_to_the_same_pose(hexapod: Mechanism) -> None:
     np.testing.assert_allclose(warm.as_matrix(), cold.as_matrix(), atol=1e-12)
 
 
-def test_a_start_in_another_assembly_mode_stays_there(hexapod: Mechanism) -> None:
+def test_a_start_in_another_assembly_mode_stays_there(hexapod: Machine) -> None:
     # Base and platform joints are coplanar: the mirror image in their planes has equal legs.
     below = RigidTransform.from_components(
         hexapod.home.translation * [1.0, 1.0, -1.0], hexapod.home.rotation
@@ -113,7 +113,7 @@ def test_a_start_in_another_assembly_mode_stays_there(hexapod: Mechanism) -> Non
     )
 
 
-def test_both_readers_of_the_urdf_place_every_link_alike(hexapod: Mechanism) -> None:
+def test_both_readers_of_the_urdf_place_every_link_alike(hexapod: Machine) -> None:
     from yourdfpy import URDF
 
     robot = URDF.load(str(SHIPPED_URDF), load_meshes=False)
@@ -158,7 +158,7 @@ def test_the_jacobian_of_a_closure_is_the_derivative_of_its_residual(kind: str) 
     assert np.abs(jacobian).max() > 0.1
 
 
-def test_rotation_columns_are_those_that_turn(hexapod: Mechanism) -> None:
+def test_rotation_columns_are_those_that_turn(hexapod: Machine) -> None:
     columns = set(hexapod.chain.rotation_columns().tolist())
     angles = {
         hexapod.chain.v_index(joint.name)
@@ -169,7 +169,7 @@ def test_rotation_columns_are_those_that_turn(hexapod: Mechanism) -> None:
     assert columns == angles | {floating + 3, floating + 4, floating + 5}
 
 
-def test_closing_at_a_pose_never_flips_a_leg(hexapod: Mechanism) -> None:
+def test_closing_at_a_pose_never_flips_a_leg(hexapod: Machine) -> None:
     T = RigidTransform.from_components([0.05, -0.03, 0.42], Rotation.from_rotvec([0.2, 0.1, 0.8]))
     configuration = close_at(hexapod, T)
     np.testing.assert_allclose(
@@ -180,14 +180,14 @@ def test_closing_at_a_pose_never_flips_a_leg(hexapod: Mechanism) -> None:
         assert leg.sign * q + leg.q0 > 0.1
 
 
-def test_motors_that_do_not_determine_the_pose_are_refused(hexapod: Mechanism) -> None:
+def test_motors_that_do_not_determine_the_pose_are_refused(hexapod: Machine) -> None:
     passive = replace(hexapod.legs[1], kind=LegKind.PASSIVE)
     legs = (hexapod.legs[0], passive, *hexapod.legs[2:])
     with pytest.raises(NotIdentifiable, match="mobility 6 and 5 motors"):
         forward_kinematics(replace(hexapod, legs=legs), np.zeros(6))
 
 
-def test_readings_that_make_no_sense_are_refused(hexapod: Mechanism) -> None:
+def test_readings_that_make_no_sense_are_refused(hexapod: Machine) -> None:
     with pytest.raises(UsageError, match=r"needed \(6,\)"):
         forward_kinematics(hexapod, np.zeros(5))
     q = np.full(6, 0.07)
@@ -199,13 +199,13 @@ def test_readings_that_make_no_sense_are_refused(hexapod: Mechanism) -> None:
         forward_kinematics_many(hexapod, np.array([np.full(6, 0.07), q]))
 
 
-def test_readings_that_no_pose_has_do_not_converge(hexapod: Mechanism) -> None:
+def test_readings_that_no_pose_has_do_not_converge(hexapod: Machine) -> None:
     q = np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(DidNotConverge, match=r"of row 2 could not be reached: at .* %"):
         forward_kinematics_many(hexapod, np.array([np.full(6, 0.07), q]))
 
 
-def test_mobility_is_six_although_the_neutral_tree_is_singular(hexapod: Mechanism) -> None:
+def test_mobility_is_six_although_the_neutral_tree_is_singular(hexapod: Machine) -> None:
     assert mobility(hexapod) == 6
     assert pin.__version__.startswith("4.")
 
@@ -213,17 +213,17 @@ def test_mobility_is_six_although_the_neutral_tree_is_singular(hexapod: Mechanis
 def test_spheres_as_revolutes_move_as_far_as_cut_ones(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    machine = geometry()
+    description = geometry()
     layouts = (Layout(), Layout(welded=True), Layout(hung="base", first="S", welded=True))
     found = [
-        load_mechanism(write_hexapod(tmp_path_factory.mktemp("layout"), layout, machine))
+        load_mechanism(write_hexapod(tmp_path_factory.mktemp("layout"), layout, description))
         for layout in layouts
     ]
     T = RigidTransform.from_components([0.06, 0.05, 0.40], Rotation.from_rotvec([0.3, -0.3, 0.9]))
     q = inverse_kinematics(found[0], T)
-    for mechanism in found:
+    for machine in found:
         np.testing.assert_allclose(
-            forward_kinematics(mechanism, q).as_matrix(), T.as_matrix(), atol=1e-10
+            forward_kinematics(machine, q).as_matrix(), T.as_matrix(), atol=1e-10
         )
 
 

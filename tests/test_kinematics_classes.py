@@ -16,7 +16,7 @@ from legcal.errors import NotIdentifiable, UsageError
 from legcal.machine import (
     Follower,
     LegKind,
-    Mechanism,
+    Machine,
     forward_kinematics,
     forward_kinematics_many,
     inverse_kinematics,
@@ -55,23 +55,23 @@ LAYOUTS = {
 
 
 @pytest.fixture(scope="module", params=SHIPPED)
-def shipped(request: pytest.FixtureRequest) -> Mechanism:
+def shipped(request: pytest.FixtureRequest) -> Machine:
     return load_mechanism(str(request.param))
 
 
-def test_mobility_of_the_shipped_models(shipped: Mechanism) -> None:
+def test_mobility_of_the_shipped_models(shipped: Machine) -> None:
     assert mobility(shipped) == MOBILITY[shipped.yaml_path.stem]
     assert shipped.mobility == len(shipped.motors)
 
 
-def test_what_is_free_beyond_the_platform_are_idle_spins(shipped: Mechanism) -> None:
+def test_what_is_free_beyond_the_platform_are_idle_spins(shipped: Machine) -> None:
     spins = sum(chain.idle_spins for chain in shipped.leg_chains)
     for configuration in generic_configurations(shipped, 3):
         every, of_platform = freedoms(shipped, configuration)
         assert every - of_platform == spins
 
 
-def test_generic_configurations_are_closed_and_differ(shipped: Mechanism) -> None:
+def test_generic_configurations_are_closed_and_differ(shipped: Machine) -> None:
     found = list(generic_configurations(shipped, 3))
     assert len(found) == 3
     for configuration in found:
@@ -81,7 +81,7 @@ def test_generic_configurations_are_closed_and_differ(shipped: Mechanism) -> Non
 
 
 def test_random_configurations_are_closed_inside_unflipped_and_in_one_mode(
-    shipped: Mechanism,
+    shipped: Machine,
 ) -> None:
     drawn = random_configurations(shipped, 12, 5)
     sides = {side(shipped, shipped.home)}
@@ -96,13 +96,13 @@ def test_random_configurations_are_closed_inside_unflipped_and_in_one_mode(
     assert np.ptp(drawn.readings[:, list(shipped.motors)], axis=0).min() > 1e-3
 
 
-def test_forward_kinematics_inverts_inverse_kinematics_in_every_class(shipped: Mechanism) -> None:
+def test_forward_kinematics_inverts_inverse_kinematics_in_every_class(shipped: Machine) -> None:
     drawn = random_configurations(shipped, 8, 6)
     for T, found in zip(drawn.poses, forward_kinematics_many(shipped, drawn.readings), strict=True):
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
 
-def test_legs_point_from_base_to_platform_along_their_sliders(shipped: Mechanism) -> None:
+def test_legs_point_from_base_to_platform_along_their_sliders(shipped: Machine) -> None:
     sliding = tuple(j for j, leg in enumerate(shipped.legs) if leg.prismatic is not None)
     for configuration, _, T in zip(*random_configurations(shipped, 4, 7), strict=True):
         lengths = np.linalg.norm(leg_vectors(shipped, T), axis=1)
@@ -114,7 +114,7 @@ def test_legs_point_from_base_to_platform_along_their_sliders(shipped: Mechanism
                 assert T.rotation.apply(leg.platform_axis) @ u > 0.0
 
 
-def test_closed_forms_have_the_derivatives_of_the_closures(shipped: Mechanism) -> None:
+def test_closed_forms_have_the_derivatives_of_the_closures(shipped: Machine) -> None:
     drawn = random_configurations(shipped, 3, 8)
     step = 1e-6
     for configuration, T in zip(drawn.configurations, drawn.poses, strict=True):
@@ -141,14 +141,16 @@ def test_closed_forms_have_the_derivatives_of_the_closures(shipped: Mechanism) -
 
 
 @pytest.mark.parametrize(
-    ("machine", "layout"),
+    ("description", "layout"),
     thinned(
         product(MACHINES, LAYOUTS),
-        lambda machine, layout: machine in OF_EACH_KIND or layout == "carried by leg 1",
+        lambda description, layout: description in OF_EACH_KIND or layout == "carried by leg 1",
     ),
 )
-def test_every_layout_has_the_same_kinematics(machine: str, layout: str, tmp_path: Path) -> None:
-    drawn = MACHINES[machine]()
+def test_every_layout_has_the_same_kinematics(
+    description: str, layout: str, tmp_path: Path
+) -> None:
+    drawn = MACHINES[description]()
     plain = load_mechanism(write_machine(tmp_path / "plain", drawn, Layout()))
     other = load_mechanism(write_machine(tmp_path / "other", drawn, LAYOUTS[layout]))
     home = inverse_kinematics(plain, plain.home)
@@ -166,49 +168,49 @@ def test_every_layout_has_the_same_kinematics(machine: str, layout: str, tmp_pat
 def test_a_planar_platform_is_where_three_distances_put_it(
     name: str, virtual: str, tmp_path: Path
 ) -> None:
-    machine = MACHINES[name]()
-    mechanism = load_mechanism(write_machine(tmp_path, machine, Layout(virtual=virtual)))
-    assert not mechanism.spatial
-    drawn = random_configurations(mechanism, 5, 2)
-    n = machine.normal
+    description = MACHINES[name]()
+    machine = load_mechanism(write_machine(tmp_path, description, Layout(virtual=virtual)))
+    assert not machine.spatial
+    drawn = random_configurations(machine, 5, 2)
+    n = description.normal
     assert n is not None
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        motion = T * mechanism.home.inv()
+        motion = T * machine.home.inv()
         axis = motion.rotation.as_rotvec()
         assert np.abs(np.cross(axis, n)).max() < 1e-12
-        assert abs((T.translation - mechanism.home.translation) @ n) < 1e-12
-        found = np.linalg.norm(leg_vectors(mechanism, T), axis=1)
-        np.testing.assert_allclose(found, mechanism.sign * q + mechanism.q0, atol=1e-12)
+        assert abs((T.translation - machine.home.translation) @ n) < 1e-12
+        found = np.linalg.norm(leg_vectors(machine, T), axis=1)
+        np.testing.assert_allclose(found, machine.sign * q + machine.q0, atol=1e-12)
 
 
 def test_a_3_rpr_agrees_with_its_distance_equations() -> None:
-    mechanism = load_mechanism("3-rpr")
-    drawn = random_configurations(mechanism, 10, 4)
+    machine = load_mechanism("3-rpr")
+    drawn = random_configurations(machine, 10, 4)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
         x, y, _ = T.translation
         angle = T.rotation.as_rotvec()[2]
         c, s = np.cos(angle), np.sin(angle)
         for j in range(3):
-            bx, by, _ = mechanism.B_platform[j]
-            ax, ay, _ = mechanism.A_base[j]
+            bx, by, _ = machine.B_platform[j]
+            ax, ay, _ = machine.A_base[j]
             square = (x + c * bx - s * by - ax) ** 2 + (y + s * bx + c * by - ay) ** 2
-            assert np.sqrt(square) == pytest.approx(q[j] + mechanism.q0[j], abs=1e-12)
+            assert np.sqrt(square) == pytest.approx(q[j] + machine.q0[j], abs=1e-12)
 
 
 def test_a_translating_3_upu_only_translates() -> None:
-    mechanism = load_mechanism("3-upu")
-    for T in random_configurations(mechanism, 10, 4).poses:
-        turn = (T.rotation * mechanism.home.rotation.inv()).magnitude()
+    machine = load_mechanism("3-upu")
+    for T in random_configurations(machine, 10, 4).poses:
+        turn = (T.rotation * machine.home.rotation.inv()).magnitude()
         assert turn < 1e-9
 
 
 def test_a_tilted_3_upu_turns_too() -> None:
-    mechanism = load_mechanism("3-upu-tilted")
-    turns = [T.rotation.magnitude() for T in random_configurations(mechanism, 10, 4).poses]
+    machine = load_mechanism("3-upu-tilted")
+    turns = [T.rotation.magnitude() for T in random_configurations(machine, 10, 4).poses]
     assert max(turns) > 1e-3
 
 
-def test_a_follower_goes_where_forward_kinematics_goes(shipped: Mechanism) -> None:
+def test_a_follower_goes_where_forward_kinematics_goes(shipped: Machine) -> None:
     q = random_configurations(shipped, 1, 3).readings[0]
     home = inverse_kinematics(shipped, shipped.home)
     follower = Follower(shipped)
@@ -227,11 +229,11 @@ def test_a_follower_goes_where_forward_kinematics_goes(shipped: Mechanism) -> No
 def test_without_a_determinant_a_path_is_followed_in_small_changes(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mechanism = load_mechanism(name)
-    drawn = random_configurations(mechanism, 3, 9)
+    machine = load_mechanism(name)
+    drawn = random_configurations(machine, 3, 9)
     monkeypatch.setattr("legcal.machine.kinematics.side", lambda *_: 0.0)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        found = forward_kinematics(mechanism, q)
+        found = forward_kinematics(machine, q)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
 
@@ -246,23 +248,23 @@ def test_without_a_determinant_a_path_is_followed_in_small_changes(
     ],
 )
 def test_poses_that_legs_forbid_are_refused(name: str, step: tuple[float, ...], found: str) -> None:
-    mechanism = load_mechanism(name)
+    machine = load_mechanism(name)
     with pytest.raises(UsageError, match=f"The platform cannot stand there: .*{found}"):
-        inverse_kinematics(mechanism, displaced(mechanism.home, step))
+        inverse_kinematics(machine, displaced(machine.home, step))
 
 
 def test_a_start_that_legs_forbid_is_refused() -> None:
-    mechanism = load_mechanism("3-rps")
-    q = inverse_kinematics(mechanism, mechanism.home)
-    start = displaced(mechanism.home, [0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
+    machine = load_mechanism("3-rps")
+    q = inverse_kinematics(machine, machine.home)
+    start = displaced(machine.home, [0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
     with pytest.raises(UsageError, match=r"followed from its start: found leg .* mm off"):
-        forward_kinematics(mechanism, q, start=start)
+        forward_kinematics(machine, q, start=start)
 
 
 def test_too_few_motors_are_refused_with_both_numbers() -> None:
-    mechanism = load_mechanism("3-rps")
-    passive = replace(mechanism.legs[0], kind=LegKind.PASSIVE)
-    loose = replace(mechanism, legs=(passive, *mechanism.legs[1:]))
+    machine = load_mechanism("3-rps")
+    passive = replace(machine.legs[0], kind=LegKind.PASSIVE)
+    loose = replace(machine, legs=(passive, *machine.legs[1:]))
     with pytest.raises(NotIdentifiable, match="mobility 3 and 2 motors"):
         Follower(loose)
 
@@ -270,8 +272,8 @@ def test_too_few_motors_are_refused_with_both_numbers() -> None:
 def test_axes_that_are_a_little_off_still_close_and_are_not_refused(tmp_path: Path) -> None:
     path = write_machine(tmp_path, of_types(["RS"] * 3), Layout())
     urdf = path.with_suffix(".urdf")
-    mechanism = load_mechanism(path)
-    axis = mechanism.legs[0].base_axis
+    machine = load_mechanism(path)
+    axis = machine.legs[0].base_axis
     assert axis is not None
     turned = Rotation.from_rotvec([0.0, 2e-4, 0.0])
     text = urdf.read_text()

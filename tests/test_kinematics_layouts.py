@@ -12,7 +12,7 @@ from legcal.calibration import accuracy
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
 from legcal.machine import (
-    Mechanism,
+    Machine,
     follow,
     forward_kinematics,
     forward_kinematics_many,
@@ -35,10 +35,10 @@ def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
     )
 
 
-def _stops_on_the_chain(mechanism: Mechanism, readings: Array) -> bool:
-    start = mechanism.home_configuration
+def _stops_on_the_chain(machine: Machine, readings: Array) -> bool:
+    start = machine.home_configuration
     try:
-        follow(mechanism, start, readings[list(mechanism.motors)], on_the_chain=True)
+        follow(machine, start, readings[list(machine.motors)], on_the_chain=True)
     except DidNotConverge:
         return True
     return False
@@ -101,27 +101,27 @@ def test_revolutes_that_do_not_turn_so_far_are_refused(tmp_path: Path) -> None:
     "name", ["3-rpr", "3-rps", "3-spr", "3-upu", "tricept", "hexapod-rod", "hexapod-strut"]
 )
 def test_the_platform_alone_goes_where_the_chain_goes(name: str) -> None:
-    mechanism = load_mechanism(name)
-    motors = list(mechanism.motors)
-    first = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
-    drawn = random_configurations(mechanism, 5, 3)
+    machine = load_mechanism(name)
+    motors = list(machine.motors)
+    first = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
+    drawn = random_configurations(machine, 5, 3)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        found, part = follow_pose(mechanism, mechanism.home, first, q[motors], SHORTEST)
+        found, part = follow_pose(machine, machine.home, first, q[motors], SHORTEST)
         assert part == 1.0
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
 
 def test_the_platform_alone_crosses_no_singularity() -> None:
-    mechanism = load_mechanism("nategh-agheli")
-    motors = list(mechanism.motors)
-    first = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
-    lower, upper = np.array([mechanism.legs[j].travel for j in motors]).T
+    machine = load_mechanism("nategh-agheli")
+    motors = list(machine.motors)
+    first = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
+    lower, upper = np.array([machine.legs[j].travel for j in motors]).T
     rng = np.random.default_rng(1)
     parts = []
     for _ in range(10):
         last = rng.uniform(lower, upper)
-        T, part = follow_pose(mechanism, mechanism.home, first, last, 1.0 / 64.0)
-        assert side(mechanism, T) == side(mechanism, mechanism.home)
+        T, part = follow_pose(machine, machine.home, first, last, 1.0 / 64.0)
+        assert side(machine, T) == side(machine, machine.home)
         parts.append(part)
     assert min(parts) < 1.0
 

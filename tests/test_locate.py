@@ -12,8 +12,8 @@ from located import (
     TOOL,
     Located,
     located,
-    machine,
     motion_error,
+    shipped,
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -26,7 +26,7 @@ from legcal.geometry.types import Array
 
 def near_home(name: str, steps: Array) -> list[RigidTransform]:
     """Return poses displaced and turned from home, (n, 6) [m, rad]."""
-    home = machine(name).home
+    home = shipped(name).home
     return [
         RigidTransform.from_components(
             home.translation + step[:3], Rotation.from_rotvec(step[3:]) * home.rotation
@@ -46,7 +46,7 @@ def steps(n: int, size: float, turn: tuple[float, float, float]) -> Array:
 )
 def test_base_and_tool_are_found_as_well_as_is_said(name: str) -> None:
     made = located(name)
-    found = locate(made.mechanism, made.poses)
+    found = locate(made.machine, made.poses)
     error = np.concatenate(
         [motion_error(found.T_world_base, BASE), motion_error(found.T_platform_tool, TOOL)]
     )
@@ -62,7 +62,7 @@ def test_base_and_tool_are_found_as_well_as_is_said(name: str) -> None:
 @pytest.mark.parametrize("name", ["hexapod", pytest.param("3-upu", marks=pytest.mark.slow)])
 def test_exact_poses_give_exact_frames_and_the_measured_poses_again(name: str) -> None:
     made = located(name, 8, noise=0.0)
-    found = locate(made.mechanism, made.poses, tool_position=TOOL.translation.tolist())
+    found = locate(made.machine, made.poses, tool_position=TOOL.translation.tolist())
     assert np.abs(motion_error(found.T_world_base, BASE)).max() < 1e-8
     assert np.abs(motion_error(found.T_platform_tool, TOOL)).max() < 1e-8
     assert found.rms_position < 1e-9
@@ -72,7 +72,7 @@ def test_a_machine_that_only_translates_gets_what_is_determined_and_a_sentence_o
     None
 ):
     made = located("3-upu", 10)
-    found = locate(made.mechanism, made.poses)
+    found = locate(made.machine, made.poses)
     assert found.status == "located in part"
     assert "the platform of this machine does not turn" in found.sentence
     (tool,) = [held for held in found.held if held.frame == "tool"]
@@ -90,7 +90,7 @@ def test_a_machine_that_only_translates_gets_what_is_determined_and_a_sentence_o
 def test_a_planar_machine_keeps_one_height_open() -> None:
     made = located("3-rpr", 10)
     at = (0.0, 0.0, float(TOOL.translation[2]))
-    found = locate(made.mechanism, made.poses, tool_position=at)
+    found = locate(made.machine, made.poses, tool_position=at)
     assert found.status == "located in part"
     parts = {(h.frame, h.kind): h.directions for h in found.held}
     assert set(parts) == {("base", "position"), ("tool", "position")}
@@ -107,7 +107,7 @@ def test_a_planar_machine_keeps_one_height_open() -> None:
 def test_positions_alone_find_all_but_the_orientation_of_the_tool() -> None:
     made = located("hexapod")
     only = replace(made.poses, oriented=np.zeros(20, dtype=np.bool_))
-    found = locate(made.mechanism, only)
+    found = locate(made.machine, only)
     assert not found.has_tool_orientation
     assert found.noise.angle is None
     assert "its position only" in found.sentence
@@ -125,7 +125,7 @@ def test_wrong_rows_are_named_and_left_out(stated: tuple[float | None, float | N
     position[6] += 1e-3
     position[[2, 11]] = position[[11, 2]]
     found = locate(
-        made.mechanism,
+        made.machine,
         replace(made.poses, position=position),
         position_sigma=stated[0],
         angle_sigma=stated[1],
@@ -139,7 +139,7 @@ def test_wrong_rows_are_named_and_left_out(stated: tuple[float | None, float | N
 
 def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> None:
     made = located("hexapod", 6)
-    found = locate(made.mechanism, made.poses, position_sigma=1e-6, angle_sigma=1e-6)
+    found = locate(made.machine, made.poses, position_sigma=1e-6, angle_sigma=1e-6)
     assert all(row.used for row in found.rows)
     assert found.status == "doubtful"
     assert not found.trustworthy
@@ -148,14 +148,12 @@ def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> 
 
 def test_stated_sigmas_are_taken_and_tested() -> None:
     made = located("hexapod", 8)
-    found = locate(
-        made.mechanism, made.poses, position_sigma=SIGMA_POSITION, angle_sigma=SIGMA_ANGLE
-    )
+    found = locate(made.machine, made.poses, position_sigma=SIGMA_POSITION, angle_sigma=SIGMA_ANGLE)
     assert found.noise.position == pytest.approx(SIGMA_POSITION)
     assert found.p_value is not None
     assert found.p_value > 1e-3
     assert found.dof == 36
-    wide = locate(made.mechanism, made.poses, position_sigma=1e-3, angle_sigma=SIGMA_ANGLE)
+    wide = locate(made.machine, made.poses, position_sigma=1e-3, angle_sigma=SIGMA_ANGLE)
     assert any("look too large: positions" in note for note in wide.notes)
 
 
@@ -163,7 +161,7 @@ def test_errors_of_readings_make_the_answer_less_certain() -> None:
     made = located("hexapod", 8)
     without, beside = (
         locate(
-            made.mechanism,
+            made.machine,
             made.poses,
             position_sigma=SIGMA_POSITION,
             angle_sigma=SIGMA_ANGLE,
@@ -177,7 +175,7 @@ def test_errors_of_readings_make_the_answer_less_certain() -> None:
 
 def test_what_is_known_badly_is_named() -> None:
     made = located("hexapod", platform=near_home("hexapod", steps(12, 0.02, (0.01, 0.01, 1.0))))
-    found = locate(made.mechanism, made.poses)
+    found = locate(made.machine, made.poses)
     assert any(
         note.startswith("Known badly is the position of the tool in the platform along")
         for note in found.notes
@@ -198,7 +196,7 @@ def test_poses_without_two_rotation_axes_are_refused(
 ) -> None:
     made = located("hexapod", platform=near_home("hexapod", steps(10, size, turn)))
     with pytest.raises(NotIdentifiable, match=match) as refused:
-        locate(made.mechanism, made.poses)
+        locate(made.machine, made.poses)
     assert len(refused.value.problems) == 1
 
 
@@ -207,20 +205,20 @@ def test_a_translating_machine_that_moves_along_a_line_only_is_asked_for_other_d
     moves[:, 2] = np.linspace(-0.03, 0.03, 6)
     made = located("3-upu", platform=near_home("3-upu", moves))
     with pytest.raises(NotIdentifiable, match="needed displacements in 3 directions"):
-        locate(made.mechanism, made.poses)
+        locate(made.machine, made.poses)
 
 
 def test_too_few_poses_are_refused() -> None:
     made = located("hexapod")
     with pytest.raises(NotIdentifiable, match="found 1 pose, needed at least 3 poses"):
-        locate(made.mechanism, made.rows([0]))
+        locate(made.machine, made.rows([0]))
     with pytest.raises(NotIdentifiable, match="found 5 rows at 1 different reading, needed"):
-        locate(made.mechanism, made.rows([0] * 5))
+        locate(made.machine, made.rows([0] * 5))
     three = made.rows(range(3))
     only = replace(three, oriented=np.zeros(3, dtype=np.bool_))
     with pytest.raises(NotIdentifiable, match="needed at least 4 poses of which only positions"):
-        locate(made.mechanism, only)
-    found = locate(made.mechanism, three)
+        locate(made.machine, only)
+    found = locate(made.machine, three)
     assert any("A wrong row among the 3 poses could not have been" in n for n in found.notes)
 
 
@@ -228,8 +226,8 @@ def test_a_scatter_that_nothing_tells_is_asked_for() -> None:
     made = located("hexapod")
     one = replace(made.poses, oriented=np.arange(20) == 4)
     with pytest.raises(NotIdentifiable, match=r"orientations of 20 rows.*state.*--angle-sigma"):
-        locate(made.mechanism, one)
-    found = locate(made.mechanism, one, angle_sigma=SIGMA_ANGLE)
+        locate(made.machine, one)
+    found = locate(made.machine, one, angle_sigma=SIGMA_ANGLE)
     assert found.has_tool_orientation
     assert found.sigma[9:].max() > 0.9 * SIGMA_ANGLE
 
@@ -239,7 +237,7 @@ def test_rows_with_too_much_scatter_for_their_number_are_refused() -> None:
     position = made.poses.position.copy()
     position[2] += 5e-3
     with pytest.raises(NotIdentifiable, match=r"with a scatter of .* needed more or better ones"):
-        locate(made.mechanism, replace(made.poses, position=position))
+        locate(made.machine, replace(made.poses, position=position))
 
 
 def _millimetres(made: Located) -> ToolPoses:
@@ -288,7 +286,7 @@ def test_common_mistakes_are_told_by_name(
 ) -> None:
     made = located("hexapod", 6)
     with pytest.raises(DatasetError, match=match) as refused:
-        locate(made.mechanism, spoil(made))
+        locate(made.machine, spoil(made))
     assert len(refused.value.problems) == 1
 
 
@@ -300,7 +298,7 @@ def test_poses_of_other_readings_are_refused() -> None:
         rotation=np.roll(made.poses.rotation, 1, axis=0),
     )
     with pytest.raises(DatasetError, match=r"whatever the frames.*check that rows belong together"):
-        locate(made.mechanism, rolled)
+        locate(made.machine, rolled)
 
 
 def test_too_many_rows_that_disagree_are_refused_and_named() -> None:
@@ -310,7 +308,7 @@ def test_too_many_rows_that_disagree_are_refused_and_named() -> None:
     position[:4] += chance.normal(size=(4, 3)) * 5e-3
     rotation[:4] = rotation_matrices(0.02 * chance.normal(size=(4, 3))) @ rotation[:4]
     with pytest.raises(DatasetError, match=r"4 of 12 rows that disagree.*\(1, 2, 3, 4\)"):
-        locate(made.mechanism, replace(made.poses, position=position, rotation=rotation))
+        locate(made.machine, replace(made.poses, position=position, rotation=rotation))
 
 
 def test_readings_that_the_machine_cannot_have_are_refused() -> None:
@@ -319,7 +317,7 @@ def test_readings_that_the_machine_cannot_have_are_refused() -> None:
     q[1] = [0.0, 0.14, 0.0, 0.14, 0.0, 0.14]
     q[1, 0] = 2.0
     with pytest.raises(DidNotConverge, match=r"The tool poses: .*row 2"):
-        locate(made.mechanism, replace(made.poses, q=q))
+        locate(made.machine, replace(made.poses, q=q))
 
 
 @pytest.mark.parametrize(
@@ -335,14 +333,14 @@ def test_readings_that_the_machine_cannot_have_are_refused() -> None:
 def test_numbers_that_cannot_be_meant_are_refused(numbers: dict[str, float], match: str) -> None:
     made = located("hexapod", 4)
     with pytest.raises(UsageError, match=match):
-        locate(made.mechanism, made.poses, **numbers)  # type: ignore[arg-type]
+        locate(made.machine, made.poses, **numbers)  # type: ignore[arg-type]
 
 
 def test_sigmas_that_are_stated_twice_are_refused() -> None:
     made = located("hexapod", 4)
     twice = replace(made.poses, position_sigma=np.full(4, 1e-5))
     with pytest.raises(UsageError, match="found it in the column position_sigma and as an option"):
-        locate(made.mechanism, twice, position_sigma=1e-5)
+        locate(made.machine, twice, position_sigma=1e-5)
 
 
 def test_a_row_that_is_stated_to_be_worse_counts_less() -> None:
@@ -352,7 +350,7 @@ def test_a_row_that_is_stated_to_be_worse_counts_less() -> None:
     sigma = np.full(8, SIGMA_POSITION)
     sigma[0] = 2e-3
     found = locate(
-        made.mechanism,
+        made.machine,
         replace(made.poses, position=position, position_sigma=sigma),
         angle_sigma=SIGMA_ANGLE,
     )

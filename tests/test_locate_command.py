@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from located import BASE, TOOL, Located, located, machine, motion_error, write_poses
+from located import BASE, TOOL, Located, located, motion_error, shipped, write_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal import Location, cli, load_location, load_mechanism, locate, write_location
@@ -26,13 +26,13 @@ def made() -> Located:
 
 @pytest.fixture(scope="module")
 def found(made: Located) -> Location:
-    return locate(made.mechanism, made.poses)
+    return locate(made.machine, made.poses)
 
 
 @pytest.fixture(scope="module")
 def in_part() -> Location:
     planar = located("3-rpr", 6)
-    return locate(planar.mechanism, replace(planar.poses, oriented=np.zeros(6, dtype=np.bool_)))
+    return locate(planar.machine, replace(planar.poses, oriented=np.zeros(6, dtype=np.bool_)))
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
@@ -118,7 +118,7 @@ def test_a_machine_whose_motors_do_not_determine_the_pose_is_refused(
     made: Located, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_poses(tmp_path / "poses.csv", made)
-    loose = replace(made.mechanism, mobility=7)
+    loose = replace(made.machine, mobility=7)
     with pytest.raises(Exception, match="the pose cannot be computed from readings"):
         locate(loose, tmp_path / "poses.csv")
 
@@ -175,15 +175,15 @@ def test_damaged_files_are_refused(
 def test_the_written_urdf_is_the_same_machine_with_world_and_tool_in_it(
     name: str, found: Location, tmp_path: Path
 ) -> None:
-    mechanism = machine(name)
+    machine = shipped(name)
     there = replace(found, T_world_base=BASE, T_platform_tool=TOOL)
-    yaml_path, urdf_path = write_located_model(mechanism, there, tmp_path)
-    old, new = mechanism.urdf.content.decode(), urdf_path.read_text()
+    yaml_path, urdf_path = write_located_model(machine, there, tmp_path)
+    old, new = machine.urdf.content.decode(), urdf_path.read_text()
     lines = [line for line in new.splitlines(keepends=True) if line not in old.splitlines(True)]
     assert len(lines) == 4
     assert "".join(line for line in new.splitlines(keepends=True) if line not in lines) == old
     written = load_mechanism(yaml_path)
-    np.testing.assert_allclose(written.A_base, mechanism.A_base, atol=1e-14)
+    np.testing.assert_allclose(written.A_base, machine.A_base, atol=1e-14)
     model = pin.buildModelFromUrdf(str(urdf_path))
     data = model.createData()
     configuration = written.home_configuration
@@ -195,15 +195,15 @@ def test_the_written_urdf_is_the_same_machine_with_world_and_tool_in_it(
 
 
 def test_frames_of_an_earlier_location_are_replaced(found: Location, tmp_path: Path) -> None:
-    first, _ = write_located_model(machine("hexapod"), found, tmp_path / "one")
+    first, _ = write_located_model(shipped("hexapod"), found, tmp_path / "one")
     turned = replace(found, T_world_base=BASE * TOOL, T_platform_tool=TOOL.inv())
     _, again = write_located_model(load_mechanism(first), turned, tmp_path / "two")
-    _, direct = write_located_model(machine("hexapod"), turned, tmp_path / "three")
+    _, direct = write_located_model(shipped("hexapod"), turned, tmp_path / "three")
     assert again.read_text().count('<link name="world"/>') == 1
     one, two = (_origins(path.read_text()) for path in (again, direct))
     np.testing.assert_allclose(one, two, atol=1e-14)
     with pytest.raises(UsageError, match="already there"):
-        write_located_model(machine("hexapod"), found, tmp_path / "one")
+        write_located_model(shipped("hexapod"), found, tmp_path / "one")
 
 
 def _origins(text: str) -> list[list[float]]:
@@ -216,14 +216,14 @@ def _origins(text: str) -> list[list[float]]:
 
 
 def _machine_with(tmp_path: Path, *changes: tuple[str, str]) -> Path:
-    text = machine("hexapod").urdf.content.decode()
+    text = shipped("hexapod").urdf.content.decode()
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
     for folder in ("models", "urdf"):
         (tmp_path / folder).mkdir()
     (tmp_path / "urdf/hexapod.urdf").write_bytes(text.encode())
-    source = machine("hexapod").yaml_path
+    source = shipped("hexapod").yaml_path
     (tmp_path / "models/hexapod.yaml").write_bytes(source.read_bytes())
     return tmp_path / "models/hexapod.yaml"
 
@@ -237,19 +237,19 @@ def test_links_of_another_meaning_are_refused_and_other_names_taken(
         for link, parent in (("world", "base"), ("tool", "base"))
     )
     model = _machine_with(tmp_path, ("</robot>", extra + "</robot>"))
-    mechanism = load_mechanism(model)
+    machine = load_mechanism(model)
     with pytest.raises(UsageError, match=r"found a link 'world' that is not a root.*--world-link"):
-        with_frames(mechanism, found)
+        with_frames(machine, found)
     with pytest.raises(
         UsageError, match=r"found a link 'tool' that is not at the end.*--tool-link"
     ):
-        with_frames(mechanism, found, world="cell")
-    content = with_frames(mechanism, found, world="cell", tool="tcp").decode()
+        with_frames(machine, found, world="cell")
+    content = with_frames(machine, found, world="cell", tool="tcp").decode()
     assert '<link name="cell"/>' in content
     assert content.index(extra) < content.index('<link name="cell"/>')
     for names in (("a b", "tool"), ("same", "same")):
         with pytest.raises(UsageError, match="frames could not be written"):
-            with_frames(mechanism, found, world=names[0], tool=names[1])
+            with_frames(machine, found, world=names[0], tool=names[1])
 
 
 def test_the_world_goes_above_a_root_that_carries_the_base(found: Location, tmp_path: Path) -> None:
@@ -257,8 +257,8 @@ def test_the_world_goes_above_a_root_that_carries_the_base(found: Location, tmp_
         '<link name="table"/><joint name="on_table" type="fixed"><parent link="table"/>'
         '<child link="base"/><origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/></joint>\n</robot>'
     )
-    mechanism = load_mechanism(_machine_with(tmp_path, ("</robot>", table)))
-    yaml_path, _ = write_located_model(mechanism, found, tmp_path / "out")
+    machine = load_mechanism(_machine_with(tmp_path, ("</robot>", table)))
+    yaml_path, _ = write_located_model(machine, found, tmp_path / "out")
     written = load_mechanism(yaml_path).urdf
     joint = written.joints["world_table_frame"]
     on_table = RigidTransform.from_components(
@@ -269,12 +269,12 @@ def test_the_world_goes_above_a_root_that_carries_the_base(found: Location, tmp_
 
 
 def test_a_base_on_a_moving_joint_is_refused(found: Location) -> None:
-    mechanism = replace(machine("hexapod"), base="platform")
+    machine = replace(shipped("hexapod"), base="platform")
     with pytest.raises(ModelError, match="below the joint 'platform_free', which moves"):
-        with_frames(mechanism, found)
+        with_frames(machine, found)
 
 
 def test_the_tool_of_positions_alone_is_written_along_the_platform(in_part: Location) -> None:
     assert not in_part.has_tool_orientation
-    content = with_frames(machine("3-rpr"), in_part).decode()
+    content = with_frames(shipped("3-rpr"), in_part).decode()
     assert 'rpy="0.0 0.0 0.0"/></joint>\n</robot>' in content.replace("-0.0", "0.0")

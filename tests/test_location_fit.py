@@ -13,9 +13,9 @@ from located import (
     TOOL,
     frame_errors,
     frames_of,
-    machine,
     noisy,
     pairs_at,
+    shipped,
     workspace_poses,
 )
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -160,20 +160,20 @@ def test_a_search_ends_at_most_rows_where_others_are_wrong() -> None:
 
 @pytest.mark.parametrize("name", ["hexapod", "3-rps", "3-rpr"])
 def test_errors_of_readings_move_the_tool_as_the_machine_does(name: str) -> None:
-    mechanism, drawn = machine(name), workspace_poses(name, 3)
+    machine, drawn = shipped(name), workspace_poses(name, 3)
     matrices = np.array([T.as_matrix() for T in drawn.poses])
     n = len(matrices)
     pairs = PosePairs(matrices[:, :3, :3], matrices[:, :3, 3], np.tile(np.eye(3), (n, 1, 1)),
                       np.zeros((n, 3)), np.ones(n, dtype=np.bool_), 0.1)  # fmt: skip
     h, frames = 1e-6, frames_of(BASE, TOOL)
-    found = motions_by_readings(mechanism, drawn.poses, h).of_tool(frames, pairs)
+    found = motions_by_readings(machine, drawn.poses, h).of_tool(frames, pairs)
     covariance = found @ np.swapaxes(found, 1, 2)
     for i, T in enumerate(drawn.poses):
         columns = []
-        for j in mechanism.motors:
+        for j in machine.motors:
             q = drawn.readings[i].copy()
             q[j] += h
-            M = BASE * forward_kinematics(mechanism, q, start=T) * TOOL
+            M = BASE * forward_kinematics(machine, q, start=T) * TOOL
             true = BASE * T * TOOL
             turn = (M.rotation * true.rotation.inv()).as_rotvec()
             columns.append(np.concatenate([M.translation - true.translation, turn]))

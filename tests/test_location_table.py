@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from located import Located, located, machine, write_poses, write_rows
+from located import Located, located, shipped, write_poses, write_rows
 
 from legcal.calibration.location.table import read_tool_poses
 from legcal.errors import DatasetError
@@ -47,7 +47,7 @@ def twice(rows: Rows) -> None:
 
 def test_what_was_written_is_read(made: Located, tmp_path: Path) -> None:
     write_poses(tmp_path / "poses.csv", made)
-    found = read_tool_poses(tmp_path / "poses.csv", made.mechanism)
+    found = read_tool_poses(tmp_path / "poses.csv", made.machine)
     np.testing.assert_array_equal(found.q, made.poses.q)
     np.testing.assert_array_equal(found.position, made.poses.position)
     np.testing.assert_allclose(found.rotation, made.poses.rotation, atol=1e-15)
@@ -61,10 +61,10 @@ def test_orientations_may_be_missing_in_some_rows_or_all(made: Located, tmp_path
     rows = write_poses(path, made)
     rows[2].update(qx="", qy="", qz="", qw="")
     write_rows(path, [row | {"angle_sigma": "0.001" * (row is not rows[2])} for row in rows])
-    found = read_tool_poses(path, made.mechanism)
+    found = read_tool_poses(path, made.machine)
     assert found.oriented.tolist() == [True, True, False, True]
     write_poses(path, made, quaternions=False)
-    assert not read_tool_poses(path, made.mechanism).oriented.any()
+    assert not read_tool_poses(path, made.machine).oriented.any()
 
 
 def test_columns_may_stand_in_any_order_with_names_and_sigmas(
@@ -74,7 +74,7 @@ def test_columns_may_stand_in_any_order_with_names_and_sigmas(
     rows = write_poses(path, made)
     more = {"position_sigma": "2e-5", "angle_sigma": "1e-4", "name": "first"}
     write_rows(path, [dict(reversed(list((more | row).items()))) for row in rows])
-    found = read_tool_poses(path, made.mechanism)
+    found = read_tool_poses(path, made.machine)
     np.testing.assert_array_equal(found.position, made.poses.position)
     assert found.position_sigma is not None
     assert found.position_sigma.tolist() == [2e-5] * 4
@@ -88,7 +88,7 @@ def test_rounded_quaternions_are_made_unit_and_told(made: Located, tmp_path: Pat
         for row in rows
     ]
     write_rows(path, short)
-    found = read_tool_poses(path, made.mechanism)
+    found = read_tool_poses(path, made.machine)
     np.testing.assert_allclose(
         found.rotation @ np.swapaxes(found.rotation, 1, 2),
         np.tile(np.eye(3), (4, 1, 1)),
@@ -128,7 +128,7 @@ def test_what_is_wrong_with_a_table_is_told_by_row_and_column(
     spoil(rows)
     write_rows(path, rows)
     with pytest.raises(DatasetError, match=match):
-        read_tool_poses(path, made.mechanism)
+        read_tool_poses(path, made.machine)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_what_is_no_table_is_refused(tmp_path: Path, text: str, match: str) -> N
     path = tmp_path / "poses.csv"
     path.write_text(text)
     with pytest.raises(DatasetError, match=match):
-        read_tool_poses(path, machine("hexapod"))
+        read_tool_poses(path, shipped("hexapod"))
 
 
 def test_a_short_row_is_refused(made: Located, tmp_path: Path) -> None:
@@ -152,6 +152,6 @@ def test_a_short_row_is_refused(made: Located, tmp_path: Path) -> None:
     write_poses(path, made)
     path.write_text(path.read_text() + "1,2\n")
     with pytest.raises(DatasetError, match=r"row 5 .*found 2 cells, needed 13 as in the header"):
-        read_tool_poses(path, made.mechanism)
+        read_tool_poses(path, made.machine)
     with pytest.raises(DatasetError, match="found no such file"):
-        read_tool_poses(tmp_path / "none.csv", made.mechanism)
+        read_tool_poses(tmp_path / "none.csv", made.machine)

@@ -82,7 +82,7 @@ def test_motors_that_are_too_many_or_hold_nothing_are_noted(
     asked = Family(
         family, "mm", base_radius=300, platform_radius=150, height=None if planar else 400
     )
-    description = describe(create_model(describe_family(asked), tmp_path).mechanism)
+    description = describe(create_model(describe_family(asked), tmp_path).machine)
     assert found in _table(description)
     told = [note for note in description["diagnostics"] if "motors" in note or "cannot" in note]
     assert len(told) == len(notes)
@@ -100,23 +100,23 @@ def test_legs_that_cannot_be_seen_are_told_in_one_note(
     tmp_path: Path, hidden: str, note: str
 ) -> None:
     asked = Family("3-RPS", "mm", 300.0, 150.0, 400.0)
-    mechanism = create_model(describe_family(asked), tmp_path).mechanism
-    text = mechanism.urdf_path.read_text()
+    machine = create_model(describe_family(asked), tmp_path).machine
+    text = machine.urdf_path.read_text()
     text = re.sub(rf'(<link name="leg{hidden}_\w+">)<visual>.*</visual>', r"\1", text)
-    mechanism.urdf_path.write_text(text)
-    (found,) = describe(load_mechanism(mechanism.yaml_path))["diagnostics"]
+    machine.urdf_path.write_text(text)
+    (found,) = describe(load_mechanism(machine.yaml_path))["diagnostics"]
     assert found.startswith(note)
 
 
 def test_the_table_shows_axes_and_twists_where_they_are_parameters() -> None:
-    mechanism = load_mechanism("3-upu-tilted")
-    document = json.loads(json.dumps(describe(mechanism), allow_nan=False))
+    machine = load_mechanism("3-upu-tilted")
+    document = json.loads(json.dumps(describe(machine), allow_nan=False))
     assert (document["r"], document["n_ac"], document["idle_spins"]) == (0, 3, 0)
-    assert document["legs"][0]["twist"] == mechanism.legs[0].twist
+    assert document["legs"][0]["twist"] == machine.legs[0].twist
     text = _table(document)
     assert max(len(line) for line in text.splitlines()) <= 80
     assert "axis at base" in text
-    assert f"{np.degrees(mechanism.legs[1].twist or 0.0):.3f}" in text
+    assert f"{np.degrees(machine.legs[1].twist or 0.0):.3f}" in text
     assert "axis at base" not in _table(describe(load_mechanism("3-rpr")))
     assert describe(load_mechanism("3-rps"))["r"] == 3
     assert describe(load_mechanism("hexapod-strut"))["idle_spins"] == 1

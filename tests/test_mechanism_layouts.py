@@ -13,7 +13,7 @@ from layouts import (
     Layout,
     LegLayout,
     LegSpec,
-    Machine,
+    MachineSpec,
     expected_axes,
     expected_B,
     write_machine,
@@ -24,7 +24,7 @@ from thinned import thinned
 from legcal.errors import OutOfClass
 from legcal.machine import (
     Leg,
-    Mechanism,
+    Machine,
     forward_kinematics,
     inverse_kinematics,
     load_mechanism,
@@ -61,23 +61,23 @@ LAYOUTS = {
 OF_EACH_KIND = ("6-UPS", "3-RPR, tilted plane", "3-UPU", "Tricept")
 
 
-def _check(mechanism: Mechanism, machine: Machine, layout: Layout) -> None:
+def _check(machine: Machine, description: MachineSpec, layout: Layout) -> None:
     """Check that a mechanism is the machine that was drawn, to 1e-9."""
-    assert mechanism.spatial == (machine.normal is None)
-    assert mechanism.frame_legs == machine.frame_legs
-    for j, (leg, spec) in enumerate(zip(mechanism.legs, machine.legs, strict=True)):
+    assert machine.spatial == (description.normal is None)
+    assert machine.frame_legs == description.frame_legs
+    for j, (leg, spec) in enumerate(zip(machine.legs, description.legs, strict=True)):
         _check_leg(leg, spec, layout.of(j))
-        base_axis, platform_axis, twist = expected_axes(machine, j)
-        A, B = spec.A, expected_B(machine, j)
+        base_axis, platform_axis, twist = expected_axes(description, j)
+        A, B = spec.A, expected_B(description, j)
         _close(leg.A, A)
         _close(leg.B, B)
         _close(leg.base_axis, base_axis)
         _close(leg.platform_axis, platform_axis)
         _close(leg.twist, twist)
-        length = np.linalg.norm(machine.home.apply(B) - A)
+        length = np.linalg.norm(description.home.apply(B) - A)
         out = 0.0 if spec.kind == "constant" else PASSED
         _close(leg.q0, length - out)
-        spins = mechanism.leg_chains[j].idle_spins
+        spins = machine.leg_chains[j].idle_spins
         added = layout.of(j).spin == "S" and "S" in spec.type
         assert spins == (spec.type == "SS") + added
 
@@ -105,57 +105,59 @@ def _close(found: object, wanted: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("machine", "name"),
+    ("description", "name"),
     thinned(
         product(MACHINES, LAYOUTS),
-        lambda machine, name: machine in OF_EACH_KIND or name == "every leg otherwise",
+        lambda description, name: description in OF_EACH_KIND or name == "every leg otherwise",
     ),
 )
 def test_every_layout_of_a_machine_gives_the_same_analysis(
-    machine: str, name: str, tmp_path: Path
+    description: str, name: str, tmp_path: Path
 ) -> None:
-    drawn, layout = MACHINES[machine](), LAYOUTS[name]
-    mechanism = load_mechanism(write_machine(tmp_path, drawn, layout))
-    _check(mechanism, drawn, layout)
-    freedoms = {"6": 6, "3": 3, "2": 2, "T": 3, "h": 5 if "rod" in machine else 6}
-    assert mechanism.mobility == freedoms[machine[0]]
+    drawn, layout = MACHINES[description](), LAYOUTS[name]
+    machine = load_mechanism(write_machine(tmp_path, drawn, layout))
+    _check(machine, drawn, layout)
+    freedoms = {"6": 6, "3": 3, "2": 2, "T": 3, "h": 5 if "rod" in description else 6}
+    assert machine.mobility == freedoms[description[0]]
 
 
-@pytest.mark.parametrize("machine", ["3-RPR", "3-RPR, tilted plane"])
+@pytest.mark.parametrize("description", ["3-RPR", "3-RPR, tilted plane"])
 @pytest.mark.parametrize("hung", ["base", "platform"])
-def test_a_planar_virtual_joint_changes_nothing(machine: str, hung: str, tmp_path: Path) -> None:
-    drawn, layout = MACHINES[machine](), Layout((LegLayout(hung=hung),), virtual="planar")
-    mechanism = load_mechanism(write_machine(tmp_path, drawn, layout))
-    _check(mechanism, drawn, layout)
-    assert mechanism.mobility == 3
+def test_a_planar_virtual_joint_changes_nothing(
+    description: str, hung: str, tmp_path: Path
+) -> None:
+    drawn, layout = MACHINES[description](), Layout((LegLayout(hung=hung),), virtual="planar")
+    machine = load_mechanism(write_machine(tmp_path, drawn, layout))
+    _check(machine, drawn, layout)
+    assert machine.mobility == 3
     assert drawn.normal is not None
-    _close(mechanism.T_base_Rb.rotation.apply([0.0, 0.0, 1.0]), drawn.normal)
-    z_e = (mechanism.home * mechanism.T_platform_Re).rotation.apply([0.0, 0.0, 1.0])
+    _close(machine.T_base_Rb.rotation.apply([0.0, 0.0, 1.0]), drawn.normal)
+    z_e = (machine.home * machine.T_platform_Re).rotation.apply([0.0, 0.0, 1.0])
     _close(z_e, drawn.normal)
 
 
 @pytest.mark.parametrize(
-    ("machine", "name"),
+    ("description", "name"),
     thinned(
         product(["3-RPR", "3-RPR, tilted plane"], [*LAYOUTS, "planar joint"]),
-        lambda machine, name: machine != "3-RPR" or name == "planar joint",
+        lambda description, name: description != "3-RPR" or name == "planar joint",
     ),
 )
 def test_a_planar_machine_may_be_written_with_few_digits(
-    machine: str, name: str, tmp_path: Path
+    description: str, name: str, tmp_path: Path
 ) -> None:
-    drawn = MACHINES[machine]()
+    drawn = MACHINES[description]()
     layout = LAYOUTS.get(name, Layout((LegLayout(slid=0.01),), virtual="planar"))
     path = write_machine(tmp_path, drawn, layout)
     _round(path.with_suffix(".urdf"), 6)
-    mechanism = load_mechanism(path)
-    assert (mechanism.spatial, mechanism.mobility) == (False, 3)
-    for j, leg in enumerate(mechanism.legs):
+    machine = load_mechanism(path)
+    assert (machine.spatial, machine.mobility) == (False, 3)
+    for j, leg in enumerate(machine.legs):
         np.testing.assert_allclose(leg.A, drawn.legs[j].A, atol=1e-5)
-    step = mechanism.sign * np.array([0.01, -0.02, 0.03])
-    q = inverse_kinematics(mechanism, mechanism.home) + step
-    T = forward_kinematics(mechanism, q)
-    np.testing.assert_allclose(readings_at(mechanism, T), q, atol=1e-5)
+    step = machine.sign * np.array([0.01, -0.02, 0.03])
+    q = inverse_kinematics(machine, machine.home) + step
+    T = forward_kinematics(machine, q)
+    np.testing.assert_allclose(readings_at(machine, T), q, atol=1e-5)
 
 
 def _round(path: Path, digits: int) -> None:
@@ -210,9 +212,9 @@ def test_any_legs_in_any_layout_are_found_as_drawn(
     legs: list[tuple[str, str]], layouts: list[LegLayout], seed: int, tmp_path: Path
 ) -> None:
     types, kinds = [leg[0] for leg in legs], [leg[1] for leg in legs]
-    machine, layout = of_types(types, kinds, seed), Layout(tuple(layouts))
-    mechanism = load_mechanism(write_machine(tmp_path, machine, layout))
-    _check(mechanism, machine, layout)
+    description, layout = of_types(types, kinds, seed), Layout(tuple(layouts))
+    machine = load_mechanism(write_machine(tmp_path, description, layout))
+    _check(machine, description, layout)
 
 
 @pytest.mark.parametrize(
@@ -232,20 +234,20 @@ def test_any_legs_in_any_layout_are_found_as_drawn(
 def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
     drawn: str, side: str, found: str, idle: int, tmp_path: Path
 ) -> None:
-    machine = of_types([drawn] * 3)
+    description = of_types([drawn] * 3)
     for layout in (LegLayout(spin=side, sphere=False), LegLayout(spin=side, cut="mid", slid=0.03)):
-        mechanism = load_mechanism(write_machine(tmp_path, machine, Layout((layout,))))
-        assert [leg.type for leg in mechanism.legs] == [found] * 3
-        assert [chain.idle_spins for chain in mechanism.leg_chains] == [idle] * 3
-        assert all(leg.twist is None for leg in mechanism.legs)
-        for j, leg in enumerate(mechanism.legs):
-            _close(leg.A, machine.legs[j].A)
-            _close(leg.B, expected_B(machine, j))
+        machine = load_mechanism(write_machine(tmp_path, description, Layout((layout,))))
+        assert [leg.type for leg in machine.legs] == [found] * 3
+        assert [chain.idle_spins for chain in machine.leg_chains] == [idle] * 3
+        assert all(leg.twist is None for leg in machine.legs)
+        for j, leg in enumerate(machine.legs):
+            _close(leg.A, description.legs[j].A)
+            _close(leg.B, expected_B(description, j))
 
 
 @pytest.mark.parametrize("drawn", ["RR", "R"])
 def test_a_revolute_along_a_leg_between_revolutes_is_refused(drawn: str, tmp_path: Path) -> None:
-    machine = of_types([drawn] * 3)
-    path = write_machine(tmp_path, machine, Layout((LegLayout(spin="base"),)))
+    description = of_types([drawn] * 3)
+    path = write_machine(tmp_path, description, Layout((LegLayout(spin="base"),)))
     with pytest.raises(OutOfClass, match="'leg1_spin' along the leg, and no S joint"):
         load_mechanism(path)

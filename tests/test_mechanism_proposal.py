@@ -62,19 +62,19 @@ def test_base_platform_and_legs_are_taken_from_the_bodies(
 
 def test_base_frame_may_be_left_out(tmp_path: Path) -> None:
     path = write_machine(tmp_path, MACHINES["6-UPS"](), Layout())
-    mechanism = load_mechanism(_without_block(path, "base_frame"))
-    assert len(mechanism.frame_legs) == 3
-    assert any("legcal.base_frame is not given" in note for note in mechanism.diagnostics)
+    machine = load_mechanism(_without_block(path, "base_frame"))
+    assert len(machine.frame_legs) == 3
+    assert any("legcal.base_frame is not given" in note for note in machine.diagnostics)
 
 
 def test_the_shipped_hexapod_is_proposed_as_it_is_written(tmp_path: Path) -> None:
     (tmp_path / "hexapod.urdf").write_bytes(SHIPPED_URDF.read_bytes())
     (tmp_path / "hexapod.yaml").write_bytes(SHIPPED_YAML.read_bytes())
-    mechanism = load_mechanism(_without_block(tmp_path / "hexapod.yaml"))
-    assert (mechanism.base, mechanism.platform) == ("base", "platform")
-    assert mechanism.platform_joint == "platform_free"
-    assert mechanism.leg_names == tuple(f"leg{j}" for j in range(1, 7))
-    assert mechanism.frame_legs == (0, 2, 4)
+    machine = load_mechanism(_without_block(tmp_path / "hexapod.yaml"))
+    assert (machine.base, machine.platform) == ("base", "platform")
+    assert machine.platform_joint == "platform_free"
+    assert machine.leg_names == tuple(f"leg{j}" for j in range(1, 7))
+    assert machine.frame_legs == (0, 2, 4)
 
 
 def test_a_closed_chain_in_which_the_joint_at_A_moves_is_refused(tmp_path: Path) -> None:

@@ -98,8 +98,8 @@ def test_joints_that_stand_for_others_need_a_type_each(tmp_path: Path) -> None:
 
 def test_an_almost_unit_quaternion_is_normalised(tmp_path: Path) -> None:
     text = SHIPPED.replace("0.951057", "0.9515").replace("0.309017", "0.30903")
-    mechanism = load_mechanism(_folder(tmp_path, text))
-    assert np.linalg.norm(mechanism.home.rotation.as_quat()) == pytest.approx(1.0, abs=1e-15)
+    machine = load_mechanism(_folder(tmp_path, text))
+    assert np.linalg.norm(machine.home.rotation.as_quat()) == pytest.approx(1.0, abs=1e-15)
 
 
 def test_yaml_is_read_safely(tmp_path: Path) -> None:
@@ -115,8 +115,8 @@ def test_what_is_not_a_mechanism_file_is_refused(tmp_path: Path, text: str) -> N
 
 
 def test_keys_of_other_programs_are_left_alone(tmp_path: Path) -> None:
-    mechanism = load_mechanism(_folder(tmp_path, "robot_color: red\n" + SHIPPED))
-    assert mechanism.mobility == 6
+    machine = load_mechanism(_folder(tmp_path, "robot_color: red\n" + SHIPPED))
+    assert machine.mobility == 6
 
 
 def test_the_urdf_is_found_beside_or_in_the_neighbour_folder(tmp_path: Path) -> None:

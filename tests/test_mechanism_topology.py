@@ -27,15 +27,15 @@ from legcal.machine.mobility import mobility
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_every_layout_of_a_machine_gives_the_same_analysis(name: str, tmp_path: Path) -> None:
-    machine, layout = geometry(), LAYOUTS[name]
-    mechanism = load_mechanism(write_hexapod(tmp_path, layout, machine))
-    np.testing.assert_allclose(mechanism.A_base, machine.A, atol=1e-12)
-    np.testing.assert_allclose(mechanism.B_platform, machine.B, atol=1e-12)
-    np.testing.assert_allclose(mechanism.q0, machine.q0, atol=1e-12)
-    assert list(mechanism.sign) == [layout.sign] * 6
-    assert {leg.type for leg in mechanism.legs} == {name[:3]}
-    assert mechanism.mobility == mobility(mechanism) == 6
-    for leg in mechanism.legs:
+    description, layout = geometry(), LAYOUTS[name]
+    machine = load_mechanism(write_hexapod(tmp_path, layout, description))
+    np.testing.assert_allclose(machine.A_base, description.A, atol=1e-12)
+    np.testing.assert_allclose(machine.B_platform, description.B, atol=1e-12)
+    np.testing.assert_allclose(machine.q0, description.q0, atol=1e-12)
+    assert list(machine.sign) == [layout.sign] * 6
+    assert {leg.type for leg in machine.legs} == {name[:3]}
+    assert machine.mobility == mobility(machine) == 6
+    for leg in machine.legs:
         assert leg.kind is LegKind.ACTUATED
         spans: dict[str, Array] = {c.side: np.array(c.span(0.4)) for c in leg.cylinders}
         hung, far = ("base", "platform") if layout.hung == "base" else ("platform", "base")
@@ -43,33 +43,33 @@ def test_every_layout_of_a_machine_gives_the_same_analysis(name: str, tmp_path: 
         expected = at_hung if layout.hung == "base" else at_far
         np.testing.assert_allclose(spans[hung], expected[0], atol=1e-9)
         np.testing.assert_allclose(spans[far], expected[1], atol=1e-9)
-    spins = [note for note in mechanism.diagnostics if "spin about themselves" in note]
+    spins = [note for note in machine.diagnostics if "spin about themselves" in note]
     assert len(spins) == (name[:3] == "SPS")
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_every_layout_of_a_machine_has_the_same_poses(name: str, tmp_path: Path) -> None:
-    machine, layout = geometry(), LAYOUTS[name]
-    mechanism = load_mechanism(write_hexapod(tmp_path, layout, machine))
-    for T in poses_near_home(machine, 2):
-        lengths = np.linalg.norm(T.apply(machine.B) - machine.A, axis=1)
-        q = layout.sign * (lengths - machine.q0)
-        np.testing.assert_allclose(inverse_kinematics(mechanism, T), q, atol=1e-12)
-        found = forward_kinematics(mechanism, q)
+    description, layout = geometry(), LAYOUTS[name]
+    machine = load_mechanism(write_hexapod(tmp_path, layout, description))
+    for T in poses_near_home(description, 2):
+        lengths = np.linalg.norm(T.apply(description.B) - description.A, axis=1)
+        q = layout.sign * (lengths - description.q0)
+        np.testing.assert_allclose(inverse_kinematics(machine, T), q, atol=1e-12)
+        found = forward_kinematics(machine, q)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
 
 def test_the_shipped_hexapod_loads_by_name_by_yaml_and_by_urdf() -> None:
     found = [load_mechanism(model) for model in ("hexapod", SHIPPED_YAML, SHIPPED_URDF)]
-    for mechanism in found:
-        assert mechanism.name == "hexapod"
-        assert mechanism.leg_names == tuple(f"leg{j}" for j in range(1, 7))
-        assert {leg.type for leg in mechanism.legs} == {"SPU"}
-        assert mechanism.frame_legs == (0, 2, 4)
-        assert mechanism.diagnostics == ()
-        np.testing.assert_allclose(mechanism.q0, 0.345, atol=1e-15)
-        np.testing.assert_allclose(mechanism.legs[0].travel, (-0.004, 0.144))
-        assert {c.radius for leg in mechanism.legs for c in leg.cylinders} == {0.01}
+    for machine in found:
+        assert machine.name == "hexapod"
+        assert machine.leg_names == tuple(f"leg{j}" for j in range(1, 7))
+        assert {leg.type for leg in machine.legs} == {"SPU"}
+        assert machine.frame_legs == (0, 2, 4)
+        assert machine.diagnostics == ()
+        np.testing.assert_allclose(machine.q0, 0.345, atol=1e-15)
+        np.testing.assert_allclose(machine.legs[0].travel, (-0.004, 0.144))
+        assert {c.radius for leg in machine.legs for c in leg.cylinders} == {0.01}
 
 
 def test_parameters_are_zero_where_the_frames_make_them_zero() -> None:
@@ -82,29 +82,29 @@ def test_parameters_are_zero_where_the_frames_make_them_zero() -> None:
 
 
 def test_leg_order_follows_the_request() -> None:
-    mechanism = load_mechanism("hexapod")
+    machine = load_mechanism("hexapod")
     names = ("leg3", "leg1", "leg2", "leg6", "leg5", "leg4")
-    other = mechanism.with_leg_order(names)
+    other = machine.with_leg_order(names)
     assert other.leg_names == names
     assert [names[j] for j in other.frame_legs] == ["leg1", "leg3", "leg5"]
-    q = inverse_kinematics(mechanism, mechanism.home) + np.linspace(0.0, 0.02, 6)
-    reordered = q[[mechanism.leg_names.index(name) for name in names]]
+    q = inverse_kinematics(machine, machine.home) + np.linspace(0.0, 0.02, 6)
+    reordered = q[[machine.leg_names.index(name) for name in names]]
     np.testing.assert_allclose(
         forward_kinematics(other, reordered).as_matrix(),
-        forward_kinematics(mechanism, q).as_matrix(),
+        forward_kinematics(machine, q).as_matrix(),
         atol=1e-12,
     )
     with pytest.raises(UsageError, match="each of leg1"):
-        mechanism.with_leg_order(["leg1"])
+        machine.with_leg_order(["leg1"])
 
 
 def test_a_mechanism_survives_pickling() -> None:
-    mechanism = load_mechanism("hexapod")
-    copy = pickle.loads(pickle.dumps(mechanism))
-    q = inverse_kinematics(mechanism, mechanism.home) + 0.01
+    machine = load_mechanism("hexapod")
+    copy = pickle.loads(pickle.dumps(machine))
+    q = inverse_kinematics(machine, machine.home) + 0.01
     np.testing.assert_allclose(
         forward_kinematics(copy, q).as_matrix(),
-        forward_kinematics(mechanism, q).as_matrix(),
+        forward_kinematics(machine, q).as_matrix(),
         atol=1e-13,
     )
 
@@ -114,13 +114,11 @@ def test_a_file_without_home_gets_one_and_says_so(tmp_path: Path) -> None:
     text = path.read_text()
     start, end = text.index("  home:"), text.index("  legs:")
     path.write_text(text[:start] + text[end:])
-    mechanism = load_mechanism(path)
-    assert any("legcal.home is not given" in note for note in mechanism.diagnostics)
-    np.testing.assert_allclose(
-        inverse_kinematics(mechanism, mechanism.home), [0.075] * 6, atol=1e-8
-    )
-    assert mechanism.home.translation[2] > 0.2
-    assert mechanism.home.rotation.magnitude() < np.deg2rad(60.0)
+    machine = load_mechanism(path)
+    assert any("legcal.home is not given" in note for note in machine.diagnostics)
+    np.testing.assert_allclose(inverse_kinematics(machine, machine.home), [0.075] * 6, atol=1e-8)
+    assert machine.home.translation[2] > 0.2
+    assert machine.home.rotation.magnitude() < np.deg2rad(60.0)
 
 
 def test_a_home_outside_the_travel_is_noted(tmp_path: Path) -> None:
@@ -133,11 +131,11 @@ def test_a_home_outside_the_travel_is_noted(tmp_path: Path) -> None:
 def test_a_passive_slider_is_found_and_takes_a_motor_away(tmp_path: Path) -> None:
     path = write_hexapod(tmp_path)
     path.write_text(path.read_text().replace("- leg2_prismatic\n", "", 1))
-    mechanism = load_mechanism(path)
-    assert [leg.kind for leg in mechanism.legs].count(LegKind.PASSIVE) == 1
-    assert mechanism.legs[1].kind is LegKind.PASSIVE
-    assert np.isnan(mechanism.parameters.offsets[1])
-    assert any("mobility 6, motors 5" in note for note in mechanism.diagnostics)
+    machine = load_mechanism(path)
+    assert [leg.kind for leg in machine.legs].count(LegKind.PASSIVE) == 1
+    assert machine.legs[1].kind is LegKind.PASSIVE
+    assert np.isnan(machine.parameters.offsets[1])
+    assert any("mobility 6, motors 5" in note for note in machine.diagnostics)
 
 
 def _with_rod(folder: Path, length: float) -> Path:
@@ -155,19 +153,21 @@ def _with_rod(folder: Path, length: float) -> Path:
 
 
 def test_a_rod_is_a_leg_of_constant_length_and_home_settles_on_it(tmp_path: Path) -> None:
-    machine = geometry()
-    length = float(np.linalg.norm(machine.home.apply(machine.B[3]) - machine.A[3])) + 1e-5
-    mechanism = load_mechanism(_with_rod(tmp_path, length))
-    rod = mechanism.legs[3]
+    description = geometry()
+    length = (
+        float(np.linalg.norm(description.home.apply(description.B[3]) - description.A[3])) + 1e-5
+    )
+    machine = load_mechanism(_with_rod(tmp_path, length))
+    rod = machine.legs[3]
     assert (rod.kind, rod.type, rod.travel) == (LegKind.CONSTANT, "SU", (0.0, 0.0))
     assert rod.q0 == pytest.approx(length, abs=1e-12)
-    assert mechanism.mobility == len(mechanism.motors) == 5
-    q = inverse_kinematics(mechanism, mechanism.home)
+    assert machine.mobility == len(machine.motors) == 5
+    q = inverse_kinematics(machine, machine.home)
     q[[0, 1, 2, 4, 5]] += np.linspace(0.0, 0.01, 5)
-    found = forward_kinematics(mechanism, q)
-    np.testing.assert_allclose(inverse_kinematics(mechanism, found), q, atol=1e-12)
+    found = forward_kinematics(machine, q)
+    np.testing.assert_allclose(inverse_kinematics(machine, found), q, atol=1e-12)
     with pytest.raises(UsageError, match="leg 'leg4' would be"):
-        inverse_kinematics(mechanism, RigidTransform.from_translation([0.0, 0.0, 0.5]))
+        inverse_kinematics(machine, RigidTransform.from_translation([0.0, 0.0, 0.5]))
 
 
 def test_a_rod_that_home_does_not_keep_is_refused(tmp_path: Path) -> None:
@@ -231,10 +231,10 @@ def test_a_universal_joint_that_is_blocked_on_one_axis_is_a_revolute(tmp_path: P
     urdf = path.with_suffix(".urdf")
     old = 'name="leg4_a1" type="revolute"'
     urdf.write_text(urdf.read_text().replace(old, old.replace("revolute", "fixed")))
-    mechanism = load_mechanism(path)
-    assert mechanism.legs[3].type == "SPR"
-    assert mechanism.legs[3].platform_axis is not None
-    assert mechanism.mobility == 5
+    machine = load_mechanism(path)
+    assert machine.legs[3].type == "SPR"
+    assert machine.legs[3].platform_axis is not None
+    assert machine.mobility == 5
 
 
 def test_a_motor_that_turns_is_outside_the_method(tmp_path: Path) -> None:
@@ -295,21 +295,21 @@ def test_a_platform_fixed_to_the_base_is_refused(tmp_path: Path) -> None:
 
 
 def test_frame_legs_on_one_line_are_refused(tmp_path: Path) -> None:
-    machine = geometry()
-    machine.A[[0, 2, 4]] = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]
-    path = write_hexapod(tmp_path, None, machine)
+    description = geometry()
+    description.A[[0, 2, 4]] = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]
+    path = write_hexapod(tmp_path, None, description)
     with pytest.raises(ModelError, match="base joints of leg1, leg3, leg5 in one point or on one"):
         load_mechanism(path)
 
 
 def test_lengths_in_millimetres_are_refused(tmp_path: Path) -> None:
-    machine = geometry()
+    description = geometry()
     scaled = Geometry(
-        1e3 * machine.A,
-        1e3 * machine.B,
-        1e3 * machine.q0,
+        1e3 * description.A,
+        1e3 * description.B,
+        1e3 * description.q0,
         RigidTransform.from_components(
-            1e3 * np.asarray(machine.home.translation), machine.home.rotation
+            1e3 * np.asarray(description.home.translation), description.home.rotation
         ),
         (-5.0, 155.0),
     )
@@ -339,9 +339,9 @@ def test_without_a_home_sizes_beyond_reason_are_asked_about_at_once(
 ) -> None:
     if scale > 1.0:  # no home is looked for
         monkeypatch.delattr("legcal.machine.load.closed_home")
-    machine = geometry()
-    A, B, q0 = scale * machine.A, scale * machine.B, scale * machine.q0
-    scaled = Geometry(A, B, q0, machine.home, (0.0, 0.15 * scale))
+    description = geometry()
+    A, B, q0 = scale * description.A, scale * description.B, scale * description.q0
+    scaled = Geometry(A, B, q0, description.home, (0.0, 0.15 * scale))
     path = write_hexapod(tmp_path, None, scaled)
     text = path.read_text()
     path.write_text(text[: text.index("  home:")] + text[text.index("  legs:") :])
@@ -350,9 +350,15 @@ def test_without_a_home_sizes_beyond_reason_are_asked_about_at_once(
 
 
 def test_travel_in_millimetres_is_refused(tmp_path: Path) -> None:
-    machine = geometry()
-    machine = Geometry(machine.A, machine.B, machine.q0, machine.home, (-5.0, 155.0))
-    path = write_hexapod(tmp_path, None, machine)
+    description = geometry()
+    description = Geometry(
+        description.A,
+        description.B,
+        description.q0,
+        description.home,
+        (-5.0, 155.0),
+    )
+    path = write_hexapod(tmp_path, None, description)
     with pytest.raises(ModelError, match=r"travel of leg 'leg1' .* -5 to 155 m, needed at most"):
         load_mechanism(path)
 

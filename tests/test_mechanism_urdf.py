@@ -174,8 +174,8 @@ def test_visuals_that_are_no_cylinder_do_no_harm(tmp_path: Path, part: str) -> N
     text = _with('<link name="leg1_tube">', f'<link name="leg1_tube">{part}')
     (tmp_path / "urdf" / "hexapod.urdf").write_text(text)
     (tmp_path / "models" / "hexapod.yaml").write_bytes(SHIPPED_YAML.read_bytes())
-    mechanism = load_mechanism(tmp_path / "models" / "hexapod.yaml")
-    assert [len(leg.cylinders) for leg in mechanism.legs] == [2] * 6
+    machine = load_mechanism(tmp_path / "models" / "hexapod.yaml")
+    assert [len(leg.cylinders) for leg in machine.legs] == [2] * 6
 
 
 def test_a_folder_and_a_missing_file_are_refused(tmp_path: Path) -> None:

@@ -99,21 +99,19 @@ def test_images_that_determine_nothing_are_refused() -> None:
 
 @pytest.mark.parametrize(("model", "size"), [("hexapod", 7), ("3-rpr", 5), ("3-upu-tilted", 11)])
 def test_a_joint_of_a_frame_leg_moves_the_coordinates_of_all_others(model: str, size: int) -> None:
-    mechanism = load_mechanism(model)
-    legs, parametrization = geometries(mechanism), parametrization_of(mechanism)
+    machine = load_mechanism(model)
+    legs, parametrization = geometries(machine), parametrization_of(machine)
     single, joints, whole = possible_changes(
-        mechanism.leg_names, legs, mechanism.frame_legs, parametrization
+        machine.leg_names, legs, machine.frame_legs, parametrization
     )
-    assert {change.what for change in single} == {
-        f"offset of {name}" for name in mechanism.leg_names
-    }
-    first = mechanism.leg_names[mechanism.frame_legs[0]]
+    assert {change.what for change in single} == {f"offset of {name}" for name in machine.leg_names}
+    first = machine.leg_names[machine.frame_legs[0]]
     origin = next(change for change in joints if change.what == f"base joint of {first}")
     # The origin of R_b moves: x of another joint, off the x axis or not, goes the other way.
-    second = mechanism.leg_names[mechanism.frame_legs[1]]
+    second = machine.leg_names[machine.frame_legs[1]]
     x = parametrization.names.index(f"{second}.base.x")
     np.testing.assert_allclose(origin.columns[x, 0], -1.0, atol=1e-6)
-    assert len(origin.components) == (3 if mechanism.spatial else 2)
-    assert [len(change.components) for change in whole] == [size] * mechanism.n_legs
+    assert len(origin.components) == (3 if machine.spatial else 2)
+    assert [len(change.components) for change in whole] == [size] * machine.n_legs
     everything = np.concatenate([change.columns for change in whole], axis=1)
     assert np.linalg.matrix_rank(everything, tol=1e-6) == len(parametrization)

@@ -44,9 +44,7 @@ def spoiled(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
     """The same, to be changed and written."""
     entry = json.loads(json.dumps(rendered.entry))
     rows = [dict(row) for row in rendered.rows]
-    return RepeatedImages(
-        tmp_path / "set", rendered.mechanism, entry, rows, dict(rendered.pictures)
-    )
+    return RepeatedImages(tmp_path / "set", rendered.machine, entry, rows, dict(rendered.pictures))
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
@@ -246,7 +244,7 @@ def _nothing_shown_twice(made: RepeatedImages) -> None:
 
 
 def _a_motor_less(made: RepeatedImages) -> None:
-    motor = str(made.mechanism.legs[0].prismatic)
+    motor = str(made.machine.legs[0].prismatic)
 
     def change(urdf: str, entry: dict[str, Any]) -> str:
         entry["name_mot"].remove(motor)
@@ -260,8 +258,8 @@ def _a_motor_less(made: RepeatedImages) -> None:
 def _new_model(made: RepeatedImages, change: Callable[[str, dict[str, Any]], str]) -> None:
     """Give the dataset a changed model of its own."""
     made.path.mkdir(parents=True)
-    entry = yaml.safe_load(made.mechanism.yaml_path.read_text())
-    urdf = change(made.mechanism.urdf_path.read_text(), entry)
+    entry = yaml.safe_load(made.machine.yaml_path.read_text())
+    urdf = change(made.machine.urdf_path.read_text(), entry)
     entry["legcal"]["urdf"] = "model.urdf"
     (made.path / "model.urdf").write_text(urdf)
     (made.path / "model.yaml").write_text(yaml.safe_dump(entry, sort_keys=False))

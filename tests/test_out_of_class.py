@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from layouts import Layout, Machine, write_machine
+from layouts import Layout, MachineSpec, write_machine
 from machines import MACHINES, of_types, planar
 from scipy.spatial.transform import Rotation
 
@@ -243,7 +243,7 @@ def _moved(path: Path, leg: str, by: Array) -> Path:
     return path
 
 
-def _across(types: str) -> tuple[Machine, Array]:
+def _across(types: str) -> tuple[MachineSpec, Array]:
     """Return a machine, and the direction across leg 2 in which its ends cannot move apart."""
     machine = planar() if types == "RR" else of_types([types] * 3)
     leg = machine.legs[1]

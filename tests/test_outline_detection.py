@@ -321,7 +321,7 @@ def test_the_sample_is_detected_from_its_nominal_model() -> None:
 
     folder = ROOT / "examples" / "hexapod"
     dataset = load_dataset(folder)
-    mechanism = dataset.mechanism
+    machine = dataset.machine
     rows = np.arange(0, 45, 5)
     whole = dataset.measurements
     chosen = Measurements(
@@ -338,11 +338,11 @@ def test_the_sample_is_detected_from_its_nominal_model() -> None:
         assert image is not None
         return np.asarray(image)
 
-    A = np.repeat(mechanism.A_base[None], len(rows), axis=0)
-    B = np.array([forward_kinematics(mechanism, q).apply(mechanism.B_platform) for q in chosen.q])
-    cylinders = [leg.cylinders for leg in mechanism.legs]
+    A = np.repeat(machine.A_base[None], len(rows), axis=0)
+    B = np.array([forward_kinematics(machine, q).apply(machine.B_platform) for q in chosen.q])
+    cylinders = [leg.cylinders for leg in machine.legs]
     wanted = np.ones((3, 6), dtype=np.bool_)
-    search = Search(load, chosen, A, B, cylinders, wanted, mechanism.leg_names)
+    search = Search(load, chosen, A, B, cylinders, wanted, machine.leg_names)
     placed = recognise(search, np.arange(len(rows)), [None] * 3)
     found, _ = measure_outlines(search, placed, range(len(rows)))
     truth = json.loads((ROOT / "tests/data/hexapod-truth/truth.json").read_text())

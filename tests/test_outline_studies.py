@@ -404,11 +404,11 @@ def test_the_start_is_the_nominal_model_at_the_readings(machine: str) -> None:
 @pytest.fixture(scope="module")
 def open_machine() -> tuple[Design, OutlineSession, Solution]:
     """Return a session of a 3-UPU that only translates, and its fit."""
-    exact, mechanism = machine_session("3-upu"), load_mechanism("3-upu")
+    exact, machine = machine_session("3-upu"), load_mechanism("3-upu")
     R, t = components(exact.truth.T_Rb_Re)
     design = Design(
         legs=dataclasses.replace(exact.legs, nominal=exact.truth.legs),
-        home=platform_in_base(mechanism, mechanism.home),
+        home=platform_in_base(machine, machine.home),
         R=np.asarray(R),
         t=np.asarray(t),
         q=exact.measurements.q,

@@ -94,11 +94,11 @@ def test_names_say_what_each_parameter_is() -> None:
 
 
 def test_a_hexapod_has_the_parameters_that_the_fit_has() -> None:
-    mechanism = load_mechanism("hexapod")
-    found, legs = parametrization_of(mechanism), geometries(mechanism)
+    machine = load_mechanism("hexapod")
+    found, legs = parametrization_of(machine), geometries(machine)
     assert found.names[::24] == ("leg2.base.x", "leg1.offset")
     np.testing.assert_array_equal(
-        vector_of(found, legs, legs), to_vector(mechanism.parameters, mechanism.frame_legs)
+        vector_of(found, legs, legs), to_vector(machine.parameters, machine.frame_legs)
     )
 
 

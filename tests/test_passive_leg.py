@@ -33,9 +33,9 @@ def _with_a_telescope(folder: Path) -> Path:
 def test_an_evaluation_leaves_out_the_offset_that_a_passive_leg_does_not_have(
     tmp_path: Path,
 ) -> None:
-    mechanism = load_mechanism(_with_a_telescope(tmp_path))
-    assert (mechanism.n_legs, mechanism.mobility, len(mechanism.motors)) == (7, 6, 6)
-    evaluation = evaluate(mechanism, mechanism)
+    machine = load_mechanism(_with_a_telescope(tmp_path))
+    assert (machine.n_legs, machine.mobility, len(machine.motors)) == (7, 6, 6)
+    evaluation = evaluate(machine, machine)
     assert "leg7.platform.z" in evaluation.names
     assert "leg7.offset" not in evaluation.names
     assert np.all(evaluation.values == evaluation.references)

@@ -166,7 +166,7 @@ def test_mirrored_pictures_of_a_planar_machine_are_believed() -> None:
     rng = np.random.default_rng(3)
     spatial, T = lp.machine(4, rng), lp.camera(rng)
     flat = np.array([1.0, 1.0, 0.0])
-    made = lp.Machine(flat * spatial.A, flat * spatial.B)
+    made = lp.MachineSpec(flat * spatial.A, flat * spatial.B)
     steps = [
         RigidTransform.from_components([*rng.uniform(-0.05, 0.05, 2), 0.0], Rotation.identity())
         for _ in range(4)

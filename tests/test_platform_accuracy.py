@@ -13,7 +13,7 @@ from legcal.calibration.joint_fit.platform import PlatformAccuracy, platform_acc
 from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.geometry.types import Array
 from legcal.machine import (
-    Mechanism,
+    Machine,
     forward_kinematics_many,
     geometries,
     load_mechanism,
@@ -25,7 +25,7 @@ from legcal.machine import (
 
 
 def _accuracy(
-    nominal: Mechanism, calibrated: Mechanism, q: Array, root: Array, *mistakes: Sensitivity
+    nominal: Machine, calibrated: Machine, q: Array, root: Array, *mistakes: Sensitivity
 ) -> PlatformAccuracy:
     """Return what is told of a calibration that ended at a given model."""
     poses = forward_kinematics_many(calibrated, q)

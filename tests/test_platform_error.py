@@ -18,7 +18,7 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine import (
     LegKind,
-    Mechanism,
+    Machine,
     forward_kinematics_many,
     geometries,
     load_mechanism,
@@ -31,7 +31,7 @@ from legcal.machine import (
 MACHINES = ("hexapod-rod", "hexapod-strut", "3-rpr", "3-rps", "3-spr", "3-upu-tilted", "tricept")
 
 
-def _motions(nominal: Mechanism, other: Mechanism, q: Array) -> Array:
+def _motions(nominal: Machine, other: Machine, q: Array) -> Array:
     """Return rotation vectors and displacements of R_e in R_b from one model to another, (k, 6)."""
     pairs = zip(forward_kinematics_many(nominal, q), forward_kinematics_many(other, q), strict=True)
     found = []

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal import load_mechanism
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, Image
-from legcal.machine import Mechanism, forward_kinematics
+from legcal.machine import Machine, forward_kinematics
 from legcal.perception import recognise as recognising
 from legcal.perception.agreement import Picture, Poses, Targets, agreement, improved, targets_of
 from legcal.perception.camera_search import Candidates, place_camera, place_near
@@ -28,7 +28,7 @@ CAMERA = Camera(np.array([[500.0, 0.0, 260.0], [0.0, 500.0, 200.0], [0.0, 0.0, 1
 
 
 @pytest.fixture(scope="module")
-def hexapod() -> Mechanism:
+def hexapod() -> Machine:
     return load_mechanism("hexapod")
 
 
@@ -76,7 +76,7 @@ def bars_of(
 
 
 def pictures_of(
-    mechanism: Mechanism,
+    machine: Machine,
     T_base_camera: RigidTransform,
     readings: Array,
     rng: Generator,
@@ -84,21 +84,21 @@ def pictures_of(
     hidden: int = 0,
 ) -> list[Picture]:
     """Return what pictures at some readings show, some of the legs being hidden in each."""
-    cylinders = [leg.cylinders for leg in mechanism.legs]
-    n_legs = len(mechanism.legs)
+    cylinders = [leg.cylinders for leg in machine.legs]
+    n_legs = len(machine.legs)
     found = []
     for q in readings:
-        B = forward_kinematics(mechanism, q).apply(mechanism.B_platform)
+        B = forward_kinematics(machine, q).apply(machine.B_platform)
         seen = np.sort(rng.permutation(n_legs)[: n_legs - hidden])
-        shown = targets_of(mechanism.A_base, B, cylinders, seen)
-        every = targets_of(mechanism.A_base, B, cylinders, np.arange(n_legs))
+        shown = targets_of(machine.A_base, B, cylinders, seen)
+        every = targets_of(machine.A_base, B, cylinders, np.arange(n_legs))
         found.append(Picture(bars_of(shown, T_base_camera, rng, clutter), every, CORNERS))
     return found
 
 
-def readings_of(mechanism: Mechanism, n: int, rng: Generator) -> Array:
+def readings_of(machine: Machine, n: int, rng: Generator) -> Array:
     """Return readings all over the travel."""
-    travel = np.array([leg.travel for leg in mechanism.legs if leg.prismatic])
+    travel = np.array([leg.travel for leg in machine.legs if leg.prismatic])
     return np.asarray(
         rng.uniform(0.2, 0.8, (n, len(travel))) * np.ptp(travel, axis=1) + travel[:, 0]
     )
@@ -117,7 +117,7 @@ CENTRE = np.array([0.0, 0.0, 0.18])
 
 @pytest.mark.parametrize(("seed", "hidden"), [(0, 0), (1, 3), (2, 2), (3, 1)])
 def test_a_camera_is_placed_at_any_roll_in_clutter_with_legs_hidden(
-    hexapod: Mechanism, seed: int, hidden: int
+    hexapod: Machine, seed: int, hidden: int
 ) -> None:
     rng = np.random.default_rng(seed)
     turn = rng.uniform(0.0, 2.0 * np.pi)
@@ -131,7 +131,7 @@ def test_a_camera_is_placed_at_any_roll_in_clutter_with_legs_hidden(
     assert angle < 2.0
 
 
-def test_a_model_a_centimetre_off_is_recognised_all_the_same(hexapod: Mechanism) -> None:
+def test_a_model_a_centimetre_off_is_recognised_all_the_same(hexapod: Machine) -> None:
     rng = np.random.default_rng(5)
     T = looking_at(np.array([0.7, -0.8, 0.3]), CENTRE, 0.3)
     pictures = pictures_of(hexapod, T, readings_of(hexapod, 6, rng), rng)
@@ -153,7 +153,7 @@ def _rest(targets: Targets) -> tuple[Array, Array, Array]:
 
 
 def test_symmetric_readings_are_ambiguous_and_other_readings_or_a_rough_pose_decide(
-    hexapod: Mechanism,
+    hexapod: Machine,
 ) -> None:
     rng = np.random.default_rng(7)
     T = looking_at(np.array([0.9, 0.2, 0.4]), CENTRE, 0.1)
@@ -172,14 +172,14 @@ def test_symmetric_readings_are_ambiguous_and_other_readings_or_a_rough_pose_dec
     assert apart(decided, T)[1] < 2.0
 
 
-def test_bars_of_nothing_place_no_camera(hexapod: Mechanism) -> None:
+def test_bars_of_nothing_place_no_camera(hexapod: Machine) -> None:
     rng = np.random.default_rng(3)
     T = looking_at(np.array([0.9, 0.2, 0.4]), CENTRE, 0.0)
     pictures = pictures_of(hexapod, T, readings_of(hexapod, 4, rng), rng, clutter=25, hidden=6)
     assert not place_camera(pictures, 6).is_convincing
 
 
-def test_starts_lay_legs_on_bars(hexapod: Mechanism) -> None:
+def test_starts_lay_legs_on_bars(hexapod: Machine) -> None:
     rng = np.random.default_rng(4)
     T = looking_at(np.array([0.8, 0.6, 0.3]), CENTRE, 1.0)
     picture = pictures_of(hexapod, T, readings_of(hexapod, 1, rng), rng, clutter=0)[0]
@@ -190,7 +190,7 @@ def test_starts_lay_legs_on_bars(hexapod: Mechanism) -> None:
     assert np.degrees(np.arccos(np.clip(cosine.max(), -1.0, 1.0))) < 15.0
 
 
-def test_steps_end_at_the_true_pose_and_shifts_are_found(hexapod: Mechanism) -> None:
+def test_steps_end_at_the_true_pose_and_shifts_are_found(hexapod: Machine) -> None:
     rng = np.random.default_rng(8)
     T = looking_at(np.array([0.8, -0.5, 0.3]), CENTRE, 0.0)
     pictures = pictures_of(hexapod, T, readings_of(hexapod, 3, rng), rng, clutter=0)
@@ -245,19 +245,17 @@ class _Known(Search):
 
 
 def _recognised(
-    mechanism: Mechanism, pictures: list[Picture], hint: RigidTransform | None
+    machine: Machine, pictures: list[Picture], hint: RigidTransform | None
 ) -> Placement:
     """Return what is recognised in the pictures of one view by bars alone: there are no images."""
-    n, n_legs = len(pictures), mechanism.n_legs
+    n, n_legs = len(pictures), machine.n_legs
     rows, names = np.arange(n), tuple(f"{k}.png" for k in range(n))
     measurements = Measurements(
         (View("c1", CAMERA),), names, np.zeros(n, dtype=np.intp), rows, np.zeros((n, n_legs)), 1e-6
     )
-    nowhere, cylinders = np.zeros((n, n_legs, 3)), [leg.cylinders for leg in mechanism.legs]
+    nowhere, cylinders = np.zeros((n, n_legs, 3)), [leg.cylinders for leg in machine.legs]
     wanted = np.ones((1, n_legs), dtype=np.bool_)
-    search = _Known(
-        _no_image, measurements, nowhere, nowhere, cylinders, wanted, mechanism.leg_names
-    )
+    search = _Known(_no_image, measurements, nowhere, nowhere, cylinders, wanted, machine.leg_names)
     _Known.made[:] = pictures
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
@@ -272,7 +270,7 @@ def _no_image(row: int) -> Image:
 
 @pytest.mark.parametrize("hidden", [2, 3])
 def test_many_images_with_a_rough_pose_and_hidden_legs_are_placed(
-    hexapod: Mechanism, hidden: int
+    hexapod: Machine, hidden: int
 ) -> None:
     rng = np.random.default_rng(hidden)
     T = looking_at(np.array([0.8, -0.5, 0.35]), CENTRE, 0.4)
@@ -284,7 +282,7 @@ def test_many_images_with_a_rough_pose_and_hidden_legs_are_placed(
 
 @pytest.mark.parametrize("spread", [0.05, 0.1])
 def test_a_rough_pose_turned_by_a_symmetry_of_the_machine_is_not_believed(
-    hexapod: Mechanism, spread: float
+    hexapod: Machine, spread: float
 ) -> None:
     rng = np.random.default_rng(1)
     T = looking_at(np.array([0.9, 0.3, 0.35]), CENTRE, 0.2)

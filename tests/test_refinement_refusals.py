@@ -195,13 +195,13 @@ def test_lengths_that_no_pose_has_give_the_nearest_pose(session: Session) -> Non
 
 
 def test_legs_of_a_mechanism_bring_names_signs_axes_and_radii() -> None:
-    mechanism = load_mechanism("tricept")
-    legs = fitted_legs(mechanism)
-    assert legs.names == mechanism.leg_names
-    assert legs.sign.tolist() == mechanism.sign.tolist()
-    assert legs.frame_legs == tuple(mechanism.frame_legs)
+    machine = load_mechanism("tricept")
+    legs = fitted_legs(machine)
+    assert legs.names == machine.leg_names
+    assert legs.sign.tolist() == machine.sign.tolist()
+    assert legs.frame_legs == tuple(machine.frame_legs)
     assert legs.spatial
-    assert legs.radii[3, "centre_rod"] == mechanism.legs[3].radius_of_part["centre_rod"]
+    assert legs.radii[3, "centre_rod"] == machine.legs[3].radius_of_part["centre_rod"]
     assert "centre.base_axis.1" in legs.parametrization.names
     assert "centre.twist" in legs.parametrization.names
     assert not fitted_legs(load_mechanism("3-rpr")).spatial

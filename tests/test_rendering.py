@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import UsageError
 from legcal.geometry.types import Array
-from legcal.machine import Mechanism, load_mechanism
+from legcal.machine import Machine, load_mechanism
 from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.rendering.rays import PixelRays
 from legcal.simulation.rendering.scene import prepare_view, render
@@ -53,11 +53,11 @@ LENSES = {
 
 
 @pytest.fixture(scope="module", params=sorted(p.stem for p in (ROOT / "models").glob("*.yaml")))
-def shipped(request: pytest.FixtureRequest) -> Mechanism:
+def shipped(request: pytest.FixtureRequest) -> Machine:
     return load_mechanism(ROOT / "models" / f"{request.param}.yaml")
 
 
-def looking_at(mechanism: Mechanism, solids: tuple[PlacedSolid, ...]) -> RigidTransform:
+def looking_at(machine: Machine, solids: tuple[PlacedSolid, ...]) -> RigidTransform:
     """Return T_base_camera of a camera a little above the machine, which fills its picture."""
     points = np.array([p.T_base_solid.translation for p in solids])
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -206,7 +206,7 @@ def test_a_shadow_falls_opposite_the_lamp_and_soft_lamps_make_it_soft(size: floa
     assert half_shadow <= 6 if size == 0.0 else half_shadow > 12
 
 
-def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Mechanism) -> None:
+def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Machine) -> None:
     solids = placed(solids_of(shipped), link_poses(shipped, shipped.home_configuration))
     camera, T = LENSES["pinhole"], looking_at(shipped, solids)
     image = render(solids, camera, T, Appearance.clean(), np.random.default_rng(0)) / 65535.0
@@ -215,7 +215,7 @@ def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Mechanism)
         assert image[v, u] > 0.3
 
 
-def test_every_mechanism_makes_a_photograph(shipped: Mechanism) -> None:
+def test_every_mechanism_makes_a_photograph(shipped: Machine) -> None:
     solids = placed(dressed(shipped), link_poses(shipped, shipped.home_configuration))
     T, rng = looking_at(shipped, solids), np.random.default_rng(1)
     image = render(solids, LENSES["barrel"], T, Appearance(clutter=4, samples=13), rng)

@@ -26,8 +26,8 @@ def test_a_simulated_dataset_loads_with_the_nominal_model(outlines: SimulatedDat
     assert dataset.measurements.n_rows == 24
     assert dataset.measurements.n_poses == 24
     nominal = legcal.load_mechanism("hexapod")
-    assert np.array_equal(dataset.mechanism.A_base, nominal.A_base)
-    assert dataset.mechanism.yaml_path.is_relative_to(outlines.folder)
+    assert np.array_equal(dataset.machine.A_base, nominal.A_base)
+    assert dataset.machine.yaml_path.is_relative_to(outlines.folder)
 
 
 def test_calibration_comes_much_nearer_to_the_truth(
@@ -54,7 +54,7 @@ def test_outlines_scatter_about_the_true_ones_as_their_covariance_says(
 ) -> None:
     dataset = load_dataset(outlines.folder)
     m = dataset.measurements
-    exact = read_observations(outlines.folder / "truth" / "outlines.csv", dataset.mechanism.legs, m)
+    exact = read_observations(outlines.folder / "truth" / "outlines.csv", dataset.machine.legs, m)
     found = dataset.observations
     assert found is not None
     assert (found.row.tolist(), found.leg.tolist()) == (exact.row.tolist(), exact.leg.tolist())

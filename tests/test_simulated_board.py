@@ -13,7 +13,7 @@ from boards import CHARUCO
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.files import motion_from_xyz_quat
-from legcal.machine import Mechanism, load_mechanism
+from legcal.machine import Machine, load_mechanism
 from legcal.perception.boards import camera_poses
 from legcal.simulation.board import chosen_board
 from legcal.simulation.dataset import simulate
@@ -24,7 +24,7 @@ from legcal.vision.corners import find_corners
 
 
 @cache
-def machine() -> Mechanism:
+def machine() -> Machine:
     return load_mechanism("3-rps")
 
 

@@ -48,7 +48,7 @@ def picture(dataset: Dataset) -> Array:
 
 def true_outlines(dataset: Dataset) -> Outlines:
     path = dataset.folder / "truth" / "outlines.csv"
-    return read_observations(path, dataset.mechanism.legs, dataset.measurements)
+    return read_observations(path, dataset.machine.legs, dataset.measurements)
 
 
 def profiles(image: Array, camera: Camera, ends: Array, other: Array) -> Array:
@@ -111,7 +111,7 @@ def test_photographs_of_every_class_show_the_legs_that_they_are_said_to(
     truth, (view,) = true_outlines(dataset), dataset.measurements.views
     image = picture(dataset)
     assert image.shape == (240, 320)
-    names = dataset.mechanism.leg_names
+    names = dataset.machine.leg_names
     said = {names.index(leg) for leg in view.legs or names}
     assert said <= set(truth.leg.tolist())
     for leg in said:

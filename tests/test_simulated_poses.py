@@ -20,7 +20,7 @@ from legcal.machine import (
     REGULAR,
     Configurations,
     LegKind,
-    Mechanism,
+    Machine,
     forward_kinematics,
     inverse_kinematics,
     leg_vectors,
@@ -34,59 +34,57 @@ SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel
 
 
-def _drawn(
-    mechanism: Mechanism, n: int, sampling: str = "extreme", seed: int = 0
-) -> Configurations:
-    return draw_poses(mechanism, n, np.random.default_rng(seed), sampling)
+def _drawn(machine: Machine, n: int, sampling: str = "extreme", seed: int = 0) -> Configurations:
+    return draw_poses(machine, n, np.random.default_rng(seed), sampling)
 
 
-def _parts(mechanism: Mechanism, poses: Configurations) -> Array:
+def _parts(machine: Machine, poses: Configurations) -> Array:
     """Return where the motors are in their travel, from 0 to 1, (n_poses, n_motors)."""
-    motors = list(mechanism.motors)
-    lower, upper = np.array([mechanism.legs[j].travel for j in motors]).T
+    motors = list(machine.motors)
+    lower, upper = np.array([machine.legs[j].travel for j in motors]).T
     return np.asarray((poses.readings[:, motors] - lower) / (upper - lower))
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> None:
-    mechanism = load_mechanism(name)
-    poses = _drawn(mechanism, 4)
+    machine = load_mechanism(name)
+    poses = _drawn(machine, 4)
     assert len(poses.poses) == 4
-    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
-    least = REGULAR * singularity(mechanism, mechanism.home)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
+    least = REGULAR * singularity(machine, machine.home)
     for configuration, readings, T in zip(
         poses.configurations, poses.readings, poses.poses, strict=True
     ):
-        assert np.abs(mechanism.chain.residual(configuration)).max() < 1e-11
-        np.testing.assert_allclose(readings, inverse_kinematics(mechanism, T), atol=1e-10)
+        assert np.abs(machine.chain.residual(configuration)).max() < 1e-11
+        np.testing.assert_allclose(readings, inverse_kinematics(machine, T), atol=1e-10)
         assert np.all((readings >= lower - 1e-9) & (readings <= upper + 1e-9))
-        assert singularity(mechanism, T) >= least
-        assert side(mechanism, T) == side(mechanism, mechanism.home)
-    part = _parts(mechanism, poses)
+        assert singularity(machine, T) >= least
+        assert side(machine, T) == side(machine, machine.home)
+    part = _parts(machine, poses)
     assert np.ptp(part, axis=0).max() > 0.4
     if name != LONG_TRAVEL:
         assert np.all((part <= JITTER) | (part >= 1.0 - JITTER))
 
 
 def test_long_travel_leaves_some_poses_extreme_and_they_are_counted() -> None:
-    mechanism = load_mechanism(LONG_TRAVEL)
-    poses = _drawn(mechanism, 16)
-    part = _parts(mechanism, poses)
+    machine = load_mechanism(LONG_TRAVEL)
+    poses = _drawn(machine, 16)
+    part = _parts(machine, poses)
     extreme = np.all((part <= JITTER) | (part >= 1.0 - JITTER), axis=1)
-    assert are_extreme(mechanism, poses.readings).tolist() == extreme.tolist()
+    assert are_extreme(machine, poses.readings).tolist() == extreme.tolist()
     assert 2 <= extreme.sum() < 16
 
 
 def test_poses_of_the_workspace_are_anywhere_in_the_travel() -> None:
-    mechanism = load_mechanism("hexapod")
-    part = _parts(mechanism, _drawn(mechanism, 40, "workspace"))
+    machine = load_mechanism("hexapod")
+    part = _parts(machine, _drawn(machine, 40, "workspace"))
     assert np.abs(part.mean(axis=0) - 0.5).max() < 0.2
     assert 0.4 < np.mean((part > 0.25) & (part < 0.75)) < 0.6
 
 
 def test_the_seed_gives_the_same_poses_to_the_last_bit() -> None:
-    mechanism = load_mechanism("3-rps")
-    one, two, other = (_drawn(mechanism, 3, seed=seed) for seed in (4, 4, 5))
+    machine = load_mechanism("3-rps")
+    one, two, other = (_drawn(machine, 3, seed=seed) for seed in (4, 4, 5))
     np.testing.assert_array_equal(one.configurations, two.configurations)
     np.testing.assert_array_equal(one.readings, two.readings)
     assert np.abs(one.readings - other.readings).max() > 1e-3
@@ -94,18 +92,18 @@ def test_the_seed_gives_the_same_poses_to_the_last_bit() -> None:
 
 @pytest.mark.parametrize("name", ["hexapod", "tricept"])
 def test_without_enough_motors_the_machine_wanders(name: str) -> None:
-    mechanism = load_mechanism(name)
-    passive = replace(mechanism.legs[1], kind=LegKind.PASSIVE)
-    free = replace(mechanism, legs=(mechanism.legs[0], passive, *mechanism.legs[2:]))
+    machine = load_mechanism(name)
+    passive = replace(machine.legs[1], kind=LegKind.PASSIVE)
+    free = replace(machine, legs=(machine.legs[0], passive, *machine.legs[2:]))
     poses = _drawn(free, 8)
     lower, upper = np.array([leg.travel for leg in free.legs]).T
     assert np.all((poses.readings >= lower - 1e-9) & (poses.readings <= upper + 1e-9))
     assert np.ptp(poses.readings, axis=0).min() > 1e-3
     for configuration in poses.configurations:
-        assert np.abs(mechanism.chain.residual(configuration)).max() < 1e-11
+        assert np.abs(machine.chain.residual(configuration)).max() < 1e-11
 
 
-def _copy(name: str, folder: Path, change: Callable[[str], str]) -> Mechanism:
+def _copy(name: str, folder: Path, change: Callable[[str], str]) -> Machine:
     """Load a copy of a shipped model with another URDF."""
     for kind, suffix in (("models", "yaml"), ("urdf", "urdf")):
         (folder / kind).mkdir()
@@ -114,7 +112,7 @@ def _copy(name: str, folder: Path, change: Callable[[str], str]) -> Mechanism:
     return load_mechanism(folder / "models" / f"{name}.yaml")
 
 
-def _limited(name: str, joint: str, limits: tuple[float, float], folder: Path) -> Mechanism:
+def _limited(name: str, joint: str, limits: tuple[float, float], folder: Path) -> Machine:
     """Load a copy of a shipped model with other limits of some revolutes."""
     lower, upper = limits
     pattern = re.compile(rf'(<joint name="{joint}".*?<limit )lower="\S*" upper="\S*"')
@@ -181,33 +179,31 @@ def test_no_poses_and_unknown_samplings_are_refused(n: int, sampling: str) -> No
         _drawn(load_mechanism("3-rpr"), n, sampling)
 
 
-def _along(
-    mechanism: Mechanism, T: RigidTransform, j: int, n: int = 40
-) -> list[tuple[Array, float]]:
+def _along(machine: Machine, T: RigidTransform, j: int, n: int = 40) -> list[tuple[Array, float]]:
     """Return points of the axes of a leg's cylinders, and their radii."""
-    vector = leg_vectors(mechanism, T)[j]
+    vector = leg_vectors(machine, T)[j]
     length = float(np.linalg.norm(vector))
     return [
-        (mechanism.A_base[j] + np.linspace(*c.span(length), n)[:, None] * vector / length, c.radius)
-        for c in mechanism.legs[j].cylinders
+        (machine.A_base[j] + np.linspace(*c.span(length), n)[:, None] * vector / length, c.radius)
+        for c in machine.legs[j].cylinders
     ]
 
 
-def _overlap(mechanism: Mechanism, T: RigidTransform, i: int, j: int) -> float:
+def _overlap(machine: Machine, T: RigidTransform, i: int, j: int) -> float:
     """Return by how much the cylinders of two legs overlap, from sampled points [m]."""
     return max(
         r + s - float(np.linalg.norm(P[:, None] - Q[None], axis=-1).min())
-        for P, r in _along(mechanism, T, i)
-        for Q, s in _along(mechanism, T, j)
+        for P, r in _along(machine, T, i)
+        for Q, s in _along(machine, T, j)
     )
 
 
-def _penetration(mechanism: Mechanism, T: RigidTransform) -> float:
+def _penetration(machine: Machine, T: RigidTransform) -> float:
     """Return by how much the cylinders of any two legs overlap [m]."""
-    return max(_overlap(mechanism, T, i, j) for i, j in combinations(range(mechanism.n_legs), 2))
+    return max(_overlap(machine, T, i, j) for i, j in combinations(range(machine.n_legs), 2))
 
 
-def _with_radius(radius: float, folder: Path) -> Mechanism:
+def _with_radius(radius: float, folder: Path) -> Machine:
     """Load a copy of the shipped hexapod with legs of another radius [m]."""
     return _copy(
         "hexapod", folder, lambda text: re.sub(r'radius="[^"]*"', f'radius="{radius}"', text)
@@ -259,9 +255,9 @@ def test_the_distance_of_two_pieces_is_the_smallest_of_their_points(seed: int, f
     assert found >= sampled - step
 
 
-def _csv(folder: Path, mechanism: Mechanism, rows: Array, names: list[str] | None = None) -> Path:
+def _csv(folder: Path, machine: Machine, rows: Array, names: list[str] | None = None) -> Path:
     """Write readings of all motors as a CSV."""
-    header = names or [str(mechanism.legs[j].prismatic) for j in mechanism.motors]
+    header = names or [str(machine.legs[j].prismatic) for j in machine.motors]
     path = folder / "poses.csv"
     lines = [",".join(header), *[",".join(repr(float(q)) for q in row) for row in rows]]
     path.write_text("\n".join([*lines, ""]))
@@ -270,23 +266,23 @@ def _csv(folder: Path, mechanism: Mechanism, rows: Array, names: list[str] | Non
 
 @pytest.mark.parametrize("name", ["hexapod", "tricept", "3-rpr"])
 def test_given_readings_are_reached_in_their_order(name: str, tmp_path: Path) -> None:
-    mechanism = load_mechanism(name)
-    motors = list(mechanism.motors)
-    drawn = _drawn(mechanism, 4)
-    path = _csv(tmp_path, mechanism, drawn.readings[:, motors])
-    found = given_poses(mechanism, path)
+    machine = load_mechanism(name)
+    motors = list(machine.motors)
+    drawn = _drawn(machine, 4)
+    path = _csv(tmp_path, machine, drawn.readings[:, motors])
+    found = given_poses(machine, path)
     np.testing.assert_allclose(found.readings, drawn.readings, atol=1e-10)
     for T, T_drawn, q in zip(found.poses, drawn.poses, found.readings, strict=True):
         np.testing.assert_allclose(T.as_matrix(), T_drawn.as_matrix(), atol=1e-9)
-        alone = forward_kinematics(mechanism, q).as_matrix()
+        alone = forward_kinematics(machine, q).as_matrix()
         np.testing.assert_allclose(T.as_matrix(), alone, atol=1e-9)
 
 
 def test_columns_of_given_readings_may_stand_in_any_order(tmp_path: Path) -> None:
-    mechanism = load_mechanism("3-rps")
+    machine = load_mechanism("3-rps")
     rows = np.array([[0.02, 0.05, 0.09], [0.1, 0.06, 0.01]])
     names = [f"leg{j}_prismatic" for j in (3, 1, 2)]
-    found = given_poses(mechanism, _csv(tmp_path, mechanism, rows[:, [2, 0, 1]], names))
+    found = given_poses(machine, _csv(tmp_path, machine, rows[:, [2, 0, 1]], names))
     np.testing.assert_allclose(found.readings, rows, atol=1e-12)
 
 
@@ -321,26 +317,26 @@ def test_malformed_files_of_poses_are_refused(text: str, said: str, tmp_path: Pa
 
 
 def test_given_readings_that_are_not_reached_are_named_by_row(tmp_path: Path) -> None:
-    mechanism = load_mechanism(LONG_TRAVEL)
+    machine = load_mechanism(LONG_TRAVEL)
     (home, lower, upper) = (
-        inverse_kinematics(mechanism, mechanism.home),
-        *np.array([leg.travel for leg in mechanism.legs]).T,
+        inverse_kinematics(machine, machine.home),
+        *np.array([leg.travel for leg in machine.legs]).T,
     )
     rows = np.array([home, np.where(np.arange(6) % 2 == 0, lower, upper), home + 1e-3])
     with pytest.raises(DatasetError) as caught:
-        given_poses(mechanism, _csv(tmp_path, mechanism, rows))
+        given_poses(machine, _csv(tmp_path, machine, rows))
     (problem,) = caught.value.problems
     assert "row 2 (line 3): the pose could not be used: found legs that cannot have" in problem
 
 
 def test_given_readings_a_little_outside_the_travel_are_refused_by_row(tmp_path: Path) -> None:
-    mechanism = load_mechanism("hexapod")
-    q = inverse_kinematics(mechanism, mechanism.home)
-    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    machine = load_mechanism("hexapod")
+    q = inverse_kinematics(machine, machine.home)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
     rows = np.tile(q, (4, 1))
     rows[1, 2], rows[2, 4], rows[3, 4] = upper[2] + 0.003, lower[4] - 0.001, upper[4]
     with pytest.raises(DatasetError) as caught:
-        given_poses(mechanism, _csv(tmp_path, mechanism, rows))
+        given_poses(machine, _csv(tmp_path, machine, rows))
     one, two = caught.value.problems
     assert "row 2 (line 3)" in one
     assert "leg3_prismatic at 0.147 m, outside its travel of -0.004 to 0.144 m" in one
@@ -359,8 +355,8 @@ def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) ->
 
 
 def test_readings_that_do_not_tell_the_pose_are_refused(tmp_path: Path) -> None:
-    mechanism = load_mechanism("hexapod")
-    passive = replace(mechanism.legs[1], kind=LegKind.PASSIVE)
-    free = replace(mechanism, legs=(mechanism.legs[0], passive, *mechanism.legs[2:]))
+    machine = load_mechanism("hexapod")
+    passive = replace(machine.legs[1], kind=LegKind.PASSIVE)
+    free = replace(machine, legs=(machine.legs[0], passive, *machine.legs[2:]))
     with pytest.raises(UsageError, match="found a machine of 6 freedoms and 5 motors"):
         given_poses(free, tmp_path / "poses.csv")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import Layout, LegSpec, Machine, write_machine
+from layouts import Layout, LegSpec, MachineSpec, write_machine
 from machines import planar, ring
 from mechanisms import ROOT, displaced
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -14,7 +14,7 @@ from legcal.errors import DidNotConverge
 from legcal.machine import (
     Follower,
     LegKind,
-    Mechanism,
+    Machine,
     forward_kinematics,
     inverse_kinematics,
     leg_vectors,
@@ -27,37 +27,37 @@ from legcal.machine.mobility import dimensionless, side
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 
 
-def _turned(mechanism: Mechanism, degrees: float, height: float = 0.4) -> RigidTransform:
+def _turned(machine: Machine, degrees: float, height: float = 0.4) -> RigidTransform:
     """Return home turned about z, from the attitude in which base and platform are symmetric."""
-    turn = Rotation.from_euler("z", degrees, degrees=True) * mechanism.home.rotation
+    turn = Rotation.from_euler("z", degrees, degrees=True) * machine.home.rotation
     return RigidTransform.from_components([0.0, 0.0, height], turn)
 
 
 def test_leg_lines_alone_say_the_same_as_all_equations_of_a_hexapod() -> None:
-    mechanism = load_mechanism("hexapod-strut")
-    T = displaced(mechanism.home, [0.1, 0.2, -0.1, 0.02, 0.03, 0.01])
-    jacobian = demands_at(mechanism, T).by_pose[0]
-    lengths = np.linalg.norm(leg_vectors(mechanism, T), axis=1)
-    centre = T.rotation.apply(mechanism.B_platform.mean(axis=0))
+    machine = load_mechanism("hexapod-strut")
+    T = displaced(machine.home, [0.1, 0.2, -0.1, 0.02, 0.03, 0.01])
+    jacobian = demands_at(machine, T).by_pose[0]
+    lengths = np.linalg.norm(leg_vectors(machine, T), axis=1)
+    centre = T.rotation.apply(machine.B_platform.mean(axis=0))
     moments = (jacobian[:, :3] - np.cross(centre, jacobian[:, 3:])) / lengths.mean()
     expected = np.hstack([moments, jacobian[:, 3:]])
-    np.testing.assert_allclose(dimensionless(mechanism, T), expected, atol=1e-12)
+    np.testing.assert_allclose(dimensionless(machine, T), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_home_of_a_shipped_model_is_regular(name: str) -> None:
-    mechanism = load_mechanism(name)
-    assert singularity(mechanism, mechanism.home) > 0.03
+    machine = load_mechanism(name)
+    assert singularity(machine, machine.home) > 0.03
 
 
 @pytest.mark.parametrize("quarter", [90.0, -90.0])
 def test_a_symmetric_hexapod_is_singular_after_a_quarter_turn(quarter: float) -> None:
     # Fichter: at 90 degrees about the normal all leg lines belong to one linear complex
-    mechanism = load_mechanism("hexapod")
+    machine = load_mechanism("hexapod")
     for height in (0.3, 0.5):
-        assert singularity(mechanism, _turned(mechanism, quarter, height)) < 1e-6  # digits
+        assert singularity(machine, _turned(machine, quarter, height)) < 1e-6  # digits
         for degrees in (quarter - 20.0, quarter + 20.0):
-            assert singularity(mechanism, _turned(mechanism, degrees, height)) > 0.05
+            assert singularity(machine, _turned(machine, degrees, height)) > 0.05
 
 
 def test_similar_hexagons_in_the_same_order_are_singular_everywhere(tmp_path: Path) -> None:
@@ -68,19 +68,19 @@ def test_similar_hexagons_in_the_same_order_are_singular_everywhere(tmp_path: Pa
         LegSpec("US", a, np.asarray(home.apply(b)), base_axis=np.array([1.0, 0.0, 0.0]))
         for a, b in zip(A, B, strict=True)
     )
-    mechanism = load_mechanism(write_machine(tmp_path, Machine(legs, home), Layout()))
+    machine = load_mechanism(write_machine(tmp_path, MachineSpec(legs, home), Layout()))
     for step in ([0.0] * 6, [0.2, 0.1, -0.1, 0.03, 0.02, 0.05]):
-        assert singularity(mechanism, displaced(home, step)) < 1e-12
+        assert singularity(machine, displaced(home, step)) < 1e-12
 
 
 def test_a_hexapod_whose_legs_lie_in_its_base_is_singular() -> None:
-    mechanism = load_mechanism("hexapod")
-    assert singularity(mechanism, _turned(mechanism, 0.0, height=0.0)) < 1e-12
+    machine = load_mechanism("hexapod")
+    assert singularity(machine, _turned(machine, 0.0, height=0.0)) < 1e-12
 
 
 def test_a_planar_platform_is_singular_where_its_legs_meet_in_a_point(tmp_path: Path) -> None:
-    mechanism = load_mechanism("3-rpr")
-    A, B = mechanism.A_base, mechanism.B_platform
+    machine = load_mechanism("3-rpr")
+    A, B = machine.A_base, machine.B_platform
     centre = B.mean(axis=0)
     about = A.mean(axis=0)
 
@@ -89,28 +89,28 @@ def test_a_planar_platform_is_singular_where_its_legs_meet_in_a_point(tmp_path: 
         return RigidTransform.from_components(about - turn.apply(centre), turn)
 
     angles = np.linspace(-np.pi, np.pi, 721)
-    measures = [singularity(mechanism, at(a)) for a in angles]
+    measures = [singularity(machine, at(a)) for a in angles]
     # both triangles are regular: legs meet in the centre where the platform's corners face them
     best = float(angles[int(np.argmin(measures))])
-    lines = leg_vectors(mechanism, at(best))[:, :2]
+    lines = leg_vectors(machine, at(best))[:, :2]
     moments = A[:, 0] * lines[:, 1] - A[:, 1] * lines[:, 0]
     concurrent = np.linalg.det(np.column_stack([lines, moments]))
     assert min(measures) < 2e-3
     assert abs(concurrent) < 1e-4
-    assert singularity(mechanism, at(best + 0.5 * np.pi)) > 0.1
+    assert singularity(machine, at(best + 0.5 * np.pi)) > 0.1
 
 
 def test_the_measure_is_the_concurrency_determinant_of_a_planar_platform(tmp_path: Path) -> None:
-    mechanism = load_mechanism(write_machine(tmp_path, planar(), Layout()))
+    machine = load_mechanism(write_machine(tmp_path, planar(), Layout()))
     for angle in np.linspace(-1.0, 1.0, 9):
-        T = displaced(mechanism.home, [0.0, 0.0, angle, 0.01, 0.02, 0.0])
-        vectors = leg_vectors(mechanism, T)
+        T = displaced(machine.home, [0.0, 0.0, angle, 0.01, 0.02, 0.0])
+        vectors = leg_vectors(machine, T)
         u = vectors / np.linalg.norm(vectors, axis=1)[:, None]
-        A = mechanism.A_base
+        A = machine.A_base
         moments = A[:, 0] * u[:, 1] - A[:, 1] * u[:, 0]
         lines = np.column_stack([moments, u[:, :2]])
-        assert abs(side(mechanism, T)) == 1.0
-        found = dimensionless(mechanism, T)
+        assert abs(side(machine, T)) == 1.0
+        found = dimensionless(machine, T)
         scale = np.linalg.norm(vectors, axis=1).mean()
         assert abs(np.linalg.det(found)) == pytest.approx(
             abs(np.linalg.det(lines)) / scale, abs=1e-9
@@ -118,24 +118,24 @@ def test_the_measure_is_the_concurrency_determinant_of_a_planar_platform(tmp_pat
 
 
 def test_a_3_upu_is_singular_in_its_constraints_where_all_legs_are_parallel() -> None:
-    mechanism = load_mechanism("3-upu")
+    machine = load_mechanism("3-upu")
     measures = []
     for height in (0.45, 5.0, 50.0):
-        T = RigidTransform.from_components([0.0, 0.0, height], mechanism.home.rotation)
-        rows = dimensionless(mechanism, T)[~demands_at(mechanism, T).measured]
+        T = RigidTransform.from_components([0.0, 0.0, height], machine.home.rotation)
+        rows = dimensionless(machine, T)[~demands_at(machine, T).measured]
         measures.append(float(np.linalg.svd(rows, compute_uv=False)[2]))
     assert measures[0] > 5.0 * measures[1] > 20.0 * measures[2]
 
 
 def test_a_3_upu_in_its_base_plane_has_no_hold_on_its_attitude() -> None:
     # all legs lie in the plane: nothing but the plane's own couple is left
-    mechanism = load_mechanism("3-upu")
-    T = RigidTransform.from_components([0.0, 0.0, 0.0], mechanism.home.rotation)
-    assert singularity(mechanism, T) < 1e-9
+    machine = load_mechanism("3-upu")
+    T = RigidTransform.from_components([0.0, 0.0, 0.0], machine.home.rotation)
+    assert singularity(machine, T) < 1e-9
 
 
 def test_the_measure_does_not_depend_on_size_or_frames(tmp_path: Path) -> None:
-    def machine(scale: float, shift: np.ndarray) -> Machine:
+    def description(scale: float, shift: np.ndarray) -> MachineSpec:
         angles, turned = (
             [10.0, 110.0, 130.0, 230.0, 250.0, 350.0],
             [50.0, 70.0, 170.0, 190.0, 290.0, 310.0],
@@ -147,41 +147,41 @@ def test_the_measure_does_not_depend_on_size_or_frames(tmp_path: Path) -> None:
             LegSpec("US", a + shift, np.asarray(home.apply(b)), base_axis=np.array([1.0, 0.0, 0.0]))
             for a, b in zip(A, B, strict=True)
         )
-        return Machine(legs, home)
+        return MachineSpec(legs, home)
 
     found = []
     for k, (scale, shift) in enumerate([(1.0, 0.0), (4.0, 0.0), (1.0, 2.0)]):
-        path = write_machine(tmp_path / str(k), machine(scale, np.full(3, shift)), Layout())
-        mechanism = load_mechanism(path)
-        found.append(singularity(mechanism, mechanism.home))
+        path = write_machine(tmp_path / str(k), description(scale, np.full(3, shift)), Layout())
+        machine = load_mechanism(path)
+        found.append(singularity(machine, machine.home))
     np.testing.assert_allclose(found[1:], found[0], rtol=1e-9)
 
 
 def test_forward_kinematics_does_not_pass_a_singular_attitude() -> None:
-    mechanism = load_mechanism("hexapod")
-    here = side(mechanism, mechanism.home)
-    beyond = _turned(mechanism, 100.0)
-    assert side(mechanism, beyond) == -here
-    follower = Follower(mechanism)
+    machine = load_mechanism("hexapod")
+    here = side(machine, machine.home)
+    beyond = _turned(machine, 100.0)
+    assert side(machine, beyond) == -here
+    follower = Follower(machine)
     for degrees in (20.0, 40.0, 60.0, 75.0):
-        wanted = _turned(mechanism, degrees)
-        reached = follower.move_to(inverse_kinematics(mechanism, wanted))
+        wanted = _turned(machine, degrees)
+        reached = follower.move_to(inverse_kinematics(machine, wanted))
         np.testing.assert_allclose(reached.as_matrix(), wanted.as_matrix(), atol=1e-9)
     # the same lengths have a pose on this side: it is found, and not the one beyond
-    back = forward_kinematics(mechanism, inverse_kinematics(mechanism, beyond))
-    assert side(mechanism, back) == here
+    back = forward_kinematics(machine, inverse_kinematics(machine, beyond))
+    assert side(machine, back) == here
     assert (back.rotation * beyond.rotation.inv()).magnitude() > 0.1
-    there = forward_kinematics(mechanism, inverse_kinematics(mechanism, beyond), start=beyond)
+    there = forward_kinematics(machine, inverse_kinematics(machine, beyond), start=beyond)
     np.testing.assert_allclose(there.as_matrix(), beyond.as_matrix(), atol=1e-9)
     with pytest.raises(DidNotConverge, match="or the mechanism is singular"):
         follower.move_to(np.array([0.5, 0.07, 0.07, 0.07, 0.07, 0.07]))
     np.testing.assert_allclose(
-        follower.pose.as_matrix(), _turned(mechanism, 75.0).as_matrix(), atol=1e-9
+        follower.pose.as_matrix(), _turned(machine, 75.0).as_matrix(), atol=1e-9
     )
 
 
 def test_a_mechanism_with_too_few_motors_measures_zero() -> None:
-    mechanism = load_mechanism("hexapod")
-    passive = replace(mechanism.legs[0], kind=LegKind.PASSIVE)
-    loose = replace(mechanism, legs=(passive, *mechanism.legs[1:]))
+    machine = load_mechanism("hexapod")
+    passive = replace(machine.legs[0], kind=LegKind.PASSIVE)
+    loose = replace(machine, legs=(passive, *machine.legs[1:]))
     assert singularity(loose, loose.home) == 0.0

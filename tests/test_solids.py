@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
-from legcal.machine import Mechanism, load_mechanism
+from legcal.machine import Machine, load_mechanism
 from legcal.simulation.poses import draw_poses
 from legcal.simulation.solids import (
     Box,
@@ -36,7 +36,7 @@ endsolid one
 """
 
 
-def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Mechanism:
+def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Machine:
     """Return the hexapod with visuals on its platform and materials in its file."""
     (folder / "models").mkdir()
     (folder / "urdf").mkdir()
@@ -50,12 +50,12 @@ def hexapod_showing(folder: Path, visuals: str, materials: str = "") -> Mechanis
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_leg_cylinders_stand_on_the_lines_of_their_legs(name: str) -> None:
-    mechanism = load_mechanism(ROOT / "models" / f"{name}.yaml")
-    solids = solids_of(mechanism)
-    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
-    counted = {(j, c.link) for j, leg in enumerate(mechanism.legs) for c in leg.cylinders}
+    machine = load_mechanism(ROOT / "models" / f"{name}.yaml")
+    solids = solids_of(machine)
+    A, B = machine.A_base, machine.home.apply(machine.B_platform)
+    counted = {(j, c.link) for j, leg in enumerate(machine.legs) for c in leg.cylinders}
     assert {(s.leg, s.part) for s in solids if s.leg is not None} == counted
-    for p in placed(solids, link_poses(mechanism, mechanism.home_configuration)):
+    for p in placed(solids, link_poses(machine, machine.home_configuration)):
         if p.solid.leg is not None:
             along = B[p.solid.leg] - A[p.solid.leg]
             axis = p.T_base_solid.rotation.as_matrix()[:, 2]
@@ -67,7 +67,7 @@ def test_leg_cylinders_stand_on_the_lines_of_their_legs(name: str) -> None:
 def test_every_shape_is_read_with_its_pose_and_colour(tmp_path: Path) -> None:
     (tmp_path / "urdf_meshes").mkdir()
     (tmp_path / "urdf_meshes" / "one.stl").write_bytes(STL)
-    mechanism = hexapod_showing(
+    machine = hexapod_showing(
         tmp_path,
         '<visual><origin xyz="0.1 0 0" rpy="0 0 1.5"/><material name="red"/>'
         '<geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
@@ -76,7 +76,7 @@ def test_every_shape_is_read_with_its_pose_and_colour(tmp_path: Path) -> None:
         '</geometry><material name="own"><color rgba="0.2 0.4 0.6 1"/></material></visual>',
         '<material name="red"><color rgba="0.9 0.3 0.3 1"/></material>',
     )
-    box, ball, mesh = (s for s in solids_of(mechanism) if s.link == "platform")
+    box, ball, mesh = (s for s in solids_of(machine) if s.link == "platform")
     assert box.shape == Box((0.1, 0.2, 0.3))
     assert box.T_link_solid.translation == pytest.approx([0.1, 0.0, 0.0])
     assert box.T_link_solid.rotation.as_euler("xyz") == pytest.approx([0.0, 0.0, 1.5])
@@ -110,21 +110,21 @@ def test_visuals_that_cannot_be_shown_are_named(tmp_path: Path, visual: str, mes
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_visuals_stand_where_the_scene_of_yourdfpy_shows_them(name: str) -> None:
-    mechanism = load_mechanism(ROOT / "models" / f"{name}.yaml")
-    robot = URDF.load(io.BytesIO(mechanism.urdf.content))
-    joints = mechanism.urdf.joints.values()
+    machine = load_mechanism(ROOT / "models" / f"{name}.yaml")
+    robot = URDF.load(io.BytesIO(machine.urdf.content))
+    joints = machine.urdf.joints.values()
     parents = {joint.child: joint.parent for joint in joints if joint.type != "floating"}
-    for configuration in draw_poses(mechanism, 2, np.random.default_rng(0)).configurations:
+    for configuration in draw_poses(machine, 2, np.random.default_rng(0)).configurations:
         q = {
-            joint.name: float(configuration[mechanism.chain.q_index(joint.name)])
+            joint.name: float(configuration[machine.chain.q_index(joint.name)])
             for joint in joints
             if joint.type in ("revolute", "prismatic")
         }
         robot.update_cfg(q)
-        poses = link_poses(mechanism, configuration)
+        poses = link_poses(machine, configuration)
         shown = [robot.scene.graph.get(node) for node in robot.scene.graph.nodes_geometry]
-        ours = placed(solids_of(mechanism), poses)
-        assert len(ours) == len(shown) >= mechanism.n_legs
+        ours = placed(solids_of(machine), poses)
+        assert len(ours) == len(shown) >= machine.n_legs
         for p in ours:
             root = str(p.solid.link)
             while root in parents:  # it knows no loops: legs hang where the tree has them
@@ -143,12 +143,12 @@ def test_visuals_stand_where_the_scene_of_yourdfpy_shows_them(name: str) -> None
 
 def test_a_mesh_is_scaled_and_placed_as_yourdfpy_shows_it(tmp_path: Path) -> None:
     (tmp_path / "one.stl").write_bytes(STL)
-    mechanism = hexapod_showing(
+    machine = hexapod_showing(
         tmp_path,
         '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/>'
         '<geometry><mesh filename="../one.stl" scale="0.1 -0.2 0.3"/></geometry></visual>',
     )
-    (mesh,) = (s for s in solids_of(mechanism) if s.link == "platform")
+    (mesh,) = (s for s in solids_of(machine) if s.link == "platform")
     assert isinstance(mesh.shape, Mesh)
     turn = Rotation.from_euler("xyz", [0.4, 0.5, 0.6])
     expected = turn.apply([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, -0.2, 0.0]])
@@ -162,11 +162,11 @@ def test_a_mesh_is_scaled_and_placed_as_yourdfpy_shows_it(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> None:
-    mechanism = load_mechanism(ROOT / "models" / f"{name}.yaml")
-    solids = placed(dressed(mechanism), link_poses(mechanism, mechanism.home_configuration))
+    machine = load_mechanism(ROOT / "models" / f"{name}.yaml")
+    solids = placed(dressed(machine), link_poses(machine, machine.home_configuration))
     balls = [p.T_base_solid.translation for p in solids if isinstance(p.solid.shape, Sphere)]
-    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
-    ends = [A, B[[leg.platform_joint != "" for leg in mechanism.legs]]]
+    A, B = machine.A_base, machine.home.apply(machine.B_platform)
+    ends = [A, B[[leg.platform_joint != "" for leg in machine.legs]]]
     assert np.allclose(balls, np.concatenate(ends), atol=1e-6)
     plates = [p for p in solids if p.solid.name.endswith("_plate")]
     assert len(plates) == 2
@@ -179,16 +179,16 @@ def test_dressing_carries_every_joint_and_leaves_the_legs_free(name: str) -> Non
 
 
 def test_plates_of_a_planar_machine_lie_below_its_legs_and_each_other() -> None:
-    mechanism = load_mechanism("3-rpr")
-    solids = placed(dressed(mechanism), link_poses(mechanism, mechanism.home_configuration))
+    machine = load_mechanism("3-rpr")
+    solids = placed(dressed(machine), link_poses(machine, machine.home_configuration))
     heights = {
-        p.solid.name: (p.T_base_solid.translation - mechanism.A_base[0]) @ mechanism.base_normal
+        p.solid.name: (p.T_base_solid.translation - machine.A_base[0]) @ machine.base_normal
         for p in solids
     }
-    base, platform = (heights[f"{end}_plate"] for end in (mechanism.base, mechanism.platform))
+    base, platform = (heights[f"{end}_plate"] for end in (machine.base, machine.platform))
     thickness = max(
         s.shape.length
-        for s in dressed(mechanism)
+        for s in dressed(machine)
         if s.name.endswith("_plate") and isinstance(s.shape, Cylinder)
     )
     assert base + thickness < platform
@@ -203,8 +203,8 @@ def test_a_link_with_visuals_of_its_own_is_not_dressed(tmp_path: Path) -> None:
 
 
 def test_a_solid_without_a_link_stays_in_the_base_frame() -> None:
-    mechanism = load_mechanism("hexapod")
-    one = solids_of(mechanism)[0]
+    machine = load_mechanism("hexapod")
+    one = solids_of(machine)[0]
     free = type(one)("free", None, one.shape, RigidTransform.from_translation([1.0, 2.0, 3.0]))
     (found,) = placed([free], {})
     assert found.T_base_solid.translation == pytest.approx([1.0, 2.0, 3.0])

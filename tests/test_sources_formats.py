@@ -15,7 +15,7 @@ from legcal import load_mechanism
 from legcal.cli import main
 from legcal.errors import LegcalError, UsageError
 from legcal.geometry.types import Array
-from legcal.machine import Mechanism, geometries
+from legcal.machine import Machine, geometries
 from legcal.machine.written import reload_and_check, write_calibrated_yaml, write_model, write_urdf
 
 MACHINES = ("hexapod", "3-upu", "3-rpr", "tricept", "hexapod-strut")
@@ -30,7 +30,7 @@ def _difference(one: Array | float | None, two: Array | float | None) -> float:
     return float(np.nanmax(np.abs(np.nan_to_num(one) - np.nan_to_num(two))))
 
 
-def assert_same_analysis(found: Mechanism, expected: Mechanism) -> None:
+def assert_same_analysis(found: Machine, expected: Machine) -> None:
     """Check that two mechanisms are one, legs matched by where they stand."""
     assert (found.spatial, found.mobility, found.n_legs) == (
         expected.spatial,
@@ -142,16 +142,16 @@ def test_what_is_written_down_loads_with_an_equal_analysis(
 
 
 def test_a_urdf_that_needs_no_change_is_copied_byte_for_byte(tmp_path: Path) -> None:
-    mechanism = machine_of("hexapod")
-    _, urdf_path = write_model(mechanism, tmp_path)
-    assert urdf_path.read_bytes() == mechanism.urdf_path.read_bytes()
+    machine = machine_of("hexapod")
+    _, urdf_path = write_model(machine, tmp_path)
+    assert urdf_path.read_bytes() == machine.urdf_path.read_bytes()
 
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:
-    mechanism = machine_of("hexapod")
-    write_model(mechanism, tmp_path)
+    machine = machine_of("hexapod")
+    write_model(machine, tmp_path)
     with pytest.raises(UsageError, match="already there, needed new files"):
-        write_model(mechanism, tmp_path)
+        write_model(machine, tmp_path)
 
 
 def _gepetto_robots() -> Path | None:
@@ -166,14 +166,14 @@ def test_the_six_sps_leg_of_gepetto_is_understood() -> None:
     robots = _gepetto_robots()
     if robots is None:
         pytest.skip("set LEGCAL_GEPETTO to a checkout of Gepetto/example-parallel-robots")
-    mechanism = load_mechanism(robots / "wl16_like")
-    assert [leg.type for leg in mechanism.legs] == ["SPS"] * 6
-    assert (mechanism.mobility, len(mechanism.motors)) == (6, 6)
-    assert (mechanism.base, mechanism.platform) == ("hip_part", "foot_part")
-    q0 = {leg.prismatic: leg.q0 for leg in mechanism.legs}
+    machine = load_mechanism(robots / "wl16_like")
+    assert [leg.type for leg in machine.legs] == ["SPS"] * 6
+    assert (machine.mobility, len(machine.motors)) == (6, 6)
+    assert (machine.base, machine.platform) == ("hip_part", "foot_part")
+    q0 = {leg.prismatic: leg.q0 for leg in machine.legs}
     assert q0["motor_6"] == pytest.approx(0.3582 + 0.198, abs=1e-12)
     assert q0["motor_1"] == pytest.approx(0.4878 + 0.099 + 0.099, abs=1e-12)
-    assert any("6 legs have an S joint at both ends" in note for note in mechanism.diagnostics)
+    assert any("6 legs have an S joint at both ends" in note for note in machine.diagnostics)
 
 
 def test_the_other_robots_of_gepetto_are_refused_in_one_sentence() -> None:

@@ -147,10 +147,10 @@ def test_free_bodies_lights_and_meshes_of_a_scene_are_left_out(tmp_path: Path) -
     )
     path = tmp_path / "machine.xml"
     path.write_text(MJCF.replace("</worldbody>", scene))
-    mechanism = load_mechanism(path)
-    assert mechanism.n_legs == 6
+    machine = load_mechanism(path)
+    assert machine.n_legs == 6
     assert any("Free bodies that touch no loop were left out: 'ball'" in note
-               for note in mechanism.diagnostics)  # fmt: skip
+               for note in machine.diagnostics)  # fmt: skip
 
 
 def test_what_moves_no_joint_is_left_alone(tmp_path: Path) -> None:
@@ -164,9 +164,9 @@ def test_what_moves_no_joint_is_left_alone(tmp_path: Path) -> None:
 def test_slides_without_a_range_are_noted(tmp_path: Path) -> None:
     path = tmp_path / "machine.xml"
     path.write_text(MJCF.replace('range="-0.004 0.144"', ""))
-    mechanism = load_mechanism(path)
-    assert any("gives no travel for 6 sliders" in note for note in mechanism.diagnostics)
-    reach = [leg.travel[1] - leg.travel[0] for leg in mechanism.legs]
+    machine = load_mechanism(path)
+    assert any("gives no travel for 6 sliders" in note for note in machine.diagnostics)
+    reach = [leg.travel[1] - leg.travel[0] for leg in machine.legs]
     assert max(reach) < 0.1
 
 

@@ -23,7 +23,7 @@ from legcal.paper.joints_in_base import (
 )
 from legcal.paper.joints_in_camera import locate_joints_in_cameras, oriented
 from legcal.paper.motions import turned_axis
-from legcal.paper.nominal import NominalMechanism
+from legcal.paper.nominal import NominalMachine
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 ACROSS = np.array([[0.3, 1.0, 0.0], [-0.2, 1.0, 0.1], [1.0, 0.2, 0.0], [0.1, 0.4, 1.0]])
@@ -263,7 +263,7 @@ def plane_with_joints_on_a_line(A: Array, B: Array, nominal_A: Array) -> Observe
         for P in (nominal_A, A)
     )
     return Observed(
-        NominalMechanism(("leg1", "leg2", "leg3"), nominal, np.ones(3), (0, 1)),
+        NominalMachine(("leg1", "leg2", "leg3"), nominal, np.ones(3), (0, 1)),
         LegAxes(np.repeat(rows, 3), leg, u, M, normal_basis(u), covariance),
         Measurements(
             (View("c1", PINHOLE), View("c2", PINHOLE)), ("",) * 12, view, rows, length - 0.1, 2e-6

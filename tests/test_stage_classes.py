@@ -76,9 +76,9 @@ def test_literal_steps_are_exact_where_their_equations_have_full_rank(name: str)
 
 def test_the_ranks_of_9_tell_for_which_machines_it_is_exact() -> None:
     for name in ("3-rpr", "3-rps"):
-        mechanism = load_mechanism(name)
-        views = [tuple(range(mechanism.n_legs))]
-        ranks = Analysis(planned_session(mechanism, views, 4)).step_ranks
+        machine = load_mechanism(name)
+        views = [tuple(range(machine.n_legs))]
+        ranks = Analysis(planned_session(machine, views, 4)).step_ranks
         (rank,) = [r for r in ranks if (r.name, r.criteria) == ("base_joints", "literal")]
         assert (rank.rank == rank.of) == (name in FULL_RANK)
 
@@ -105,11 +105,11 @@ VIEWS = [
 def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
     name: str, views: tuple[tuple[int, ...], ...]
 ) -> None:
-    mechanism = load_mechanism(name)
-    session = planned_session(mechanism, views, 8)
+    machine = load_mechanism(name)
+    session = planned_session(machine, views, 8)
     ranks = [r for r in Analysis(session).step_ranks if r.criteria == "default"]
     determined = {r.name: r.rank == r.of for r in ranks}
-    observed = planned(session, mechanism.sign)
+    observed = planned(session, machine.sign)
     assert determined["joints_in_cameras"]
     if determined["base_joints"]:
         steps = three_steps(observed)

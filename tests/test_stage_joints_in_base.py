@@ -12,18 +12,18 @@ from legcal.machine import KinematicParameters
 from legcal.paper.joints_in_base import JointsInBase, build_scalar_products, locate_joints_in_base
 from legcal.paper.joints_in_camera import locate_joints_in_cameras
 from legcal.paper.nominal import Criteria
-from legcal.simulation.hexapod import HexapodSession, Machine, hexapod
+from legcal.simulation.hexapod import HexapodSession, PaperHexapod, hexapod
 from legcal.simulation.paper import nominal_of
 
 
 def _locate(
-    session: HexapodSession, nominal: Machine, criteria: Criteria = "default"
+    session: HexapodSession, nominal: PaperHexapod, criteria: Criteria = "default"
 ) -> JointsInBase:
     joints = locate_joints_in_cameras(nominal_of(nominal), session.axes, session.measurements)
     return locate_joints_in_base(nominal_of(nominal), joints, criteria=criteria)
 
 
-def _with_base(machine: Machine, A_Rb: Array) -> Machine:
+def _with_base(machine: PaperHexapod, A_Rb: Array) -> PaperHexapod:
     parameters = KinematicParameters(
         A_Rb, machine.parameters.platform_joints, machine.parameters.offsets
     )

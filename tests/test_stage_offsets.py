@@ -20,12 +20,14 @@ from legcal.paper.leg_directions import (
 )
 from legcal.paper.nominal import Criteria
 from legcal.paper.offsets import build_consecutive, identify_offsets, leg_ends, pairs_apart
-from legcal.simulation.hexapod import HexapodSession, Machine
+from legcal.simulation.hexapod import HexapodSession, PaperHexapod
 from legcal.simulation.observe import OutlineNoise
 from legcal.simulation.paper import nominal_of
 
 
-def _directions(session: HexapodSession, nominal: Machine, criteria: Criteria) -> LegDirections:
+def _directions(
+    session: HexapodSession, nominal: PaperHexapod, criteria: Criteria
+) -> LegDirections:
     joints = locate_joints_in_cameras(
         nominal_of(nominal), session.axes, session.measurements, criteria=criteria
     )

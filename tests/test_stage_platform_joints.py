@@ -12,12 +12,12 @@ from legcal.paper.four_steps import run_steps
 from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
 from legcal.paper.leg_directions import LegDirections, directions_through_joints
-from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.nominal import Criteria, NominalMachine
 from legcal.paper.offsets import Offsets, identify_offsets
 from legcal.paper.platform import PlatformJoints, locate_platform_joints
 from legcal.simulation.hexapod import (
     HexapodSession,
-    Machine,
+    PaperHexapod,
     cameras_around,
     hexapod,
     hexapod_session,
@@ -31,7 +31,7 @@ from legcal.simulation.paper import nominal_of
 class Before:
     """What steps 1 to 3 give."""
 
-    mechanism: NominalMechanism
+    machine: NominalMachine
     joints: JointsInCamera
     base: JointsInBase
     directions: LegDirections
@@ -40,17 +40,17 @@ class Before:
     def platform(self, criteria: Criteria = "default") -> PlatformJoints:
         """Return the result of step 4."""
         known = (self.joints, self.base, self.directions, self.offsets)
-        return locate_platform_joints(self.mechanism, *known, 2e-6, criteria=criteria)
+        return locate_platform_joints(self.machine, *known, 2e-6, criteria=criteria)
 
 
-def _until_offsets(session: HexapodSession, nominal: Machine) -> Before:
+def _until_offsets(session: HexapodSession, nominal: PaperHexapod) -> Before:
     axes, measurements = session.axes, session.measurements
-    mechanism = nominal_of(nominal)
-    joints = locate_joints_in_cameras(mechanism, axes, measurements)
-    base = locate_joints_in_base(mechanism, joints)
-    directions = directions_through_joints(mechanism, axes, measurements, joints, base)
-    offsets = identify_offsets(mechanism, directions, measurements.sigma_q)
-    return Before(mechanism, joints, base, directions, offsets)
+    machine = nominal_of(nominal)
+    joints = locate_joints_in_cameras(machine, axes, measurements)
+    base = locate_joints_in_base(machine, joints)
+    directions = directions_through_joints(machine, axes, measurements, joints, base)
+    offsets = identify_offsets(machine, directions, measurements.sigma_q)
+    return Before(machine, joints, base, directions, offsets)
 
 
 @pytest.mark.parametrize("coplanar", [False, True])

@@ -14,12 +14,14 @@ from legcal.geometry.types import IntArray
 from legcal.machine import KinematicParameters
 from legcal.paper.four_steps import StagedResult, run_steps
 from legcal.paper.nominal import Criteria
-from legcal.simulation.hexapod import HexapodSession, Machine, extreme_poses
+from legcal.simulation.hexapod import HexapodSession, PaperHexapod, extreme_poses
 from legcal.simulation.observe import OutlineNoise, TableNoise, shifted_outlines
 from legcal.simulation.paper import nominal_of, platform_errors
 
 
-def _run(session: HexapodSession, nominal: Machine, criteria: Criteria = "default") -> StagedResult:
+def _run(
+    session: HexapodSession, nominal: PaperHexapod, criteria: Criteria = "default"
+) -> StagedResult:
     return run_steps(nominal_of(nominal), session.axes, session.measurements, criteria=criteria)
 
 
@@ -67,8 +69,8 @@ def test_turning_the_cameras_where_they_stand_changes_nothing() -> None:
 
 
 def _relabelled(
-    session: HexapodSession, nominal: Machine, order: IntArray
-) -> tuple[HexapodSession, Machine]:
+    session: HexapodSession, nominal: PaperHexapod, order: IntArray
+) -> tuple[HexapodSession, PaperHexapod]:
     """Return the session and the nominal machine with leg order[i] in place i."""
     place = np.argsort(order)
     axes, measurements = session.axes, session.measurements

@@ -65,9 +65,9 @@ def off(observed: Observed, legs: tuple[Leg, ...], *, twists: bool = False) -> A
 
 def open_space(name: str, parametrization: Parametrization) -> Array:
     """Return an orthonormal basis (w, p) of what the staged ranks leave open, turns as metres."""
-    mechanism = load_mechanism(name)
-    views = [tuple(range(mechanism.n_legs))] * 3
-    ranks = Analysis(planned_session(mechanism, views, 6)).staged
+    machine = load_mechanism(name)
+    views = [tuple(range(machine.n_legs))] * 3
+    ranks = Analysis(planned_session(machine, views, 6)).staged
     assert ranks.complete
     rows = np.zeros((len(ranks.weak), len(parametrization)))
     for row, weak in zip(rows, ranks.weak, strict=True):
@@ -169,10 +169,10 @@ VIEWS = [
 def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
     name: str, views: tuple[tuple[int, ...], ...]
 ) -> None:
-    mechanism = load_mechanism(name)
-    session = planned_session(mechanism, views, 8)
+    machine = load_mechanism(name)
+    session = planned_session(machine, views, 8)
     ranks = Analysis(session).staged
-    observed = planned(session, mechanism.sign)
+    observed = planned(session, machine.sign)
     if ranks.complete:
         assert np.abs(off(observed, run(observed).legs)).max() < 1e-7
     else:
@@ -182,14 +182,14 @@ def test_steps_find_what_ranks_call_determined_and_refuse_the_rest(
 
 @pytest.mark.parametrize("name", ["3-rpr", "3-spr", "3-upu", "3-upu-tilted", "tricept"])
 def test_the_rigid_criterion_has_the_rank_that_is_predicted(name: str) -> None:
-    mechanism = load_mechanism(name)
-    session = planned_session(mechanism, [tuple(range(mechanism.n_legs))], 8)
+    machine = load_mechanism(name)
+    session = planned_session(machine, [tuple(range(machine.n_legs))], 8)
     (rank,) = [
         r
         for r in Analysis(session).step_ranks
         if (r.name, r.criteria) == ("platform_joints", "default")
     ]
-    observed = planned(session, mechanism.sign)
+    observed = planned(session, machine.sign)
     observed = replace(observed, nominal=replace(observed.nominal, legs=session.legs))
     steps = three_steps(observed)
     unknowns = PlatformUnknowns.of(observed.nominal)
@@ -259,9 +259,9 @@ def found_rotation(observed: Observed) -> Array:
 
 
 def test_axes_that_no_three_legs_at_once_show_are_refused_in_geometric_words() -> None:
-    mechanism = load_mechanism("3-spr")
-    session = planned_session(mechanism, ((0, 1), (1, 2), (0, 2)), 8)
-    observed = planned(session, mechanism.sign)
+    machine = load_mechanism("3-spr")
+    session = planned_session(machine, ((0, 1), (1, 2), (0, 2)), 8)
+    observed = planned(session, machine.sign)
     with pytest.raises(NotIdentifiable, match="no pose shows three legs of known length at once"):
         run(observed, "literal")
     words = r"angle \d of platform axis of leg \d can change without any image noticing"

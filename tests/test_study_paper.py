@@ -16,7 +16,7 @@ from legcal.errors import DidNotConverge, UsageError
 from legcal.machine import KinematicParameters, from_vector, to_vector
 from legcal.simulation.hexapod import (
     HexapodSession,
-    Machine,
+    PaperHexapod,
     hexapod,
     noncoplanar_hexapod,
     random_poses,
@@ -42,7 +42,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyResult, Path]
     return run_study(PaperStudy(), N_RUNS, output=output), output
 
 
-def _poses(machine: Machine, n: int = 10) -> RigidTransform:
+def _poses(machine: PaperHexapod, n: int = 10) -> RigidTransform:
     return random_poses(machine, n, np.random.default_rng(0))
 
 
@@ -52,7 +52,7 @@ def _printed(result: StudyResult) -> str:
     return told.getvalue()
 
 
-def _changed(machine: Machine, change: np.ndarray) -> KinematicParameters:
+def _changed(machine: PaperHexapod, change: np.ndarray) -> KinematicParameters:
     vector = to_vector(machine.parameters, machine.frame_legs) + change
     return from_vector(vector, machine.n_legs, machine.frame_legs)
 
@@ -204,13 +204,13 @@ def test_an_estimator_that_fails_is_counted_and_leaves_the_others(
 ) -> None:
     calls = []
 
-    def often_fails(session: HexapodSession, nominal: Machine) -> KinematicParameters:
+    def often_fails(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
         calls.append(session)
         if len(calls) % 2:
             raise DidNotConverge("It did not.")
         return nominal.parameters
 
-    def always_fails(session: HexapodSession, nominal: Machine) -> KinematicParameters:
+    def always_fails(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
         raise DidNotConverge("It never does.")
 
     for name, estimate in (("literal", often_fails), ("default", always_fails)):

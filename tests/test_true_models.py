@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from layouts import Layout, LegLayout, LegSpec, Machine, write_machine
+from layouts import Layout, LegLayout, LegSpec, MachineSpec, write_machine
 from machines import MACHINES, ring
 from mechanisms import ROOT
 from scipy.spatial.transform import RigidTransform
@@ -22,7 +22,7 @@ from legcal.machine import (
     Demand,
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     geometries,
     load_mechanism,
     parametrization_of,
@@ -75,7 +75,7 @@ def _apart(one: Leg, two: Leg) -> float:
     return float(max(found))
 
 
-def _check(nominal: Mechanism, folder: Path, seed: int = 3) -> Mechanism:
+def _check(nominal: Machine, folder: Path, seed: int = 3) -> Machine:
     """Check that a true model has the numbers that were drawn, and meets them where it stands."""
     true = write_true_model(nominal, ALL, np.random.default_rng(seed), folder)
     rng = np.random.default_rng(seed)
@@ -94,7 +94,7 @@ def _check(nominal: Mechanism, folder: Path, seed: int = 3) -> Mechanism:
     return true
 
 
-def _check_equations(true: Mechanism, legs: tuple[Leg, ...]) -> None:
+def _check_equations(true: Machine, legs: tuple[Leg, ...]) -> None:
     """Check the chain's poses and readings against the closed form of the drawn legs."""
     poses = draw_poses(true, 2, np.random.default_rng(0), "workspace")
     for T, readings in zip(poses.poses, poses.readings, strict=True):
@@ -172,7 +172,7 @@ def test_without_errors_the_urdf_is_the_nominal_one(tmp_path: Path) -> None:
 
 
 def _differences(
-    nominal: Mechanism, errors: ParameterErrors, n: int
+    nominal: Machine, errors: ParameterErrors, n: int
 ) -> tuple[tuple[str, ...], Array]:
     """Return the names of all parameters and n draws of their errors, (n, n_parameters)."""
     found, legs = parametrization_of(nominal, twists=True), geometries(nominal)
@@ -279,7 +279,7 @@ def _five_parallel_rods(folder: Path) -> Path:
     B = np.vstack([A[:5] + home.translation, home.apply(ring([121.0, 218.0, 315.0], 0.15))])
     kinds = ["constant"] * 5 + ["actuated"] * 3
     legs = [LegSpec("US", a, b, kind) for a, b, kind in zip(A, B, kinds, strict=True)]
-    return write_machine(folder, Machine(tuple(legs), home), Layout())
+    return write_machine(folder, MachineSpec(tuple(legs), home), Layout())
 
 
 def test_errors_that_leave_no_closed_machine_are_refused(

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, ModelError, OutOfClass
 from legcal.machine import (
     KinematicParameters,
-    Mechanism,
+    Machine,
     forward_kinematics,
     geometries,
     inverse_kinematics,
@@ -45,11 +45,9 @@ def _canonical(content: bytes) -> bytes:
     return ORIGIN.sub(rb"\1\3", etree.tostring(tree, method="c14n"))
 
 
-def _written(mechanism: Mechanism, parameters: KinematicParameters, folder: Path) -> Mechanism:
-    write_urdf(
-        mechanism, with_joints(geometries(mechanism), parameters), folder / "calibrated.urdf"
-    )
-    write_calibrated_yaml(mechanism, folder / "calibrated.yaml", "calibrated.urdf")
+def _written(machine: Machine, parameters: KinematicParameters, folder: Path) -> Machine:
+    write_urdf(machine, with_joints(geometries(machine), parameters), folder / "calibrated.urdf")
+    write_calibrated_yaml(machine, folder / "calibrated.yaml", "calibrated.urdf")
     return reload_and_check(folder / "calibrated.yaml")
 
 
@@ -210,11 +208,11 @@ def test_the_yaml_changes_in_one_value_only(
 
 
 def test_a_mechanism_that_does_not_close_at_home_is_noticed() -> None:
-    mechanism = load_mechanism("hexapod")
-    check_closes(mechanism)
+    machine = load_mechanism("hexapod")
+    check_closes(machine)
     mirror = RigidTransform.from_components(
-        mechanism.home.translation * np.array([1.0, 1.0, -1.0]), mechanism.home.rotation
+        machine.home.translation * np.array([1.0, 1.0, -1.0]), machine.home.rotation
     )
-    below = replace(mechanism, home=mirror)
+    below = replace(machine, home=mirror)
     with pytest.raises(DidNotConverge, match="does not close at home"):
         check_closes(below)

@@ -9,7 +9,7 @@ from thinned import thinned
 
 import legcal
 from legcal.geometry.types import Array
-from legcal.machine import Configurations, Mechanism
+from legcal.machine import Configurations, Machine
 from legcal.simulation.cameras import look_at, sample_camera
 from legcal.simulation.places import cameras_around
 from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
@@ -24,20 +24,20 @@ MIDDLE = np.array([0.0, 0.0, 0.2])
 
 
 @cache
-def machine(name: str) -> Mechanism:
+def posed_machine(name: str) -> Machine:
     return legcal.load_mechanism(name)
 
 
 def posed(name: str, n_poses: int, *more: Solid, bare: bool = True) -> tuple[PosedMachine, ...]:
-    mechanism = machine(name)
+    machine = posed_machine(name)
     if n_poses == 1:
-        home = mechanism.home_configuration[None]
-        poses = Configurations(home, np.zeros((1, mechanism.n_legs)), [mechanism.home])
+        home = machine.home_configuration[None]
+        poses = Configurations(home, np.zeros((1, machine.n_legs)), [machine.home])
     else:
-        found = legcal.random_configurations(mechanism, n_poses, 0)
+        found = legcal.random_configurations(machine, n_poses, 0)
         poses = Configurations(found.configurations, found.readings, found.poses)
-    shown = solids_of(mechanism) if bare else dressed(mechanism)
-    return pose_machine(mechanism, [*shown, *more], poses)
+    shown = solids_of(machine) if bare else dressed(machine)
+    return pose_machine(machine, [*shown, *more], poses)
 
 
 def box(centre: Array, size: tuple[float, float, float]) -> Solid:
@@ -46,12 +46,14 @@ def box(centre: Array, size: tuple[float, float, float]) -> Solid:
 
 def seen_at_home(*more: Solid) -> tuple[LegView, ...]:
     T = look_at(FAR, MIDDLE)
-    return legs_in_image(machine("hexapod").legs, posed("hexapod", 1, *more)[0], sample_camera(), T)
+    return legs_in_image(
+        posed_machine("hexapod").legs, posed("hexapod", 1, *more)[0], sample_camera(), T
+    )
 
 
 def test_without_anything_before_it_the_nearest_leg_is_seen_whole() -> None:
     views = seen_at_home()
-    nearest = int(np.argmin(np.linalg.norm(machine("hexapod").A_base - FAR, axis=1)))
+    nearest = int(np.argmin(np.linalg.norm(posed_machine("hexapod").A_base - FAR, axis=1)))
     assert views[nearest].share == pytest.approx(1.0, abs=0.02)
     [stretch] = views[nearest].stretches
     assert stretch.part == f"leg{nearest + 1}_tube"
@@ -59,9 +61,9 @@ def test_without_anything_before_it_the_nearest_leg_is_seen_whole() -> None:
 
 
 def test_a_box_hides_what_the_lines_of_sight_say() -> None:
-    mechanism = machine("hexapod")
-    nearest = int(np.argmin(np.linalg.norm(mechanism.A_base - FAR, axis=1)))
-    A, B = mechanism.A_base[nearest], mechanism.home.apply(mechanism.B_platform[nearest])
+    machine = posed_machine("hexapod")
+    nearest = int(np.argmin(np.linalg.norm(machine.A_base - FAR, axis=1)))
+    A, B = machine.A_base[nearest], machine.home.apply(machine.B_platform[nearest])
     split = A + 0.3 * (B - A)
     # The upper face of a wide box stands where the line of sight to that point passes.
     height = (split + 0.5 * (FAR - split))[2]
@@ -82,18 +84,18 @@ def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
 
 
 def test_a_camera_that_looks_along_a_leg_does_not_see_it() -> None:
-    mechanism = machine("hexapod")
-    A, B = mechanism.A_base[0], mechanism.home.apply(mechanism.B_platform[0])
+    machine = posed_machine("hexapod")
+    A, B = machine.A_base[0], machine.home.apply(machine.B_platform[0])
     T = look_at(A + 3.0 * (A - B), A, up=np.array([1.0, 0.0, 0.0]))
-    views = legs_in_image(mechanism.legs, posed("hexapod", 1)[0], sample_camera(), T)
+    views = legs_in_image(machine.legs, posed("hexapod", 1)[0], sample_camera(), T)
     assert not views[0].is_seen
 
 
 def test_the_border_of_the_image_cuts_legs() -> None:
-    mechanism, camera = machine("hexapod"), sample_camera()
+    machine, camera = posed_machine("hexapod"), sample_camera()
     here = posed("hexapod", 1)[0]
     T = look_at(FAR, MIDDLE + np.array([0.0, 0.0, 0.45]))  # the base is below the image
-    views = legs_in_image(mechanism.legs, here, camera, T)
+    views = legs_in_image(machine.legs, here, camera, T)
     seen = [s for view in views for s in view.stretches]
     assert seen
     for s in seen:
@@ -104,7 +106,7 @@ def test_the_border_of_the_image_cuts_legs() -> None:
 
 
 def test_a_thick_tube_covers_the_rod_in_it() -> None:
-    leg = machine("3-rps").legs[0]
+    leg = posed_machine("3-rps").legs[0]
     here = posed("3-rps", 1)[0]
     T = look_at(np.array([1.0, -0.8, 0.3]), MIDDLE)
     [first, *_] = legs_in_image(
@@ -122,7 +124,7 @@ def test_a_thick_tube_covers_the_rod_in_it() -> None:
 
 
 def test_cylinders_of_one_radius_are_one_part() -> None:
-    leg = machine("hexapod").legs[0]
+    leg = posed_machine("hexapod").legs[0]
     radii = {c.radius for c in leg.cylinders}
     assert (len(leg.cylinders), len(radii)) == (2, 1)
     assert all(len(view.stretches) <= 1 for view in seen_at_home())
@@ -130,28 +132,28 @@ def test_cylinders_of_one_radius_are_one_part() -> None:
 
 @pytest.mark.parametrize("name", thinned(SHIPPED, ["hexapod", "3-rpr", "3-upu", "tricept"]))
 def test_cameras_around_any_machine_see_its_legs_and_all_of_it(name: str) -> None:
-    mechanism, camera = machine(name), sample_camera()
-    machines = posed(name, 3, bare=False)
-    views, _ = cameras_around(mechanism, machines, {"c1": camera}, np.random.default_rng(1))
-    for m in machines:
+    machine, camera = posed_machine(name), sample_camera()
+    posed_machines = posed(name, 3, bare=False)
+    views, _ = cameras_around(machine, posed_machines, {"c1": camera}, np.random.default_rng(1))
+    for m in posed_machines:
         for view in views:
             T = view.T_base_camera
             inside = camera.project(T.inv().apply(m.vertices))
             assert np.all(inside > 0.0)
             assert np.all(inside < [camera.width, camera.height])
             assert not m.encloses(T.translation)
-    images = take_images(mechanism.legs, machines, views, [range(len(machines))], 1)
+    images = take_images(machine.legs, posed_machines, views, [range(len(posed_machines))], 1)
     seen = np.array([[leg.is_seen for leg in shown] for shown in images.shown])
     assert seen.mean() > 0.7
 
 
 def test_walls_do_not_drive_cameras_away_from_the_machine() -> None:
-    mechanism, camera = machine("hexapod"), sample_camera()
-    machines = posed("hexapod", 2, bare=False)
+    machine, camera = posed_machine("hexapod"), sample_camera()
+    posed_machines = posed("hexapod", 2, bare=False)
     walled = posed("hexapod", 2, box(np.array([0.0, -9.0, 0.0]), (20.0, 0.1, 20.0)), bare=False)
     one, two = (
-        cameras_around(mechanism, m, {"c1": camera}, np.random.default_rng(1))[0][0]
-        for m in (machines, walled)
+        cameras_around(machine, m, {"c1": camera}, np.random.default_rng(1))[0][0]
+        for m in (posed_machines, walled)
     )
     assert np.array_equal(one.T_base_camera.as_matrix(), two.T_base_camera.as_matrix())
 
@@ -164,14 +166,14 @@ def test_cameras_of_a_machine_far_from_the_origin_stand_around_it() -> None:
     moved_solids = tuple(
         Solid(p.solid.name, None, p.solid.shape, motion * p.T_base_solid) for p in here.solids
     )
-    mechanism = machine("hexapod")
-    home = Configurations(mechanism.home_configuration[None], np.zeros((1, 6)), [mechanism.home])
-    moved = pose_machine(mechanism, moved_solids, home)[0]
+    machine = posed_machine("hexapod")
+    home = Configurations(machine.home_configuration[None], np.zeros((1, 6)), [machine.home])
+    moved = pose_machine(machine, moved_solids, home)[0]
     moved = PosedMachine(
         motion.apply(here.A), motion.apply(here.B), moved.solids, moved.vertices, moved.faces
     )
-    one = legs_in_image(mechanism.legs, here, sample_camera(), T)
-    two = legs_in_image(mechanism.legs, moved, sample_camera(), motion * T)
+    one = legs_in_image(machine.legs, here, sample_camera(), T)
+    two = legs_in_image(machine.legs, moved, sample_camera(), motion * T)
     assert [v.share for v in one] == pytest.approx([v.share for v in two], abs=0.03)
 
 

@@ -9,7 +9,7 @@ import pytest
 from legcal.errors import ModelError
 from legcal.machine import (
     Leg,
-    Mechanism,
+    Machine,
     footed,
     geometries,
     home_with,
@@ -21,7 +21,7 @@ from legcal.machine import (
 from legcal.machine.written import reload_and_check, write_calibrated_yaml, write_urdf
 
 
-def _other_legs(nominal: Mechanism, size: float) -> tuple[Leg, ...]:
+def _other_legs(nominal: Machine, size: float) -> tuple[Leg, ...]:
     """Return legs whose every parameter is wrong by so much [m, and ten times that in rad]."""
     parametrization = parametrization_of(nominal, twists=True)
     unit = np.where([unit == "m" for unit in parametrization.units], size, 10.0 * size)

@@ -19,7 +19,7 @@ from legcal.geometry import Array
 from legcal.machine import (
     WORKSPACE_POSES,
     WORKSPACE_SEED,
-    Mechanism,
+    Machine,
     forward_kinematics,
     forward_kinematics_many,
     geometries,
@@ -95,8 +95,8 @@ class Evaluation:
 
 
 def evaluate(
-    model: str | Path | Mechanism,
-    reference: str | Path | Mechanism,
+    model: str | Path | Machine,
+    reference: str | Path | Machine,
     *,
     dataset: str | Path | None = None,
 ) -> Evaluation:
@@ -104,7 +104,7 @@ def evaluate(
 
     Parameters
     ----------
-    model, reference : path, name or Mechanism
+    model, reference : path, name or Machine
         The two mechanisms; they must have the same legs and frames.
     dataset : path, optional
         Take the readings of this dataset; else those of 100 poses of the workspace, which are
@@ -126,21 +126,21 @@ def evaluate(
     Where the motors do not determine the pose only parameters are compared: both arrays of
     platform errors are empty then.
     """
-    mechanism = model if isinstance(model, Mechanism) else load_mechanism(model)
-    truth = reference if isinstance(reference, Mechanism) else load_mechanism(reference)
-    truth = _in_the_order_of(truth, mechanism)
+    machine = model if isinstance(model, Machine) else load_mechanism(model)
+    truth = reference if isinstance(reference, Machine) else load_mechanism(reference)
+    truth = _in_the_order_of(truth, machine)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
-    if not (mechanism.is_determined and truth.is_determined):
+    if not (machine.is_determined and truth.is_determined):
         pass  # no reading says where the platform is
     elif dataset is None:
-        poses, reference_poses = _random_poses(mechanism, truth)
+        poses, reference_poses = _random_poses(machine, truth)
     else:
-        q = _readings_of(load_dataset(dataset, check_images=False), mechanism)
-        poses = forward_kinematics_many(mechanism, q)
+        q = _readings_of(load_dataset(dataset, check_images=False), machine)
+        poses = forward_kinematics_many(machine, q)
         reference_poses = forward_kinematics_many(truth, q)
     displacement, rotation = pose_differences(
-        [platform_in_base(mechanism, T) for T in poses],
+        [platform_in_base(machine, T) for T in poses],
         [platform_in_base(truth, T) for T in reference_poses],
     )
     parametrization = parametrization_of(truth, twists=True)
@@ -150,12 +150,12 @@ def evaluate(
         rotation,
         parametrization.names,
         parametrization.units,
-        vector_of(parametrization, geometries(mechanism), origin),
+        vector_of(parametrization, geometries(machine), origin),
         vector_of(parametrization, origin, origin),
     )
 
 
-def _in_the_order_of(reference: Mechanism, model: Mechanism) -> Mechanism:
+def _in_the_order_of(reference: Machine, model: Machine) -> Machine:
     """Return the reference with legs and frame legs in the model's order."""
     if set(reference.leg_names) != set(model.leg_names):
         raise ModelError(
@@ -187,25 +187,25 @@ def _in_the_order_of(reference: Mechanism, model: Mechanism) -> Mechanism:
     return reference
 
 
-def _readings_of(dataset: Dataset, mechanism: Mechanism) -> Array:
+def _readings_of(dataset: Dataset, machine: Machine) -> Array:
     """Return one row of readings for each pose of a dataset, in the mechanism's leg order [m]."""
-    names = list(dataset.mechanism.leg_names)
-    missing = [name for name in mechanism.leg_names if name not in names]
+    names = list(dataset.machine.leg_names)
+    missing = [name for name in machine.leg_names if name not in names]
     if missing:
         raise ModelError(
             f"The models could not be compared at the readings of {dataset.folder}: its mechanism "
             f"has no {', '.join(missing)}; the dataset must belong to the same machine."
         )
-    legs = [names.index(name) for name in mechanism.leg_names]
+    legs = [names.index(name) for name in machine.leg_names]
     return dataset.measurements.q[dataset.measurements.first_rows][:, legs]
 
 
 def _random_poses(
-    mechanism: Mechanism, reference: Mechanism
+    machine: Machine, reference: Machine
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
     """Return platform poses of both models at the same random readings inside the travel."""
-    names = sorted(mechanism.leg_names)
-    mechanism, reference = mechanism.with_leg_order(names), reference.with_leg_order(names)
+    names = sorted(machine.leg_names)
+    machine, reference = machine.with_leg_order(names), reference.with_leg_order(names)
     rng = np.random.default_rng(WORKSPACE_SEED)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
@@ -213,7 +213,7 @@ def _random_poses(
         if turn > 0 and not poses:
             break
         count = WORKSPACE_POSES - len(poses) if turn > 0 else _HOPELESS
-        drawn = random_configurations(mechanism, count, rng)
+        drawn = random_configurations(machine, count, rng)
         for q, T in zip(drawn.readings, drawn.poses, strict=True):
             try:
                 reference_poses.append(forward_kinematics(reference, q))

@@ -170,7 +170,7 @@ def board_notes(dataset: Dataset, solution: Solution, corners: Corners | None) -
         )
     given, found = dataset.T_base_board, solution.T_Rb_board
     if given is not None and found is not None:
-        place = dataset.mechanism.T_base_Rb * found
+        place = dataset.machine.T_base_Rb * found
         if not _agree(given, place):
             far, turned = _apart(given, place)
             notes.append(

@@ -33,7 +33,7 @@ from legcal.estimation import Frames, NoiseModel
 from legcal.files import Document
 from legcal.geometry import Array
 from legcal.machine import (
-    Mechanism,
+    Machine,
     Parametrization,
     geometries,
     parametrization_of,
@@ -230,7 +230,7 @@ def check(
     earlier = read_result(result)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     dataset = _as_calibrated(dataset, earlier)
-    prior = _Prior.of(dataset.mechanism, earlier)
+    prior = _Prior.of(dataset.machine, earlier)
     choices = _choices(dataset, earlier, prior)
     with worker_pool(workers) as pool:
         run = start_run(dataset, pool, progress, choices, use_cache=True, every_leg=False)
@@ -249,7 +249,7 @@ def check(
 
 def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
     """Return new images with the calibrated model in place of the one that they name."""
-    given, calibrated = dataset.mechanism, earlier.mechanism
+    given, calibrated = dataset.machine, earlier.machine
     if sorted(given.leg_names) != sorted(calibrated.leg_names):
         different = f"the legs {', '.join(calibrated.leg_names)}, not {', '.join(given.leg_names)}"
     else:
@@ -261,10 +261,10 @@ def _as_calibrated(dataset: Dataset, earlier: EarlierResult) -> Dataset:
             f"found the result of another machine, with {different}, needed one of the same; give "
             "the result that belongs to these images."
         )
-    return replace(dataset, mechanism=calibrated, overrides=())
+    return replace(dataset, machine=calibrated, overrides=())
 
 
-def _difference(calibrated: Mechanism, given: Mechanism) -> str:
+def _difference(calibrated: Machine, given: Machine) -> str:
     """Return what differs between two models of the same legs, nothing if they are one machine."""
     for one, other in zip(calibrated.legs, given.legs, strict=True):
         here, there = (f"{leg.name} ({leg.kind}, {leg.type})" for leg in (one, other))
@@ -289,12 +289,12 @@ class _Prior:
     furthest: float  # the same along directions that are held [m]
 
     @classmethod
-    def of(cls, mechanism: Mechanism, earlier: EarlierResult) -> _Prior:
+    def of(cls, machine: Machine, earlier: EarlierResult) -> _Prior:
         """Return what an earlier result says of the parameters of its mechanism."""
-        legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
+        legs, found = geometries(machine), parametrization_of(machine, twists=True)
         values = vector_of(found, legs, legs)
         chosen = [found.names.index(name) for name in earlier.names]
-        at_home = mechanism.home.apply(mechanism.B_platform) - mechanism.A_base
+        at_home = machine.home.apply(machine.B_platform) - machine.A_base
         furthest = _PLAUSIBLE * float(np.mean(np.linalg.norm(at_home, axis=1)))
         plausible = np.array([furthest if found.units[i] == "m" else _PLAUSIBLE for i in chosen])
         covariance = earlier.covariance + furthest**2 * earlier.held.T @ earlier.held
@@ -316,7 +316,7 @@ def _choices(dataset: Dataset, earlier: EarlierResult, prior: _Prior) -> Choices
             for key in intrinsic_names(view.camera):
                 if f"{owner}.{key}" in intrinsics:
                     priors[f"{view.name}.{key}"] = Prior(*intrinsics[f"{owner}.{key}"])
-    owned = known_parameters(dataset.mechanism, dataset.measurements.views).by_name
+    owned = known_parameters(dataset.machine, dataset.measurements.views).by_name
     return Choices(
         fixed=frozenset(earlier.fixed),
         priors={name: prior for name, prior in priors.items() if name in owned},
@@ -332,7 +332,7 @@ def _compare(
     significance: float,
 ) -> Check:
     """Return what the fit of the new images says against the earlier result."""
-    mechanism, parametrization = dataset.mechanism, solution.parametrization
+    machine, parametrization = dataset.machine, solution.parametrization
     columns = [parametrization.names.index(name) for name in prior.names]
     values = np.array([solution.values[name] for name in prior.names])
     held = solution.held_basis[:, columns]
@@ -343,13 +343,13 @@ def _compare(
     dof = earlier.document.residuals.dof
     if worse == 1.0:
         dof = noise_dof(solution.dof, covariance, prior.plausible)
-    legs = geometries(mechanism)
+    legs = geometries(machine)
     changes = possible_changes(
-        mechanism.leg_names, legs, mechanism.frame_legs, _only(parametrization, columns)
+        machine.leg_names, legs, machine.frame_legs, _only(parametrization, columns)
     )
     movement = judge_movement(found, dof, changes, significance)
     poses = Frames.of(solution.T_Rb_Re)
-    J = pose_sensitivity(legs, parametrization, mechanism.frame_legs, *poses)[:, :, columns]
+    J = pose_sensitivity(legs, parametrization, machine.frame_legs, *poses)[:, :, columns]
     # Priors pull what was found to the earlier result by 1 - G.
     G = np.eye(len(values)) - covariance / prior.plausible**2
     spread = worse * G @ covariance + G @ prior.covariance @ G.T

@@ -131,7 +131,7 @@ def _detected(run: CalibrationRun, images: IntArray) -> Detection:
         )
         scene = replace(seen.placement, T_base_camera=drawn)
     rows, legs, views = inverse(order.rows), inverse(order.legs), inverse(order.views)
-    names = dataset.mechanism.leg_names
+    names = dataset.machine.leg_names
     return Detection(
         dataset=dataset,
         outlines=reject_unused_legs(order.restore(outlines), dataset.measurements, names),

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.joint_fit import DISAGREES, Solution
 from legcal.data import Measurements
 from legcal.geometry import Array, IntArray
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 
 MANY, SOME_LEGS = 0.34, 2  # of an image's outlines that the fit rejected, and legs altogether
 MOST = 0.67  # of them, if the readings suit the image
@@ -28,7 +28,7 @@ SHOWN = 4  # legs that are named
 
 
 def disagreeing_images(
-    measurements: Measurements, mechanism: Mechanism, solution: Solution
+    measurements: Measurements, machine: Machine, solution: Solution
 ) -> dict[int, str]:
     """Return a note on every fitted image most of which the fit has rejected, by row."""
     o = solution.outlines
@@ -44,8 +44,8 @@ def disagreeing_images(
             continue
         view = measurements.views[int(measurements.view[row])]
         name = f"view {view.name}, image {measurements.image[row] or f'of row {row + 1}'}"
-        readings = _readings(measurements, mechanism, solution, row, judged)
-        explanation = _explanation(measurements, mechanism, row, readings)
+        readings = _readings(measurements, machine, solution, row, judged)
+        explanation = _explanation(measurements, machine, row, readings)
         if not explanation and len(wrong) < MOST * len(judged):
             continue  # what is wrong there is not of this image
         notes[row] = (
@@ -57,7 +57,7 @@ def disagreeing_images(
 
 def _readings(
     measurements: Measurements,
-    mechanism: Mechanism,
+    machine: Machine,
     solution: Solution,
     row: int,
     chosen: IntArray,
@@ -99,18 +99,18 @@ def _readings(
     J = np.stack([(lengths(solved.x + d) - lengths(solved.x - d)) / 2e-6 for d in step], axis=1)
     variance = np.einsum("ja,ab,jb->j", J, noise**2 * np.linalg.inv(normal), J)
     q0 = np.array([leg.q0 for leg in solution.legs])
-    sign = np.array([leg.sign for leg in mechanism.legs])
+    sign = np.array([leg.sign for leg in machine.legs])
     return sign * (lengths(solved.x) - q0), np.sqrt(variance)
 
 
 def _explanation(
     measurements: Measurements,
-    mechanism: Mechanism,
+    machine: Machine,
     row: int,
     readings: tuple[Array, Array] | None,
 ) -> str:
     """Return what to check; nothing where the readings suit the image."""
-    motors = list(mechanism.motors)
+    motors = list(machine.motors)
     if readings is None or not motors:
         return "check its reading and that nobody moved camera or machine"
     given = measurements.q[row, motors]
@@ -133,7 +133,7 @@ def _explanation(
             f"it shows the reading given for image {measurements.image[nearest]}; check which "
             "image belongs to which row"
         )
-    names = [mechanism.leg_names[motors[k]] for k in wrong]
+    names = [machine.leg_names[motors[k]] for k in wrong]
     if len(wrong) == 1:
         k = int(wrong[0])
         return (

@@ -15,7 +15,7 @@ from legcal.errors import DatasetError, ModelError, OutOfClass
 from legcal.geometry import Array
 from legcal.machine import (
     Leg,
-    Mechanism,
+    Machine,
     calibrated_axis,
     geometries,
     load_mechanism,
@@ -35,7 +35,7 @@ class EarlierResult:
 
     folder: Path
     document: Result
-    mechanism: Mechanism  # the calibrated model
+    machine: Machine  # the calibrated model
     names: tuple[str, ...]  # kinematic parameters that were estimated, or weak
     covariance: Array  # theirs, zero along what was held; axes count from the calibrated ones
     held: Array  # (w, n) how they change along the directions that were held, by a metre
@@ -68,20 +68,20 @@ def read_result(given: str | Path) -> EarlierResult:
     path = path if path.name == RESULT_NAME and not os.path.isdir(path) else path / RESULT_NAME
     document = Result.read(path)
     try:
-        mechanism = load_mechanism(path.parent / MODEL_NAME)
+        machine = load_mechanism(path.parent / MODEL_NAME)
     except (ModelError, OutOfClass) as error:
         raise DatasetError(error.problems) from error
-    if sorted(document.legs) != sorted(mechanism.leg_names):
+    if sorted(document.legs) != sorted(machine.leg_names):
         found = f"the legs {', '.join(document.legs)} in {RESULT_NAME}"
-        needed = f"{', '.join(mechanism.leg_names)} as in {MODEL_NAME} beside it"
+        needed = f"{', '.join(machine.leg_names)} as in {MODEL_NAME} beside it"
         raise refused(path, found, needed)
-    mechanism = mechanism.with_leg_order(document.legs)
-    legs, known = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    machine = machine.with_leg_order(document.legs)
+    legs, known = geometries(machine), parametrization_of(machine, twists=True)
     values = {row.name: row.value for row in document.parameters}
-    nominal_legs = _with_nominal_axes(mechanism.leg_names, legs, document, values)
+    nominal_legs = _with_nominal_axes(machine.leg_names, legs, document, values)
     estimated = [row for row in document.parameters if row.status == "estimated"]
     _check_covariance(path, estimated, np.array([row.sigma for row in estimated]), document)
-    _check_same_model(path, document, values, mechanism, nominal_legs)
+    _check_same_model(path, document, values, machine, nominal_legs)
     covariance, held = _kinematic(path, estimated, document, known.names)
     others = [name for name in document.residuals.shared_px if name not in KINDS]
     if others:
@@ -92,7 +92,7 @@ def read_result(given: str | Path) -> EarlierResult:
     return EarlierResult(
         folder=path.parent,
         document=document,
-        mechanism=mechanism,
+        machine=machine,
         names=tuple(known.names[i] for i in kept),
         covariance=(turns @ covariance @ turns.T)[np.ix_(kept, kept)],
         held=(held @ turns.T)[:, kept],
@@ -170,11 +170,11 @@ def _check_same_model(
     path: Path,
     document: Result,
     values: Mapping[str, float],
-    mechanism: Mechanism,
+    machine: Machine,
     nominal_legs: Sequence[Leg],
 ) -> None:
     """Refuse a document whose parameters are not those of the model beside it."""
-    legs, known = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    legs, known = geometries(machine), parametrization_of(machine, twists=True)
     numbers = dict(zip(known.names, vector_of(known, legs, nominal_legs).tolist(), strict=True))
     other = [
         name
@@ -182,7 +182,7 @@ def _check_same_model(
         if "_axis." not in name and not abs(values.get(name, number) - number) <= _SAME
     ]
     other += [name for name in numbers if name not in values and not name.endswith(".twist")]
-    for side, axes in nominal_axes(mechanism.leg_names, legs).items():
+    for side, axes in nominal_axes(machine.leg_names, legs).items():
         for leg, axis in axes.items():
             nominal = document.nominal_axes.get(side, {}).get(leg)
             found = None if nominal is None else calibrated_axis(nominal, leg, side, values)

@@ -45,7 +45,7 @@ from legcal.data import (
 )
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.geometry import IntArray
-from legcal.machine import Cylinder, Mechanism, geometries
+from legcal.machine import Cylinder, Machine, geometries
 from legcal.paper import nominal_mechanism, run_base_steps, run_platform_steps
 from legcal.perception import (
     Observed,
@@ -109,7 +109,7 @@ def _observe_and_fit(run: CalibrationRun, rows: IntArray) -> Found:
     seen.placement.require_one()
     other_radii = bool(seen.placement.radii.factor)
     if other_radii:
-        run = replace(run, mechanism=seen.photographs.mechanism)
+        run = replace(run, machine=seen.photographs.machine)
     if run.every_leg and (seen.left_out or seen.placement.unplaced):
         _refuse_too_few(run, rows, seen)
     found = _fit(run.part(rows), seen.outlines, seen.placement, board)
@@ -120,7 +120,7 @@ def _observe_and_fit(run: CalibrationRun, rows: IntArray) -> Found:
 
 def rough_scene(run: CalibrationRun) -> tuple[Placement, BoardViews | None]:
     """Return where the nominal model has the legs, with rough cameras, and what shows the board."""
-    scene = nominal_placement(run.mechanism, run.measurements, run.T_base_platform)
+    scene = nominal_placement(run.machine, run.measurements, run.T_base_platform)
     board = observe_board(run)
     if board is not None:
         T_base_board = base_of_board(run.dataset, board, scene.T_base_camera)
@@ -135,7 +135,7 @@ def _fit(
 ) -> Found:
     """Run the four steps, then the joint fit, with the outlines of all images."""
     seen = outlines.at(part.rows)
-    seen = reject_unused_legs(seen, part.measurements, part.mechanism.leg_names)
+    seen = reject_unused_legs(seen, part.measurements, part.machine.leg_names)
     if part.every_leg:
         _refuse_unseen_legs(part, seen)
     steps = _four_steps(part, seen, board)
@@ -175,7 +175,7 @@ def _measure_again(
         return found, []
     before = _disagreeing(found)
     again = seen.photographs.narrowed(np.array(shown, dtype=np.intp), found.outlines)
-    again = replace(again, mechanism=_with_fitted_radii(again.mechanism, found.solution))
+    again = replace(again, machine=_with_fitted_radii(again.machine, found.solution))
     told = known_gammas(again.keep, again.measurements)
     gammas: list[tuple[EstimatedGamma, ...]] = []
     for _ in range(1 + ROUNDS):
@@ -196,25 +196,25 @@ def _measure_again(
     return found, lost
 
 
-def _with_fitted_radii(mechanism: Mechanism, solution: Solution) -> Mechanism:
+def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
     """Return what is seen of the legs with the radii of a fit.
 
     Cylinders of a leg that were equally thick stay so: they look like one.
     """
     cylinders: list[list[Cylinder]] = []
-    for j, leg in enumerate(mechanism.legs):
+    for j, leg in enumerate(machine.legs):
         fitted = {
             c.radius: solution.radii[j, c.link]
             for c in leg.cylinders
             if (j, c.link) in solution.radii
         }
         cylinders.append([replace(c, radius=fitted.get(c.radius, c.radius)) for c in leg.cylinders])
-    return mechanism.with_cylinders(cylinders)
+    return machine.with_cylinders(cylinders)
 
 
 def _fitted_placement(run: CalibrationRun, solution: Solution, seen: Observed) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
-    T_base_Rb = run.mechanism.T_base_Rb
+    T_base_Rb = run.machine.T_base_Rb
     A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
     B = np.array([leg.B for leg in solution.legs])
     placed = np.array([(T_base_Rb * T).apply(B) for T in run.poses_by(solution.legs)])
@@ -237,9 +237,9 @@ def _four_steps(part: CalibrationRun, outlines: Outlines, board: BoardViews | No
     part.progress("Four steps", 0, 1)
     axes, measurements = part.axes, part.measurements
     try:
-        nominal = nominal_mechanism(part.mechanism)
+        nominal = nominal_mechanism(part.machine)
         if axes is None:
-            radii = {p: r for leg in part.mechanism.legs for p, r in leg.radius_of_part.items()}
+            radii = {p: r for leg in part.machine.legs for p, r in leg.radius_of_part.items()}
             axes = axes_from_outlines(outlines, measurements, radii)
         if board is not None:
             axes, measurements, T_first_camera, new_view = in_one_camera(
@@ -277,10 +277,10 @@ def _starts(
     board: BoardViews | None,
 ) -> list[Start]:
     """Return the starts of the fit: the nominal model, and the steps where they gave a result."""
-    mechanism = part.mechanism
-    rough = [None if T is None else T.inv() * mechanism.T_base_Rb for T in scene.T_base_camera]
+    machine = part.machine
+    rough = [None if T is None else T.inv() * machine.T_base_Rb for T in scene.T_base_camera]
     staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
-    starts = [(geometries(mechanism), rough, staged, "nominal")]
+    starts = [(geometries(machine), rough, staged, "nominal")]
     if steps.legs is not None:
         starts.append((steps.legs, staged, rough, "staged"))
     found = []
@@ -318,7 +318,7 @@ def _start_cameras(
 
 
 def _disagreeing(found: Found) -> dict[int, str]:
-    return disagreeing_images(found.part.measurements, found.part.mechanism, found.solution)
+    return disagreeing_images(found.part.measurements, found.part.machine, found.solution)
 
 
 def _doubts(found: Found) -> tuple[str, ...]:
@@ -327,7 +327,7 @@ def _doubts(found: Found) -> tuple[str, ...]:
     shown = set(part.measurements.view[o.row[o.used]].tolist())
     views = part.measurements.views
     cameras = [
-        part.mechanism.T_base_Rb * T.inv() if v in shown else None
+        part.machine.T_base_Rb * T.inv() if v in shown else None
         for v, T in enumerate(found.solution.T_camera_Rb)
     ]
     hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
@@ -358,7 +358,7 @@ def _refuse_unseen_legs(part: CalibrationRun, outlines: Outlines) -> None:
     views = [part.measurements.views[v] for v in np.unique(part.measurements.view).tolist()]
     unseen = [
         leg.name
-        for j, leg in enumerate(part.mechanism.legs)
+        for j, leg in enumerate(part.machine.legs)
         if j not in shown
         and leg.cylinders
         and any(view.legs is None or leg.name in view.legs for view in views)

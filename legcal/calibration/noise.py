@@ -169,7 +169,7 @@ class Noise:
         counts = [len(group.rows) for group in self.repeats]
         return NoiseDocument(
             legcal_noise=1,
-            mechanism=self.dataset.mechanism.name,
+            mechanism=self.dataset.machine.name,
             images=sum(counts),
             orientations=len(counts),
             repeats=RepeatCounts(least=min(counts), most=max(counts)),
@@ -346,7 +346,7 @@ def measure_noise(
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     with worker_pool(workers) as pool_of_workers:
         run = start_run(dataset, pool_of_workers, progress, Choices(), use_cache=False)
-        mechanism, measurements = run.mechanism, run.measurements
+        machine, measurements = run.machine, run.measurements
         paths = [dataset.image_path(row) for row in run.order.rows.tolist()]
         has_image = np.array(
             [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
@@ -356,10 +356,10 @@ def measure_noise(
         placement, outlines = _search(every, repeats, progress)
     methods = []
     for name, table in outlines.items():
-        found = leg_orientations(table, measurements, mechanism.legs, repeats)
+        found = leg_orientations(table, measurements, machine.legs, repeats)
         legs = []
-        for leg in dataset.mechanism.leg_names:
-            j = mechanism.leg_names.index(leg)
+        for leg in dataset.machine.leg_names:
+            j = machine.leg_names.index(leg)
             legs.append(LegNoise(leg, tuple(o for o in found if o.leg == j)))
         methods.append(MethodNoise(name, tuple(legs)))
     if not any(method.spread(OUTLINE) for method in methods):
@@ -381,9 +381,9 @@ def measure_noise(
         pose_labels=measurements.pose_labels,
         repeats=tuple(repeats),
         methods=tuple(methods),
-        leg_names=tuple(mechanism.leg_names),
+        leg_names=tuple(machine.leg_names),
         differences=_differences(
-            outlines["detector"], outlines["canny"], measurements, repeats, mechanism.leg_names
+            outlines["detector"], outlines["canny"], measurements, repeats, machine.leg_names
         ),
         notes=(
             *dataset.notes,
@@ -427,8 +427,8 @@ def _search(
 ) -> tuple[Placement, dict[str, Outlines]]:
     """Place the cameras; return the outlines that each method finds in all repeated images."""
     measurements = every.measurements
-    poses = forward_kinematics_many(every.mechanism, measurements.q[measurements.first_rows])
-    nominal = nominal_placement(every.mechanism, measurements, poses)
+    poses = forward_kinematics_many(every.machine, measurements.q[measurements.first_rows])
+    nominal = nominal_placement(every.machine, measurements, poses)
     views = {group.view for group in repeats}  # placed by one image of every pose
     groups = group_rows(measurements, every.detect)
     rows = np.sort([group.rows[0] for group in groups if group.view in views])

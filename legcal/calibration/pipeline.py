@@ -160,7 +160,7 @@ def _choices(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
     error of its twist, and one that was left at nominal would spoil the others.
     """
     known = known_parameters(
-        dataset.mechanism,
+        dataset.machine,
         dataset.measurements.views,
         axes_given=dataset.axes is not None,
         with_board=dataset.board is not None,
@@ -204,7 +204,7 @@ def _compare_held_out(run: CalibrationRun, found: Found, file_rows: IntArray) ->
     """Return what the images that were kept aside say of the fit."""
     aside, solution = run.part(run.here(file_rows)), found.solution
     outlines = found.outlines.at(aside.rows)
-    outlines = reject_unused_legs(outlines, aside.measurements, aside.mechanism.leg_names)
+    outlines = reject_unused_legs(outlines, aside.measurements, aside.machine.leg_names)
     poses = aside.poses_by(solution.legs)
     return compare_held_out(
         solution.posterior, aside.measurements, outlines, poses, DEFAULT_SETTINGS.rejection

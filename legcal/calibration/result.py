@@ -305,12 +305,12 @@ def refused(path: Path, found: str, needed: str) -> DatasetError:
 def result_of(calibration: Calibration) -> Result:
     """Return the document of a calibration."""
     solution, dataset = calibration.solution, calibration.dataset
-    mechanism, measurements = dataset.mechanism, dataset.measurements
-    names, views, steps = mechanism.leg_names, measurements.views, calibration.steps
+    machine, measurements = dataset.machine, dataset.measurements
+    names, views, steps = machine.leg_names, measurements.views, calibration.steps
     owners = shared_cameras([view.name for view in views], [view.camera for view in views])
     o, axes = solution.outlines, dataset.axes
     shown = np.unique(measurements.view[o.row[o.used] if axes is None else axes.row]).tolist()
-    T_base_Rb = mechanism.T_base_Rb
+    T_base_Rb = machine.T_base_Rb
     return Result(
         legcal_result=1,
         status="converged",
@@ -318,7 +318,7 @@ def result_of(calibration: Calibration) -> Result:
         trustworthy=calibration.verdict.trustworthy,
         legs=list(names),
         **_legs(names, solution.legs),
-        nominal_axes=nominal_axes(names, geometries(mechanism)),
+        nominal_axes=nominal_axes(names, geometries(machine)),
         parameters=_parameters(calibration),
         covariance=solution.covariance.tolist(),
         kinematic=Kinematic(
@@ -381,13 +381,13 @@ def _pose(T: RigidTransform) -> Pose:
 def _parameters(calibration: Calibration) -> list[ParameterRow]:
     """Return all kinematic parameters, the radii that were observed, and estimated intrinsics."""
     solution, dataset = calibration.solution, calibration.dataset
-    mechanism = dataset.mechanism
-    found = parametrization_of(mechanism, twists=True)
-    numbers = vector_of(found, solution.legs, geometries(mechanism)).tolist()
+    machine = dataset.machine
+    found = parametrization_of(machine, twists=True)
+    numbers = vector_of(found, solution.legs, geometries(machine)).tolist()
     values = {**solution.values, **dict(zip(found.names, numbers, strict=True))}
     sigma = dict(zip(solution.names, solution.sigma.tolist(), strict=True))
     with_board = dataset.board is not None
-    known = known_parameters(mechanism, dataset.measurements.views, with_board=with_board).by_name
+    known = known_parameters(machine, dataset.measurements.views, with_board=with_board).by_name
     return [
         ParameterRow(
             name=name,
@@ -409,7 +409,7 @@ def _board(calibration: Calibration) -> BoardPlace | None:
         return None
     given = dataset.T_base_board
     return BoardPlace(
-        T_base_board=_pose(dataset.mechanism.T_base_Rb * solution.T_Rb_board),
+        T_base_board=_pose(dataset.machine.T_base_Rb * solution.T_Rb_board),
         given=None if given is None else _pose(given),
         scale=solution.values.get(BOARD_SCALE, 1.0),
         rms_px=solution.rms_corners_px,
@@ -504,25 +504,25 @@ def write_result(calibration: Calibration, destination: Path) -> None:
         If the written model does not load as what was computed.
     """
     dataset, solution = calibration.dataset, calibration.solution
-    mechanism = dataset.mechanism
+    machine = dataset.machine
     stale = [Path(OBSERVATIONS_NAME), Path(CORNERS_NAME)]
     with result_folder(destination, stale=stale) as folder:
         urdf, yaml = folder / "calibrated.urdf", folder / MODEL_NAME
-        write_urdf(mechanism, solution.legs, urdf)
-        home = home_with(mechanism, solution.legs, _FURTHEST)
+        write_urdf(machine, solution.legs, urdf)
+        home = home_with(machine, solution.legs, _FURTHEST)
         if home is None:
             raise DidNotConverge(
-                f"{mechanism.yaml_path}: the calibrated model could not be written: found no "
+                f"{machine.yaml_path}: the calibrated model could not be written: found no "
                 "closed pose of its legs near legcal.home, needed one; check legcal.home and the "
                 "nominal model; nothing was written."
             )
-        write_calibrated_yaml(mechanism, yaml, urdf.name, None if home is mechanism.home else home)
+        write_calibrated_yaml(machine, yaml, urdf.name, None if home is machine.home else home)
         _check_written(yaml, solution.legs)
         document = json.dumps(result_of(calibration).document(), indent=1, allow_nan=False)
         (folder / RESULT_NAME).write_text(document + "\n", encoding="utf-8")
         if dataset.axes is None:
             table, measurements = folder / OBSERVATIONS_NAME, dataset.measurements
-            write_observations(table, solution.outlines, measurements, mechanism.leg_names)
+            write_observations(table, solution.outlines, measurements, machine.leg_names)
         if calibration.corners is not None:
             write_corners(folder / CORNERS_NAME, calibration.corners, dataset.measurements)
 

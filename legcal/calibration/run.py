@@ -40,7 +40,7 @@ from legcal.errors import DatasetError
 from legcal.geometry import Array, IntArray, components
 from legcal.machine import (
     Leg,
-    Mechanism,
+    Machine,
     followed_poses,
     geometries,
     joined,
@@ -64,7 +64,7 @@ class CalibrationRun:
     order: Order  # from the files to the canonical order
     plan: DetectionPlan  # which images are still to be searched, by their rows in the files
     fingerprint: str  # of all that detected outlines depend on
-    mechanism: Mechanism  # from here on in canonical order
+    machine: Machine  # from here on in canonical order
     measurements: Measurements
     axes: LegAxes | None
     rows: IntArray  # of all images, those that are here
@@ -79,7 +79,7 @@ class CalibrationRun:
     def photographs(self) -> Photographs:
         """All images, what to search in them and what to keep."""
         return Photographs(
-            mechanism=self.mechanism,
+            machine=self.machine,
             measurements=self.measurements,
             load=self.dataset.image_reader(self.order.rows.tolist()),
             run=self.pool,
@@ -90,11 +90,11 @@ class CalibrationRun:
     @cached_property
     def fitted_legs(self) -> FittedLegs:
         """The legs as the joint fit sees them."""
-        return fitted_legs(self.mechanism)
+        return fitted_legs(self.machine)
 
     @cached_property
     def _nominal(self) -> tuple[tuple[RigidTransform, ...], Array]:
-        return nominal_poses(self.mechanism, self.measurements)
+        return nominal_poses(self.machine, self.measurements)
 
     @property
     def T_Rb_Re(self) -> tuple[RigidTransform, ...]:
@@ -104,8 +104,8 @@ class CalibrationRun:
     @property
     def T_base_platform(self) -> list[RigidTransform]:
         """The same between the links."""
-        back = self.mechanism.T_platform_Re.inv()
-        return [self.mechanism.T_base_Rb * T * back for T in self.T_Rb_Re]
+        back = self.machine.T_platform_Re.inv()
+        return [self.machine.T_base_Rb * T * back for T in self.T_Rb_Re]
 
     def unreached_notes(self) -> list[str]:
         """Return what a reader should know of poses that the nominal model does not reach."""
@@ -169,7 +169,7 @@ def start_run(
     every_leg: bool = True,
 ) -> CalibrationRun:
     """Put a dataset into canonical order, and see which images are still to be searched."""
-    names = dataset.mechanism.leg_names
+    names = dataset.machine.leg_names
     order = canonical_order(dataset.measurements, names)
     # Doubtful images are searched again near the fit, which depends on the choices.
     current = fingerprint(dataset, detection_settings() | choices.document())
@@ -178,7 +178,7 @@ def start_run(
         order=order,
         plan=plan_dataset(dataset, current if use_cache else ""),
         fingerprint=current,
-        mechanism=dataset.mechanism.with_leg_order([names[leg] for leg in order.legs]),
+        machine=dataset.machine.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
         axes=None if dataset.axes is None else order.reorder(dataset.axes),
         rows=np.arange(dataset.measurements.n_rows),
@@ -192,7 +192,7 @@ def start_run(
 
 
 def nominal_poses(
-    mechanism: Mechanism, measurements: Measurements
+    machine: Machine, measurements: Measurements
 ) -> tuple[tuple[RigidTransform, ...], Array]:
     """Return T_Rb_Re of a nominal model at the readings, and what its legs miss (n_poses,) [m].
 
@@ -207,19 +207,19 @@ def nominal_poses(
         mean leg length.
     """
     q = measurements.q[measurements.first_rows]
-    if not mechanism.is_determined:
-        home = [platform_in_base(mechanism, mechanism.home)] * len(q)
-        return _least_squares(mechanism, q, home)[0], np.zeros(len(q))
-    followed = list(followed_poses(mechanism, q))
-    T = [platform_in_base(mechanism, pose) for pose, _ in followed]
+    if not machine.is_determined:
+        home = [platform_in_base(machine, machine.home)] * len(q)
+        return _least_squares(machine, q, home)[0], np.zeros(len(q))
+    followed = list(followed_poses(machine, q))
+    T = [platform_in_base(machine, pose) for pose, _ in followed]
     off = [k for k, (_, failure) in enumerate(followed) if failure is not None]
     missed = np.zeros(len(q))
     if off:
-        nearest, missed[off] = _least_squares(mechanism, q[off], [T[k] for k in off])
+        nearest, missed[off] = _least_squares(machine, q[off], [T[k] for k in off])
         for k, pose in zip(off, nearest, strict=True):
             T[k] = pose
-    B = mechanism.home.apply(mechanism.B_platform)
-    most = MOST_MISSED * float(np.linalg.norm(B - mechanism.A_base, axis=1).mean())
+    B = machine.home.apply(machine.B_platform)
+    most = MOST_MISSED * float(np.linalg.norm(B - machine.A_base, axis=1).mean())
     problems = [
         f"The readings of {_image_of(measurements, k)} could not be used: found that the legs of "
         f"the nominal model miss them by {1e3 * missed[k]:.1f} mm at the nearest pose, needed at "
@@ -233,11 +233,11 @@ def nominal_poses(
 
 
 def _least_squares(
-    mechanism: Mechanism, q: Array, nearby: list[RigidTransform]
+    machine: Machine, q: Array, nearby: list[RigidTransform]
 ) -> tuple[tuple[RigidTransform, ...], Array]:
     """Return the poses at which the legs miss least, and the largest miss of each [m]."""
     R, t = components(nearby)
-    found = solve_poses(geometries(mechanism), mechanism.frame_legs, R, t, mechanism.sign * q)
+    found = solve_poses(geometries(machine), machine.frame_legs, R, t, machine.sign * q)
     poses = RigidTransform.from_components(found.t, Rotation.from_matrix(found.R))
     return tuple(poses), found.missed
 

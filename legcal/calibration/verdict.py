@@ -93,9 +93,9 @@ def judge(dataset: Dataset, solution: Solution, steps: Steps, notes: Sequence[st
     calibrated platform at the readings of the dataset; it counts where it exceeds two of its
     standard deviations. Where readings do not determine a pose, it is that of the parameters.
     """
-    mechanism, measurements = dataset.mechanism, dataset.measurements
+    machine, measurements = dataset.machine, dataset.measurements
     platform = platform_accuracy(
-        mechanism,
+        machine,
         solution.legs,
         solution.parametrization,
         solution.kinematic_covariance + solution.held_covariance,
@@ -134,7 +134,7 @@ def _verdict_on_platform(platform: PlatformAccuracy, focal_doubt: float) -> Verd
 def _verdict_on_parameters(dataset: Dataset, solution: Solution) -> Verdict:
     """Compare the change of joints and lengths with their uncertainty."""
     known = known_parameters(
-        dataset.mechanism, dataset.measurements.views, with_board=dataset.board is not None
+        dataset.machine, dataset.measurements.views, with_board=dataset.board is not None
     ).by_name
     lengths = [
         (solution.values[name] - known[name].nominal, sigma)

@@ -177,12 +177,13 @@ def inspect(
     ] = None,
 ) -> None:
     """Show a mechanism as legcal understands it: legs, joints, frames, mobility."""
-    from legcal import machine, report
+    from legcal import report
+    from legcal.machine import describe, load_mechanism, write_model
 
-    mechanism = machine.load_mechanism(model)
-    description = machine.describe(mechanism)
+    machine = load_mechanism(model)
+    description = describe(machine)
     if write is not None:
-        for path in machine.write_model(mechanism, write):
+        for path in write_model(machine, write):
             typer.echo(f"Wrote {path}.", err=True)
     show(as_json, lambda: description, lambda: report.inspect_table(description))
 
@@ -238,9 +239,9 @@ def locate(
         return None if text is None else parse_quantity(text, units, what)
 
     calibration.LOCATION_FILE.check_place(output)
-    mechanism = load_mechanism(model)
+    machine = load_mechanism(model)
     location = calibration.locate(
-        mechanism,
+        machine,
         poses,
         position_sigma=quantity(position_sigma, LENGTH, "--position-sigma"),
         angle_sigma=quantity(angle_sigma, ANGLE, "--angle-sigma"),
@@ -250,7 +251,7 @@ def locate(
     written = []
     if urdf is not None:
         paths = calibration.write_located_model(
-            mechanism, location, urdf, world=world_link, tool=tool_link
+            machine, location, urdf, world=world_link, tool=tool_link
         )
         written += [str(path) for path in paths]
     calibration.write_location(location, output)
@@ -342,7 +343,7 @@ def new(
     }
     asked = machine.described(table, family=family, unit=unit, name=name, dimensions=dimensions)
     created = machine.create_model(asked, output, force=force)
-    description = machine.describe(created.mechanism)
+    description = machine.describe(created.machine)
     paths = {"yaml": str(created.yaml_path), "urdf": str(created.urdf_path)}
     written = f"written: {paths['yaml']} {paths['urdf']}"
     show(

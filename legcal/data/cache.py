@@ -110,7 +110,7 @@ def fingerprint(dataset: Dataset, settings: Mapping[str, object]) -> str:
 
 def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
     """Return settings, views, readings and board as bytes that do not depend on the rows' order."""
-    leg_names = dataset.mechanism.leg_names
+    leg_names = dataset.machine.leg_names
     order = canonical_order(dataset.measurements, leg_names)
     measurements = reorder_measurements(dataset.measurements, order)
     views = [
@@ -138,8 +138,8 @@ def _described(dataset: Dataset, settings: Mapping[str, object]) -> list[bytes]:
 
 def _files(dataset: Dataset) -> list[bytes]:
     """Return digests of the mechanism's files and of the images, sorted by name."""
-    mechanism = dataset.mechanism
-    models = [path for path in (mechanism.yaml_path, mechanism.urdf_path) if path is not None]
+    machine = dataset.machine
+    models = [path for path in (machine.yaml_path, machine.urdf_path) if path is not None]
     images = sorted({image for image in dataset.measurements.image if image})
     return [_digest(path) for path in (*models, *(dataset.folder / name for name in images))]
 
@@ -169,7 +169,7 @@ def store_outlines(
     }
     path = dataset.folder / OBSERVATIONS_NAME
     try:
-        write_observations(path, outlines, dataset.measurements, dataset.mechanism.leg_names)
+        write_observations(path, outlines, dataset.measurements, dataset.machine.leg_names)
         write_atomically(dataset.folder / CACHE_NAME, (json.dumps(entry) + "\n").encode())
     except OSError as error:
         return (

@@ -34,7 +34,7 @@ from legcal.files import (
     validate,
 )
 from legcal.geometry import Image
-from legcal.machine import DATASET_YAML, Mechanism, load_mechanism, shipped_folders, shipped_names
+from legcal.machine import DATASET_YAML, Machine, load_mechanism, shipped_folders, shipped_names
 from legcal.vision import Board, Camera, image_problem, read_board, read_camera, read_image
 
 AXES_NAME = "axes.csv"
@@ -54,7 +54,7 @@ class Dataset:
     yaml_path: Path  # ``dataset.yaml`` and the table of measurements
     table_path: Path  # ``dataset.yaml`` and the table of measurements
     camera_paths: tuple[Path, ...]  # the camera file of each view
-    mechanism: Mechanism  # the nominal model
+    machine: Machine  # the nominal model
     measurements: Measurements  # the rows of the table, in its order
     observations: Outlines | None  # the rows of ``observations.csv`` if there is one
     notes: tuple[str, ...] = ()  # what is odd but allowed
@@ -222,8 +222,8 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         )
     camera_paths = tuple(folder / view.camera for view in entry.views.values())
     cameras = _read_cameras(camera_paths, problems)
-    mechanism = load_mechanism(_mechanism_path(folder, entry.mechanism))
-    problems += _leg_problems(yaml_path, entry.views, mechanism.leg_names)
+    machine = load_mechanism(_mechanism_path(folder, entry.mechanism))
+    problems += _leg_problems(yaml_path, entry.views, machine.leg_names)
     if problems:
         raise DatasetError(problems)
     views = tuple(
@@ -231,20 +231,20 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
         for (name, view), path in zip(entry.views.items(), camera_paths, strict=True)
     )
     table_path = folder / entry.measurements
-    rows, notes = read_measurements(table_path, folder, views, mechanism.legs, entry.encoder_sigma)
+    rows, notes = read_measurements(table_path, folder, views, machine.legs, entry.encoder_sigma)
     measurements, origin, problems = expand_hand_held(yaml_path, rows, entry.views)
     if problems:
         raise DatasetError(problems)
     _refuse_two_tables(folder)
-    axes, left_out = read_given_axes(folder / AXES_NAME, mechanism.leg_names, measurements)
+    axes, left_out = read_given_axes(folder / AXES_NAME, machine.leg_names, measurements)
     dataset = Dataset(
         folder=folder,
         yaml_path=yaml_path,
         table_path=table_path,
         camera_paths=tuple(camera_paths[v] for v in origin),
-        mechanism=mechanism,
+        machine=machine,
         measurements=measurements,
-        observations=_read_outlines(folder, mechanism, measurements),
+        observations=_read_outlines(folder, machine, measurements),
         notes=(*notes, *left_out, *_unused_views(yaml_path, rows)),
         axes=axes,
         overrides=entry.parameters.overrides(yaml_path),
@@ -343,15 +343,13 @@ def _view(name: str, entry: ViewEntry, camera: Camera) -> View:
     )
 
 
-def _read_outlines(
-    folder: Path, mechanism: Mechanism, measurements: Measurements
-) -> Outlines | None:
+def _read_outlines(folder: Path, machine: Machine, measurements: Measurements) -> Outlines | None:
     """Return the outlines beside the dataset, if there are any."""
     path = folder / OBSERVATIONS_NAME
     if not os.path.exists(path):
         return None
     is_own = (folder / CACHE_NAME).exists()
-    return read_observations(path, mechanism.legs, measurements, skip_stale=is_own)
+    return read_observations(path, machine.legs, measurements, skip_stale=is_own)
 
 
 def _unused_views(path: Path, measurements: Measurements) -> list[str]:

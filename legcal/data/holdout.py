@@ -75,14 +75,14 @@ def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:
 def _poses_by_chance(dataset: Dataset) -> IntArray:
     """Return all poses in an order of chance that does not depend on the order of the rows."""
     measurements = dataset.measurements
-    rows = canonical_order(measurements, dataset.mechanism.leg_names).rows
+    rows = canonical_order(measurements, dataset.machine.leg_names).rows
     poses = np.array(list(dict.fromkeys(measurements.pose[rows].tolist())), dtype=np.intp)
     return np.random.default_rng(_SEED).permutation(poses)
 
 
 def _shown(dataset: Dataset) -> BoolArray:
     """Return which leg in which view each row shows or may show, (n_rows, n_views * n_legs)."""
-    measurements, names = dataset.measurements, dataset.mechanism.leg_names
+    measurements, names = dataset.measurements, dataset.machine.leg_names
     shown = np.zeros((measurements.n_rows, len(measurements.views), len(names)), dtype=np.bool_)
     given = np.zeros(measurements.n_rows, dtype=np.bool_)
     for table, used in _tables(dataset):

@@ -1,7 +1,7 @@
 """Section 2: a parallel machine from its files, and what its legs demand of poses.
 
 In come mechanism YAMLs with a URDF, URDFs with loops of their own, MJCF files and tables of joints;
-out comes a :class:`Mechanism`: legs, joint frames R_b and R_e, mobility, a closed home, and the
+out comes a :class:`Machine`: legs, joint frames R_b and R_e, mobility, a closed home, and the
 chain in Pinocchio. A :class:`Leg` holds the numbers of its equations; :class:`Parametrization` says
 where they stand in the parameter vector, with names, units and gauge; :func:`pose_equations` is all
 that legs demand of poses, with derivatives by the pose and by the parameters, and is checked

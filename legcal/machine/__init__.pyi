@@ -57,7 +57,7 @@ from .load import load_mechanism as load_mechanism
 from .load import singular_note as singular_note
 from .mobility import leg_scale as leg_scale
 from .mobility import singularity as singularity
-from .model import Mechanism as Mechanism
+from .model import Machine as Machine
 from .model import describe as describe
 from .new_model import create_model as create_model
 from .parameters import Parametrization as Parametrization

@@ -25,7 +25,7 @@ from legcal.machine.kinematics import (
 )
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import free_motions, project, singularity
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.solver import RANK, moved
 
 TRIES = 40  # draws for each configuration
@@ -73,7 +73,7 @@ class Configurations(NamedTuple):
 
 
 def random_configurations(
-    mechanism: Mechanism, count: int, rng: np.random.Generator | int
+    machine: Machine, count: int, rng: np.random.Generator | int
 ) -> Configurations:
     """Return random closed configurations with every slider inside its travel.
 
@@ -83,7 +83,7 @@ def random_configurations(
 
     Parameters
     ----------
-    mechanism : Mechanism
+    machine : Machine
         The machine.
     count : int
         How many.
@@ -101,22 +101,22 @@ def random_configurations(
         If too few are reached.
     """
     chance = np.random.default_rng(rng)
-    draw = _drawn if mechanism.is_determined else _wandered
-    found = list(draw(mechanism, count, chance))
+    draw = _drawn if machine.is_determined else _wandered
+    found = list(draw(machine, count, chance))
     if len(found) < count:
         raise DidNotConverge(
-            f"{mechanism.yaml_path}: random poses could not be drawn: found {len(found)} of "
+            f"{machine.yaml_path}: random poses could not be drawn: found {len(found)} of "
             f"{count} inside the travel in {TRIES} tries for each, needed all; check legcal.home "
             "and the limits of the sliders."
         )
     return Configurations(
-        np.array(found).reshape(count, mechanism.chain.nq),
-        np.array([joint_values(mechanism, c) for c in found]).reshape(count, mechanism.n_legs),
-        [platform_pose(mechanism, c) for c in found],
+        np.array(found).reshape(count, machine.chain.nq),
+        np.array([joint_values(machine, c) for c in found]).reshape(count, machine.n_legs),
+        [platform_pose(machine, c) for c in found],
     )
 
 
-def workspace(mechanism: Mechanism) -> Configurations:
+def workspace(machine: Machine) -> Configurations:
     """Return the configurations that stand for the workspace, the same at every call.
 
     Errors over the workspace are those at these poses, whether they are predicted or found by
@@ -127,19 +127,19 @@ def workspace(mechanism: Mechanism) -> Configurations:
     DidNotConverge
         As :func:`random_configurations`.
     """
-    names = sorted(mechanism.leg_names)
-    ordered = mechanism.with_leg_order(names)
+    names = sorted(machine.leg_names)
+    ordered = machine.with_leg_order(names)
     drawn = random_configurations(ordered, WORKSPACE_POSES, WORKSPACE_SEED)
-    legs = [names.index(name) for name in mechanism.leg_names]
+    legs = [names.index(name) for name in machine.leg_names]
     return drawn._replace(readings=drawn.readings[:, legs])
 
 
-def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Iterator[Array]:
+def _drawn(machine: Machine, count: int, chance: np.random.Generator) -> Iterator[Array]:
     """Yield what is reached from home at random readings of the motors."""
-    motors = [mechanism.legs[j] for j in mechanism.motors]
+    motors = [machine.legs[j] for j in machine.motors]
     lower, upper = np.array([leg.travel for leg in motors]).T
-    home = mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]
-    least = REGULAR * singularity(mechanism, mechanism.home)
+    home = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
+    least = REGULAR * singularity(machine, machine.home)
     drawn = 0
     for turn in range(count):
         if turn == HOPELESS and not drawn:
@@ -150,52 +150,52 @@ def _drawn(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Ite
                 q = np.clip(home + nearer * (q - home), lower, upper)
             try:
                 reached = follow(
-                    mechanism,
-                    mechanism.home_configuration,
+                    machine,
+                    machine.home_configuration,
                     q,
                     shortest=SHORTEST,
                     on_the_chain=tries % (ON_THE_CHAIN + 1) < ON_THE_CHAIN,
                 )
             except DidNotConverge:  # the legs cannot have these lengths at the same time
                 continue
-            if beyond_travel(mechanism, reached).any():
+            if beyond_travel(machine, reached).any():
                 continue
-            if singularity(mechanism, platform_pose(mechanism, reached)) >= least:
+            if singularity(machine, platform_pose(machine, reached)) >= least:
                 drawn += 1
                 yield reached
                 break
 
 
-def _wandered(mechanism: Mechanism, count: int, chance: np.random.Generator) -> Iterator[Array]:
+def _wandered(machine: Machine, count: int, chance: np.random.Generator) -> Iterator[Array]:
     """Yield every few steps of a random walk whose sliders stay inside their travel."""
-    here = mechanism.home_configuration
+    here = machine.home_configuration
     for _ in range(count):
         for _ in range(TRIES):
-            here = strolled(mechanism, here, chance)
-            if not beyond_travel(mechanism, here).any():
+            here = strolled(machine, here, chance)
+            if not beyond_travel(machine, here).any():
                 yield here
                 break
 
 
-def strolled(mechanism: Mechanism, here: Array, chance: np.random.Generator) -> Array:
+def strolled(machine: Machine, here: Array, chance: np.random.Generator) -> Array:
     """Return a closed configuration a few steps away, no further outside the travel."""
     for _ in range(WALK):
-        motions = free_motions(mechanism, here)
+        motions = free_motions(machine, here)
         weights = chance.normal(size=motions.shape[1]) / np.sqrt(max(motions.shape[1], 1))
-        there = project(mechanism, mechanism.chain.integrate(here, STRIDE * motions @ weights))
+        there = project(machine, machine.chain.integrate(here, STRIDE * motions @ weights))
         if there is None:
             continue
-        if not np.any(beyond_travel(mechanism, there) & ~beyond_travel(mechanism, here)):
+        if not np.any(beyond_travel(machine, there) & ~beyond_travel(machine, here)):
             here = there
     return here
 
 
-def beyond_travel(mechanism: Mechanism, configuration: Array) -> BoolArray:
+def beyond_travel(machine: Machine, configuration: Array) -> BoolArray:
     """Return which legs are outside their travel, or flipped, (n_legs,)."""
-    values = joint_values(mechanism, configuration)
-    lower, upper = np.array([leg.travel for leg in mechanism.legs]).T
+    values = joint_values(machine, configuration)
+    lower, upper = np.array([leg.travel for leg in machine.legs]).T
     outside = (values < lower - INSIDE) | (values > upper + INSIDE)
-    return np.asarray(outside | (mechanism.sign * values + mechanism.q0 <= 0.0))
+    return np.asarray(outside | (machine.sign * values + machine.q0 <= 0.0))
 
 
 def random_poses(

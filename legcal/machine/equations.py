@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine.leg import N_LOCAL, Demand, Leg, LegKind
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization
 
 
@@ -99,27 +99,27 @@ def linearize(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> PoseEqu
     )
 
 
-def equations_at(mechanism: Mechanism, R: Array, t: Array) -> PoseEquations:
+def equations_at(machine: Machine, R: Array, t: Array) -> PoseEquations:
     """Return all equations of a machine, its plane too, at poses of its links, without by_local."""
-    found = pose_equations(mechanism.legs, R, t, by_local=False)
-    return found if mechanism.spatial else _stacked([found, _plane(mechanism, R, t)])
+    found = pose_equations(machine.legs, R, t, by_local=False)
+    return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
 
 
-def demands_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> PoseEquations:
+def demands_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
     """Return the same at one pose."""
     matrix = T_base_platform.as_matrix()[None]
-    return equations_at(mechanism, matrix[:, :3, :3], matrix[:, :3, 3])
+    return equations_at(machine, matrix[:, :3, :3], matrix[:, :3, 3])
 
 
-def constraints_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> PoseEquations:
+def constraints_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
     """Return the equations that hold at one pose whatever the readings are."""
-    demands = demands_at(mechanism, T_base_platform)
+    demands = demands_at(machine, T_base_platform)
     return demands.of(~demands.measured)
 
 
-def is_constrained(mechanism: Mechanism) -> bool:
+def is_constrained(machine: Machine) -> bool:
     """Say whether the machine itself forbids some poses, whatever the lengths of its sliders."""
-    return not mechanism.spatial or any(map(n_bonds, mechanism.legs))
+    return not machine.spatial or any(map(n_bonds, machine.legs))
 
 
 def n_bonds(leg: Leg) -> int:
@@ -182,30 +182,30 @@ _WORDS = {
 _EXACT = 1e-9  # [m]
 
 
-def worst_in_words(mechanism: Mechanism, equations: PoseEquations, verb: str = "") -> str:
+def worst_in_words(machine: Machine, equations: PoseEquations, verb: str = "") -> str:
     """Return the row furthest from met at the first pose: who (verb) how far how."""
     row = int(np.argmax(np.abs(equations.values[0])))
     leg, how = equations.leg[row], _WORDS[equations.demands[row]]
-    who = "the platform" if leg < 0 else f"leg '{mechanism.leg_names[leg]}'"
+    who = "the platform" if leg < 0 else f"leg '{machine.leg_names[leg]}'"
     return " ".join(f"{who} {verb} {1e3 * abs(equations.values[0, row]):.3g} mm {how}".split())
 
 
-def unmet(mechanism: Mechanism, T_base_platform: RigidTransform) -> str | None:
+def unmet(machine: Machine, T_base_platform: RigidTransform) -> str | None:
     """Return which constraint a pose does not meet, in words; None where it meets all.
 
     A constraint counts as met within a nanometre, or as well as the machine meets it at home where
     its axes are a little off (they may be, by up to a milliradian).
     """
-    if not is_constrained(mechanism):
+    if not is_constrained(machine):
         return None
-    here = constraints_at(mechanism, T_base_platform)
+    here = constraints_at(machine, T_base_platform)
     worst = np.abs(here.values).max()
     if worst <= _EXACT:
         return None
-    at_home = np.abs(constraints_at(mechanism, mechanism.home).values).max()
+    at_home = np.abs(constraints_at(machine, machine.home).values).max()
     if worst <= _EXACT + 10.0 * at_home:
         return None
-    return worst_in_words(mechanism, here, "would be")
+    return worst_in_words(machine, here, "would be")
 
 
 def _is_point_like(leg: Leg) -> bool:
@@ -233,12 +233,12 @@ def _point_like(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> Pose
     )
 
 
-def _plane(mechanism: Mechanism, R: Array, t: Array) -> PoseEquations:
+def _plane(machine: Machine, R: Array, t: Array) -> PoseEquations:
     """Return the three equations that keep a platform in its plane, tilts at a mean leg's end."""
-    normal = mechanism.T_base_Rb.as_matrix()[:3, 2]
-    carried = R @ mechanism.T_platform_Re.as_matrix()[:3, 2]
-    arms = mechanism.B_platform @ np.swapaxes(R, 1, 2)
-    vectors = arms + t[:, None] - mechanism.A_base
+    normal = machine.T_base_Rb.as_matrix()[:3, 2]
+    carried = R @ machine.T_platform_Re.as_matrix()[:3, 2]
+    arms = machine.B_platform @ np.swapaxes(R, 1, 2)
+    vectors = arms + t[:, None] - machine.A_base
     scale = np.linalg.norm(vectors, axis=2).mean(axis=1)
     values, by_pose = np.zeros((len(t), 3)), np.zeros((len(t), 3, 6))
     values[:, 0] = (vectors @ normal).mean(axis=1)

@@ -16,7 +16,7 @@ from legcal.geometry import Array, motion_of
 from legcal.machine.equations import equations_at, is_constrained
 from legcal.machine.kinematics import close_at, platform_pose, readings_at, settle
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.parameters import in_links
 from legcal.machine.solver import moved, solve
 
@@ -29,7 +29,7 @@ FAR = 1.0  # of the travel: refused beyond, if it is also beyond
 _FAR_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
 
 
-def closed_home(mechanism: Mechanism, home: RigidTransform | None) -> tuple[RigidTransform, Array]:
+def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTransform, Array]:
     """Return the home pose and the closed configuration there, from a given pose or from none.
 
     Raises
@@ -37,14 +37,14 @@ def closed_home(mechanism: Mechanism, home: RigidTransform | None) -> tuple[Rigi
     ModelError, DidNotConverge
         As :func:`settle_home`, :func:`find_home` and :func:`legcal.machine.kinematics.close_at`.
     """
-    start = find_home(mechanism) if home is None else home
-    settled = settle_home(mechanism, start)
-    configuration = close_at(mechanism, settled, hold=False)
-    constrained = is_constrained(mechanism)
-    return platform_pose(mechanism, configuration) if constrained else settled, configuration
+    start = find_home(machine) if home is None else home
+    settled = settle_home(machine, start)
+    configuration = close_at(machine, settled, hold=False)
+    constrained = is_constrained(machine)
+    return platform_pose(machine, configuration) if constrained else settled, configuration
 
 
-def settle_home(mechanism: Mechanism, home: RigidTransform) -> RigidTransform:
+def settle_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     """Return the pose nearest to home that meets every demand of legs and plane.
 
     Files give home with few digits; sliders absorb that, but rods, revolute axes and universal
@@ -55,16 +55,16 @@ def settle_home(mechanism: Mechanism, home: RigidTransform) -> RigidTransform:
     ModelError
         If home is more than 1 % of a leg length away from any such pose.
     """
-    settled, problem = settle(mechanism, home)
+    settled, problem = settle(machine, home)
     if problem is not None:
         raise ModelError(
-            f"{mechanism.yaml_path}: legcal.home could not be used: found {problem} there, needed "
+            f"{machine.yaml_path}: legcal.home could not be used: found {problem} there, needed "
             "a closed pose; correct legcal.home."
         )
     return settled
 
 
-def find_home(mechanism: Mechanism) -> RigidTransform:
+def find_home(machine: Machine) -> RigidTransform:
     """Return a pose where every leg is at the middle of its travel.
 
     Of all that seeded starts find, the one that turns the platform least is taken, and of the
@@ -76,12 +76,12 @@ def find_home(mechanism: Mechanism) -> RigidTransform:
     DidNotConverge
         If none is found.
     """
-    middle = np.array([0.5 * sum(leg.travel) for leg in mechanism.legs])
-    wanted = mechanism.sign * middle
-    held = np.array([leg.kind is LegKind.ACTUATED for leg in mechanism.legs])
+    middle = np.array([0.5 * sum(leg.travel) for leg in machine.legs])
+    wanted = machine.sign * middle
+    held = np.array([leg.kind is LegKind.ACTUATED for leg in machine.legs])
     rng = np.random.default_rng(1965)
-    centre = mechanism.A_base.mean(axis=0)
-    reach = float(np.abs(wanted + mechanism.q0).mean())
+    centre = machine.A_base.mean(axis=0)
+    reach = float(np.abs(wanted + machine.q0).mean())
     best: tuple[float, RigidTransform] | None = None
     for first in range(0, TRIALS, TOGETHER):
         trials = np.arange(first, min(first + TOGETHER, TRIALS))
@@ -89,24 +89,24 @@ def find_home(mechanism: Mechanism) -> RigidTransform:
             (centre + rng.normal(0.0, reach, 3), rng.normal(0.0, 0.1 + trial / TRIALS, 3))
             for trial in trials
         ]
-        found = _with_lengths(mechanism, starts, wanted[held], reach)
+        found = _with_lengths(machine, starts, wanted[held], reach)
         for trial, T in zip(trials, found, strict=True):
             if T is None:
                 continue
-            rank = _unlikely(mechanism, T) + float(T.rotation.magnitude())
+            rank = _unlikely(machine, T) + float(T.rotation.magnitude())
             if best is None or rank < best[0] - 1e-6:
                 best = rank, T
             if trial >= ENOUGH and best[0] < 5.0:
                 return best[1]
     if best is None:
         raise DidNotConverge(
-            f"{mechanism.yaml_path}: no home pose was found: with all legs at mid-travel the "
+            f"{machine.yaml_path}: no home pose was found: with all legs at mid-travel the "
             f"loops did not close from {TRIALS} starts, needed a closed pose; write legcal.home."
         )
     return best[1]
 
 
-def home_with(mechanism: Mechanism, legs: Sequence[Leg], furthest: float) -> RigidTransform | None:
+def home_with(machine: Machine, legs: Sequence[Leg], furthest: float) -> RigidTransform | None:
     """Return the closed pose nearest to home once the legs have other numbers, None if none is.
 
     *legs* are those of the machine in R_b and R_e as they are to be; both frames stay where they
@@ -123,21 +123,21 @@ def home_with(mechanism: Mechanism, legs: Sequence[Leg], furthest: float) -> Rig
             platform_axis=wanted.platform_axis,
             twist=wanted.twist,
         )
-        for leg, wanted in zip(mechanism.legs, in_links(mechanism, legs), strict=True)
+        for leg, wanted in zip(machine.legs, in_links(machine, legs), strict=True)
     )
-    home, problem = settle(replace(mechanism, legs=changed), mechanism.home, furthest)
+    home, problem = settle(replace(machine, legs=changed), machine.home, furthest)
     return None if problem is not None else home
 
 
 def _with_lengths(
-    mechanism: Mechanism, starts: Sequence[tuple[Array, Array]], lengths: Array, reach: float
+    machine: Machine, starts: Sequence[tuple[Array, Array]], lengths: Array, reach: float
 ) -> list[RigidTransform | None]:
     """Return the poses, found from places and turns, with those lengths of the actuated legs."""
     t, turns = (np.array(part) for part in zip(*starts, strict=True))
     poses = np.concatenate([Rotation.from_rotvec(turns).as_matrix(), t[..., None]], axis=2)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = equations_at(mechanism, poses[:, :, :3], poses[:, :, 3])
+        found = equations_at(machine, poses[:, :, :3], poses[:, :, 3])
         found.values[:, found.measured] -= lengths
         return found.values, found.by_pose
 
@@ -151,24 +151,24 @@ def _with_lengths(
     ]
 
 
-def _unlikely(mechanism: Mechanism, T: RigidTransform) -> float:
+def _unlikely(machine: Machine, T: RigidTransform) -> float:
     """Return a penalty: below the base, a fixed leg backwards, a passive one outside its travel."""
-    centre = mechanism.A_base.mean(axis=0)
-    B = np.asarray(T.apply(mechanism.B_platform))
-    size = float(np.abs(B - mechanism.A_base).max())
-    below = mechanism.spatial and B.mean(axis=0)[2] < centre[2] - 1e-6 * size
+    centre = machine.A_base.mean(axis=0)
+    B = np.asarray(T.apply(machine.B_platform))
+    size = float(np.abs(B - machine.A_base).max())
+    below = machine.spatial and B.mean(axis=0)[2] < centre[2] - 1e-6 * size
     penalty = 10.0 * float(below)
-    for j, (leg, q) in enumerate(zip(mechanism.legs, readings_at(mechanism, T), strict=True)):
+    for j, (leg, q) in enumerate(zip(machine.legs, readings_at(machine, T), strict=True)):
         lower, upper = leg.travel
         if leg.kind is LegKind.PASSIVE and not lower <= q <= upper:
             penalty += 5.0
         if leg.platform_joint == "" and leg.platform_axis is not None:
-            along = T.rotation.apply(leg.platform_axis) @ (B[j] - mechanism.A_base[j])
+            along = T.rotation.apply(leg.platform_axis) @ (B[j] - machine.A_base[j])
             penalty += 100.0 * float(along < 0.0)
     return penalty
 
 
-def check_home_travel(mechanism: Mechanism) -> None:
+def check_home_travel(machine: Machine) -> None:
     """Check that the home that a file gives is not far outside the travel of its motors.
 
     Raises
@@ -178,32 +178,32 @@ def check_home_travel(mechanism: Mechanism) -> None:
         1 % of its length.
     """
     far = {}
-    q = readings_at(mechanism, mechanism.home)
-    for j, excess in legs_outside(mechanism, FAR).items():
-        leg = mechanism.legs[j]
+    q = readings_at(machine, machine.home)
+    for j, excess in legs_outside(machine, FAR).items():
+        leg = machine.legs[j]
         length = leg.sign * float(q[j]) + leg.q0
         if leg.kind is LegKind.ACTUATED and excess > _FAR_OF_LEG * length:
             far[j] = excess
     if not far:
         return
     worst = max(far, key=lambda j: far[j])
-    leg = mechanism.legs[worst]
+    leg = machine.legs[worst]
     others = ""
     if len(far) > 1:
         others = f" ({len(far) - 1} more {'leg is' if len(far) == 2 else 'legs are'} as far off)"
     raise ModelError(
-        f"{mechanism.yaml_path}: legcal.home could not be used: found leg '{leg.name}' at "
+        f"{machine.yaml_path}: legcal.home could not be used: found leg '{leg.name}' at "
         f"{1e3 * q[worst]:.2f} mm there{others}, needed a reading near its travel of "
         f"{1e3 * leg.travel[0]:.2f} to {1e3 * leg.travel[1]:.2f} mm; correct legcal.home or the "
         "limits of the slider."
     )
 
 
-def legs_outside(mechanism: Mechanism, share: float = 0.0) -> dict[int, float]:
+def legs_outside(machine: Machine, share: float = 0.0) -> dict[int, float]:
     """Return the legs outside their travel at home by more than a share of it, and how far [m]."""
     found = {}
-    q = readings_at(mechanism, mechanism.home)
-    for j, leg in enumerate(mechanism.legs):
+    q = readings_at(machine, machine.home)
+    for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel
         excess = max(lower - float(q[j]), float(q[j]) - upper)
         if leg.kind is not LegKind.CONSTANT and excess > share * (upper - lower):

@@ -26,7 +26,7 @@ from legcal.machine.equations import (
 )
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.mobility import CLOSED, dimensionless, hardly_changes, leg_scale, side
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.solver import Equations, Retraction, moved, newton, solve, walk
 
 EXACT = 1e-11  # [m, rad]: where a held platform is
@@ -41,13 +41,13 @@ FURTHEST = 0.01  # of a leg length: how far a given pose may be from a closed on
 
 
 def forward_kinematics(
-    mechanism: Mechanism, q: Array, start: RigidTransform | None = None
+    machine: Machine, q: Array, start: RigidTransform | None = None
 ) -> RigidTransform:
     """Return the platform pose at motor readings.
 
     Parameters
     ----------
-    mechanism : Mechanism
+    machine : Machine
         The machine.
     q : (n_legs,) array
         Readings [m]; those of legs without a motor are ignored and may be NaN.
@@ -68,7 +68,7 @@ def forward_kinematics(
     UsageError
         If the readings are too few or not finite.
     """
-    return Follower(mechanism, start).move_to(q)
+    return Follower(machine, start).move_to(q)
 
 
 class Follower:
@@ -76,7 +76,7 @@ class Follower:
 
     Parameters
     ----------
-    mechanism : Mechanism
+    machine : Machine
         The machine.
     start : RigidTransform, optional
         T_base_platform of a pose in the wanted assembly mode; ``mechanism.home`` without it.
@@ -96,18 +96,18 @@ class Follower:
         If the legs do not reach the start.
     """
 
-    def __init__(self, mechanism: Mechanism, start: RigidTransform | None = None) -> None:
-        _check_determined(mechanism)
-        self._mechanism = mechanism
-        self.configuration = mechanism.home_configuration
+    def __init__(self, machine: Machine, start: RigidTransform | None = None) -> None:
+        _check_determined(machine)
+        self._mechanism = machine
+        self.configuration = machine.home_configuration
         if start is not None:
-            settled, problem = settle(mechanism, start)
+            settled, problem = settle(machine, start)
             if problem is not None:
                 raise UsageError(
                     f"The pose could not be followed from its start: found {problem} there, needed "
                     "a pose that the legs allow; correct the start."
                 )
-            self.configuration = close_at(mechanism, settled, self.configuration, hold=False)
+            self.configuration = close_at(machine, settled, self.configuration, hold=False)
 
     @property
     def pose(self) -> RigidTransform:
@@ -135,7 +135,7 @@ class Follower:
         return self.pose
 
 
-def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransform]:
+def forward_kinematics_many(machine: Machine, q: Array) -> list[RigidTransform]:
     """Return T_base_platform of many rows of readings (n_rows, n_legs) [m], in the mode of home.
 
     Each row starts from the nearest one that is solved already, or from home.
@@ -146,7 +146,7 @@ def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransfo
         As :func:`forward_kinematics`.
     """
     poses = []
-    for pose, failure in followed_poses(mechanism, q):
+    for pose, failure in followed_poses(machine, q):
         if failure is not None:
             raise failure
         poses.append(pose)
@@ -154,28 +154,28 @@ def forward_kinematics_many(mechanism: Mechanism, q: Array) -> list[RigidTransfo
 
 
 def followed_poses(
-    mechanism: Mechanism, q: Array
+    machine: Machine, q: Array
 ) -> Iterator[tuple[RigidTransform, DidNotConverge | None]]:
     """Yield the platform pose at each of many rows of readings, and no failure.
 
     Where a row is not reached, the pose of the nearest row that is, or home, comes with the
     failure. Arguments and other exceptions are those of :func:`forward_kinematics_many`.
     """
-    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
-    configurations = [mechanism.home_configuration]
-    for i, row in enumerate(_readings(mechanism, np.asarray(q, dtype=np.float64))):
+    known = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
+    configurations = [machine.home_configuration]
+    for i, row in enumerate(_readings(machine, np.asarray(q, dtype=np.float64))):
         nearest = configurations[int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))]
         try:
-            configuration = follow(mechanism, nearest, row, f" of row {i + 1}")
+            configuration = follow(machine, nearest, row, f" of row {i + 1}")
         except DidNotConverge as failure:
-            yield platform_pose(mechanism, nearest), failure
+            yield platform_pose(machine, nearest), failure
             continue
         known.append(row)
         configurations.append(configuration)
-        yield platform_pose(mechanism, configuration), None
+        yield platform_pose(machine, configuration), None
 
 
-def inverse_kinematics(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+def inverse_kinematics(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, q = sign (|AB| - q0).
 
     A length is a distance, so that no leg is ever flipped. Values outside the travel are
@@ -183,7 +183,7 @@ def inverse_kinematics(mechanism: Mechanism, T_base_platform: RigidTransform) ->
 
     Parameters
     ----------
-    mechanism : Mechanism
+    machine : Machine
         The machine.
     T_base_platform : RigidTransform
         Pose of the platform link in the base link.
@@ -199,52 +199,52 @@ def inverse_kinematics(mechanism: Mechanism, T_base_platform: RigidTransform) ->
         If the legs or the plane of motion do not allow the pose: a rod that is too short or too
         long, a revolute axis that is not perpendicular to its leg, a leg that would be twisted.
     """
-    problem = unmet(mechanism, T_base_platform)
+    problem = unmet(machine, T_base_platform)
     if problem is not None:
         raise UsageError(
             f"The platform cannot stand there: {problem}, needed a pose that every leg "
             "allows; choose one that keeps it."
         )
-    q = readings_at(mechanism, T_base_platform)
-    q[[leg.kind is LegKind.CONSTANT for leg in mechanism.legs]] = 0.0
+    q = readings_at(machine, T_base_platform)
+    q[[leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
     return q
 
 
-def _readings(mechanism: Mechanism, q: Array) -> Array:
+def _readings(machine: Machine, q: Array) -> Array:
     """Return the readings of the motors, (n_rows, n_motors), checked."""
-    if q.ndim != 2 or q.shape[1] != mechanism.n_legs:
+    if q.ndim != 2 or q.shape[1] != machine.n_legs:
         raise UsageError(
             f"The pose could not be computed: found readings of shape {q.shape[1:]}, needed "
-            f"({mechanism.n_legs},), one for each leg; pass them in the order of the legs."
+            f"({machine.n_legs},), one for each leg; pass them in the order of the legs."
         )
-    _check_determined(mechanism)
-    readings = q[:, list(mechanism.motors)]
-    legs = list(mechanism.motors)
-    lengths = mechanism.sign[legs] * readings + mechanism.q0[legs]
+    _check_determined(machine)
+    readings = q[:, list(machine.motors)]
+    legs = list(machine.motors)
+    lengths = machine.sign[legs] * readings + machine.q0[legs]
     wrong = np.argwhere(~((lengths > 0.0) & np.isfinite(lengths)))
     if len(wrong):
         row, column = wrong[0]
         raise UsageError(
             f"The pose of row {row + 1} could not be computed: found the reading "
-            f"{readings[row, column]:g} of leg '{mechanism.legs[legs[column]].name}', needed a "
+            f"{readings[row, column]:g} of leg '{machine.legs[legs[column]].name}', needed a "
             "finite number above a leg length of zero; correct the reading."
         )
     return readings
 
 
-def _check_determined(mechanism: Mechanism) -> None:
+def _check_determined(machine: Machine) -> None:
     """Refuse a mechanism whose motors do not determine the pose."""
-    if not mechanism.is_determined:
+    if not machine.is_determined:
         raise NotIdentifiable(
-            f"{mechanism.yaml_path}: the pose cannot be computed from readings: found mobility "
-            f"{mechanism.mobility} and {len(mechanism.motors)} motors, needed as many motors as "
+            f"{machine.yaml_path}: the pose cannot be computed from readings: found mobility "
+            f"{machine.mobility} and {len(machine.motors)} motors, needed as many motors as "
             "mobility; correct name_mot, or do not ask for poses of this mechanism."
         )
 
 
-def platform_in_base(mechanism: Mechanism, T_base_platform: RigidTransform) -> RigidTransform:
+def platform_in_base(machine: Machine, T_base_platform: RigidTransform) -> RigidTransform:
     """Return T_Rb_Re, the pose of the frame on the platform joints, from that of the links."""
-    return product(mechanism.T_base_Rb.inv(), T_base_platform, mechanism.T_platform_Re)
+    return product(machine.T_base_Rb.inv(), T_base_platform, machine.T_platform_Re)
 
 
 def pose_differences(
@@ -266,35 +266,35 @@ def pose_differences(
     return displacement, np.asarray(Rotation.from_matrix(between).magnitude())
 
 
-def leg_vectors(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+def leg_vectors(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the vectors from base to platform joint of every leg, (n_legs, 3), base link [m]."""
-    return np.asarray(T_base_platform.apply(mechanism.B_platform)) - mechanism.A_base
+    return np.asarray(T_base_platform.apply(machine.B_platform)) - machine.A_base
 
 
-def readings_at(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+def readings_at(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the joint value of every leg at a pose, q = sign (|AB| - q0), (n_legs,) [m]."""
-    lengths = np.linalg.norm(leg_vectors(mechanism, T_base_platform), axis=1)
-    return np.asarray(mechanism.sign * (lengths - mechanism.q0))
+    lengths = np.linalg.norm(leg_vectors(machine, T_base_platform), axis=1)
+    return np.asarray(machine.sign * (lengths - machine.q0))
 
 
-def platform_pose(mechanism: Mechanism, configuration: Array) -> RigidTransform:
+def platform_pose(machine: Machine, configuration: Array) -> RigidTransform:
     """Return T_base_platform at a configuration."""
-    return mechanism.chain.pose(configuration, mechanism.base, mechanism.platform)
+    return machine.chain.pose(configuration, machine.base, machine.platform)
 
 
-def slider_columns(mechanism: Mechanism, legs: Sequence[int]) -> tuple[list[int], list[int]]:
+def slider_columns(machine: Machine, legs: Sequence[int]) -> tuple[list[int], list[int]]:
     """Return where the sliders of some legs stand in configurations and in tangent vectors."""
-    names = [mechanism.legs[j].prismatic for j in legs]
+    names = [machine.legs[j].prismatic for j in legs]
     joints = [name for name in names if name is not None]
-    chain = mechanism.chain
+    chain = machine.chain
     return [chain.q_index(j) for j in joints], [chain.v_index(j) for j in joints]
 
 
-def joint_values(mechanism: Mechanism, configuration: Array) -> Array:
+def joint_values(machine: Machine, configuration: Array) -> Array:
     """Return the joint value of every leg at a configuration, zero for rods, (n_legs,) [m]."""
-    values = np.zeros(mechanism.n_legs)
-    sliding = [j for j, leg in enumerate(mechanism.legs) if leg.kind is not LegKind.CONSTANT]
-    values[sliding] = configuration[slider_columns(mechanism, sliding)[0]]
+    values = np.zeros(machine.n_legs)
+    sliding = [j for j, leg in enumerate(machine.legs) if leg.kind is not LegKind.CONSTANT]
+    values[sliding] = configuration[slider_columns(machine, sliding)[0]]
     return values
 
 
@@ -343,21 +343,21 @@ def solve_poses(
 
 
 def settle(
-    mechanism: Mechanism, T: RigidTransform, furthest: float = FURTHEST
+    machine: Machine, T: RigidTransform, furthest: float = FURTHEST
 ) -> tuple[RigidTransform, str | None]:
     """Return the nearest pose that meets every constraint, and what is in the way if none is near.
 
     Constraints may be missed by *furthest* leg lengths at the start, T_base_platform.
     """
-    if not is_constrained(mechanism):
+    if not is_constrained(machine):
         return T, None
-    scale = leg_scale(mechanism, T)
-    first = constraints_at(mechanism, T)
+    scale = leg_scale(machine, T)
+    first = constraints_at(machine, T)
     if np.abs(first.values).max() > furthest * scale:
-        return T, worst_in_words(mechanism, first)
+        return T, worst_in_words(machine, first)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = equations_at(mechanism, poses[:, :, :3], poses[:, :, 3])
+        found = equations_at(machine, poses[:, :, :3], poses[:, :, 3])
         held = ~found.measured
         return found.values[:, held], found.by_pose[:, held]
 
@@ -366,11 +366,11 @@ def settle(
     settled = motion_of(found.points[0, :, :3], found.points[0, :, 3])
     if found.worst[0] <= 1e-9 * scale:
         return settled, None
-    return settled, worst_in_words(mechanism, constraints_at(mechanism, settled))
+    return settled, worst_in_words(machine, constraints_at(machine, settled))
 
 
 def close_at(
-    mechanism: Mechanism,
+    machine: Machine,
     T_base_platform: RigidTransform,
     start: Array | None = None,
     restarts: int = RESTARTS,
@@ -389,18 +389,18 @@ def close_at(
     DidNotConverge
         If a leg does not close, naming its closure and the distance left.
     """
-    chain, astray = mechanism.chain, EXACT if hold else NEAR
+    chain, astray = machine.chain, EXACT if hold else NEAR
     angles = np.zeros(chain.nv, dtype=np.bool_)
-    for joint in mechanism.urdf.joints.values():
+    for joint in machine.urdf.joints.values():
         if joint.type in ("revolute", "continuous"):
             angles[chain.v_index(joint.name)] = True
     # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
     # weigh too little to be closed, and NEAR would be a large part of a leg.
-    metre = min(1.0, leg_scale(mechanism, T_base_platform))
-    configuration = _placed(mechanism, T_base_platform, start, astray)
+    metre = min(1.0, leg_scale(machine, T_base_platform))
+    configuration = _placed(machine, T_base_platform, start, astray)
     rng = np.random.default_rng(20020701)
     for _ in range(restarts):
-        equations, retract = _held(mechanism, T_base_platform, metre, angles)
+        equations, retract = _held(machine, T_base_platform, metre, angles)
         found = solve(equations, retract, configuration[None], met=0.01 * CLOSED, far=True)
         configuration = found.points[0]
         stuck = np.abs(found.values[0]) > NEAR
@@ -410,30 +410,30 @@ def close_at(
         columns[angles] = np.abs(found.jacobian[0, stuck]).max(axis=0) > 1e-9
         step = np.where(columns, rng.uniform(-np.pi, np.pi, chain.nv), 0.0)
         configuration = chain.integrate(configuration, step)
-    everything = _held(mechanism, T_base_platform, 1.0, angles)
+    everything = _held(machine, T_base_platform, 1.0, angles)
     left = everything[0](configuration[None])[0][0]
     if np.abs(left).max(initial=0.0) >= CLOSED:
-        angles[slider_columns(mechanism, range(mechanism.n_legs))[1]] = True  # and sliders
+        angles[slider_columns(machine, range(machine.n_legs))[1]] = True  # and sliders
         pose = T_base_platform if hold else None
         every = angles if hold else np.ones(chain.nv, dtype=np.bool_)
-        equations, retract = _held(mechanism, pose, 1.0, every)
+        equations, retract = _held(machine, pose, 1.0, every)
         found = solve(equations, retract, configuration[None], met=0.01 * CLOSED, far=True)
         configuration, left = found.points[0], found.values[0]
-    off = _off(mechanism, T_base_platform, configuration)
+    off = _off(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
-        problem = f"{worst_closure(mechanism, left)}, needed less than 1e-12 m"
+        problem = f"{worst_closure(machine, left)}, needed less than 1e-12 m"
     elif max(off) > astray:
         problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
     else:
         return configuration
-    raise _not_closed(mechanism, T_base_platform, problem)
+    raise _not_closed(machine, T_base_platform, problem)
 
 
-def worst_closure(mechanism: Mechanism, residual: Array) -> str:
+def worst_closure(machine: Machine, residual: Array) -> str:
     """Return which closure is most open, in words."""
     row = 0
     worst = (0.0, "the platform pose")
-    for closure in mechanism.chain.closures:
+    for closure in machine.chain.closures:
         gap = float(np.abs(residual[row : row + closure.rows]).max())
         worst = max(worst, (gap, f"'{closure.frame_1}' and '{closure.frame_2}'"))
         row += closure.rows
@@ -441,42 +441,42 @@ def worst_closure(mechanism: Mechanism, residual: Array) -> str:
 
 
 def _placed(
-    mechanism: Mechanism, T_base_platform: RigidTransform, start: Array | None, astray: float
+    machine: Machine, T_base_platform: RigidTransform, start: Array | None, astray: float
 ) -> Array:
     """Return a configuration with the platform and the sliders set."""
-    chain = mechanism.chain
+    chain = machine.chain
     configuration = chain.neutral() if start is None else start.copy()
-    if mechanism.platform_joint is not None:
+    if machine.platform_joint is not None:
         configuration = chain.with_platform(
             configuration,
-            mechanism.platform_joint,
-            mechanism.base,
-            mechanism.platform,
+            machine.platform_joint,
+            machine.base,
+            machine.platform,
             T_base_platform,
         )
-        off = _off(mechanism, T_base_platform, configuration)
+        off = _off(machine, T_base_platform, configuration)
         if max(off) > astray:
             raise _not_closed(
-                mechanism,
+                machine,
                 T_base_platform,
-                f"the virtual joint '{mechanism.platform_joint}' leaves it {_away(off)} away, "
+                f"the virtual joint '{machine.platform_joint}' leaves it {_away(off)} away, "
                 "needed a joint that reaches it",
             )
-    q = readings_at(mechanism, T_base_platform)
-    sliding = [j for j, leg in enumerate(mechanism.legs) if leg.prismatic is not None]
-    configuration[slider_columns(mechanism, sliding)[0]] = q[sliding]
+    q = readings_at(machine, T_base_platform)
+    sliding = [j for j, leg in enumerate(machine.legs) if leg.prismatic is not None]
+    configuration[slider_columns(machine, sliding)[0]] = q[sliding]
     return configuration
 
 
 def _held(
-    mechanism: Mechanism, T: RigidTransform | None, metre: float, free: BoolArray | IntArray
+    machine: Machine, T: RigidTransform | None, metre: float, free: BoolArray | IntArray
 ) -> tuple[Equations, Retraction]:
     """Return the closures by free tangent coordinates; the platform held at T where legs carry it.
 
     Lengths are divided by ``metre``.
     """
-    chain = mechanism.chain
-    weld = T if mechanism.platform_joint is None else None
+    chain = machine.chain
+    weld = T if machine.platform_joint is None else None
     weights = np.ones(chain.n_rows + 6 * (weld is not None))
     row = 0
     for rows in [closure.rows for closure in chain.closures] + [6]:
@@ -486,7 +486,7 @@ def _held(
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
         if weld is not None:
-            held, held_jacobian = chain.welded(mechanism.base, mechanism.platform, weld)
+            held, held_jacobian = chain.welded(machine.base, machine.platform, weld)
             residual = np.concatenate([residual, held])
             jacobian = np.concatenate([jacobian, held_jacobian])
         return (residual * weights)[None], (jacobian[:, free] * weights[:, None])[None]
@@ -500,10 +500,10 @@ def _held(
 
 
 def _off(
-    mechanism: Mechanism, T_base_platform: RigidTransform, configuration: Array
+    machine: Machine, T_base_platform: RigidTransform, configuration: Array
 ) -> tuple[float, float]:
     """Return how far the platform is from where it should be [m], and how far turned [rad]."""
-    R, t = mechanism.chain.placement(configuration, mechanism.base, mechanism.platform)
+    R, t = machine.chain.placement(configuration, machine.base, machine.platform)
     matrix = T_base_platform.as_matrix()
     chord = float(np.linalg.norm(R - matrix[:3, :3]))  # of small turns as good as of large ones
     turn = 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
@@ -516,19 +516,17 @@ def _away(off: tuple[float, float]) -> str:
     return " and ".join(text for text, x in zip(said, off, strict=True) if x > 1e-6 * max(off))
 
 
-def _not_closed(
-    mechanism: Mechanism, T_base_platform: RigidTransform, problem: str
-) -> DidNotConverge:
+def _not_closed(machine: Machine, T_base_platform: RigidTransform, problem: str) -> DidNotConverge:
     """Return the error of a pose at which the chain does not close."""
     place = "(" + ", ".join(f"{1e3 * x:.1f}" for x in T_base_platform.translation) + ")"
     return DidNotConverge(
-        f"{mechanism.yaml_path}: the legs could not be closed with the platform at {place} mm: "
+        f"{machine.yaml_path}: the legs could not be closed with the platform at {place} mm: "
         f"{problem}; check that the legs reach this pose (legcal.home)."
     )
 
 
 def follow(
-    mechanism: Mechanism,
+    machine: Machine,
     configuration: Array,
     readings: Array,
     which: str = "",
@@ -546,23 +544,23 @@ def follow(
     DidNotConverge
         If the steps stop contracting or reach a singularity, even tiny ones.
     """
-    q_columns, v_columns = slider_columns(mechanism, mechanism.motors)
-    free = np.delete(np.arange(mechanism.chain.nv), v_columns)
+    q_columns, v_columns = slider_columns(machine, machine.motors)
+    free = np.delete(np.arange(machine.chain.nv), v_columns)
     first = configuration[q_columns]
-    known = mechanism.chain.linearize(configuration)[1][:, free]
+    known = machine.chain.linearize(configuration)[1][:, free]
     here: float | None = None
 
     def attempt(part: float) -> bool:
         nonlocal configuration, known, here
         trial = configuration.copy()
         trial[q_columns] = readings if part == 1.0 else first + part * (readings - first)
-        reached, jacobian = _closed_from(mechanism, trial, free)
-        if reached is None or _is_flipped(mechanism, reached):
+        reached, jacobian = _closed_from(machine, trial, free)
+        if reached is None or _is_flipped(machine, reached):
             return False
         if not hardly_changes(known, jacobian):
             if here is None:
-                here = side(mechanism, platform_pose(mechanism, configuration))
-            there = side(mechanism, platform_pose(mechanism, reached))
+                here = side(machine, platform_pose(machine, configuration))
+            there = side(machine, platform_pose(machine, reached))
             if not here == there != 0.0:  # not square: only ways on which little changes
                 return False
         configuration, known = reached, jacobian
@@ -571,21 +569,21 @@ def follow(
     done = walk(attempt, shortest)
     if done == 1.0:
         return configuration
-    T = platform_pose(mechanism, configuration)
+    T = platform_pose(machine, configuration)
     part = 0.0
     if not on_the_chain:
-        T, part = follow_pose(mechanism, T, configuration[q_columns], readings, shortest)
+        T, part = follow_pose(machine, T, configuration[q_columns], readings, shortest)
     if part < 1.0:
         raise DidNotConverge(
-            f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: at "
+            f"{machine.yaml_path}: the pose at the readings{which} could not be reached: at "
             f"{100 * (done + part * (1.0 - done)):.1f} % of the way from the starting pose the "
             "legs meet no more or the mechanism is singular, needed a regular path; check the "
             "readings and legcal.home."
         )
-    closed = _closed_at(mechanism, T, configuration, readings, free)
+    closed = _closed_at(machine, T, configuration, readings, free)
     if closed is None:
         raise DidNotConverge(
-            f"{mechanism.yaml_path}: the pose at the readings{which} could not be reached: found a "
+            f"{machine.yaml_path}: the pose at the readings{which} could not be reached: found a "
             "platform pose at which the legs have the right lengths, but joints that were not "
             "closed there, needed a closed chain; give the joints of the legs axes at right angles "
             "(of three revolutes, and of a universal joint and its leg), which turn anywhere, or "
@@ -595,31 +593,31 @@ def follow(
 
 
 def follow_pose(
-    mechanism: Mechanism, T: RigidTransform, first: Array, last: Array, shortest: float
+    machine: Machine, T: RigidTransform, first: Array, last: Array, shortest: float
 ) -> tuple[RigidTransform, float]:
     """Return the pose followed from T at first to last readings, and which part of it is done."""
-    pose, known = T.as_matrix()[None, :3], dimensionless(mechanism, T)
-    motors = list(mechanism.motors)
+    pose, known = T.as_matrix()[None, :3], dimensionless(machine, T)
+    motors = list(machine.motors)
 
     def attempt(part: float) -> bool:
         nonlocal pose, known
         readings = last if part == 1.0 else first + part * (last - first)
-        lengthening = mechanism.sign[motors] * readings
+        lengthening = machine.sign[motors] * readings
 
         def equations(poses: Array) -> tuple[Array, Array]:
-            found = equations_at(mechanism, poses[:, :, :3], poses[:, :, 3])
+            found = equations_at(machine, poses[:, :, :3], poses[:, :, 3])
             found.values[:, found.measured] -= lengthening
             return found.values, found.by_pose
 
-        scale = leg_scale(mechanism, motion_of(pose[0, :, :3], pose[0, :, 3]))
+        scale = leg_scale(machine, motion_of(pose[0, :, :3], pose[0, :, 3]))
         unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
         found = newton(
             equations, moved, pose, met=MET * scale, contraction=CONTRACTION, first=scale, unit=unit
         )
         there = motion_of(found.points[0, :, :3], found.points[0, :, 3])
-        if not (found.arrived[0] or found.worst[0] < MET * scale) or _is_reversed(mechanism, there):
+        if not (found.arrived[0] or found.worst[0] < MET * scale) or _is_reversed(machine, there):
             return False
-        jacobian = dimensionless(mechanism, there)
+        jacobian = dimensionless(machine, there)
         if not hardly_changes(known, jacobian):
             if known.shape[0] != known.shape[1]:
                 return False
@@ -634,10 +632,10 @@ def follow_pose(
 
 
 def _closed_from(
-    mechanism: Mechanism, configuration: Array, free: IntArray
+    machine: Machine, configuration: Array, free: IntArray
 ) -> tuple[Array | None, Array]:
     """Return the configuration closed with the motors held, None if not near, and its Jacobian."""
-    equations, retract = _held(mechanism, None, 1.0, free)
+    equations, retract = _held(machine, None, 1.0, free)
     found = newton(
         equations, retract, configuration[None], met=0.01 * CLOSED, contraction=CONTRACTION
     )
@@ -645,44 +643,44 @@ def _closed_from(
 
 
 def _closed_at(
-    mechanism: Mechanism, T: RigidTransform, start: Array, readings: Array, free: IntArray
+    machine: Machine, T: RigidTransform, start: Array, readings: Array, free: IntArray
 ) -> Array | None:
     """Return the closed configuration at readings whose pose is known, None if joints forbid it.
 
     The platform is let go only where axes that are a little off leave no other way.
     """
     rng = np.random.default_rng(1965)
-    angles = mechanism.chain.rotation_columns()
-    turns = np.zeros((1 + FRESH, mechanism.chain.nv))
-    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (FRESH, mechanism.chain.nv))[:, angles]
-    tries = [(turn, True) for turn in turns] + [(turns[0], False)] * is_constrained(mechanism)
+    angles = machine.chain.rotation_columns()
+    turns = np.zeros((1 + FRESH, machine.chain.nv))
+    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (FRESH, machine.chain.nv))[:, angles]
+    tries = [(turn, True) for turn in turns] + [(turns[0], False)] * is_constrained(machine)
     for turn, hold in tries:
-        there = mechanism.chain.integrate(start, turn)
+        there = machine.chain.integrate(start, turn)
         try:
-            trial = close_at(mechanism, T, there, FEW_RESTARTS, hold=hold)
+            trial = close_at(machine, T, there, FEW_RESTARTS, hold=hold)
         except DidNotConverge:
             continue
-        trial[slider_columns(mechanism, mechanism.motors)[0]] = readings
-        closed, _ = _closed_from(mechanism, trial, free)
+        trial[slider_columns(machine, machine.motors)[0]] = readings
+        closed, _ = _closed_from(machine, trial, free)
         if closed is not None:
             return closed
     return None
 
 
-def _is_flipped(mechanism: Mechanism, configuration: Array) -> bool:
+def _is_flipped(machine: Machine, configuration: Array) -> bool:
     """Say whether a leg without a motor has shrunk through its base joint."""
-    rows = [j for j, leg in enumerate(mechanism.legs) if leg.kind is LegKind.PASSIVE]
+    rows = [j for j, leg in enumerate(machine.legs) if leg.kind is LegKind.PASSIVE]
     if not rows:
         return False
-    q = configuration[slider_columns(mechanism, rows)[0]]
-    return bool(np.any(mechanism.sign[rows] * q + mechanism.q0[rows] <= 0.0))
+    q = configuration[slider_columns(machine, rows)[0]]
+    return bool(np.any(machine.sign[rows] * q + machine.q0[rows] <= 0.0))
 
 
-def _is_reversed(mechanism: Mechanism, T: RigidTransform) -> bool:
+def _is_reversed(machine: Machine, T: RigidTransform) -> bool:
     """Say whether a leg that is fixed to the platform points the wrong way."""
     return any(
         leg.platform_joint == ""
         and leg.platform_axis is not None
         and float(T.rotation.apply(leg.platform_axis) @ vector) <= 0.0
-        for leg, vector in zip(mechanism.legs, leg_vectors(mechanism, T), strict=True)
+        for leg, vector in zip(machine.legs, leg_vectors(machine, T), strict=True)
     )

@@ -1,7 +1,7 @@
 """A leg: the joint at its base, a slider or a rod, the joint at its platform, and its numbers.
 
 What belongs to the base stands in a frame of the base, what belongs to the platform in a frame of
-the platform: the links for the legs of a :class:`~legcal.machine.model.Mechanism`, the joint
+the platform: the links for the legs of a :class:`~legcal.machine.model.Machine`, the joint
 frames R_b and R_e for :func:`legcal.machine.parameters.geometries`.
 """
 

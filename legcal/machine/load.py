@@ -28,7 +28,7 @@ from legcal.machine.leg import (
     LegKind,
 )
 from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility, singularity
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
 from legcal.machine.topology import (
@@ -57,7 +57,7 @@ _FOUND = {
 REGULAR = 1e-4  # singularity measure: less than that is the rounding of a file
 
 
-def load_mechanism(model: str | Path) -> Mechanism:
+def load_mechanism(model: str | Path) -> Machine:
     """Return the mechanism of a file, its legs found from geometry.
 
     Parameters
@@ -81,7 +81,7 @@ def load_mechanism(model: str | Path) -> Mechanism:
         raise type(error)(said) from error
 
 
-def _load(source: Source) -> Mechanism:
+def _load(source: Source) -> Machine:
     """Return the mechanism of a source."""
     file, urdf = source.file, source.urdf
     check_origins(urdf)
@@ -93,26 +93,26 @@ def _load(source: Source) -> Mechanism:
         T = source.poses[block.base].inv() * source.poses[block.platform]
         drawn = MotionEntry.model_validate(motion_to_xyz_quat(T))
         block = block.model_copy(update={"home": drawn})
-    mechanism = _assemble(source, block, closures)
-    given = mechanism.home if block.home is not None else None
+    machine = _assemble(source, block, closures)
+    given = machine.home if block.home is not None else None
     if given is None:
-        check_spread(mechanism)  # before a home of kilometres is looked for
+        check_spread(machine)  # before a home of kilometres is looked for
     else:
-        check_unit(mechanism)  # before lengths of hundreds of metres fail to close
+        check_unit(machine)  # before lengths of hundreds of metres fail to close
     if file.legcal is not None and file.legcal.home is not None:  # a drawing may be anywhere
-        check_home_travel(mechanism)
-    pose, configuration = closed_home(mechanism, given)
-    mechanism = replace(mechanism, home=pose, home_configuration=configuration)
-    check_unit(mechanism)
-    check_across(mechanism)
-    mechanism = replace(mechanism, mobility=mobility(mechanism))
-    check_equations(mechanism)
-    proposed = proposal_notes(file.legcal, mechanism)
-    found = map(source.in_its_words, diagnose(mechanism, home_is_given=block.home is not None))
-    return replace(mechanism, diagnostics=(*source.notes, *proposed, *found))
+        check_home_travel(machine)
+    pose, configuration = closed_home(machine, given)
+    machine = replace(machine, home=pose, home_configuration=configuration)
+    check_unit(machine)
+    check_across(machine)
+    machine = replace(machine, mobility=mobility(machine))
+    check_equations(machine)
+    proposed = proposal_notes(file.legcal, machine)
+    found = map(source.in_its_words, diagnose(machine, home_is_given=block.home is not None))
+    return replace(machine, diagnostics=(*source.notes, *proposed, *found))
 
 
-def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Mechanism:
+def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -> Machine:
     """Return the mechanism, its chain not closed yet."""
     file, urdf, yaml_path = source.file, source.urdf, source.path
     check_type(block, urdf, yaml_path)
@@ -156,7 +156,7 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
     names = list(block.legs)
     base_normal, platform_normal = in_plane or (None, None)
     base_frame = block.base_frame or propose_frame(names, chains)
-    mechanism = Mechanism(
+    machine = Machine(
         name=urdf.name,
         yaml_path=yaml_path,
         urdf_path=urdf.path,
@@ -174,8 +174,8 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base_normal=base_normal,
         platform_normal=platform_normal,
     )
-    check_frames(mechanism)
-    return mechanism
+    check_frames(machine)
+    return machine
 
 
 def _travel(chain: LegChain, urdf: Urdf) -> tuple[float, float]:
@@ -343,7 +343,7 @@ def check_motors(file: MechanismFile, chains: Sequence[LegChain], urdf: Urdf, pa
         raise OutOfClass(problems)
 
 
-def check_frames(mechanism: Mechanism) -> None:
+def check_frames(machine: Machine) -> None:
     """Check that the joint centres of the frame legs span a frame on base and platform.
 
     Raises
@@ -351,10 +351,10 @@ def check_frames(mechanism: Mechanism) -> None:
     ModelError
         If they are too few or too many, coincide, or are collinear.
     """
-    path, n_d = mechanism.yaml_path, n_frame_legs(spatial=mechanism.spatial)
-    chosen = [mechanism.leg_names[j] for j in mechanism.frame_legs]
+    path, n_d = machine.yaml_path, n_frame_legs(spatial=machine.spatial)
+    chosen = [machine.leg_names[j] for j in machine.frame_legs]
     if len(chosen) != n_d:
-        where = "in space" if mechanism.spatial else "in a plane"
+        where = "in space" if machine.spatial else "in a plane"
         raise ModelError(
             f"{path}: legcal.base_frame could not be used: found {len(chosen)} legs, needed {n_d} "
             f"for a mechanism {where}; name {n_d} legs."
@@ -362,7 +362,7 @@ def check_frames(mechanism: Mechanism) -> None:
     problems = []
     for side in ("base", "platform"):
         try:
-            _ = mechanism.T_base_Rb if side == "base" else mechanism.T_platform_Re
+            _ = machine.T_base_Rb if side == "base" else machine.T_platform_Re
         except ValueError:
             needed = "three that span a plane" if n_d == 3 else "two that lie apart in the plane"
             problems.append(
@@ -392,7 +392,7 @@ def check_origins(urdf: Urdf) -> None:
             )
 
 
-def check_spread(mechanism: Mechanism) -> None:
+def check_spread(machine: Machine) -> None:
     """Check that the joints are as near each other as metres put them, before home is looked for.
 
     Raises
@@ -401,19 +401,19 @@ def check_spread(mechanism: Mechanism) -> None:
         If the joints of base or platform lie more than 20 m apart.
     """
     sizes = {
-        "the joints on the base": float(np.linalg.norm(np.ptp(mechanism.A_base, axis=0))),
-        "the joints on the platform": float(np.linalg.norm(np.ptp(mechanism.B_platform, axis=0))),
+        "the joints on the base": float(np.linalg.norm(np.ptp(machine.A_base, axis=0))),
+        "the joints on the platform": float(np.linalg.norm(np.ptp(machine.B_platform, axis=0))),
     }
     for name, size in sizes.items():
         if size > LONGEST:
             raise ModelError(
-                f"{mechanism.urdf_path}: the lengths could not be used: found {name} {size:.4g} m "
+                f"{machine.urdf_path}: the lengths could not be used: found {name} {size:.4g} m "
                 f"apart, needed at most {LONGEST:g} m; write all lengths in metres (are they "
                 "millimetres?)."
             )
 
 
-def check_unit(mechanism: Mechanism) -> None:
+def check_unit(machine: Machine) -> None:
     """Check that the legs are as long at home, and move as far, as those written in metres.
 
     Raises
@@ -422,40 +422,40 @@ def check_unit(mechanism: Mechanism) -> None:
         If one is longer than 20 m or shorter than 1 mm, its motor moves further than 20 m, or a
         cylinder along it is thicker than half of it or thinner than 2e-4 of it.
     """
-    lengths = np.linalg.norm(leg_vectors(mechanism, mechanism.home), axis=1)
-    fixed = np.array([leg.platform_joint == "" for leg in mechanism.legs])
+    lengths = np.linalg.norm(leg_vectors(machine, machine.home), axis=1)
+    fixed = np.array([leg.platform_joint == "" for leg in machine.legs])
     odd = np.flatnonzero(~fixed & ((lengths < SHORTEST) | (lengths > LONGEST)))
     if len(odd):
         raise ModelError(
-            f"{mechanism.urdf_path}: the lengths could not be used: found leg "
-            f"'{mechanism.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home, needed 1 mm to "
+            f"{machine.urdf_path}: the lengths could not be used: found leg "
+            f"'{machine.leg_names[odd[0]]}' {lengths[odd[0]]:.4g} m long at home, needed 1 mm to "
             "20 m; write all lengths in metres (are they millimetres?)."
         )
-    for leg in mechanism.legs:
+    for leg in machine.legs:
         reach = leg.travel[1] - leg.travel[0]
         if leg.kind is LegKind.ACTUATED and reach > LONGEST:
             raise ModelError(
-                f"{mechanism.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
+                f"{machine.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
                 "limits of its slider in metres (are they millimetres?)."
             )
-    _check_radii(mechanism, np.where(fixed, lengths.max(), lengths))
+    _check_radii(machine, np.where(fixed, lengths.max(), lengths))
 
 
-def _check_radii(mechanism: Mechanism, lengths: Array) -> None:
+def _check_radii(machine: Machine, lengths: Array) -> None:
     """Check that what a camera sees of each leg is no thicker and no thinner than a leg is."""
-    for leg, length in zip(mechanism.legs, lengths, strict=True):
+    for leg, length in zip(machine.legs, lengths, strict=True):
         for cylinder in leg.cylinders:
             if not THINNEST < cylinder.radius / length < THICKEST:
                 raise ModelError(
-                    f"{mechanism.urdf_path}: the <visual> cylinder of link '{cylinder.link}' "
+                    f"{machine.urdf_path}: the <visual> cylinder of link '{cylinder.link}' "
                     f"could not be used: found a radius of {1e3 * cylinder.radius:.4g} mm along "
                     f"leg '{leg.name}', which is {1e3 * length:.4g} mm long at home, needed "
                     f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
                 )
 
 
-def check_across(mechanism: Mechanism) -> None:
+def check_across(machine: Machine) -> None:
     """Check that the closures of a planar mechanism hold across its plane too.
 
     Raises
@@ -463,15 +463,15 @@ def check_across(mechanism: Mechanism) -> None:
     OutOfClass
         If one is more than 10 um open, or turned by more than 1 mrad.
     """
-    row, residual = 0, mechanism.chain.residual(mechanism.home_configuration)
+    row, residual = 0, machine.chain.residual(machine.home_configuration)
     problems = []
-    for closure in mechanism.chain.closures:
+    for closure in machine.chain.closures:
         gap = float(np.linalg.norm(residual[row : row + 3]))
         tilt = float(np.linalg.norm(residual[row + 3 : row + closure.rows]))
         row += closure.rows
         if gap > CONCURRENT or tilt > PERPENDICULAR:
             problems.append(
-                f"{mechanism.yaml_path}: the loops could not be closed: found "
+                f"{machine.yaml_path}: the loops could not be closed: found "
                 f"'{closure.frame_1}' and '{closure.frame_2}' {1e3 * gap:.3g} mm and "
                 f"{np.degrees(tilt):.3f} deg apart across the plane in which the legs move, needed "
                 f"at most 0.01 mm and {np.degrees(PERPENDICULAR):.2g} deg; correct the origins and "
@@ -481,7 +481,7 @@ def check_across(mechanism: Mechanism) -> None:
         raise OutOfClass(problems)
 
 
-def check_equations(mechanism: Mechanism) -> None:
+def check_equations(machine: Machine) -> None:
     """Check the equations of all legs against Pinocchio at home and at poses near it.
 
     The closed configurations come from the URDF alone, the equations from the geometry that was
@@ -494,20 +494,20 @@ def check_equations(mechanism: Mechanism) -> None:
         If a length is more than 10 um off, or an axis, a direction or a twist more than 1 mrad.
     """
     problems: dict[str, str] = {}
-    for configuration in generic_configurations(mechanism, CONFIGURATIONS):
-        T = platform_pose(mechanism, configuration)
+    for configuration in generic_configurations(machine, CONFIGURATIONS):
+        T = platform_pose(machine, configuration)
         R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
-        for j, leg in enumerate(mechanism.legs):
+        for j, leg in enumerate(machine.legs):
             equations = linearize(leg, R, t, by_local=False)
             values = equations.values[0].copy()
             if leg.kind is not LegKind.CONSTANT:
-                values[0] -= leg.sign * configuration[slider_columns(mechanism, (j,))[0][0]]
+                values[0] -= leg.sign * configuration[slider_columns(machine, (j,))[0][0]]
             for demand, value in zip(equations.demands, np.abs(values), strict=True):
                 problem = _problem(demand, float(value))
                 if problem is not None:
                     problems.setdefault(
                         leg.name,
-                        f"{mechanism.yaml_path}: leg '{leg.name}' is outside the method: found "
+                        f"{machine.yaml_path}: leg '{leg.name}' is outside the method: found "
                         f"{problem} at a closed pose; check the origins and axes along the leg.",
                     )
     if problems:
@@ -526,35 +526,35 @@ def _problem(demand: Demand, value: float) -> str | None:
     return f"{_FOUND[demand].format(angle)}, needed at most {np.degrees(PERPENDICULAR):.2g} deg,"
 
 
-def diagnose(mechanism: Mechanism, *, home_is_given: bool) -> tuple[str, ...]:
+def diagnose(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
     """Return what deserves attention in a mechanism, one sentence each."""
     notes = []
     if not home_is_given:
-        xyz = ", ".join(f"{x:.6g}" for x in mechanism.home.translation)
-        quat = ", ".join(f"{x:.6g}" for x in mechanism.home.rotation.as_quat(canonical=True))
+        xyz = ", ".join(f"{x:.6g}" for x in machine.home.translation)
+        quat = ", ".join(f"{x:.6g}" for x in machine.home.rotation.as_quat(canonical=True))
         notes.append(
             "legcal.home is not given: a pose with all legs at mid-travel was taken, xyz "
             f"[{xyz}], quat_xyzw [{quat}]; write it down if the machine is assembled this way."
         )
-    q = readings_at(mechanism, mechanism.home)
-    outside = legs_outside(mechanism)
-    for j, leg in enumerate(mechanism.legs):
+    q = readings_at(machine, machine.home)
+    outside = legs_outside(machine)
+    for j, leg in enumerate(machine.legs):
         lower, upper = leg.travel
         if j in outside:
             notes.append(
                 f"leg '{leg.name}' is at {1e3 * q[j]:.2f} mm at home, outside its travel of "
                 f"{1e3 * lower:.2f} to {1e3 * upper:.2f} mm; check legcal.home or the limits."
             )
-    return (*notes, *_unseen_notes(mechanism), *_motor_notes(mechanism), *_spin_notes(mechanism))
+    return (*notes, *_unseen_notes(machine), *_motor_notes(machine), *_spin_notes(machine))
 
 
-def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[str, ...]:
+def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, ...]:
     """Return what of the block ``legcal`` was proposed because the file does not have it."""
-    frame = ", ".join(mechanism.leg_names[j] for j in mechanism.frame_legs)
+    frame = ", ".join(machine.leg_names[j] for j in machine.frame_legs)
     if written is None:
         return (
-            f"the file has no block legcal: base '{mechanism.base}', platform "
-            f"'{mechanism.platform}', legs {', '.join(mechanism.leg_names)} and base_frame "
+            f"the file has no block legcal: base '{machine.base}', platform "
+            f"'{machine.platform}', legs {', '.join(machine.leg_names)} and base_frame "
             f"[{frame}] were taken from its bodies; write them down to choose others.",
         )
     if written.base_frame is None:
@@ -565,11 +565,11 @@ def proposal_notes(written: LegcalBlock | None, mechanism: Mechanism) -> tuple[s
     return ()
 
 
-def singular_note(mechanism: Mechanism) -> str | None:
+def singular_note(machine: Machine) -> str | None:
     """Return that the motors do not hold the platform at home, None where they do."""
-    if not 0 < mechanism.mobility <= len(mechanism.motors):
+    if not 0 < machine.mobility <= len(machine.motors):
         return None
-    measure = singularity(mechanism, mechanism.home)
+    measure = singularity(machine, machine.home)
     if measure > REGULAR:
         return None
     return (
@@ -579,9 +579,9 @@ def singular_note(mechanism: Mechanism) -> str | None:
     )
 
 
-def _unseen_notes(mechanism: Mechanism) -> list[str]:
+def _unseen_notes(machine: Machine) -> list[str]:
     """Return which legs show no cylinder."""
-    unseen = [leg.name for leg in mechanism.legs if not leg.cylinders]
+    unseen = [leg.name for leg in machine.legs if not leg.cylinders]
     if not unseen:
         return []
     if len(unseen) == 1:
@@ -592,29 +592,29 @@ def _unseen_notes(mechanism: Mechanism) -> list[str]:
     return [f"{who} cannot be seen in images; {add} with its radius."]
 
 
-def _motor_notes(mechanism: Mechanism) -> list[str]:
+def _motor_notes(machine: Machine) -> list[str]:
     """Return where forward kinematics has too few motors, or too many, or a singular start."""
     notes = []
-    if mechanism.mobility == 0:
+    if machine.mobility == 0:
         return ["the platform cannot move: mobility 0; check the joints and axes of the legs."]
-    if not mechanism.is_determined:
-        n_motors = len(mechanism.motors)
+    if not machine.is_determined:
+        n_motors = len(machine.motors)
         found = "the motors do not determine the pose"
-        if n_motors > mechanism.mobility:
+        if n_motors > machine.mobility:
             found = "there are more motors than the pose needs"
         notes.append(
-            f"{found}: mobility {mechanism.mobility}, motors {n_motors}; forward kinematics is "
+            f"{found}: mobility {machine.mobility}, motors {n_motors}; forward kinematics is "
             "refused."
         )
-    singular = singular_note(mechanism)
+    singular = singular_note(machine)
     return notes if singular is None else [*notes, singular]
 
 
-def _spin_notes(mechanism: Mechanism) -> list[str]:
+def _spin_notes(machine: Machine) -> list[str]:
     """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
     notes = []
-    chains = mechanism.leg_chains
-    both = sum(leg.base_joint == leg.platform_joint == "S" for leg in mechanism.legs)
+    chains = machine.leg_chains
+    both = sum(leg.base_joint == leg.platform_joint == "S" for leg in machine.legs)
     if both:
         legs, spin = "1 leg has", "spins about itself"
         if both > 1:

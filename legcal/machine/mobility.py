@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array
 from legcal.machine.equations import demands_at, is_constrained
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.solver import solve
 
 CLOSED = 1e-12  # [m], and [rad] for frames
@@ -22,38 +22,38 @@ CONFIGURATIONS = 3
 SURE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity between J0 and J1
 
 
-def leg_scale(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
+def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
     """Return the mean length of the legs at a pose [m]."""
-    B = T_base_platform.apply(mechanism.B_platform)
-    return float(np.linalg.norm(B - mechanism.A_base, axis=1).mean())
+    B = T_base_platform.apply(machine.B_platform)
+    return float(np.linalg.norm(B - machine.A_base, axis=1).mean())
 
 
-def mobility(mechanism: Mechanism) -> int:
+def mobility(machine: Machine) -> int:
     """Return the freedoms of the platform; the motors determine it where they are as many.
 
     The rank is taken where the closures have their largest, at closed configurations near home too,
     because a symmetric pose may be singular.
     """
-    found = [freedoms_at(mechanism, c) for c in generic_configurations(mechanism, CONFIGURATIONS)]
+    found = [freedoms_at(machine, c) for c in generic_configurations(machine, CONFIGURATIONS)]
     return min(found)[1]
 
 
-def freedoms_at(mechanism: Mechanism, configuration: Array) -> tuple[int, int]:
+def freedoms_at(machine: Machine, configuration: Array) -> tuple[int, int]:
     """Return the freedoms of all joints and of the platform alone at a closed configuration."""
-    null_space = free_motions(mechanism, configuration)
-    twist = mechanism.chain.twist(mechanism.base, mechanism.platform) @ null_space
-    twist[:3] /= leg_scale(mechanism, mechanism.home)
+    null_space = free_motions(machine, configuration)
+    twist = machine.chain.twist(machine.base, machine.platform) @ null_space
+    twist[:3] /= leg_scale(machine, machine.home)
     values = np.linalg.svd(twist, compute_uv=False)
     return null_space.shape[1], int(np.sum(values > RANK_TOLERANCE))
 
 
-def generic_configurations(mechanism: Mechanism, count: int) -> Iterator[Array]:
+def generic_configurations(machine: Machine, count: int) -> Iterator[Array]:
     """Yield home, then up to ``count - 1`` closed ones a little way off in seeded directions."""
-    chain = mechanism.chain
-    yield mechanism.home_configuration
+    chain = machine.chain
+    yield machine.home_configuration
     rng = np.random.default_rng(1965)
-    unit = _column_units(mechanism)
-    jacobian = chain.linearize(mechanism.home_configuration)[1] * unit
+    unit = _column_units(machine)
+    jacobian = chain.linearize(machine.home_configuration)[1] * unit
     inverse = np.linalg.pinv(jacobian, rcond=RANK_TOLERANCE)
     for _ in range(count - 1):
         direction = rng.normal(size=chain.nv)
@@ -62,14 +62,14 @@ def generic_configurations(mechanism: Mechanism, count: int) -> Iterator[Array]:
         if size < RANK_TOLERANCE:
             return  # nothing moves
         step = STEP * unit * direction / size
-        configuration = project(mechanism, chain.integrate(mechanism.home_configuration, step))
+        configuration = project(machine, chain.integrate(machine.home_configuration, step))
         if configuration is not None:
             yield configuration
 
 
-def project(mechanism: Mechanism, configuration: Array) -> Array | None:
+def project(machine: Machine, configuration: Array) -> Array | None:
     """Return the closed configuration nearest to one that is almost closed, None if none is."""
-    chain = mechanism.chain
+    chain = machine.chain
 
     def equations(points: Array) -> tuple[Array, Array]:
         residual, jacobian = chain.linearize(points[0])
@@ -80,21 +80,21 @@ def project(mechanism: Mechanism, configuration: Array) -> Array | None:
         lambda points, step: chain.integrate(points[0], step[0])[None],
         configuration[None],
         met=0.01 * CLOSED,
-        unit=_column_units(mechanism),
+        unit=_column_units(machine),
         steps=15,
     )
     return found.points[0] if found.worst[0] < CLOSED else None
 
 
-def free_motions(mechanism: Mechanism, configuration: Array) -> Array:
+def free_motions(machine: Machine, configuration: Array) -> Array:
     """Return a basis (nv, k) of the tangent steps that keep all loops closed, idle spins too.
 
     It is orthonormal with lengths in leg lengths.
     """
-    units = _column_units(mechanism)
-    jacobian = mechanism.chain.linearize(configuration)[1] * units
-    row, scale = 0, leg_scale(mechanism, mechanism.home)
-    for closure in mechanism.chain.closures:
+    units = _column_units(machine)
+    jacobian = machine.chain.linearize(configuration)[1] * units
+    row, scale = 0, leg_scale(machine, machine.home)
+    for closure in machine.chain.closures:
         jacobian[row : row + 3] /= scale
         row += closure.rows
     _, values, right = np.linalg.svd(jacobian)
@@ -102,14 +102,14 @@ def free_motions(mechanism: Mechanism, configuration: Array) -> Array:
     return np.asarray(units[:, None] * right[rank:].T)
 
 
-def _column_units(mechanism: Mechanism) -> Array:
+def _column_units(machine: Machine) -> Array:
     """Return what turns tangent steps without a unit into [m] and [rad]."""
-    units = np.full(mechanism.chain.nv, leg_scale(mechanism, mechanism.home))
-    units[mechanism.chain.rotation_columns()] = 1.0
+    units = np.full(machine.chain.nv, leg_scale(machine, machine.home))
+    units[machine.chain.rotation_columns()] = 1.0
     return units
 
 
-def singularity(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
+def singularity(machine: Machine, T_base_platform: RigidTransform) -> float:
     """Return the smallest singular value of the dimensionless Jacobian of the legs' equations.
 
     Rows are the lengths of actuated and constant legs and all other demands, counted at the end
@@ -119,7 +119,7 @@ def singularity(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
 
     Parameters
     ----------
-    mechanism : Mechanism
+    machine : Machine
         The machine.
     T_base_platform : RigidTransform
         A pose; its readings need not be inside the travel.
@@ -130,32 +130,32 @@ def singularity(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
         Zero at a singular pose, and wherever the motors do not determine the pose; of the order
         of the platform's size in leg lengths at a good one.
     """
-    jacobian = dimensionless(mechanism, T_base_platform)
+    jacobian = dimensionless(machine, T_base_platform)
     if len(jacobian) < 6:
         return 0.0
     return float(np.linalg.svd(jacobian, compute_uv=False)[5])
 
 
-def side(mechanism: Mechanism, T_base_platform: RigidTransform) -> float:
+def side(machine: Machine, T_base_platform: RigidTransform) -> float:
     """Return the sign of the determinant of the legs' equations where they are square, else 0.
 
     Between two poses of different sign lies a singularity.
     """
-    rows = dimensionless(mechanism, T_base_platform)
+    rows = dimensionless(machine, T_base_platform)
     return float(np.sign(np.linalg.det(rows))) if len(rows) == 6 else 0.0
 
 
-def dimensionless(mechanism: Mechanism, T_base_platform: RigidTransform) -> Array:
+def dimensionless(machine: Machine, T_base_platform: RigidTransform) -> Array:
     """Return the Jacobian of :func:`singularity`, (n_rows, 6): rotation, displacement."""
     matrix = T_base_platform.as_matrix()
-    turned = mechanism.B_platform @ matrix[:3, :3].T
-    vectors = turned + matrix[:3, 3] - mechanism.A_base
+    turned = machine.B_platform @ matrix[:3, :3].T
+    vectors = turned + matrix[:3, 3] - machine.A_base
     lengths = np.linalg.norm(vectors, axis=1)
-    if is_constrained(mechanism):
-        jacobian = demands_at(mechanism, T_base_platform).by_pose[0]
+    if is_constrained(machine):
+        jacobian = demands_at(machine, T_base_platform).by_pose[0]
         gradient, moment, centre = jacobian[:, 3:], jacobian[:, :3], turned.mean(axis=0)
         return np.hstack([(moment - np.cross(centre, gradient)) / lengths.mean(), gradient])
-    motors = list(mechanism.motors)  # lines alone; arm x u is written out, np.cross is slow
+    motors = list(machine.motors)  # lines alone; arm x u is written out, np.cross is slow
     arms = (turned - turned.mean(axis=0))[motors] / lengths.mean()
     u = (vectors / lengths[:, None])[motors]
     (x, y, z), (a, b, c) = arms.T, u.T

@@ -18,7 +18,7 @@ from legcal.machine.urdf import Urdf
 
 
 @dataclass(frozen=True, eq=False)
-class Mechanism:
+class Machine:
     """A platform on legs, read from a YAML and its URDF."""
 
     name: str
@@ -102,7 +102,7 @@ class Mechanism:
         passive = [leg.kind is LegKind.PASSIVE for leg in self.legs]
         return KinematicParameters(base, platform, np.where(passive, np.nan, self.q0))
 
-    def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Mechanism":
+    def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Machine":
         """Return the mechanism with other visible cylinders of its legs."""
         legs = tuple(
             replace(leg, cylinders=tuple(of_leg))
@@ -110,7 +110,7 @@ class Mechanism:
         )
         return replace(self, legs=legs)
 
-    def with_leg_order(self, names: Sequence[str]) -> "Mechanism":
+    def with_leg_order(self, names: Sequence[str]) -> "Machine":
         """Return the same mechanism with its legs, each named once, in another order.
 
         Raises
@@ -138,26 +138,26 @@ def _fixed(array: Array) -> Array:
     return array
 
 
-def describe(mechanism: Mechanism) -> dict[str, Any]:
+def describe(machine: Machine) -> dict[str, Any]:
     """Return the document of ``legcal inspect --json``: legs with types, frames, mobility.
 
     A is in the base link and B in the platform link [m], twist in [rad]; ``n_d`` is the number of
     legs that define the frames, ``r`` that of R joints on the base, ``n_ac`` that of legs that are
     actuated or of constant length, ``idle_spins`` the freedoms that only turn a leg about itself.
     """
-    kinds = [leg.kind for leg in mechanism.legs]
+    kinds = [leg.kind for leg in machine.legs]
     return {
-        "name": mechanism.name,
-        "spatial": mechanism.spatial,
-        "mobility": mechanism.mobility,
-        "motors": len(mechanism.motors),
-        "n": mechanism.n_legs,
-        "n_d": len(mechanism.frame_legs),
-        "r": sum(leg.base_joint == "R" for leg in mechanism.legs),
+        "name": machine.name,
+        "spatial": machine.spatial,
+        "mobility": machine.mobility,
+        "motors": len(machine.motors),
+        "n": machine.n_legs,
+        "n_d": len(machine.frame_legs),
+        "r": sum(leg.base_joint == "R" for leg in machine.legs),
         "n_ac": len(kinds) - kinds.count(LegKind.PASSIVE),
-        "idle_spins": sum(chain.idle_spins for chain in mechanism.leg_chains),
-        "legs": [_leg(leg) for leg in mechanism.legs],
-        "diagnostics": list(mechanism.diagnostics),
+        "idle_spins": sum(chain.idle_spins for chain in machine.leg_chains),
+        "legs": [_leg(leg) for leg in machine.legs],
+        "diagnostics": list(machine.diagnostics),
     }
 
 

@@ -13,7 +13,7 @@ from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
 from legcal.machine.leg import LegKind
 from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.schema import mechanism_yaml
 from legcal.machine.tree import TreeText, along, limit, place, visual
 
@@ -199,7 +199,7 @@ def _unit(vector: Array) -> Array:
 class Created:
     """A model that was written."""
 
-    mechanism: Mechanism  # the model as legcal understands it
+    machine: Machine  # the model as legcal understands it
     yaml_path: Path
     urdf_path: Path
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
 from legcal.machine.leg import N_LOCAL, KinematicParameters, Leg, LegKind
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 
 _LENGTH, _TWIST = 6, 11
 _COLUMNS = (range(3), range(3, 6), (_LENGTH,), (7, 8), (9, 10), (_TWIST,))  # in this order
@@ -72,11 +72,9 @@ def parametrize(
     return Parametrization(tuple(n for n, _ in found), tuple(u for _, u in found), place)
 
 
-def parametrization_of(mechanism: Mechanism, *, twists: bool = False) -> Parametrization:
+def parametrization_of(machine: Machine, *, twists: bool = False) -> Parametrization:
     """Return the parameters of a mechanism; see :func:`parametrize`."""
-    return parametrize(
-        mechanism.leg_names, geometries(mechanism), mechanism.frame_legs, twists=twists
-    )
+    return parametrize(machine.leg_names, geometries(machine), machine.frame_legs, twists=twists)
 
 
 def n_frame_legs(*, spatial: bool) -> int:
@@ -97,19 +95,19 @@ def free_coordinates(n_legs: int, frame_legs: Sequence[int]) -> BoolArray:
     return free
 
 
-def geometries(mechanism: Mechanism) -> tuple[Leg, ...]:
+def geometries(machine: Machine) -> tuple[Leg, ...]:
     """Return the legs of a mechanism in its joint frames: A and axes in R_b, B and axes in R_e."""
-    parameters = mechanism.parameters
-    moved = _in_frames(mechanism.legs, mechanism.T_base_Rb.inv(), mechanism.T_platform_Re.inv())
+    parameters = machine.parameters
+    moved = _in_frames(machine.legs, machine.T_base_Rb.inv(), machine.T_platform_Re.inv())
     return tuple(
         replace(leg, A=A, B=B)  # zero by definition, not by rounding
         for leg, A, B in zip(moved, parameters.base_joints, parameters.platform_joints, strict=True)
     )
 
 
-def in_links(mechanism: Mechanism, legs: Sequence[Leg]) -> tuple[Leg, ...]:
+def in_links(machine: Machine, legs: Sequence[Leg]) -> tuple[Leg, ...]:
     """Return legs in R_b and R_e as they stand in the links, the inverse of :func:`geometries`."""
-    return _in_frames(legs, mechanism.T_base_Rb, mechanism.T_platform_Re)
+    return _in_frames(legs, machine.T_base_Rb, machine.T_platform_Re)
 
 
 def _in_frames(

@@ -29,7 +29,7 @@ from legcal.machine.formats import XML_SUFFIXES
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.load import load_mechanism
-from legcal.machine.model import Mechanism
+from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
     in_links,
@@ -52,12 +52,12 @@ class Handle(NamedTuple):
 class Handles:
     """What moves the joints of legs in the bodies of a mechanism."""
 
-    def __init__(self, mechanism: Mechanism) -> None:
-        self._mechanism = mechanism
-        self._urdf = mechanism.urdf
-        self._closures = mechanism.chain.closures
-        self._fixed = rigid_bodies(self._urdf, (), mechanism.platform_joint)
-        self.bodies: Bodies = rigid_bodies(self._urdf, self._closures, mechanism.platform_joint)
+    def __init__(self, machine: Machine) -> None:
+        self._mechanism = machine
+        self._urdf = machine.urdf
+        self._closures = machine.chain.closures
+        self._fixed = rigid_bodies(self._urdf, (), machine.platform_joint)
+        self.bodies: Bodies = rigid_bodies(self._urdf, self._closures, machine.platform_joint)
         self._above = {joint.child: joint for joint in self._urdf.joints.values()}
 
     def of(self, step: Step, side: int, body: str, leg: str) -> Handle:
@@ -172,11 +172,9 @@ class Motion:
         return RigidTransform.from_components(self.about + arm + self.shift, self.turn * T.rotation)
 
 
-def moved_origins(
-    mechanism: Mechanism, legs: Sequence[Leg]
-) -> dict[str, tuple[RigidTransform, bool]]:
+def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[RigidTransform, bool]]:
     """Return the new origin of every joint that carries a number of a leg, and if it is turned."""
-    handles = Handles(mechanism)
+    handles = Handles(machine)
     found: dict[str, tuple[RigidTransform, bool]] = {}
 
     def move(handle: Handle, motion: Motion, body: str) -> None:
@@ -189,7 +187,7 @@ def moved_origins(
         found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
     for leg, chain, wanted in zip(
-        mechanism.legs, mechanism.leg_chains, in_links(mechanism, legs), strict=True
+        machine.legs, machine.leg_chains, in_links(machine, legs), strict=True
     ):
         at_base, at_platform = _ends(leg, wanted)
         grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)
@@ -198,7 +196,7 @@ def moved_origins(
         elif any(grown):
             move(*_in_rod(handles, leg, chain, grown))
         first, last = chain.steps[0], chain.steps[-1]
-        base, platform = mechanism.base, mechanism.platform
+        base, platform = machine.base, machine.platform
         move(handles.of(first, first.near, base, leg.name), at_base, base)
         move(handles.of(last, last.far, platform, leg.name), at_platform, platform)
     return found
@@ -277,47 +275,47 @@ def _in_rod(
     return handle, _screw(along, point, grown), body
 
 
-def mechanism_text(mechanism: Mechanism, urdf: str) -> str:
+def mechanism_text(machine: Machine, urdf: str) -> str:
     """Return the YAML of a mechanism, complete."""
     return mechanism_yaml(
-        [(c.frame_1, c.frame_2, c.kind) for c in mechanism.chain.closures],
-        [str(leg.prismatic) for leg in mechanism.legs if leg.kind is LegKind.ACTUATED],
+        [(c.frame_1, c.frame_2, c.kind) for c in machine.chain.closures],
+        [str(leg.prismatic) for leg in machine.legs if leg.kind is LegKind.ACTUATED],
         {
             "urdf": urdf,
-            "base": mechanism.base,
-            "platform": mechanism.platform,
-            "platform_joint": mechanism.platform_joint,
-            "base_frame": [mechanism.leg_names[j] for j in mechanism.frame_legs],
-            "home": motion_to_xyz_quat(mechanism.home),
-            "legs": {leg.name: _joint_of(mechanism, j) for j, leg in enumerate(mechanism.legs)},
+            "base": machine.base,
+            "platform": machine.platform,
+            "platform_joint": machine.platform_joint,
+            "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
+            "home": motion_to_xyz_quat(machine.home),
+            "legs": {leg.name: _joint_of(machine, j) for j, leg in enumerate(machine.legs)},
         },
     )
 
 
-def model_name(mechanism: Mechanism) -> str:
+def model_name(machine: Machine) -> str:
     """Return the name that the files of a mechanism get: that of its file, or of its folder."""
-    path = mechanism.yaml_path
+    path = machine.yaml_path
     return path.resolve().parent.name if path.name == FOLDER_YAML else path.stem
 
 
-def write_model(mechanism: Mechanism, folder: Path) -> tuple[Path, Path]:
+def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a mechanism.
 
     A URDF that was read as it stands is copied byte for byte.
     """
-    name = model_name(mechanism)
+    name = model_name(machine)
     places = folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
     there = [str(path) for path in places if os.path.lexists(path)]
     if there:
         raise UsageError(
-            f"{mechanism.yaml_path}: the model '{name}' could not be written: found "
+            f"{machine.yaml_path}: the model '{name}' could not be written: found "
             f"{' and '.join(there)} already there, needed new files; give another folder."
         )
     try:
         for path in places:
             path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(places[1], mechanism.urdf.content)
-        text = mechanism_text(mechanism, f"../urdf/{name}.urdf")
+        write_atomically(places[1], machine.urdf.content)
+        text = mechanism_text(machine, f"../urdf/{name}.urdf")
         write_atomically(places[0], text.encode())  # last: a URDF alone is no model
     except OSError as error:
         raise OutOfResources(
@@ -327,13 +325,13 @@ def write_model(mechanism: Mechanism, folder: Path) -> tuple[Path, Path]:
     return places
 
 
-def _joint_of(mechanism: Mechanism, j: int) -> str:
+def _joint_of(machine: Machine, j: int) -> str:
     """Return a joint that stands for a leg: its slider, or any other on it."""
-    leg, chain = mechanism.legs[j], mechanism.leg_chains[j]
+    leg, chain = machine.legs[j], machine.leg_chains[j]
     if leg.prismatic is not None:
         return leg.prismatic
     moving = [step.connection.joint for step in chain.steps if step.connection.joint]
-    fixed = [joint.name for joint in mechanism.urdf.joints.values() if joint.child in chain.bodies]
+    fixed = [joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies]
     return str([*moving, *fixed][0])
 
 
@@ -341,16 +339,16 @@ _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")  # needs no quotes in YAML
 CLOSES = 1e-9  # [m] and [rad], home against the pose at its own readings
 
 
-def write_urdf(mechanism: Mechanism, legs: Sequence[Leg], destination: Path) -> None:
+def write_urdf(machine: Machine, legs: Sequence[Leg], destination: Path) -> None:
     """Write the mechanism's URDF with other numbers of its legs, of whatever class.
 
     Loading it again gives these numbers to 1e-12 m and rad, with R_b and R_e where they were.
     Radii are not written: they absorb the bias of edges. Nor is home looked at: with other rods
     or axes the mechanism may close elsewhere.
     """
-    patch = UrdfPatch(mechanism.urdf.content)
-    for name, (after, is_turned) in moved_origins(mechanism, legs).items():
-        before = mechanism.urdf.joints[name].T_parent_origin
+    patch = UrdfPatch(machine.urdf.content)
+    for name, (after, is_turned) in moved_origins(machine, legs).items():
+        before = machine.urdf.joints[name].T_parent_origin
         xyz = np.asarray(after.translation)
         stays = np.abs(xyz - before.translation).max() < ROUNDING_M
         rpy = roll_pitch_yaw(after.rotation.as_matrix()) if is_turned else None
@@ -360,7 +358,7 @@ def write_urdf(mechanism: Mechanism, legs: Sequence[Leg], destination: Path) -> 
 
 
 def write_calibrated_yaml(
-    mechanism: Mechanism, destination: Path, urdf_name: str, home: RigidTransform | None = None
+    machine: Machine, destination: Path, urdf_name: str, home: RigidTransform | None = None
 ) -> None:
     """Write the mechanism's YAML with ``legcal.urdf`` naming the calibrated file.
 
@@ -368,11 +366,11 @@ def write_calibrated_yaml(
     the key is added where the file does not have it. A mechanism of another format, or without a
     block ``legcal``, gets a YAML with all it needs.
     """
-    if not _is_written_down(mechanism):
-        there = mechanism if home is None else replace(mechanism, home=home)
+    if not _is_written_down(machine):
+        there = machine if home is None else replace(machine, home=home)
         destination.write_bytes(mechanism_text(there, urdf_name).encode("utf-8"))
         return
-    text = mechanism.yaml_path.read_bytes().decode("utf-8")
+    text = machine.yaml_path.read_bytes().decode("utf-8")
     if home is not None:
         text = _with_home(text, home)
     value = urdf_name if _PLAIN.fullmatch(urdf_name) else json.dumps(urdf_name)
@@ -400,11 +398,11 @@ def _with_home(text: str, home: RigidTransform) -> str:
     return text
 
 
-def _is_written_down(mechanism: Mechanism) -> bool:
+def _is_written_down(machine: Machine) -> bool:
     """Say whether the YAML of a mechanism is one of ours, and holds of the URDF as it is."""
-    if mechanism.yaml_path.suffix.lower() in XML_SUFFIXES:
+    if machine.yaml_path.suffix.lower() in XML_SUFFIXES:
         return False
-    content = mechanism.yaml_path.read_bytes().decode("utf-8")
+    content = machine.yaml_path.read_bytes().decode("utf-8")
     document = yaml.compose(content, Loader=yaml.SafeLoader)
     stand_ins = _entry(document, "joint_name")
     has_stand_ins = isinstance(stand_ins, yaml.SequenceNode) and bool(stand_ins.value)
@@ -418,29 +416,29 @@ def _entry(node: yaml.Node | None, key: str) -> yaml.Node | None:
     return next((value for name, value in node.value if name.value == key), None)
 
 
-def check_closes(mechanism: Mechanism) -> None:
+def check_closes(machine: Machine) -> None:
     """Check that a mechanism closes at home: its own readings lead back to it."""
-    found = forward_kinematics(mechanism, inverse_kinematics(mechanism, mechanism.home))
-    away = mechanism.home.inv() * found
+    found = forward_kinematics(machine, inverse_kinematics(machine, machine.home))
+    away = machine.home.inv() * found
     shift, turn = float(np.linalg.norm(away.translation)), float(away.rotation.magnitude())
     if not max(shift, turn) <= CLOSES:
         raise DidNotConverge(
-            f"{mechanism.yaml_path}: the mechanism does not close at home: found a pose "
+            f"{machine.yaml_path}: the mechanism does not close at home: found a pose "
             f"{1e3 * shift:.2g} mm and {np.degrees(turn):.2g} deg away from it at its own "
             f"readings, needed at most {1e3 * CLOSES:.0e} mm and {np.degrees(CLOSES):.0e} deg; "
             "check legcal.home."
         )
 
 
-def reload_and_check(path: Path) -> Mechanism:
+def reload_and_check(path: Path) -> Machine:
     """Load a mechanism that was just written and check that it closes at home.
 
     Loading closes the chain there; where the motors determine the pose they must lead back to it.
     """
-    mechanism = load_mechanism(path)
-    if mechanism.is_determined:
-        check_closes(mechanism)
-    return mechanism
+    machine = load_mechanism(path)
+    if machine.is_determined:
+        check_closes(machine)
+    return machine
 
 
 _STEP = 1e-6  # [m or rad]

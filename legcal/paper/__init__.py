@@ -1,6 +1,6 @@
 """The paper's method as its section 3 has it: four steps from leg axes to parameters.
 
-In go a :class:`NominalMechanism` (where the steps start), the leg axes that the images give
+In go a :class:`NominalMachine` (where the steps start), the leg axes that the images give
 (section 3.1, rooms vision and data) and the readings; out come the identified legs and the cameras.
 
 =====================  =======  ==================================================================

@@ -6,7 +6,7 @@ from .four_steps import run_base_steps as run_base_steps
 from .four_steps import run_platform_steps as run_platform_steps
 from .four_steps import run_steps as run_steps
 from .nominal import Criteria as Criteria
-from .nominal import NominalMechanism as NominalMechanism
+from .nominal import NominalMachine as NominalMachine
 from .nominal import Transformation as Transformation
 from .nominal import nominal_mechanism as nominal_mechanism
 from .nominal import point_like_mechanism as point_like_mechanism

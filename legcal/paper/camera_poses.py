@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.data import LegAxes, Measurements
 from legcal.geometry import Array, IntArray, register_points
 from legcal.paper.motions import axis_frames
-from legcal.paper.nominal import NominalMechanism
+from legcal.paper.nominal import NominalMachine
 
 _ON_A_LINE = 0.05  # spread of joints across their line, in that along it
 _ALONG = 0.1  # sine of the angle between an axis and the line: less does not fix a camera
@@ -87,7 +87,7 @@ def _alike_turns(along: Array, v: Array, seen: Array, signed: bool) -> Array:
 
 
 def side_of_plane(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     measurements: Measurements,
     A_camera: Array,
@@ -99,21 +99,21 @@ def side_of_plane(
     ``axes`` are those of one view of a planar mechanism; ``A_camera`` (n, 3) are the joints of
     ``legs`` (n,) that it locates, and ``normal`` (3,) is that of the plane, of any sign.
     """
-    A_Rb, up = mechanism.parameters.base_joints[legs], np.tile([0.0, 0.0, 1.0], (len(legs), 1))
+    A_Rb, up = machine.parameters.base_joints[legs], np.tile([0.0, 0.0, 1.0], (len(legs), 1))
     errors = []
     for sign in (1.0, -1.0):
         seen = np.tile(sign * normal, (len(legs), 1))
         poses, _ = camera_poses(A_Rb, up, A_camera, seen, signed=True)
         if not poses:
             return 0.0
-        errors.append(_length_errors(mechanism, axes, measurements, poses[0], A_camera, legs))
+        errors.append(_length_errors(machine, axes, measurements, poses[0], A_camera, legs))
     if max(errors) == 0.0 or min(errors) > _DECIDED * max(errors):
         return 0.0
     return 1.0 if errors[0] < errors[1] else -1.0
 
 
 def _length_errors(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     measurements: Measurements,
     T_Rb_camera: RigidTransform,
@@ -121,10 +121,10 @@ def _length_errors(
     legs: IntArray,
 ) -> float:
     """Return the sum of squared errors of leg lengths from one side [m^2]."""
-    parameters, total = mechanism.parameters, 0.0
-    place = np.full(mechanism.n_legs, -1)
+    parameters, total = machine.parameters, 0.0
+    place = np.full(machine.n_legs, -1)
     place[legs] = np.arange(len(legs))
-    q = np.where(mechanism.constant, 0.0, mechanism.sign * measurements.q)
+    q = np.where(machine.constant, 0.0, machine.sign * measurements.q)
     # Points of the plane are complex numbers x + i y here.
     A, B = (P[:, 0] + 1j * P[:, 1] for P in (parameters.base_joints, parameters.platform_joints))
     for row in np.unique(axes.row):

@@ -16,7 +16,7 @@ from legcal.paper.leg_directions import (
     find_misses,
     observed_directions,
 )
-from legcal.paper.nominal import Criteria, NominalMechanism, Transformation
+from legcal.paper.nominal import Criteria, NominalMachine, Transformation
 from legcal.paper.offsets import Offsets, identify_offsets
 from legcal.paper.platform import PlatformJoints, locate_platform_joints
 
@@ -55,7 +55,7 @@ class StagedResult:
 
 
 def run_steps(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     measurements: Measurements,
     *,
@@ -70,9 +70,9 @@ def run_steps(
     Twists of legs without an S joint are nominal unless they are freed. Raises NotIdentifiable if
     the observations do not determine the parameters, DidNotConverge if a step does not converge.
     """
-    base = run_base_steps(mechanism, axes, measurements, criteria=criteria)
+    base = run_base_steps(machine, axes, measurements, criteria=criteria)
     return run_platform_steps(
-        mechanism,
+        machine,
         axes,
         measurements,
         base,
@@ -83,19 +83,19 @@ def run_steps(
 
 
 def run_base_steps(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     measurements: Measurements,
     *,
     criteria: Criteria = "default",
 ) -> BaseSteps:
     """Locate base joints and cameras by steps 1 and 2 (3.2 and 3.3), as :func:`run_steps`."""
-    joints = locate_joints_in_cameras(mechanism, axes, measurements, criteria=criteria)
-    return BaseSteps(joints, locate_joints_in_base(mechanism, joints, criteria=criteria))
+    joints = locate_joints_in_cameras(machine, axes, measurements, criteria=criteria)
+    return BaseSteps(joints, locate_joints_in_base(machine, joints, criteria=criteria))
 
 
 def run_platform_steps(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     measurements: Measurements,
     base_steps: BaseSteps,
@@ -108,19 +108,19 @@ def run_platform_steps(
     joints, base = base_steps.joints_in_camera, base_steps.joints_in_base
     diagnostics = joints.diagnostics
     if criteria == "literal":
-        directions = observed_directions(mechanism, axes, measurements, joints)
+        directions = observed_directions(machine, axes, measurements, joints)
     else:
         wrong = find_misses(axes, measurements, joints, base)
         diagnostics += tuple(
-            f"Leg {mechanism.leg_names[leg]} in image {measurements.image[row] or row + 1} was "
+            f"Leg {machine.leg_names[leg]} in image {measurements.image[row] or row + 1} was "
             "left out of steps 3 and 4: its axis misses its base joint by far; check its outlines."
             for leg, row in zip(axes.leg[wrong].tolist(), axes.row[wrong].tolist(), strict=True)
         )
         axes = axes.choose(np.flatnonzero(~wrong))
-        directions = directions_through_joints(mechanism, axes, measurements, joints, base)
-    offsets = identify_offsets(mechanism, directions, measurements.sigma_q, criteria=criteria)
+        directions = directions_through_joints(machine, axes, measurements, joints, base)
+    offsets = identify_offsets(machine, directions, measurements.sigma_q, criteria=criteria)
     platform = locate_platform_joints(
-        mechanism,
+        machine,
         joints,
         base,
         directions,

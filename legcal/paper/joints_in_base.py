@@ -40,7 +40,7 @@ from legcal.paper.motions import (
     turned_points,
     whitener,
 )
-from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.nominal import Criteria, NominalMachine
 
 _LARGEST_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
 _APART = 1e-3  # of the size of the base: nearer joints count as one, whose distance says nothing
@@ -60,17 +60,17 @@ class JointsInBase:
 
 
 def locate_joints_in_base(
-    mechanism: NominalMechanism, joints: JointsInCamera, *, criteria: Criteria = "default"
+    machine: NominalMachine, joints: JointsInCamera, *, criteria: Criteria = "default"
 ) -> JointsInBase:
     """Locate base joint centres and revolute axes in R_b from those in the camera frames.
 
     Raises NotIdentifiable if the views do not tie all joints and axes together (of the literal
     criterion: if one is in no product, or products are too few), and DidNotConverge.
     """
-    unknowns = BaseUnknowns.of(mechanism)
+    unknowns = BaseUnknowns.of(machine)
     if criteria == "literal":
-        _check_products(mechanism, joints)
-        problem = build_scalar_products(mechanism, joints)
+        _check_products(machine, joints)
+        problem = build_scalar_products(machine, joints)
         if problem.n_residuals < len(problem.start):
             raise NotIdentifiable(
                 f"The base could not be located (eq 9): found {problem.n_residuals} scalar "
@@ -82,10 +82,10 @@ def locate_joints_in_base(
         A_Rb, axes = unknowns.joints_at(solution.x), unknowns.axes_at(solution.x)
         cameras = register_views(A_Rb, axes, joints)
     else:
-        solution, cameras = _registered(mechanism, joints)
-        _check_identifiable(mechanism, joints, solution)
+        solution, cameras = _registered(machine, joints)
+        _check_identifiable(machine, joints, solution)
         A_Rb, axes = unknowns.joints_at(solution.x), unknowns.axes_at(solution.x)
-    axes = np.where(mechanism.revolute[:, None], axes, np.nan)
+    axes = np.where(machine.revolute[:, None], axes, np.nan)
     return JointsInBase(A_Rb, cameras, solution, axes)
 
 
@@ -99,15 +99,15 @@ class BaseUnknowns:
     v_nominal: Array  # (n_legs, 3) in R_b; z in a plane, NaN without an axis
 
     @classmethod
-    def of(cls, mechanism: NominalMechanism) -> BaseUnknowns:
+    def of(cls, machine: NominalMachine) -> BaseUnknowns:
         """Return the unknowns of a mechanism."""
-        free = free_coordinates(mechanism.n_legs, mechanism.frame_legs)
-        turning = np.repeat(mechanism.revolute[:, None], 2, axis=1)
+        free = free_coordinates(machine.n_legs, machine.frame_legs)
+        turning = np.repeat(machine.revolute[:, None], 2, axis=1)
         n_joints = int(free.sum())
         joints, axes = np.full(free.shape, -1), np.full(turning.shape, -1)
         joints[free] = np.arange(n_joints)
         axes[turning] = n_joints + np.arange(turning.sum())
-        return cls(joints, axes, mechanism.parameters.base_joints, mechanism.base_normals)
+        return cls(joints, axes, machine.parameters.base_joints, machine.base_normals)
 
     def __len__(self) -> int:
         return int(np.sum(self.joints >= 0) + np.sum(self.axes >= 0))
@@ -155,11 +155,11 @@ class BaseUnknowns:
 # As printed
 
 
-def build_scalar_products(mechanism: NominalMechanism, joints: JointsInCamera) -> LeastSquares:
+def build_scalar_products(machine: NominalMachine, joints: JointsInCamera) -> LeastSquares:
     """Build C_1 of (9), products of all pairs of vectors; the squares v . v = 1 are left out."""
-    unknowns = BaseUnknowns.of(mechanism)
+    unknowns = BaseUnknowns.of(machine)
     legs = tuple(tuple(np.flatnonzero(located).tolist()) for located in joints.located)
-    revolute = joints.axis_located & mechanism.revolute
+    revolute = joints.axis_located & machine.revolute
     axes = tuple(tuple(np.flatnonzero(located).tolist()) for located in revolute)
     seen = [
         product
@@ -167,7 +167,7 @@ def build_scalar_products(mechanism: NominalMechanism, joints: JointsInCamera) -
         for product in _products(*view)
     ]
     places = tuple(unknowns.joints.ravel().tolist()), tuple(unknowns.axes.ravel().tolist())
-    n_legs = mechanism.n_legs
+    n_legs = machine.n_legs
     observed = (
         np.array(seen)[None, :],
         unknowns.known.T.reshape(1, 3, n_legs),
@@ -242,14 +242,14 @@ def _places(
 
 
 def _registered(
-    mechanism: NominalMechanism, joints: JointsInCamera
+    machine: NominalMachine, joints: JointsInCamera
 ) -> tuple[Solution, tuple[RigidTransform | None, ...]]:
     """Return the rigid solution and the cameras that it fixes.
 
     Where axes leave several places of a camera, all are tried; where they fit alike, the view says
     no more than distances.
     """
-    A_Rb, v_Rb = mechanism.parameters.base_joints, mechanism.base_normals
+    A_Rb, v_Rb = machine.parameters.base_joints, machine.base_normals
     starts: list[Sequence[RigidTransform | None]] = []
     fixed, n_trials = [], 1
     for view, located in enumerate(joints.located):
@@ -269,7 +269,7 @@ def _registered(
                 axes = np.flatnonzero(joints.axis_located[v])
                 signs[v, axes] = signs_seen(v_Rb[axes], joints.v_camera[v, axes], T)
         try:
-            return solve_least_squares(build_rigid(mechanism, with_signs(joints, signs), start))
+            return solve_least_squares(build_rigid(machine, with_signs(joints, signs), start))
         except DidNotConverge as failure:  # the wrong one of two places may end anywhere
             return failure
 
@@ -295,7 +295,7 @@ def _registered(
 
 
 def build_rigid(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     joints: JointsInCamera,
     start: Sequence[RigidTransform | None],
 ) -> LeastSquares:
@@ -304,7 +304,7 @@ def build_rigid(
     ``start`` are T_Rb_camera; a view without one gives distances between its joints. Axes have the
     signs of the nominal ones.
     """
-    unknowns = BaseUnknowns.of(mechanism)
+    unknowns = BaseUnknowns.of(machine)
     n_shared = len(unknowns)
     placed = np.array([T is not None for T in start], dtype=np.bool_)
     cameras = [T.inv() for T in start if T is not None]
@@ -325,7 +325,7 @@ def build_rigid(
         observed = (unknowns.known[leg], R[number[view]], t[number[view]], A_camera)
         if kind == "point":
             terms.append(Term(_centre(), index, (*observed, whitener(C[:, :3, :3]))))
-        elif mechanism.spatial:
+        elif machine.spatial:
             index = np.hstack([index, unknowns.axes[leg]])
             more = (unknowns.frames[leg], axis_frames(v), whitener(C))
             terms.append(Term(_centre_and_axis(), index, (*observed, *more)))
@@ -441,13 +441,13 @@ def _turns_in_camera(step: ca.SX, R: ca.SX, v: ca.SX, v_camera: ca.SX) -> ca.SX:
 # Refusals
 
 
-def _check_products(mechanism: NominalMechanism, joints: JointsInCamera) -> None:
+def _check_products(machine: NominalMachine, joints: JointsInCamera) -> None:
     """Refuse when a joint or an axis is in no product of (9), which would leave it at nominal."""
     several = joints.located.sum(axis=1) > 1
     shown = joints.located[several].any(axis=0)
-    turning = mechanism.revolute & ~joints.axis_located[several].any(axis=0)
+    turning = machine.revolute & ~joints.axis_located[several].any(axis=0)
     what = [
-        f"{kind} of {', '.join(np.array(mechanism.leg_names)[missing])}"
+        f"{kind} of {', '.join(np.array(machine.leg_names)[missing])}"
         for kind, missing in (("base joints", ~shown), ("revolute axes", turning & shown))
         if missing.any()
     ]
@@ -461,20 +461,20 @@ def _check_products(mechanism: NominalMechanism, joints: JointsInCamera) -> None
 
 
 def _check_identifiable(
-    mechanism: NominalMechanism, joints: JointsInCamera, solution: Solution
+    machine: NominalMachine, joints: JointsInCamera, solution: Solution
 ) -> None:
     """Refuse when base joints or axes can move without any camera noticing.
 
     That is known worse than the size of the base, or a radian.
     """
-    unknowns = BaseUnknowns.of(mechanism)
+    unknowns = BaseUnknowns.of(machine)
     n = len(unknowns)
     limit = np.full(n, _LARGEST_TURN)
     n_coordinates = int(np.sum(unknowns.joints >= 0))
     limit[:n_coordinates] = np.ptp(unknowns.A_nominal, axis=0).max(initial=0.0)
     sigma = np.sqrt(np.diag(solution.covariance())[:n])
     loose = np.append(solution.unseen(n) | (sigma > limit), False)
-    names = np.array(mechanism.leg_names)
+    names = np.array(machine.leg_names)
     moving = names[loose[unknowns.joints].any(axis=1)]
     turning = names[loose[unknowns.axes].any(axis=1)]
     if not len(moving) and not len(turning):
@@ -486,10 +486,10 @@ def _check_identifiable(
         can.append(f"{of_axes} of {', '.join(turning)} can turn")
     counts = f"joints located by view: {_counts(joints.located)}"
     needed = "views of three or more legs that share three legs with the others"
-    if mechanism.revolute.any():
+    if machine.revolute.any():
         counts += f"; axes: {_counts(joints.axis_located)}"
         needed += ", or two legs and a revolute axis across the line between them"
-    if not mechanism.spatial:
+    if not machine.spatial:
         needed = "views of two or more legs that share two legs with the others"
     raise NotIdentifiable(
         [

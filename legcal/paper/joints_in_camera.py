@@ -21,7 +21,7 @@ from legcal.data import LegAxes, Measurements
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.paper.camera_poses import camera_poses, side_of_plane, signs_seen
-from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.nominal import Criteria, NominalMachine
 
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
 _LARGEST_SIGMA = 0.1  # of the distance to the camera
@@ -52,7 +52,7 @@ class JointsInCamera:
 
 
 def locate_joints_in_cameras(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     measurements: Measurements,
     *,
@@ -62,7 +62,7 @@ def locate_joints_in_cameras(
 
     Raises NotIdentifiable if some leg has two different directions in no view.
     """
-    names, n_legs = mechanism.leg_names, mechanism.n_legs
+    names, n_legs = machine.leg_names, machine.n_legs
     key = measurements.view[axes.row] * n_legs + axes.leg
     views, legs = np.divmod(np.unique(key), n_legs)
     bundles = Bundles.of(key)
@@ -70,7 +70,7 @@ def locate_joints_in_cameras(
     doubts = [_too_few(*each) for each in zip(information, bundles.counts.tolist(), strict=True)]
     clear = np.array([not doubt for doubt in doubts], dtype=np.bool_)
     at = views[clear], legs[clear]
-    A, v, C = _estimate(mechanism, axes, bundles.some(clear), *at, criteria)
+    A, v, C = _estimate(machine, axes, bundles.some(clear), *at, criteria)
     has_axis = np.any(v != 0.0, axis=1)
     axis_doubts = [""] * len(A)
     if criteria == "default":
@@ -109,10 +109,10 @@ def locate_joints_in_cameras(
     covariance[at] = np.where(good[:, None, None], C, 0.0)
     unsided = np.zeros(len(located), dtype=np.bool_)
     found = oriented(
-        mechanism,
+        machine,
         JointsInCamera(A_camera, located, v_camera, axis_located, covariance, diagnostics, unsided),
     )
-    return found if mechanism.spatial else _sided(mechanism, axes, measurements, found)
+    return found if machine.spatial else _sided(machine, axes, measurements, found)
 
 
 def _too_few(information: Array, n_images: int) -> str:
@@ -150,7 +150,7 @@ def _too_tilted(covariance: Array) -> str:
 # Signs of axes
 
 
-def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCamera:
+def oriented(machine: NominalMachine, joints: JointsInCamera) -> JointsInCamera:
     """Return joints with their axes pointing to the side of the nominal axes.
 
     An axis in a camera is a line: (7) gives it up to its sign, while products of vectors need one.
@@ -159,7 +159,7 @@ def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCam
     sign remains a matter of choice: step 2 by default tries both. That of an axis whose joint is
     alone in its view does not matter. In a planar mechanism lengths of legs decide afterwards.
     """
-    nominal, A_Rb = mechanism.base_normals, mechanism.parameters.base_joints
+    nominal, A_Rb = machine.base_normals, machine.parameters.base_joints
     signs = np.ones(joints.located.shape)
     for v, (located, with_axis) in enumerate(zip(joints.located, joints.axis_located, strict=True)):
         seen = joints.v_camera[v, with_axis]
@@ -172,7 +172,7 @@ def oriented(mechanism: NominalMechanism, joints: JointsInCamera) -> JointsInCam
 
 
 def _sided(
-    mechanism: NominalMechanism, axes: LegAxes, measurements: Measurements, joints: JointsInCamera
+    machine: NominalMachine, axes: LegAxes, measurements: Measurements, joints: JointsInCamera
 ) -> JointsInCamera:
     """Return joints whose normals point up where the lengths of legs say which way that is."""
     signs, sided = np.ones(joints.located.shape), joints.sided.copy()
@@ -183,7 +183,7 @@ def _sided(
             continue
         of_view = axes.choose(np.flatnonzero(view == v))
         seen = joints.A_camera[v, legs], joints.v_camera[v, legs[0]], legs
-        side = side_of_plane(mechanism, of_view, measurements, *seen)
+        side = side_of_plane(machine, of_view, measurements, *seen)
         sided[v], signs[v] = side != 0.0, -1.0 if side < 0.0 else 1.0
     return replace(with_signs(joints, signs), sided=sided)
 
@@ -239,7 +239,7 @@ class Bundles:
 
 
 def _estimate(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     bundles: Bundles,
     views: IntArray,
@@ -250,14 +250,14 @@ def _estimate(
     A, C_A = _nearest_points(*_plain_equations(axes, bundles))
     v, C = np.zeros((len(A), 3)), np.zeros((len(A), 5, 5))
     C[:, :3, :3] = C_A
-    revolute = mechanism.revolute[legs] | (not mechanism.spatial)
+    revolute = machine.revolute[legs] | (not machine.spatial)
     if criteria == "default" and not revolute.all():
         some = bundles.some(~revolute)
         A[~revolute], C[~revolute, :3, :3] = _weighted_points(axes, some, A[~revolute])
     if revolute.any():
         # Bundles of one pool share v: each its own, or all of a view in a plane.
         some, pool = bundles.some(revolute), np.arange(int(revolute.sum()))
-        if not mechanism.spatial:
+        if not machine.spatial:
             pool = np.unique(views[revolute], return_inverse=True)[1].ravel()
         v[revolute], C[revolute, 3:, 3:] = _plain_axes(axes, some, pool)
         if criteria == "default":

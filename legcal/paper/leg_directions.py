@@ -15,7 +15,7 @@ from legcal.data import LegAxes, Measurements, join_axes
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.paper.joints_in_base import BaseUnknowns, JointsInBase
 from legcal.paper.joints_in_camera import JointsInCamera, derivative_of_miss, miss_of_joint
-from legcal.paper.nominal import NominalMechanism
+from legcal.paper.nominal import NominalMachine
 
 _FAR = 8.0  # an axis that misses its joint by so many deviations or medians is a wrong one
 _NO_AXIS = 1e6  # [rad^2] of the angle to an axis that a leg does not have
@@ -45,7 +45,7 @@ class LegDirections:
 
 
 def observed_directions(
-    mechanism: NominalMechanism, axes: LegAxes, measurements: Measurements, joints: JointsInCamera
+    machine: NominalMachine, axes: LegAxes, measurements: Measurements, joints: JointsInCamera
 ) -> LegDirections:
     """Return u as the images give it, from A of step 1 in each camera frame: the u of (13).
 
@@ -68,12 +68,12 @@ def observed_directions(
         u=u,
         basis=normal_basis(u),
         covariance=axes.covariance[first, :2, :2],
-        reading=_readings(mechanism, measurements, axes.row[first], j),
+        reading=_readings(machine, measurements, axes.row[first], j),
     )
 
 
 def directions_through_joints(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     axes: LegAxes,
     measurements: Measurements,
     joints: JointsInCamera,
@@ -103,7 +103,7 @@ def directions_through_joints(
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     frame = np.where(in_base[view], 0, 1 + view)
     A = np.where(in_base[view][:, None], base.A_Rb[axes.leg], joints.A_camera[view, axes.leg])
-    normals = _known_normals(mechanism, joints, base, view, axes.leg)
+    normals = _known_normals(machine, joints, base, view, axes.leg)
     u, basis, covariance = _conditioned(axes, A, *normals)
     return LegDirections(
         group=frame * measurements.n_poses + pose,
@@ -113,7 +113,7 @@ def directions_through_joints(
         u=u,
         basis=basis,
         covariance=covariance,
-        reading=_readings(mechanism, measurements, axes.row, axes.leg),
+        reading=_readings(machine, measurements, axes.row, axes.leg),
     )
 
 
@@ -167,7 +167,7 @@ def _conditioned(
 
 
 def _known_normals(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     joints: JointsInCamera,
     base: JointsInBase,
     view: IntArray,
@@ -182,16 +182,16 @@ def _known_normals(
     seen = joints.axis_located[view, leg]
     N = normal_basis(v[seen])
     C[seen] = np.swapaxes(N, 1, 2) @ joints.covariance[view, leg, 3:, 3:][seen] @ N
-    in_base, of_base = mechanism.base_normals, np.zeros((mechanism.n_legs, 3, 3))
-    if mechanism.revolute.any():
+    in_base, of_base = machine.base_normals, np.zeros((machine.n_legs, 3, 3))
+    if machine.revolute.any():
         in_base = base.base_axes
-        of_base = BaseUnknowns.of(mechanism).axis_covariance(base.solution)
+        of_base = BaseUnknowns.of(machine).axis_covariance(base.solution)
     for i, T in enumerate(base.T_Rb_camera):
         here = np.flatnonzero(view == i)
         if T is None or not len(here):
             continue
         with_axis = np.isfinite(in_base[leg[here], 0])
-        if mechanism.spatial:
+        if machine.spatial:
             C[here] = np.where(with_axis[:, None, None], of_base[leg[here]], 0.0)
         else:
             of_normal = np.zeros((3, 3))
@@ -206,8 +206,8 @@ def _known_normals(
 
 
 def _readings(
-    mechanism: NominalMechanism, measurements: Measurements, row: IntArray, leg: IntArray
+    machine: NominalMachine, measurements: Measurements, row: IntArray, leg: IntArray
 ) -> Array:
     """Return sign * q of legs in images [m]; a leg of constant length reads zero, as in (14)."""
-    q = np.where(mechanism.constant[leg], 0.0, measurements.q[row, leg])
-    return np.asarray(mechanism.sign[leg] * q)
+    q = np.where(machine.constant[leg], 0.0, measurements.q[row, leg])
+    return np.asarray(machine.sign[leg] * q)

@@ -15,7 +15,7 @@ from legcal.machine import (
     KinematicParameters,
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     geometries,
     point_like_legs,
 )
@@ -25,7 +25,7 @@ Transformation = Literal["points", "cross_product"]  # how (18) is solved
 
 
 @dataclass(frozen=True, eq=False)
-class NominalMechanism:
+class NominalMachine:
     """The nominal legs of a mechanism: where the steps start, and which unknowns they have."""
 
     leg_names: tuple[str, ...]
@@ -85,11 +85,9 @@ class NominalMechanism:
         return self.base_axes if self.spatial else np.tile([0.0, 0.0, 1.0], (self.n_legs, 1))
 
 
-def nominal_mechanism(mechanism: Mechanism) -> NominalMechanism:
+def nominal_mechanism(machine: Machine) -> NominalMachine:
     """Return a mechanism as the steps take it."""
-    return NominalMechanism(
-        mechanism.leg_names, geometries(mechanism), mechanism.sign, mechanism.frame_legs
-    )
+    return NominalMachine(machine.leg_names, geometries(machine), machine.sign, machine.frame_legs)
 
 
 def point_like_mechanism(
@@ -97,6 +95,6 @@ def point_like_mechanism(
     parameters: KinematicParameters,
     sign: NDArray[Any],
     frame_legs: tuple[int, ...],
-) -> NominalMechanism:
+) -> NominalMachine:
     """Return a mechanism with point-like joints; legs without an offset are passive."""
-    return NominalMechanism(tuple(leg_names), point_like_legs(parameters), sign, frame_legs)
+    return NominalMachine(tuple(leg_names), point_like_legs(parameters), sign, frame_legs)

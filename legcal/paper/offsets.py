@@ -23,7 +23,7 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, IntArray
 from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
-from legcal.paper.nominal import Criteria, NominalMechanism
+from legcal.paper.nominal import Criteria, NominalMachine
 
 _REWEIGHTINGS = 2
 _APART = 1e-3  # mean leg lengths: nearer platform joints count as one
@@ -38,7 +38,7 @@ class Offsets:
 
 
 def identify_offsets(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     directions: LegDirections,
     sigma_q: float,
     *,
@@ -48,22 +48,22 @@ def identify_offsets(
 
     Raises NotIdentifiable if the distances do not fix every offset, and DidNotConverge.
     """
-    pairs = pairs_apart(mechanism, directions)
+    pairs = pairs_apart(machine, directions)
     if criteria == "literal":
-        solution = solve_least_squares(build_consecutive(mechanism, directions))
-        _check_identifiable(mechanism, directions, pairs, solution)
-        return Offsets(_all_offsets(mechanism, solution.x), solution)
-    q0 = mechanism.parameters.offsets
+        solution = solve_least_squares(build_consecutive(machine, directions))
+        _check_identifiable(machine, directions, pairs, solution)
+        return Offsets(_all_offsets(machine, solution.x), solution)
+    q0 = machine.parameters.offsets
     for _ in range(_REWEIGHTINGS):
-        solution = solve_least_squares(build_constant_distances(mechanism, directions, q0, sigma_q))
-        _check_identifiable(mechanism, directions, pairs, solution, mean_length(directions, q0))
-        q0 = _all_offsets(mechanism, solution.x)
+        solution = solve_least_squares(build_constant_distances(machine, directions, q0, sigma_q))
+        _check_identifiable(machine, directions, pairs, solution, mean_length(directions, q0))
+        q0 = _all_offsets(machine, solution.x)
     return Offsets(q0, solution)
 
 
-def build_consecutive(mechanism: NominalMechanism, directions: LegDirections) -> LeastSquares:
+def build_consecutive(machine: NominalMachine, directions: LegDirections) -> LeastSquares:
     """Build the criterion C_2 of (14): distances equal those of the next position of the view."""
-    pairs = pairs_apart(mechanism, directions)
+    pairs = pairs_apart(machine, directions)
     last: dict[tuple[int, ...], int] = {}
     found = []
     for k, (a, b) in enumerate(pairs):
@@ -75,29 +75,29 @@ def build_consecutive(mechanism: NominalMechanism, directions: LegDirections) ->
     before, after = np.array(found, dtype=np.intp).T
     term = Term(
         _change_of_distance(),
-        _places(mechanism)[directions.leg[pairs[after]]],
+        _places(machine)[directions.leg[pairs[after]]],
         (observed_legs(directions, pairs[before]), observed_legs(directions, pairs[after])),
     )
-    return LeastSquares("The offsets (eq 14)", (term,), _start(mechanism))
+    return LeastSquares("The offsets (eq 14)", (term,), _start(machine))
 
 
 def build_constant_distances(
-    mechanism: NominalMechanism, directions: LegDirections, q0: Array, sigma_q: float
+    machine: NominalMachine, directions: LegDirections, q0: Array, sigma_q: float
 ) -> LeastSquares:
     """Build the default criterion, in standard deviations: distances equal d_jg in all poses.
 
     Offsets ``q0`` (n_legs,) are those of the weights and of the start of the distances.
     """
-    pairs = pairs_apart(mechanism, directions)
+    pairs = pairs_apart(machine, directions)
     ends = leg_ends(directions, q0)
     covariance = leg_end_covariance(directions, q0, sigma_q)
     legs = directions.leg[pairs]
     _, which = np.unique(legs, axis=0, return_inverse=True)
     which = which.ravel()
-    start = _start(mechanism)
+    start = _start(machine)
     term = Term(
         _constant_distance(),
-        np.column_stack([_places(mechanism)[legs], len(start) + which]),
+        np.column_stack([_places(machine)[legs], len(start) + which]),
         (observed_legs(directions, pairs), distance_sigma(ends, covariance, pairs)),
         robust=True,
     )
@@ -106,21 +106,21 @@ def build_constant_distances(
     return LeastSquares("The offsets (step 3)", (term,), np.concatenate([start, mean]))
 
 
-def _start(mechanism: NominalMechanism) -> Array:
+def _start(machine: NominalMachine) -> Array:
     """Return the nominal offsets of the legs that have one."""
-    offsets = mechanism.parameters.offsets
+    offsets = machine.parameters.offsets
     return offsets[np.isfinite(offsets)]
 
 
-def _places(mechanism: NominalMechanism) -> IntArray:
+def _places(machine: NominalMachine) -> IntArray:
     """Return the place of each leg among the legs with an offset, (n_legs,); -1 for passive."""
-    with_offset = np.isfinite(mechanism.parameters.offsets)
+    with_offset = np.isfinite(machine.parameters.offsets)
     return np.where(with_offset, np.cumsum(with_offset) - 1, -1)
 
 
-def _all_offsets(mechanism: NominalMechanism, x: Array) -> Array:
+def _all_offsets(machine: NominalMachine, x: Array) -> Array:
     """Return the offsets of all legs from the head of x."""
-    place = _places(mechanism)
+    place = _places(machine)
     return np.where(place >= 0, x[place], np.nan)
 
 
@@ -167,18 +167,18 @@ def pairs_of_legs(directions: LegDirections, q0: Array) -> IntArray:
     return np.array(pairs, dtype=np.intp)
 
 
-def pairs_apart(mechanism: NominalMechanism, directions: LegDirections) -> IntArray:
+def pairs_apart(machine: NominalMachine, directions: LegDirections) -> IntArray:
     """Return the pairs of :func:`pairs_of_legs` whose distance says something of their offsets.
 
     Two legs that meet in one platform joint are at distance zero whatever their offsets are; a leg
     that is fixed to the platform ends on it whatever its offset is.
     """
-    q0, B = mechanism.parameters.offsets, mechanism.parameters.platform_joints
+    q0, B = machine.parameters.offsets, machine.parameters.platform_joints
     pairs = pairs_of_legs(directions, q0)
     legs = directions.leg[pairs]
     gap = np.linalg.norm(B[legs[:, 0]] - B[legs[:, 1]], axis=1)
     apart = gap > _APART * mean_length(directions, q0)
-    chosen: IntArray = pairs[apart & ~mechanism.on_platform[legs].any(axis=1)]
+    chosen: IntArray = pairs[apart & ~machine.on_platform[legs].any(axis=1)]
     _check_any(
         chosen.tolist(),
         "image shows two legs that turn against the platform and end in different places of it",
@@ -228,22 +228,22 @@ def _check_any(found: Sequence[object], missing: str) -> None:
 
 
 def _check_identifiable(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     directions: LegDirections,
     pairs: IntArray,
     solution: Solution,
     largest_sigma: float = np.inf,
 ) -> None:
     """Refuse when an offset can change without any distance noticing."""
-    with_offset = np.flatnonzero(np.isfinite(mechanism.parameters.offsets))
+    with_offset = np.flatnonzero(np.isfinite(machine.parameters.offsets))
     loose = solution.unseen(len(with_offset))
     if np.isfinite(largest_sigma):
         sigma = np.sqrt(np.diag(solution.covariance())[: len(with_offset)])
         loose |= sigma > largest_sigma
-    loose &= ~mechanism.on_platform[with_offset]
+    loose &= ~machine.on_platform[with_offset]
     if not loose.any():
         return
-    names, reasons = [mechanism.leg_names[j] for j in with_offset[loose]], []
+    names, reasons = [machine.leg_names[j] for j in with_offset[loose]], []
     for leg in with_offset[loose]:
         mine = pairs[np.any(directions.leg[pairs] == leg, axis=1)]
         n_poses = len(np.unique(directions.group[mine[:, 0]]))

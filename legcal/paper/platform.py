@@ -41,7 +41,7 @@ from legcal.paper.leg_demands import (
 )
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.motions import axis_frames, whitener
-from legcal.paper.nominal import Criteria, NominalMechanism, Transformation
+from legcal.paper.nominal import Criteria, NominalMachine, Transformation
 from legcal.paper.offsets import (
     Offsets,
     distance_of_ends,
@@ -95,7 +95,7 @@ class PlatformJoints:
 
 
 def locate_platform_joints(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     joints: JointsInCamera,
     base: JointsInBase,
     directions: LegDirections,
@@ -113,15 +113,15 @@ def locate_platform_joints(
     not tie all joints together, or leave something open that moves the platform; DidNotConverge.
     """
     known = replace(
-        mechanism,
+        machine,
         legs=tuple(
             replace(
                 leg,
                 A=base.A_Rb[j],
-                base_axis=base.base_axes[j] if mechanism.revolute[j] else leg.base_axis,
+                base_axis=base.base_axes[j] if machine.revolute[j] else leg.base_axis,
                 q0=float(offsets.q0[j]) if np.isfinite(offsets.q0[j]) else leg.q0,
             )
-            for j, leg in enumerate(mechanism.legs)
+            for j, leg in enumerate(machine.legs)
         ),
     )
     unknowns = PlatformUnknowns.of(known, free_twists=free_twists)
@@ -164,7 +164,7 @@ def chosen_transformation(
 class RigidProblem:
     """What the rigid criterion is built of."""
 
-    mechanism: NominalMechanism  # with what steps 2 and 3 found
+    machine: NominalMachine  # with what steps 2 and 3 found
     unknowns: PlatformUnknowns
     directions: LegDirections
     poses: PlatformPoses  # to start from
@@ -175,7 +175,7 @@ class RigidProblem:
     @classmethod
     def of(
         cls,
-        known: NominalMechanism,
+        known: NominalMachine,
         unknowns: PlatformUnknowns,
         joints: JointsInCamera,
         base: JointsInBase,
@@ -206,7 +206,7 @@ class RigidProblem:
 
     def index(self, rows: IntArray) -> IntArray:
         """Return the places of B and of the step of the pose of some of the legs, (k, 9)."""
-        own = np.arange(6) if self.mechanism.spatial else _IN_PLANE
+        own = np.arange(6) if self.machine.spatial else _IN_PLANE
         first = len(self.unknowns) + (own.max() + 1) * self.poses.pose[rows, None]
         steps = np.where(own >= 0, first + own, -1)
         return np.hstack([self.unknowns.place[self.directions.leg[rows], OF_B], steps])
@@ -227,7 +227,7 @@ class RigidProblem:
         _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
         for k, i in enumerate(first):
             here = np.flatnonzero(which.ravel() == k)
-            of_leg = self.mechanism.legs[directions.leg[rows[i]]]
+            of_leg = self.machine.legs[directions.leg[rows[i]]]
             pose = self.poses.pose[rows[here]]
             linear = linearize(
                 replace(of_leg, A=directions.A[rows[i]]), self.poses.R[pose], self.poses.t[pose]
@@ -240,7 +240,7 @@ class RigidProblem:
     def poses_in_base(self, x: Array) -> tuple[Array, Array]:
         """Return R and t of the poses of groups in R_b, from the unknowns of all poses."""
         steps = np.zeros((len(self.poses.R), 6))
-        own = np.arange(6) if self.mechanism.spatial else _IN_PLANE
+        own = np.arange(6) if self.machine.spatial else _IN_PLANE
         steps[:, own >= 0] = x.reshape(len(steps), own.max() + 1)
         numbers = np.unique(self.poses.pose[self.in_base])
         return self.poses.stepped(steps, numbers[numbers >= 0])
@@ -271,8 +271,8 @@ def build_rigid(rigid: RigidProblem) -> LeastSquares:
     Axes in closed form from poses of noisy ends are further off than the nominal model. Raises
     NotIdentifiable if no pose shows two legs at once.
     """
-    directions, poses, mechanism = rigid.directions, rigid.poses, rigid.mechanism
-    q0, B = mechanism.parameters.offsets, mechanism.parameters.platform_joints
+    directions, poses, machine = rigid.directions, rigid.poses, rigid.machine
+    q0, B = machine.parameters.offsets, machine.parameters.platform_joints
     mean_offset = np.mean(q0[np.isfinite(q0)])
     posed = np.flatnonzero(poses.pose >= 0)
     # Groups without a pose: distances between ends are all they give.
@@ -307,8 +307,8 @@ def build_rigid(rigid: RigidProblem) -> LeastSquares:
         Term(length_of_leg(), lengths, (*rigid.known(ended), *read)),
         *_demands(rigid, posed),
     ]
-    x = rigid.unknowns.vector(mechanism.legs)
-    steps = np.zeros((6 if mechanism.spatial else 3) * len(poses.R))
+    x = rigid.unknowns.vector(machine.legs)
+    steps = np.zeros((6 if machine.spatial else 3) * len(poses.R))
     start = np.concatenate([x, steps])
     return LeastSquares("The platform joints (step 4)", tuple(terms), start, n_shared=len(x))
 
@@ -323,7 +323,7 @@ def _ends_and_joints() -> ca.Function:
 
 def _demands(rigid: RigidProblem, rows: IntArray) -> list[Term]:
     """Return what joints demand of legs whose poses are unknown, in standard deviations."""
-    legs, nominal = rigid.mechanism.legs, rigid.unknowns.nominal
+    legs, nominal = rigid.machine.legs, rigid.unknowns.nominal
     leg, terms = rigid.directions.leg[rows], []
     for joint, function, demand in (
         ("R", revolute_on_platform(), Demand.PLATFORM_AXIS),

@@ -23,7 +23,7 @@ from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least
 from legcal.paper.leg_demands import closure_of_leg, twisting_legs
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.motions import axis_frames
-from legcal.paper.nominal import NominalMechanism, Transformation
+from legcal.paper.nominal import NominalMachine, Transformation
 from legcal.paper.offsets import leg_ends, pairs_of_legs
 from legcal.paper.platform_pose import (
     PlatformPoses,
@@ -48,7 +48,7 @@ _CLOSED = 1e-4  # unit of the closures together, rms: what changes them by less 
 
 
 def platform_as_printed(
-    known: NominalMechanism,
+    known: NominalMachine,
     unknowns: PlatformUnknowns,
     base: JointsInBase,
     directions: LegDirections,
@@ -88,7 +88,7 @@ def platform_as_printed(
 
 
 def build_mean_distances(
-    known: NominalMechanism, unknowns: PlatformUnknowns, directions: LegDirections
+    known: NominalMachine, unknowns: PlatformUnknowns, directions: LegDirections
 ) -> LeastSquares:
     """Build the criterion C_3 of (16): mean distances of a view equal those in R_e.
 
@@ -117,7 +117,7 @@ def build_mean_distances(
 
 
 def _in_base_frame(
-    known: NominalMechanism,
+    known: NominalMachine,
     base: JointsInBase,
     directions: LegDirections,
     transformation: Transformation,
@@ -145,7 +145,7 @@ def _in_base_frame(
 
 
 def _with_axis_and_end(
-    known: NominalMechanism,
+    known: NominalMachine,
     unknowns: PlatformUnknowns,
     j: int,
     leg: Leg,
@@ -242,7 +242,7 @@ def locate_passive_end(
 
 
 def _close_legs(
-    known: NominalMechanism,
+    known: NominalMachine,
     unknowns: PlatformUnknowns,
     legs: tuple[Leg, ...],
     directions: LegDirections,
@@ -333,7 +333,7 @@ def _closed(
     )
 
 
-def _in_own_frame(known: NominalMechanism, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+def _in_own_frame(known: NominalMachine, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     """Return legs with the platform in R_e, where passive legs among the frame legs were moved."""
     frame = list(known.frame_legs)
     if all(legs[j].kind is not LegKind.PASSIVE for j in frame):

@@ -30,7 +30,7 @@ from legcal.machine import (
 )
 from legcal.paper.least_squares import Term
 from legcal.paper.motions import turned_axis, turned_axis_slope, turns_of
-from legcal.paper.nominal import NominalMechanism
+from legcal.paper.nominal import NominalMachine
 
 # Places among the twelve numbers of a leg
 OF_B, LENGTH, BASE_TURNS, PLATFORM_TURNS, TWIST = slice(3, 6), 6, slice(7, 9), slice(9, 11), 11
@@ -54,12 +54,10 @@ class PlatformUnknowns:
     nominal: tuple[Leg, ...]  # what turns of axes and changes of twists count from
 
     @classmethod
-    def of(cls, mechanism: NominalMechanism, *, free_twists: bool = False) -> PlatformUnknowns:
+    def of(cls, machine: NominalMachine, *, free_twists: bool = False) -> PlatformUnknowns:
         """Return the unknowns of a mechanism; twists are held unless they are freed."""
-        legs = mechanism.legs
-        everything = parametrize(
-            mechanism.leg_names, legs, mechanism.frame_legs, twists=free_twists
-        )
+        legs = machine.legs
+        everything = parametrize(machine.leg_names, legs, machine.frame_legs, twists=free_twists)
         wanted = np.ones((len(legs), N_LOCAL), dtype=np.bool_)
         wanted[:, :3] = False
         wanted[:, BASE_TURNS] = np.array([[leg.base_joint != "R"] for leg in legs])
@@ -153,7 +151,7 @@ def near_nominal(index: IntArray) -> tuple[Term, ...]:
 
 
 def held_at_nominal(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     unknowns: PlatformUnknowns,
     information: Array,
     legs: tuple[Leg, ...],
@@ -175,19 +173,19 @@ def held_at_nominal(
     poor, unseen = (vectors[singular * sigma * length < 1.0] for sigma in (_POOR, _OPEN))
     if not len(poor):
         return (), ()
-    motion = _motion(mechanism, unknowns, legs, poses)
+    motion = _motion(machine, unknowns, legs, poses)
     motion = None if motion is None else (motion * metre)[:, :, wanted]
     moving, _ = split_by_motion(motion, unseen, length, _HARMLESS)
     names = [unknowns.names[i] for i in wanted]
     if len(moving):
-        _refuse(mechanism, names, sparse_basis(moving))
+        _refuse(machine, names, sparse_basis(moving))
     _, still = split_by_motion(motion, poor, length, _HARMLESS)
     if not len(still):
         return (), ()
     rows = still / unit / (_HELD * length)
     index = np.tile(np.arange(n), (len(rows), 1))
     return (Term(_projection(n), index, (rows, rows @ nominal)),), tuple(
-        f"Step 4 left {_in_words(mechanism, names, row)} at nominal: the poses hardly "
+        f"Step 4 left {_in_words(machine, names, row)} at nominal: the poses hardly "
         "show it, and the platform does not move with it."
         for row in sparse_basis(still)
     )
@@ -211,7 +209,7 @@ def _mean_length(legs: Sequence[Leg], poses: tuple[Array, Array]) -> float:
 
 
 def _motion(
-    mechanism: NominalMechanism,
+    machine: NominalMachine,
     unknowns: PlatformUnknowns,
     legs: tuple[Leg, ...],
     poses: tuple[Array, Array],
@@ -221,7 +219,7 @@ def _motion(
         return None
     everything = unknowns.parametrization
     try:
-        motion = pose_sensitivity(legs, everything, mechanism.frame_legs, *poses)
+        motion = pose_sensitivity(legs, everything, machine.frame_legs, *poses)
     except NotIdentifiable:
         return None
     for place, leg, nominal in zip(everything.place, legs, unknowns.nominal, strict=True):
@@ -241,22 +239,20 @@ def _other_basis(axis: Array, nominal: Array) -> Array:
     return np.stack([-e2 @ slope, e1 @ slope])
 
 
-def _refuse(mechanism: NominalMechanism, names: Sequence[str], rows: Array) -> None:
+def _refuse(machine: NominalMachine, names: Sequence[str], rows: Array) -> None:
     """Raise NotIdentifiable in geometric words."""
     shown = np.abs(rows) > SHOWN * np.abs(rows).max(axis=1, keepdims=True)
     changing = [names[i] for i in np.flatnonzero(shown.any(axis=0)).tolist()]
     if all(name.rpartition(".")[0].endswith(".platform") for name in changing):
         legs = [
-            leg
-            for leg in mechanism.leg_names
-            if any(name.startswith(f"{leg}.") for name in changing)
+            leg for leg in machine.leg_names if any(name.startswith(f"{leg}.") for name in changing)
         ]
         raise NotIdentifiable(
             f"The platform joints could not be tied together: those of {', '.join(legs)} can "
             "move without any image noticing; needed images of three or more legs at once that "
             "share legs with each other; add images that show several legs at once."
         )
-    first = _in_words(mechanism, names, rows[0])
+    first = _in_words(machine, names, rows[0])
     more = f", and {len(rows) - 1} more such directions" if len(rows) > 1 else ""
     raise NotIdentifiable(
         f"The platform could not be identified: found that {first} can change without any image "
@@ -265,8 +261,8 @@ def _refuse(mechanism: NominalMechanism, names: Sequence[str], rows: Array) -> N
     )
 
 
-def _in_words(mechanism: NominalMechanism, names: Sequence[str], row: Array) -> str:
+def _in_words(machine: NominalMachine, names: Sequence[str], row: Array) -> str:
     """Return a direction in words."""
     shown = np.flatnonzero(np.abs(row) > SHOWN * np.abs(row).max())
     shown = shown[np.argsort(-np.abs(row[shown]).round(3), kind="stable")]
-    return describe_direction([names[i] for i in shown.tolist()], mechanism.leg_names)
+    return describe_direction([names[i] for i in shown.tolist()], machine.leg_names)

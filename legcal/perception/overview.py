@@ -106,7 +106,7 @@ class Detection:
 
     def predicted(self, row: int) -> list[PredictedLeg]:
         """Return where the legs of a row should be seen; none where the camera is not known."""
-        measurements, legs = self.dataset.measurements, self.dataset.mechanism.legs
+        measurements, legs = self.dataset.measurements, self.dataset.machine.legs
         view = int(measurements.view[row])
         T = self.T_base_camera[view]
         if T is None:
@@ -214,7 +214,7 @@ def overlay_page(
     detection: Detection, document: Mapping[str, Any], pictures: Mapping[int, str]
 ) -> str:
     """Return the text of ``index.html``; pictures of rows are relative to the page."""
-    title = f"Outlines of {detection.dataset.mechanism.name}"
+    title = f"Outlines of {detection.dataset.machine.name}"
     parts = [_HEAD.format(title=escape(title)), f"<h1>{escape(title)}</h1>\n"]
     parts.append(
         f"<p>{document['used']} of {document['outlines']} outlines in {document['images']} images "
@@ -269,7 +269,7 @@ def _figure(name: str, file: str, said: str) -> str:
 
 def _said(detection: Detection, row: int) -> str:
     """Return what was found in the image of a row."""
-    outlines, legs = detection.outlines, detection.dataset.mechanism.leg_names
+    outlines, legs = detection.outlines, detection.dataset.machine.leg_names
     here = np.flatnonzero(outlines.row == row).tolist()
     said = f"{np.count_nonzero(outlines.used[here])} of {len(here)} used"
     wrong: dict[str, list[str]] = {}
@@ -321,7 +321,7 @@ def write_detection(
     pictures = picture_names(detection)
     with result_folder(destination, DETECTION, earlier, replaceable=earlier) as folder:
         table = folder / OBSERVATIONS_NAME
-        names = dataset.mechanism.leg_names
+        names = dataset.machine.leg_names
         write_observations(table, detection.outlines, dataset.measurements, names)
         _draw_all(detection, folder, pictures, run, progress)
         document = detection_document(detection, pictures)
@@ -344,7 +344,7 @@ def detection_document(detection: Detection, pictures: Mapping[int, str]) -> dic
     names = row_names(detection.dataset.measurements)
     return DetectionDocument(
         legcal_detection=1,
-        mechanism=detection.dataset.mechanism.name,
+        mechanism=detection.dataset.machine.name,
         views=view_figures(detection),
         images=len(detection.rows),
         outlines=len(outlines),
@@ -435,7 +435,7 @@ def _marks(detection: Detection, row: int) -> list[PartMarks]:
         camera,
         outlines.choose(outlines.row == row),
         detection.predicted(row),
-        detection.dataset.mechanism.leg_names,
+        detection.dataset.machine.leg_names,
     )
 
 

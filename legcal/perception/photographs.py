@@ -25,7 +25,7 @@ from legcal.data import (
     no_outlines,
 )
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Cylinder, Mechanism
+from legcal.machine import Cylinder, Machine
 from legcal.perception.detection import measure_outlines
 from legcal.perception.diagnostics import (
     diagnose,
@@ -64,7 +64,7 @@ def detection_settings() -> dict[str, object]:
 class Photographs:
     """The images of a dataset, and which of them are searched."""
 
-    mechanism: Mechanism  # its legs in the order of the measurements' columns
+    machine: Machine  # its legs in the order of the measurements' columns
     measurements: Measurements  # all rows
     load: Load  # returns the image of a row; it can travel to another process
     run: Run  # how images are searched: in turn or by several processes
@@ -74,14 +74,14 @@ class Photographs:
     @property
     def cylinders(self) -> tuple[tuple[Cylinder, ...], ...]:
         """What can be seen of each leg."""
-        return tuple(leg.cylinders for leg in self.mechanism.legs)
+        return tuple(leg.cylinders for leg in self.machine.legs)
 
     @property
     def wanted(self) -> BoolArray:
         """Which legs to use in each view, (n_views, n_legs)."""
         return np.array(
             [
-                [view.legs is None or name in view.legs for name in self.mechanism.leg_names]
+                [view.legs is None or name in view.legs for name in self.machine.leg_names]
                 for view in self.measurements.views
             ],
             dtype=np.bool_,
@@ -96,7 +96,7 @@ class Photographs:
             nominal.B_base,
             self.cylinders,
             self.wanted,
-            self.mechanism.leg_names,
+            self.machine.leg_names,
             {} if pairs is None else pairs,
         )
 
@@ -138,11 +138,11 @@ def given_outlines(photographs: Photographs) -> Outlines:
 
 
 def nominal_placement(
-    mechanism: Mechanism, measurements: Measurements, T_base_platform: Sequence[RigidTransform]
+    machine: Machine, measurements: Measurements, T_base_platform: Sequence[RigidTransform]
 ) -> Placement:
     """Return where a model has the legs at poses (n_poses,), with the rough cameras of views."""
-    B_base = np.array([T.apply(mechanism.B_platform) for T in T_base_platform])
-    A_base = np.broadcast_to(mechanism.A_base, B_base.shape)
+    B_base = np.array([T.apply(machine.B_platform) for T in T_base_platform])
+    A_base = np.broadcast_to(machine.A_base, B_base.shape)
     hints = tuple(view.T_base_camera for view in measurements.views)
     return Placement(A_base[measurements.pose], B_base[measurements.pose], hints)
 
@@ -174,10 +174,8 @@ def observe(
     if doubtful:
         other = recognised(doubtful)
         if other.radii.factor:
-            mechanism = photographs.mechanism.with_cylinders(
-                other.radii.corrected(search.cylinders)
-            )
-            corrected = replace(photographs, mechanism=mechanism)
+            machine = photographs.machine.with_cylinders(other.radii.corrected(search.cylinders))
+            corrected = replace(photographs, machine=machine)
             by_other = corrected.search(nominal, pairs)
             again, also = _measured(corrected, by_other, other, report, together=together)
             blur = np.where(np.isnan(also), blur, also)
@@ -317,7 +315,7 @@ def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]
     used = outlines.used & np.array([one not in of_wrong_width for one in which], dtype=np.bool_)
     part = np.array(outlines.part)
     parts = []
-    for j, leg in enumerate(photographs.mechanism.legs):
+    for j, leg in enumerate(photographs.machine.legs):
         for link, radius in leg.radius_of_part.items():
             own = visible & (outlines.leg == j) & (part == link)
             is_seen = own.any() or not visible.any()

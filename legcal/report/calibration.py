@@ -103,7 +103,7 @@ def _board_lines(calibration: Calibration) -> list[str]:
         f"images, {solution.rms_corners_px or 0.0:.3f} px rms."
     )
     if dataset.T_base_board is not None:
-        apart = dataset.T_base_board.inv() * dataset.mechanism.T_base_Rb * solution.T_Rb_board
+        apart = dataset.T_base_board.inv() * dataset.machine.T_base_Rb * solution.T_Rb_board
         line += (
             f" It stands {1e3 * np.linalg.norm(apart.translation):.2f} mm and "
             f"{np.degrees(apart.rotation.magnitude()):.3f} deg from where the dataset has it, if "
@@ -122,11 +122,11 @@ def _steps_line(calibration: Calibration) -> str:
     )
     if calibration.platform is None:
         return f"The four steps alone gave a result.{left_out}"
-    mechanism, measurements = calibration.dataset.mechanism, calibration.dataset.measurements
+    machine, measurements = calibration.dataset.machine, calibration.dataset.measurements
     near, q = calibration.solution.T_Rb_Re, measurements.q[measurements.first_rows]
     displacement, rotation = pose_differences(
-        poses_at_readings(mechanism, steps.legs, q, near),
-        poses_at_readings(mechanism, calibration.solution.legs, q, near),
+        poses_at_readings(machine, steps.legs, q, near),
+        poses_at_readings(machine, calibration.solution.legs, q, near),
     )
     return (
         f"The four steps alone end {1e3 * displacement.mean():.3f} mm / "

@@ -43,7 +43,7 @@ def noise_table(noise: Noise) -> RenderableType:
     counts = sorted({len(group.rows) for group in noise.repeats})
     repeats = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     title = heading(
-        noise.dataset.mechanism.name,
+        noise.dataset.machine.name,
         f": {sum(len(group.rows) for group in noise.repeats)} images, {repeats} of each of "
         f"{len(noise.repeats)} orientations (a pose in a view)",
     )

@@ -157,21 +157,19 @@ class PlacedBoard:
         solid = Solid("calibration board", None, Box((x, y, thickness)), T, material)
         return PlacedSolid(solid, T)
 
-    def beside(self, machine: PosedMachine) -> PosedMachine:
+    def beside(self, posed: PosedMachine) -> PosedMachine:
         """Return a machine in a pose together with the plate."""
         size = self.plate.solid.shape
         assert isinstance(size, Box)
         mesh = trimesh.creation.box(size.size)
         return replace(
-            machine,
-            solids=(*machine.solids, self.plate),
-            vertices=np.concatenate(
-                [machine.vertices, self.plate.T_base_solid.apply(mesh.vertices)]
-            ),
-            faces=np.concatenate([machine.faces, mesh.faces + len(machine.vertices)]),
+            posed,
+            solids=(*posed.solids, self.plate),
+            vertices=np.concatenate([posed.vertices, self.plate.T_base_solid.apply(mesh.vertices)]),
+            faces=np.concatenate([posed.faces, mesh.faces + len(posed.vertices)]),
         )
 
-    def runs_through(self, machine: PosedMachine) -> bool:
+    def runs_through(self, posed: PosedMachine) -> bool:
         """Say whether the plate runs through a machine, or something lies right on its print."""
         size = self.plate.solid.shape
         assert isinstance(size, Box)
@@ -190,13 +188,11 @@ class PlacedBoard:
                 points = self.plate.T_base_solid.apply(
                     np.column_stack([plane, np.full(len(plane), z)])
                 )
-                if machine.hidden(points[0], points[1:], np.zeros(len(far))).any():
+                if posed.hidden(points[0], points[1:], np.zeros(len(far))).any():
                     return True
         return False
 
-    def seen(
-        self, machine: PosedMachine, camera: Camera, T_base_camera: RigidTransform
-    ) -> BoolArray:
+    def seen(self, posed: PosedMachine, camera: Camera, T_base_camera: RigidTransform) -> BoolArray:
         """Return which corners an image shows, (n_corners,)."""
         points = self._watched
         base = self.T_base_board.apply(points.reshape(-1, 3))
@@ -210,7 +206,7 @@ class PlacedBoard:
         assert isinstance(size, Box)
         margin = np.full(int(free.sum()), _IN_FRONT * size.size[2])
         if free.any():
-            free[free] = ~machine.hidden(centre, base[free], margin)
+            free[free] = ~posed.hidden(centre, base[free], margin)
         seen = np.all(free.reshape(points.shape[:2]), axis=1)
         if self.board.kind == "chessboard" and not seen.all():
             seen[:] = False  # it is found as a whole or not at all
@@ -229,14 +225,14 @@ class PlacedBoard:
 
 
 def chosen_board(
-    choice: Board | str | Path | None, machines: Sequence[PosedMachine]
+    choice: Board | str | Path | None, posed_machines: Sequence[PosedMachine]
 ) -> Board | None:
     """Return the board that settings ask for."""
     if choice is None or isinstance(choice, Board):
         return choice
     if choice not in KINDS:
         return _from_file(Path(choice))
-    joints = np.concatenate([part for m in machines for part in (m.A, m.B)])
+    joints = np.concatenate([part for m in posed_machines for part in (m.A, m.B)])
     width = _WIDTH * float(np.linalg.norm(np.ptp(joints, axis=0)))
     if choice == "aprilgrid":
         side = max(round(width / 5.3, _DIGITS), 0.001)

@@ -25,7 +25,7 @@ from legcal.data import (
 from legcal.errors import UsageError
 from legcal.files import output_path
 from legcal.geometry import Array
-from legcal.machine import Mechanism, load_mechanism, write_model
+from legcal.machine import Machine, load_mechanism, write_model
 from legcal.progress import Report, no_progress
 from legcal.simulation.folder import (
     SIMULATED,
@@ -62,7 +62,7 @@ class SimulatedDataset:
         The dataset.
     level : Level
         What it gives a calibration to work on.
-    nominal, truth : Mechanism
+    nominal, truth : Machine
         The model of the dataset, and the machine that was measured.
     truth_path : Path
         The YAML of the true model.
@@ -78,8 +78,8 @@ class SimulatedDataset:
 
     folder: Path
     level: Level
-    nominal: Mechanism
-    truth: Mechanism
+    nominal: Machine
+    truth: Machine
     truth_path: Path
     measurements: Measurements
     seen: Array
@@ -88,7 +88,7 @@ class SimulatedDataset:
 
 
 def simulate(
-    model: str | Path | Mechanism,
+    model: str | Path | Machine,
     output: str | Path,
     settings: SimulationSettings | None = None,
     *,
@@ -104,7 +104,7 @@ def simulate(
 
     Parameters
     ----------
-    model : str, Path or Mechanism
+    model : str, Path or Machine
         The nominal model, as :func:`legcal.load_mechanism` takes it.
     output : path
         The folder of the dataset.
@@ -136,7 +136,7 @@ def simulate(
     destination = output_path(output, SIMULATED)
     whole_number("workers", workers, 1)
     check_dataset_destination(destination, force=force)
-    nominal = model if isinstance(model, Mechanism) else load_mechanism(model)
+    nominal = model if isinstance(model, Machine) else load_mechanism(model)
     _check_readings(nominal, settings)
     chance = streams(settings.seed)
     with dataset_folder(destination, force=force) as folder:
@@ -156,7 +156,7 @@ def simulate(
         if session.axes is not None:
             write_axis_table(folder / AXES_NAME, *session.axes, m, legs)
         if session.board is not None:
-            exact_corners = corners_of(session.scene, session.machines, session.board, 0.0)
+            exact_corners = corners_of(session.scene, session.posed_machines, session.board, 0.0)
             write_corners(folder / TRUTH / CORNERS_NAME, exact_corners, m)
         if session.corners is not None:
             write_corners(folder / CORNERS_NAME, session.corners, m)
@@ -198,7 +198,7 @@ def _write_photographs(
             progress("Photographs", done, len(names))
 
 
-def _check_readings(nominal: Mechanism, settings: SimulationSettings) -> None:
+def _check_readings(nominal: Machine, settings: SimulationSettings) -> None:
     """Refuse errors of readings that are larger than what is read."""
     travel = min((np.ptp(nominal.legs[j].travel) for j in nominal.motors), default=np.inf)
     if settings.readings.size > travel:

@@ -38,7 +38,7 @@ from legcal.files import (
     read_table,
     result_folder,
 )
-from legcal.machine import LegKind, Mechanism, main_cylinders
+from legcal.machine import LegKind, Machine, main_cylinders
 from legcal.simulation.session import Session
 from legcal.simulation.settings import SimulationSettings
 from legcal.version import __version__
@@ -54,7 +54,7 @@ SIMULATED = OutputKind("dataset", TRUTH_NAME, "legcal_truth")
 
 def write_session(
     folder: Path,
-    mechanism: Mechanism,  # the nominal model
+    machine: Machine,  # the nominal model
     model: str,  # path of its YAML in the dataset
     m: Measurements,
     *,
@@ -91,8 +91,8 @@ def write_session(
         document["board"] = dict(board)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     (folder / "dataset.yaml").write_text(text, encoding="utf-8")
-    motors = list(mechanism.motors)
-    joints = [str(mechanism.legs[j].prismatic) for j in motors]
+    motors = list(machine.motors)
+    joints = [str(machine.legs[j].prismatic) for j in motors]
     names, readings = list(groups) or [view.name for view in m.views], m.q[:, motors].tolist()
     rows = (
         [names[v], m.image[row], m.pose_labels[m.pose[row]], *readings[row]]

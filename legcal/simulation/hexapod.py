@@ -46,7 +46,7 @@ _ROUNDS = 1000  # of draws of poses
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class PaperHexapod:
     """A 6-SPU hexapod, or any n-leg platform with point-like joints and motors on all legs."""
 
     parameters: KinematicParameters  # its parameters xi, in R_b and R_e
@@ -76,7 +76,7 @@ class Machine:
         return {part: float(R) for part, R in zip(self.parts, self.radius, strict=True)}
 
 
-def hexapod(scale: float = 1.0) -> Machine:
+def hexapod(scale: float = 1.0) -> PaperHexapod:
     """Return the coplanar 6-SPU hexapod of ``models/hexapod.yaml``, lengths times ``scale``."""
     base_angles = np.deg2rad([210.0, -54.0, -30.0, 66.0, 90.0, 186.0])
     platform_angles = np.deg2rad([210.0, 234.0, -30.0, -6.0, 90.0, 114.0])
@@ -93,7 +93,7 @@ def hexapod(scale: float = 1.0) -> Machine:
         T_platform_Re.inv().apply(B_platform),
         np.full(6, 0.345 * scale),
     )
-    return Machine(
+    return PaperHexapod(
         parameters=_without_rounding(parameters, frame_legs),
         sign=np.ones(6, dtype=np.intp),
         frame_legs=frame_legs,
@@ -103,7 +103,7 @@ def hexapod(scale: float = 1.0) -> Machine:
     )
 
 
-def noncoplanar_hexapod() -> Machine:
+def noncoplanar_hexapod() -> PaperHexapod:
     """Return that hexapod with joints 2, 4 and 6 moved out of the planes of 1, 3 and 5.
 
     They are 30 mm higher at the base and 30 mm lower at the platform.
@@ -116,8 +116,8 @@ def noncoplanar_hexapod() -> Machine:
 
 
 def perturb(
-    machine: Machine, rng: np.random.Generator, half_width: float, *, coplanar: bool = False
-) -> Machine:
+    machine: PaperHexapod, rng: np.random.Generator, half_width: float, *, coplanar: bool = False
+) -> PaperHexapod:
     """Return the machine with uniform errors on every parameter."""
     vector = to_vector(machine.parameters, machine.frame_legs)
     vector = vector + rng.uniform(-half_width, half_width, vector.shape)
@@ -187,7 +187,7 @@ def poses_with_lengths(
     return RigidTransform.from_components(found.t, Rotation.from_matrix(found.R))
 
 
-def follow_from_home(machine: Machine, lengths: Array) -> Followed:
+def follow_from_home(machine: PaperHexapod, lengths: Array) -> Followed:
     """Return the poses with given leg lengths that are reached from home in small steps.
 
     They are in the assembly mode of home; those beyond or beside a singularity are not reached.
@@ -218,7 +218,7 @@ def _solved(parameters: KinematicParameters, lengths: Array, R: Array, t: Array)
     return solve_poses(legs, range(3), R, t, lengths - parameters.offsets)
 
 
-def extreme_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> RigidTransform:
+def extreme_poses(machine: PaperHexapod, n_poses: int, rng: np.random.Generator) -> RigidTransform:
     """Return random poses with every leg near its shortest or its longest (section 4.3).
 
     Poses are followed from home in small steps, so that they stay in its assembly mode; those
@@ -228,7 +228,7 @@ def extreme_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> R
     return _drawn(machine, n_poses, lambda: near_ends(rng.integers(0, 2, n), rng.random(n)))
 
 
-def random_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> RigidTransform:
+def random_poses(machine: PaperHexapod, n_poses: int, rng: np.random.Generator) -> RigidTransform:
     """Return random poses with every leg length drawn uniformly from its travel.
 
     They are followed from home as those of :func:`extreme_poses`.
@@ -236,7 +236,7 @@ def random_poses(machine: Machine, n_poses: int, rng: np.random.Generator) -> Ri
     return _drawn(machine, n_poses, lambda: rng.random(machine.n_legs))
 
 
-def _drawn(machine: Machine, n_poses: int, draw: Callable[[], Array]) -> RigidTransform:
+def _drawn(machine: PaperHexapod, n_poses: int, draw: Callable[[], Array]) -> RigidTransform:
     """Return poses whose leg lengths are drawn, as parts of the travel, until enough are reached.
 
     Each round draws as many as are missing, so that the draws are those of one pose at a time.
@@ -268,7 +268,7 @@ class LegCamera:
 
 
 def cameras_around(
-    machine: Machine,
+    machine: PaperHexapod,
     rng: np.random.Generator,
     *,
     legs: Sequence[Sequence[int]] = PAPER_VIEWS,
@@ -302,14 +302,14 @@ class HexapodSession:
     measurements: Measurements  # with rough camera poses
     outlines: Outlines | None  # None where Table 1 gave the noise of the axes
     axes: LegAxes
-    machine: Machine
+    machine: PaperHexapod
     cameras: tuple[LegCamera, ...]
     T_Rb_Re: RigidTransform  # n_poses of them
     scene: Scene
 
 
 def hexapod_session(
-    machine: Machine,
+    machine: PaperHexapod,
     cameras: Sequence[LegCamera],
     rng: np.random.Generator,
     *,
@@ -367,7 +367,7 @@ def hexapod_session(
 
 
 def observed(
-    machine: Machine,
+    machine: PaperHexapod,
     scene: Scene,
     measurements: Measurements,
     noise: OutlineNoise | TableNoise,

@@ -271,7 +271,7 @@ def table_of_lines(u: Array, A: Array) -> Array:
 
 def corners_of(
     scene: Scene,
-    machines: Sequence[PosedMachine],  # in every pose, with the board beside them
+    posed_machines: Sequence[PosedMachine],  # in every pose, with the board beside them
     placed: PlacedBoard,
     sigma_px: float,
     rng: np.random.Generator | None = None,
@@ -281,7 +281,7 @@ def corners_of(
     found = []
     for row, (v, k) in enumerate(zip(scene.images.view, scene.images.pose, strict=True)):
         camera, T = scene.views[v].camera, scene.views[v].T_base_camera
-        corner = np.flatnonzero(placed.seen(machines[k], camera, T))
+        corner = np.flatnonzero(placed.seen(posed_machines[k], camera, T))
         if not len(corner):
             continue
         px = camera.project(T.inv().apply(P_base[corner]))

@@ -24,12 +24,12 @@ from legcal.data import LegAxes, no_outlines
 from legcal.errors import LegcalError
 from legcal.geometry import Array
 from legcal.machine import KinematicParameters, free_coordinates, point_like_legs, to_vector
-from legcal.paper import NominalMechanism, point_like_mechanism, run_steps
+from legcal.paper import NominalMachine, point_like_mechanism, run_steps
 from legcal.simulation.hexapod import (
     PAPER_VIEWS,
     RAISED,
     HexapodSession,
-    Machine,
+    PaperHexapod,
     cameras_around,
     follow_from_home,
     hexapod,
@@ -100,7 +100,7 @@ class PaperStudy:
         in_radians = self.noise == TableNoise.in_radians()
         return PaperSummary.of(records, machines, in_radians=in_radians)
 
-    def _calibrations(self, machine: Machine, rng: np.random.Generator) -> Record:
+    def _calibrations(self, machine: PaperHexapod, rng: np.random.Generator) -> Record:
         """Return the errors of all estimators for one session of a machine."""
         nominal = perturb(machine, rng, self.initial_error)
         session = hexapod_session(
@@ -132,7 +132,10 @@ class PaperStudy:
 
 
 def _errors(
-    machine: Machine, parameters: KinematicParameters, covariance: Array, checked: RigidTransform
+    machine: PaperHexapod,
+    parameters: KinematicParameters,
+    covariance: Array,
+    checked: RigidTransform,
 ) -> Record:
     """Return the errors of eq (20) and those of every parameter, or the failure to compute them."""
     difference = to_vector(parameters, machine.frame_legs) - to_vector(
@@ -159,7 +162,7 @@ class PlatformErrors:
 
 
 def platform_errors(
-    machine: Machine, parameters: KinematicParameters, T_Rb_Re: RigidTransform
+    machine: PaperHexapod, parameters: KinematicParameters, T_Rb_Re: RigidTransform
 ) -> PlatformErrors:
     """Return the errors of eq (20) that parameters cause at poses of the true machine."""
     found = poses_of_readings(machine, parameters, T_Rb_Re)
@@ -172,7 +175,7 @@ def platform_errors(
 
 
 def poses_of_readings(
-    machine: Machine, parameters: KinematicParameters, T_Rb_Re: RigidTransform
+    machine: PaperHexapod, parameters: KinematicParameters, T_Rb_Re: RigidTransform
 ) -> RigidTransform:
     """Return the poses that other parameters compute from the readings of true poses."""
     lengths = np.linalg.norm(leg_vectors(machine.parameters, T_Rb_Re), axis=-1)
@@ -180,7 +183,9 @@ def poses_of_readings(
     return poses_with_lengths(parameters, changed, T_Rb_Re)
 
 
-def expected_errors(machine: Machine, covariance: Array, T_Rb_Re: RigidTransform) -> PlatformErrors:
+def expected_errors(
+    machine: PaperHexapod, covariance: Array, T_Rb_Re: RigidTransform
+) -> PlatformErrors:
     """Return the errors of eq (20) to expect of Gaussian parameters, to first order."""
     follow = platform_by_parameters(machine, T_Rb_Re)
     of_pose = follow @ covariance @ np.swapaxes(follow, -1, -2)
@@ -189,7 +194,7 @@ def expected_errors(machine: Machine, covariance: Array, T_Rb_Re: RigidTransform
     return PlatformErrors(dX, dE, dE)
 
 
-def platform_by_parameters(machine: Machine, T_Rb_Re: RigidTransform) -> Array:
+def platform_by_parameters(machine: PaperHexapod, T_Rb_Re: RigidTransform) -> Array:
     """Return d (translation, rotation vector in R_b) / d parameters at fixed readings.
 
     The legs keep their lengths but for the offsets: u . (dt + w x R B + R dB - dA) = dq0.
@@ -223,18 +228,18 @@ def expected_norm(covariance: Array) -> Array:
 # Estimators
 
 
-def literal_steps(session: HexapodSession, nominal: Machine) -> KinematicParameters:
+def literal_steps(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
     """Return what the four steps with the criteria as printed find."""
     steps = run_steps(nominal_of(nominal), session.axes, session.measurements, criteria="literal")
     return steps.parameters
 
 
-def default_steps(session: HexapodSession, nominal: Machine) -> KinematicParameters:
+def default_steps(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
     """Return what the four steps with legcal's criteria find."""
     return run_steps(nominal_of(nominal), session.axes, session.measurements).parameters
 
 
-def one_fit(session: HexapodSession, nominal: Machine) -> KinematicParameters:
+def one_fit(session: HexapodSession, nominal: PaperHexapod) -> KinematicParameters:
     """Return what one fit of everything finds, started from the nominal model and rough cameras.
 
     ``legcal calibrate`` also starts from what the steps find and keeps the better of both; here the
@@ -273,14 +278,14 @@ def bound_covariance(session: HexapodSession, exact: LegAxes) -> Array:
     return bound(problem, truth)
 
 
-def nominal_of(machine: Machine) -> NominalMechanism:
+def nominal_of(machine: PaperHexapod) -> NominalMachine:
     """Return a simulated machine as the steps take a mechanism."""
     return point_like_mechanism(
         machine.leg_names, machine.parameters, machine.sign, machine.frame_legs
     )
 
 
-def _legs(machine: Machine) -> FittedLegs:
+def _legs(machine: PaperHexapod) -> FittedLegs:
     """Return the legs of a machine as the fit sees them."""
     legs = point_like_legs(machine.parameters)
     return FittedLegs(machine.leg_names, legs, machine.sign, machine.frame_legs, {})

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from legcal.geometry import Array
 from legcal.machine import parametrize, point_like_legs, to_vector
-from legcal.simulation.hexapod import Machine
+from legcal.simulation.hexapod import PaperHexapod
 from legcal.simulation.study import Record
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ class PaperSummary:
 
     @classmethod
     def of(
-        cls, records: Iterable[Record], machines: Mapping[str, Machine], *, in_radians: bool
+        cls, records: Iterable[Record], machines: Mapping[str, PaperHexapod], *, in_radians: bool
     ) -> PaperSummary:
         """Return the means over records, which are read once."""
         first = next(iter(machines.values()))

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import NotVisible
 from legcal.geometry import Array, normal_basis
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.cameras import UPWARD, look_at
@@ -47,8 +47,8 @@ _HIDDEN = 0.9  # of what is seen of the legs that must stay seen
 
 
 def cameras_around(
-    mechanism: Mechanism,
-    machines: Sequence[PosedMachine],  # in the poses that the cameras are to see
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],  # in the poses that the cameras are to see
     cameras: Mapping[str, Camera],
     rng: np.random.Generator,  # of the first sector, roll and distance
     progress: Report = no_progress,
@@ -59,10 +59,10 @@ def cameras_around(
     That is the least mean length of the legs in the images of a view [px], zero if a camera does
     not see the board.
     """
-    reached, tried, up = _reached(machines), _some(machines), _upward(mechanism)
+    reached, tried, up = _reached(posed_machines), _some(posed_machines), _upward(machine)
     sector = 2.0 * np.pi / len(cameras)
     first = rng.uniform(0.0, 2.0 * np.pi)
-    lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
+    lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
     found, least = [], np.inf
     for v, (name, camera) in enumerate(cameras.items()):
         progress("Cameras", v, len(cameras))
@@ -74,7 +74,7 @@ def cameras_around(
             for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
             for lift in lifts
         ]
-        scores = [_score(mechanism, tried, camera, T, board) for T in candidates]
+        scores = [_score(machine, tried, camera, T, board) for T in candidates]
         found.append(Viewpoint(name, camera, candidates[int(np.argmax(scores))]))
         least = min(least, max(scores))
     progress("Cameras", len(cameras), len(cameras))
@@ -82,21 +82,21 @@ def cameras_around(
 
 
 def camera_in_hand(
-    mechanism: Mechanism,
-    machine: PosedMachine,  # in the pose that the image is to show, with the board
+    machine: Machine,
+    posed: PosedMachine,  # in the pose that the image is to show, with the board
     camera: Camera,
     rng: np.random.Generator,
     board: PlacedBoard,
 ) -> RigidTransform | None:
     """Return T_base_camera that shows board and legs, the best of a few; None if there is none."""
-    up, reached = _upward(mechanism), _reached([machine])
-    lifts = _LIFTS if mechanism.spatial else _LIFTS_PLANAR
+    up, reached = _upward(machine), _reached([posed])
+    lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
     good = []
     for _ in range(HAND_TRIES):
         toward = _direction(up, rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lifts[0], lifts[-1]))
         roll, further = rng.uniform(-_HAND_ROLL, _HAND_ROLL), 1.0 + _HAND_FURTHER * rng.random()
         T = _before(toward, up, roll, further, reached, camera)
-        score = _score(mechanism, [machine], camera, T, board)
+        score = _score(machine, [posed], camera, T, board)
         if score > 0.0:
             good.append((score, T))
         if len(good) == _HAND_GOOD:
@@ -106,18 +106,18 @@ def camera_in_hand(
 
 def board_and_cameras(
     board: Board,
-    mechanism: Mechanism,
-    machines: Sequence[PosedMachine],
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
     cameras: Mapping[str, Camera],
     rng: np.random.Generator,
     progress: Report = no_progress,
 ) -> tuple[PlacedBoard, tuple[Viewpoint, ...]]:
     """Return a board on the base of a machine, and cameras around both."""
     good: list[tuple[float, PlacedBoard, tuple[Viewpoint, ...]]] = []
-    for placed in _lying(board, mechanism, _some(machines)):
-        together = [placed.beside(machine) for machine in machines]
+    for placed in _lying(board, machine, _some(posed_machines)):
+        together = [placed.beside(posed) for posed in posed_machines]
         views, score = cameras_around(
-            mechanism, together, cameras, copy.deepcopy(rng), progress, placed
+            machine, together, cameras, copy.deepcopy(rng), progress, placed
         )
         if score > 0.0:
             good.append((score, placed, views))
@@ -131,18 +131,18 @@ def board_and_cameras(
 
 def board_before(
     board: Board,
-    mechanism: Mechanism,
-    machines: Sequence[PosedMachine],
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
     views: Sequence[Viewpoint],
 ) -> PlacedBoard:
     """Return a board where cameras whose places are given see it."""
-    tried = _some(machines)
+    tried = _some(posed_machines)
     towards = np.mean([view.T_base_camera.translation for view in views], axis=0)
     most, best = 0.0, None
-    for placed in _lying(board, mechanism, tried, towards):
-        together = [placed.beside(machine) for machine in tried]
+    for placed in _lying(board, machine, tried, towards):
+        together = [placed.beside(posed) for posed in tried]
         seen = min(_share(placed, together, view) for view in views)
-        if seen > most and not any(_hides(mechanism, tried, together, view) for view in views):
+        if seen > most and not any(_hides(machine, tried, together, view) for view in views):
             most, best = seen, placed
     if best is None:
         raise _nowhere(
@@ -151,11 +151,11 @@ def board_before(
     return best
 
 
-def _upward(mechanism: Mechanism) -> Array:
+def _upward(machine: Machine) -> Array:
     """Return the direction from base to platform at home, or the normal of the plane of motion."""
-    if mechanism.base_normal is not None:
-        return mechanism.base_normal
-    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
+    if machine.base_normal is not None:
+        return machine.base_normal
+    A, B = machine.A_base, machine.home.apply(machine.B_platform)
     across = (B - A).mean(axis=0)
     size = float(np.linalg.norm(across))
     reach = float(np.ptp(A, axis=0).max())
@@ -169,21 +169,24 @@ def _direction(up: Array, turn: float, lift: float) -> Array:
     return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
 
 
-def _some(machines: Sequence[PosedMachine]) -> list[PosedMachine]:
+def _some(posed_machines: Sequence[PosedMachine]) -> list[PosedMachine]:
     """Return a machine in a few of its poses."""
-    return [machines[i] for i in np.unique(np.linspace(0, len(machines) - 1, _TRIED).astype(int))]
+    return [
+        posed_machines[i]
+        for i in np.unique(np.linspace(0, len(posed_machines) - 1, _TRIED).astype(int))
+    ]
 
 
-def _joints(machines: Sequence[PosedMachine]) -> Array:
+def _joints(posed_machines: Sequence[PosedMachine]) -> Array:
     """Return the joint centres (n, 3) of a machine in all of its poses [m]."""
-    return np.concatenate([part for m in machines for part in (m.A, m.B)])
+    return np.concatenate([part for m in posed_machines for part in (m.A, m.B)])
 
 
-def _reached(machines: Sequence[PosedMachine]) -> Array:
+def _reached(posed_machines: Sequence[PosedMachine]) -> Array:
     """Return points (n, 3) around a machine in all of its poses, without its walls and floors."""
-    joints = _joints(machines)
+    joints = _joints(posed_machines)
     size = float(np.linalg.norm(np.ptp(joints, axis=0)))
-    solids = [s for m in machines for s in in_view(m.solids, RigidTransform.identity())]
+    solids = [s for m in posed_machines for s in in_view(m.solids, RigidTransform.identity())]
     around = [surrounding_points(s) for s in solids if s.reach < size]
     points = np.concatenate([joints, *around])
     try:
@@ -214,19 +217,19 @@ def _before(
 
 
 def _lengths(
-    mechanism: Mechanism, machines: Sequence[PosedMachine], camera: Camera, T: RigidTransform
+    machine: Machine, posed_machines: Sequence[PosedMachine], camera: Camera, T: RigidTransform
 ) -> list[float]:
     """Return the length of every leg in every image [px], zero where it does not count as seen."""
     return [
         leg.length_px if leg.is_seen else 0.0
-        for machine in machines
-        for leg in legs_in_image(mechanism.legs, machine, camera, T, samples=_SAMPLES)
+        for posed in posed_machines
+        for leg in legs_in_image(machine.legs, posed, camera, T, samples=_SAMPLES)
     ]
 
 
 def _score(
-    mechanism: Mechanism,
-    machines: Sequence[PosedMachine],
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
     camera: Camera,
     T: RigidTransform,
     board: PlacedBoard | None,
@@ -237,23 +240,23 @@ def _score(
     """
     share = 1.0
     if board is not None:
-        shown = [board.is_enough(board.seen(machine, camera, T)) for machine in machines]
+        shown = [board.is_enough(board.seen(posed, camera, T)) for posed in posed_machines]
         share = float(np.mean(shown))
         if share < _MOSTLY:
             return 0.0
-    return share * float(np.mean(_lengths(mechanism, machines, camera, T)))
+    return share * float(np.mean(_lengths(machine, posed_machines, camera, T)))
 
 
 def _lying(
     board: Board,
-    mechanism: Mechanism,
-    machines: Sequence[PosedMachine],
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
     towards: Array | None = None,
 ) -> Iterator[PlacedBoard]:
     """Yield places near the base that the machine leaves free, also tilted towards a point."""
-    up, A = _upward(mechanism), mechanism.A_base
+    up, A = _upward(machine), machine.A_base
     middle = A.mean(axis=0)
-    size = float(np.linalg.norm(np.ptp(_joints(machines), axis=0)))
+    size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
     flat = A - middle - ((A - middle) @ up)[:, None] * up
     reach = float(np.linalg.norm(flat, axis=1).max())
     half = 0.5 * float(np.linalg.norm(np.ptp(board.extent, axis=0)))
@@ -267,7 +270,7 @@ def _lying(
             for tilt in (_TILTS if towards is not None else _TILTS[:1])
         )
         for placed in places:
-            if not any(placed.runs_through(machine) for machine in machines):
+            if not any(placed.runs_through(posed) for posed in posed_machines):
                 yield placed
                 break  # one place at each foot
 
@@ -296,20 +299,20 @@ def _facing(board: Board, place: Array, normal: Array, side: Array) -> RigidTran
 
 def _share(placed: PlacedBoard, together: Sequence[PosedMachine], view: Viewpoint) -> float:
     """Return the share of the corners that a view shows, zero if too few in one of the poses."""
-    shown = [placed.seen(machine, view.camera, view.T_base_camera) for machine in together]
+    shown = [placed.seen(posed, view.camera, view.T_base_camera) for posed in together]
     return float(np.mean(shown)) if all(map(placed.is_enough, shown)) else 0.0
 
 
 def _hides(
-    mechanism: Mechanism,
+    machine: Machine,
     alone: Sequence[PosedMachine],
     together: Sequence[PosedMachine],
     view: Viewpoint,
 ) -> bool:
     """Say whether a board beside a machine hides much of its legs from a view."""
     free, left = (
-        sum(_lengths(mechanism, machines, view.camera, view.T_base_camera))
-        for machines in (alone, together)
+        sum(_lengths(machine, posed_machines, view.camera, view.T_base_camera))
+        for posed_machines in (alone, together)
     )
     return left < _HIDDEN * free
 

@@ -18,7 +18,7 @@ from legcal.machine import (
     INSIDE,
     REGULAR,
     Configurations,
-    Mechanism,
+    Machine,
     beyond_travel,
     follow,
     forward_kinematics,
@@ -58,16 +58,16 @@ class GivenReadings:
     readings: Array  # (n_poses, n_motors) in the order of ``mechanism.motors`` [m]
 
 
-def read_readings(path: Path, mechanism: Mechanism) -> GivenReadings:
+def read_readings(path: Path, machine: Machine) -> GivenReadings:
     """Read a CSV of poses."""
     table = read_table(
         path,
         "file of poses",
         "row",
-        reading_columns(mechanism.legs),
+        reading_columns(machine.legs),
         needed="one row for each pose; write the readings of the motors",
     )
-    readings, _ = readings_in(table, mechanism.legs)
+    readings, _ = readings_in(table, machine.legs)
     table.check()
     return GivenReadings(tuple(table.where), readings)
 
@@ -77,10 +77,10 @@ def near_ends(end: IntArray, chance: Array) -> Array:
     return np.asarray(np.abs(end - JITTER * chance))
 
 
-def are_extreme(mechanism: Mechanism, readings: Array) -> BoolArray:
+def are_extreme(machine: Machine, readings: Array) -> BoolArray:
     """Say in which poses every motor is near an end of its travel, (n_poses,)."""
-    motors = list(mechanism.motors)
-    lower, upper = np.array([mechanism.legs[j].travel for j in motors]).reshape(-1, 2).T
+    motors = list(machine.motors)
+    lower, upper = np.array([machine.legs[j].travel for j in motors]).reshape(-1, 2).T
     part = (readings[:, motors] - lower) / (upper - lower)
     return np.asarray(np.all(np.minimum(part, 1.0 - part) <= JITTER, axis=1))
 
@@ -88,9 +88,9 @@ def are_extreme(mechanism: Mechanism, readings: Array) -> BoolArray:
 class Clearance:
     """The cylinders of a machine, two by two."""
 
-    def __init__(self, mechanism: Mechanism) -> None:
-        self._mechanism = mechanism
-        found = [(j, c) for j, leg in enumerate(mechanism.legs) for c in leg.cylinders]
+    def __init__(self, machine: Machine) -> None:
+        self._mechanism = machine
+        found = [(j, c) for j, leg in enumerate(machine.legs) for c in leg.cylinders]
         self._leg = np.array([j for j, _ in found], dtype=np.intp)
         self._ends = np.array([(c.start, c.end) for _, c in found]).reshape(-1, 2)
         self._from_platform = np.array([c.side == "platform" for _, c in found], dtype=np.bool_)
@@ -99,7 +99,7 @@ class Clearance:
         other = self._leg[first] != self._leg[second]
         self._pairs = np.stack([first[other], second[other]])
         self._needed = radius[self._pairs].sum(axis=0)
-        judged = ~self._touching(mechanism.home)
+        judged = ~self._touching(machine.home)
         self._pairs, self._needed = self._pairs[:, judged], self._needed[judged]
 
     def touching(self, T_base_platform: RigidTransform) -> tuple[str, str] | None:
@@ -127,22 +127,22 @@ class Clearance:
 class Admission:
     """What a configuration is held against: travel, joint limits, singularities, other legs."""
 
-    def __init__(self, mechanism: Mechanism) -> None:
-        self._mechanism = mechanism
-        self._clearance = Clearance(mechanism)
+    def __init__(self, machine: Machine) -> None:
+        self._mechanism = machine
+        self._clearance = Clearance(machine)
         limited = [
             (joint, joint.limits)
-            for joint in mechanism.urdf.joints.values()
+            for joint in machine.urdf.joints.values()
             if joint.type == "revolute" and joint.limits is not None
         ]
         self._revolutes = [joint.name for joint, _ in limited]
-        self._columns = [mechanism.chain.q_index(name) for name in self._revolutes]
+        self._columns = [machine.chain.q_index(name) for name in self._revolutes]
         self._limits = np.array([limits for _, limits in limited]).reshape(-1, 2)
-        self._least = REGULAR * singularity(mechanism, mechanism.home)
-        problem = self.beyond_limits(mechanism.home_configuration)
+        self._least = REGULAR * singularity(machine, machine.home)
+        problem = self.beyond_limits(machine.home_configuration)
         if problem is not None:
             raise ModelError(
-                f"{mechanism.yaml_path}: no pose could be drawn: found {problem} at home, needed "
+                f"{machine.yaml_path}: no pose could be drawn: found {problem} at home, needed "
                 "every joint inside its limits there; correct legcal.home or the limits of the "
                 "URDF."
             )
@@ -152,18 +152,18 @@ class Admission:
 
         The travel of motors is left out where their readings have been judged already.
         """
-        mechanism = self._mechanism
-        outside = beyond_travel(mechanism, configuration)
+        machine = self._mechanism
+        outside = beyond_travel(machine, configuration)
         if not of_motors:
-            outside[list(mechanism.motors)] = False
+            outside[list(machine.motors)] = False
         beyond = np.flatnonzero(outside)
         if len(beyond):
-            return f"leg '{mechanism.leg_names[beyond[0]]}' outside its travel"
+            return f"leg '{machine.leg_names[beyond[0]]}' outside its travel"
         problem = self.beyond_limits(configuration)
         if problem is not None:
             return problem
-        T = platform_pose(mechanism, configuration)
-        if singularity(mechanism, T) < self._least:
+        T = platform_pose(machine, configuration)
+        if singularity(machine, T) < self._least:
             return "the mechanism near a singularity"
         touching = self._clearance.touching(T)
         if touching is not None:
@@ -186,12 +186,12 @@ class Admission:
 class Draws:
     """Draws of configurations, and what stood against those that were none."""
 
-    def __init__(self, mechanism: Mechanism, rng: np.random.Generator, *, extreme: bool) -> None:
-        self._mechanism, self._rng, self._extreme = mechanism, rng, extreme
-        self._admission = Admission(mechanism)
-        self._here = mechanism.home_configuration
-        self._home = self._here[slider_columns(mechanism, mechanism.motors)[0]]
-        travel = np.array([mechanism.legs[j].travel for j in mechanism.motors]).reshape(-1, 2)
+    def __init__(self, machine: Machine, rng: np.random.Generator, *, extreme: bool) -> None:
+        self._mechanism, self._rng, self._extreme = machine, rng, extreme
+        self._admission = Admission(machine)
+        self._here = machine.home_configuration
+        self._home = self._here[slider_columns(machine, machine.motors)[0]]
+        travel = np.array([machine.legs[j].travel for j in machine.motors]).reshape(-1, 2)
         self._lower, self._upper = travel.T
         self._tried = 0  # draws until the last pose was reached
         self.problems: Counter[str] = Counter()
@@ -257,7 +257,7 @@ class Draws:
 
 
 def draw_poses(
-    mechanism: Mechanism,
+    machine: Machine,
     n_poses: int,
     rng: np.random.Generator,
     sampling: Sampling | str = Sampling.EXTREME,
@@ -269,7 +269,7 @@ def draw_poses(
             f"Poses could not be drawn: found {n_poses} poses and the sampling '{sampling}', "
             f"needed at least one pose and {' or '.join(Sampling)}; choose them."
         )
-    draws = Draws(mechanism, rng, extreme=Sampling(sampling) is Sampling.EXTREME)
+    draws = Draws(machine, rng, extreme=Sampling(sampling) is Sampling.EXTREME)
     found: list[Array] = []
     in_vain = 0
     progress(STAGE, 0, n_poses)
@@ -281,35 +281,35 @@ def draw_poses(
             progress(STAGE, len(found), n_poses)
     if len(found) < n_poses:
         raise DidNotConverge(
-            f"{mechanism.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
+            f"{machine.yaml_path}: {n_poses} poses could not be drawn: found {len(found)} that "
             f"the machine reaches in {draws.problems.total() + len(found)} draws "
             f"({draws.said()}), needed all; check legcal.home and the limits of the joints, or "
             "give poses."
         )
-    return _poses(mechanism, found)
+    return _poses(machine, found)
 
 
-def given_poses(mechanism: Mechanism, path: Path) -> Configurations:
+def given_poses(machine: Machine, path: Path) -> Configurations:
     """Return the poses at the readings of a CSV: actuated joints in its header, [m] below.
 
     Each is followed from the nearest one that is reached already, or from home.
     """
-    if not mechanism.is_determined:
+    if not machine.is_determined:
         raise UsageError(
-            f"{path}: poses could not be given: found a machine of {mechanism.mobility} freedoms "
-            f"and {len(mechanism.motors)} motors, needed one whose readings tell its pose; let "
+            f"{path}: poses could not be given: found a machine of {machine.mobility} freedoms "
+            f"and {len(machine.motors)} motors, needed one whose readings tell its pose; let "
             "poses be drawn."
         )
-    given = read_readings(path, mechanism)
-    admission, problems = Admission(mechanism), []
-    known = [mechanism.home_configuration[slider_columns(mechanism, mechanism.motors)[0]]]
-    reached = [mechanism.home_configuration]
+    given = read_readings(path, machine)
+    admission, problems = Admission(machine), []
+    known = [machine.home_configuration[slider_columns(machine, machine.motors)[0]]]
+    reached = [machine.home_configuration]
     for where, row in zip(given.where, given.readings, strict=True):
         nearest = int(np.argmin(np.abs(np.array(known) - row).max(axis=1)))
-        problem = _outside_travel(mechanism, row)
+        problem = _outside_travel(machine, row)
         if problem is None:
             try:
-                configuration = follow(mechanism, reached[nearest], row)
+                configuration = follow(machine, reached[nearest], row)
             except DidNotConverge:
                 problem = "legs that cannot have these lengths at the same time"
             else:
@@ -323,13 +323,13 @@ def given_poses(mechanism: Mechanism, path: Path) -> Configurations:
             )
     if problems:
         raise DatasetError(problems)
-    return _poses(mechanism, reached[1:])
+    return _poses(machine, reached[1:])
 
 
-def _outside_travel(mechanism: Mechanism, row: Array) -> str | None:
+def _outside_travel(machine: Machine, row: Array) -> str | None:
     """Return which reading of the motors, (n_motors,) [m], is outside its travel."""
-    for j, q in zip(mechanism.motors, row, strict=True):
-        leg = mechanism.legs[j]
+    for j, q in zip(machine.motors, row, strict=True):
+        leg = machine.legs[j]
         lower, upper = leg.travel
         if not lower - INSIDE <= q <= upper + INSIDE:
             travel = f"{lower:.9g} to {upper:.9g} m"
@@ -337,18 +337,18 @@ def _outside_travel(mechanism: Mechanism, row: Array) -> str | None:
     return None
 
 
-def _poses(mechanism: Mechanism, configurations: list[Array]) -> Configurations:
+def _poses(machine: Machine, configurations: list[Array]) -> Configurations:
     """Return closed configurations as poses."""
     return Configurations(
         np.array(configurations),
-        np.array([joint_values(mechanism, c) for c in configurations]),
-        [platform_pose(mechanism, c) for c in configurations],
+        np.array([joint_values(machine, c) for c in configurations]),
+        [platform_pose(machine, c) for c in configurations],
     )
 
 
 def commanded_poses(
-    truth: Mechanism,
-    nominal: Mechanism,
+    truth: Machine,
+    nominal: Machine,
     n_poses: int,
     rng: np.random.Generator,
     sampling: Sampling,
@@ -382,7 +382,7 @@ def _report(progress: Report, kept: int, stage: str, done: int, total: int) -> N
     progress(stage, kept + done, kept + total)
 
 
-def _reaches(nominal: Mechanism, q: Array) -> bool:
+def _reaches(nominal: Machine, q: Array) -> bool:
     """Say whether the nominal model reaches readings, away from its singularities."""
     if not nominal.is_determined:
         return True

@@ -15,7 +15,7 @@ import numpy as np
 
 from legcal.data import Corners, Measurements, Outlines, View
 from legcal.errors import NotVisible, OutOfResources
-from legcal.machine import Configurations, Mechanism
+from legcal.machine import Configurations, Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard, chosen_board
 from legcal.simulation.cameras import mild_lens, read_cameras, read_lens, rough_pose
@@ -70,10 +70,10 @@ class Session:
     outlines: Outlines | None  # with noise, where the settings ask for them
     axes: AxisTable | None
     corners: Corners | None
-    truth: Mechanism
+    truth: Machine
     poses: Configurations  # all that were drawn; images may show only some
     labels: tuple[str, ...]  # their names
-    machines: tuple[PosedMachine, ...]  # in every pose, with the board
+    posed_machines: tuple[PosedMachine, ...]  # in every pose, with the board
     scene: Scene
     left_out: int  # images that show no leg, which a table of outlines or axes has no row for
     board: PlacedBoard | None
@@ -81,8 +81,8 @@ class Session:
 
 
 def simulate_session(
-    truth: Mechanism,
-    nominal: Mechanism,
+    truth: Machine,
+    nominal: Machine,
     settings: SimulationSettings,
     chance: Streams,
     progress: Report = no_progress,
@@ -101,37 +101,44 @@ def simulate_session(
     settings.check_images(len(cameras), len(poses.poses) // n_sets)
     # Meshes lie beside the nominal URDF, of which that of the true machine is a copy.
     shown = replace(truth, urdf=replace(truth.urdf, path=nominal.urdf.path))
-    machines = pose_machine(truth, dressed(shown), poses)
-    board = chosen_board(settings.board, machines)
+    posed_machines = pose_machine(truth, dressed(shown), poses)
+    board = chosen_board(settings.board, posed_machines)
     placed: PlacedBoard | None = None
     groups: tuple[str, ...] = ()
     if board is None:
-        views = given or cameras_around(truth, machines, cameras, chance["cameras"], progress)[0]
+        views = (
+            given or cameras_around(truth, posed_machines, cameras, chance["cameras"], progress)[0]
+        )
     elif given:
-        placed, views = board_before(board, truth, machines, given), given
+        placed, views = board_before(board, truth, posed_machines, given), given
     else:
-        in_turn = [machines[p] for v in range(len(cameras)) for p in _poses_of(v, n_sets, machines)]
-        bodies = in_turn if settings.hand_held else machines
+        in_turn = [
+            posed_machines[p]
+            for v in range(len(cameras))
+            for p in _poses_of(v, n_sets, posed_machines)
+        ]
+        bodies = in_turn if settings.hand_held else posed_machines
         placed, views = board_and_cameras(
             board, truth, bodies, cameras, chance["cameras"], progress
         )
     if placed is not None:
-        machines = tuple(placed.beside(machine) for machine in machines)
+        posed_machines = tuple(placed.beside(posed) for posed in posed_machines)
     if placed is not None and settings.hand_held:
-        views, groups = _in_hand(truth, machines, n_sets, cameras, placed, chance, progress)
+        views, groups = _in_hand(truth, posed_machines, n_sets, cameras, placed, chance, progress)
     if settings.level is Level.PHOTOGRAPHS:
         views = _encoding(views, settings.appearance.gamma, settings.tell_gamma)
     poses_of = [
-        [v % len(machines)] if groups else _poses_of(v, n_sets, machines) for v in range(len(views))
+        [v % len(posed_machines)] if groups else _poses_of(v, n_sets, posed_machines)
+        for v in range(len(views))
     ]
-    images = take_images(truth.legs, machines, views, poses_of, settings.images, progress)
+    images = take_images(truth.legs, posed_machines, views, poses_of, settings.images, progress)
     rows = list(range(len(images)))
     if settings.level is not Level.PHOTOGRAPHS:
         rows = [row for row in rows if images.seen(row)]
     kept = images.chosen(rows)
     if groups:
         kept, views, groups = _numbered(kept, views, groups)
-    A, B = (np.array([getattr(m, joint) for m in machines]) for joint in "AB")
+    A, B = (np.array([getattr(m, joint) for m in posed_machines]) for joint in "AB")
     scene = Scene(A, B, views, kept)
     outlines = axes = corners = None
     if settings.level is Level.OUTLINES:
@@ -140,12 +147,12 @@ def simulate_session(
     elif settings.level is Level.AXES:
         axes = axes_of(scene, settings.table, chance["observations"])
     if placed is not None and settings.level is not Level.PHOTOGRAPHS:
-        corners = corners_of(scene, machines, placed, settings.sigma_px, chance["corners"])
+        corners = corners_of(scene, posed_machines, placed, settings.sigma_px, chance["corners"])
     width = max(2, len(str(len(poses.poses))))
     labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(poses.poses)))
     measurements = _recorded(truth, poses, labels, scene, settings, chance, told=not groups)
     return Session(
-        measurements, outlines, axes, corners, truth, poses, labels, machines, scene,
+        measurements, outlines, axes, corners, truth, poses, labels, posed_machines, scene,
         len(images) - len(rows), placed, groups,
     )  # fmt: skip
 
@@ -165,15 +172,15 @@ def _cameras(settings: SimulationSettings) -> tuple[dict[str, Camera], tuple[Vie
     return cameras, tuple(Viewpoint(name, lens, T) for name, (lens, T) in given.items())
 
 
-def _poses_of(view: int, n_sets: int, machines: Sequence[PosedMachine]) -> range:
+def _poses_of(view: int, n_sets: int, posed_machines: Sequence[PosedMachine]) -> range:
     """Return the poses that a view sees: all of them, or those of its own set."""
-    own = len(machines) // n_sets
+    own = len(posed_machines) // n_sets
     return range(own) if n_sets == 1 else range(view * own, (view + 1) * own)
 
 
 def _in_hand(
-    truth: Mechanism,
-    machines: Sequence[PosedMachine],  # with the board
+    truth: Machine,
+    posed_machines: Sequence[PosedMachine],  # with the board
     n_sets: int,
     cameras: Mapping[str, Camera],
     placed: PlacedBoard,
@@ -183,11 +190,11 @@ def _in_hand(
     """Return a place for each image from which it shows board and legs, and the view of each."""
     views: list[Viewpoint] = []
     groups: list[str] = []
-    n_images = len(cameras) * len(machines) // n_sets
+    n_images = len(cameras) * len(posed_machines) // n_sets
     for v, (name, camera) in enumerate(cameras.items()):
-        for k, pose in enumerate(_poses_of(v, n_sets, machines)):
+        for k, pose in enumerate(_poses_of(v, n_sets, posed_machines)):
             progress("Camera places", len(views), n_images)
-            T = camera_in_hand(truth, machines[pose], camera, chance["cameras"], placed)
+            T = camera_in_hand(truth, posed_machines[pose], camera, chance["cameras"], placed)
             if T is None:
                 raise NotVisible(
                     f"view {name}: a camera in the hand could not be placed: found none of "
@@ -224,7 +231,7 @@ def _encoding(views: Sequence[Viewpoint], gamma: float, is_told: bool) -> tuple[
 
 
 def _recorded(
-    truth: Mechanism,
+    truth: Machine,
     poses: Configurations,
     labels: Sequence[str],
     scene: Scene,
@@ -283,10 +290,12 @@ def photographs(
         with worker_pool(workers) as run:
             for v, view in enumerate(views):
                 rows = np.flatnonzero(images.view == v).tolist()
-                machines = {row: session.machines[images.pose[row]].solids for row in rows}
-                nearby = next(iter(machines.values()), ())
+                posed_machines = {
+                    row: session.posed_machines[images.pose[row]].solids for row in rows
+                }
+                nearby = next(iter(posed_machines.values()), ())
                 place = _Place(f"{id(session)} {v}", view, nearby, appearance, of_views[v])
-                studio = _Studio(place, machines, {row: of_images[row] for row in rows})
+                studio = _Studio(place, posed_machines, {row: of_images[row] for row in rows})
                 yield from zip(rows, run(studio.photograph, rows), strict=True)
     finally:
         _rendered_view.cache_clear()
@@ -298,7 +307,7 @@ class _Place:
 
     key: str
     viewpoint: Viewpoint = field(compare=False)
-    machine: tuple[PlacedSolid, ...] = field(compare=False)
+    posed: tuple[PlacedSolid, ...] = field(compare=False)
     appearance: Appearance = field(compare=False)
     rng: np.random.Generator = field(compare=False)
 
@@ -307,7 +316,7 @@ class _Place:
 def _rendered_view(place: _Place) -> RenderedView:
     """Return the camera in front of its surroundings, painted once in each process."""
     view = place.viewpoint
-    return prepare_view(place.machine, view.camera, view.T_base_camera, place.appearance, place.rng)
+    return prepare_view(place.posed, view.camera, view.T_base_camera, place.appearance, place.rng)
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,12 +324,12 @@ class _Studio:
     """A camera in its place, and the machine in the poses that it takes photographs of."""
 
     place: _Place
-    machines: Mapping[int, tuple[PlacedSolid, ...]]
+    posed_machines: Mapping[int, tuple[PlacedSolid, ...]]
     sensor_rngs: Mapping[int, np.random.Generator]
 
     def photograph(self, row: int) -> bytes:
         """Return the PNG of a row."""
-        image = _rendered_view(self.place).render(self.machines[row], self.sensor_rngs[row])
+        image = _rendered_view(self.place).render(self.posed_machines[row], self.sensor_rngs[row])
         encoded, content = cv2.imencode(".png", image, _FAST if image.ndim == 3 else ())
         if not encoded:
             raise OutOfResources(

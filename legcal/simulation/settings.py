@@ -35,7 +35,7 @@ from legcal.files import (
     read_text,
     validate,
 )
-from legcal.machine import Mechanism, parametrization_of
+from legcal.machine import Machine, parametrization_of
 from legcal.simulation.board import KINDS as BOARD_KINDS
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.rendering.appearance import Appearance, Light
@@ -131,11 +131,11 @@ ERRORS_OF = {  # kind of parameter, as in its name
 KINDS = (*dict.fromkeys(ERRORS_OF.values()), "radii")  # the fields that are sizes
 
 
-def kinds_of(mechanism: Mechanism) -> set[str]:
+def kinds_of(machine: Machine) -> set[str]:
     """Return the kinds of errors, fields of :class:`ParameterErrors`, that a machine can have."""
-    names = parametrization_of(mechanism, twists=True).names
+    names = parametrization_of(machine, twists=True).names
     kinds = {ERRORS_OF[name.split(".")[1]] for name in names}
-    return kinds | ({"radii"} if any(leg.cylinders for leg in mechanism.legs) else set())
+    return kinds | ({"radii"} if any(leg.cylinders for leg in machine.legs) else set())
 
 
 _MILLIMETRES = Spread(2e-3)  # of the size by which the paper disturbs its machine
@@ -403,7 +403,7 @@ _ERROR_KINDS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
 }
 
 
-def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
+def requested(request: Request, nominal: Machine) -> SimulationSettings:
     """Return the settings that options ask for."""
     given = _poses(request.poses)
     _refuse_contradictions(request, given, nominal)
@@ -436,7 +436,7 @@ def requested(request: Request, nominal: Mechanism) -> SimulationSettings:
     )
 
 
-def _refuse_contradictions(request: Request, poses: int | Path, nominal: Mechanism) -> None:
+def _refuse_contradictions(request: Request, poses: int | Path, nominal: Machine) -> None:
     """Refuse options that others make void."""
     problems = []
     if request.views is not None and request.cameras is not None:
@@ -524,7 +524,7 @@ def _poses(text: str) -> int | Path:
     return int(text)
 
 
-def _errors(request: Request, nominal: Mechanism) -> ParameterErrors:
+def _errors(request: Request, nominal: Machine) -> ParameterErrors:
     """Return the errors of parameters that options ask for."""
     found, possible = DEFAULT_ERRORS, kinds_of(nominal)
     for text in request.error or ():

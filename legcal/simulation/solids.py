@@ -17,7 +17,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from legcal.errors import ModelError
 from legcal.geometry import Array, BoolArray, IntArray, distance_to_line, product
-from legcal.machine import COAXIAL, Configurations, Leg, Mechanism, Urdf, number_list, parse_robot
+from legcal.machine import COAXIAL, Configurations, Leg, Machine, Urdf, number_list, parse_robot
 
 _SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
 
@@ -279,23 +279,23 @@ class PlacedSolid:
     T_base_solid: RigidTransform
 
 
-def solids_of(mechanism: Mechanism) -> tuple[Solid, ...]:
+def solids_of(machine: Machine) -> tuple[Solid, ...]:
     """Return the visuals of a mechanism, those that are coaxial with legs marked as such."""
-    shown = visuals(mechanism.urdf)
-    poses = link_poses(mechanism, mechanism.home_configuration)
-    lines = _leg_lines(mechanism)
+    shown = visuals(machine.urdf)
+    poses = link_poses(machine, machine.home_configuration)
+    lines = _leg_lines(machine)
     counts: dict[str, int] = {}
     solids = []
     for visual in shown:
         number = counts[visual.link] = counts.get(visual.link, 0) + 1
-        leg = _leg_of(visual, poses[visual.link], mechanism.legs, lines)
+        leg = _leg_of(visual, poses[visual.link], machine.legs, lines)
         solids.append(
             Solid(
                 name=visual.link if number == 1 else f"{visual.link}/{number}",
                 link=visual.link,
                 shape=visual.shape,
                 T_link_solid=visual.T_link_shape,
-                material=_material(visual, None if leg is None else mechanism.legs[leg]),
+                material=_material(visual, None if leg is None else machine.legs[leg]),
                 leg=leg,
                 part=None if leg is None else visual.link,
             )
@@ -303,10 +303,10 @@ def solids_of(mechanism: Mechanism) -> tuple[Solid, ...]:
     return tuple(solids)
 
 
-def link_poses(mechanism: Mechanism, configuration: Array) -> dict[str, RigidTransform]:
+def link_poses(machine: Machine, configuration: Array) -> dict[str, RigidTransform]:
     """Return T_base_link of every link at a configuration of the chain, (nq,)."""
-    chain, base = mechanism.chain, mechanism.base
-    return {link: chain.pose(configuration, base, link) for link in mechanism.urdf.links}
+    chain, base = machine.chain, machine.base
+    return {link: chain.pose(configuration, base, link) for link in machine.urdf.links}
 
 
 def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tuple[PlacedSolid, ...]:
@@ -317,9 +317,9 @@ def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tupl
     )
 
 
-def _leg_lines(mechanism: Mechanism) -> list[tuple[Array, Array]]:
+def _leg_lines(machine: Machine) -> list[tuple[Array, Array]]:
     """Return a point and the direction of every leg's axis at home, in the base frame."""
-    A, B = mechanism.A_base, mechanism.home.apply(mechanism.B_platform)
+    A, B = machine.A_base, machine.home.apply(machine.B_platform)
     u = (B - A) / np.linalg.norm(B - A, axis=-1, keepdims=True)
     return list(zip(A, u, strict=True))
 
@@ -363,7 +363,7 @@ _POST = Material(albedo=0.04, specular=0.10, shininess=20.0, limb=0.3)
 _PLATE = Material(albedo=0.09, specular=0.10, shininess=18.0, limb=0.1, texture=0.06)
 
 
-def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
+def dressed(machine: Machine) -> tuple[Solid, ...]:
     """Return all that pictures show of a mechanism: its visuals, and what they lack.
 
     A link that has no visual of its own gets balls at the joint centres and, for three joints or
@@ -371,21 +371,21 @@ def dressed(mechanism: Mechanism) -> tuple[Solid, ...]:
     planar machine are below its legs, that of the base lowest, so that the legs are seen from
     above.
     """
-    shown = solids_of(mechanism)
-    bare = {mechanism.base, mechanism.platform} - {s.link for s in shown if s.leg is None}
-    radii = np.array([_radius(leg, mechanism) for leg in mechanism.legs])
+    shown = solids_of(machine)
+    bare = {machine.base, machine.platform} - {s.link for s in shown if s.leg is None}
+    radii = np.array([_radius(leg, machine) for leg in machine.legs])
     added: list[Solid] = []
-    if mechanism.base in bare:
-        away = _away(mechanism.A_base, mechanism, -1.0)
-        below = 0.0 if mechanism.spatial else _POST_LENGTH + _PLATE_THICKNESS + _GAP
-        added += _end(mechanism.base, mechanism.A_base, radii, [True] * len(radii), away, below)
-    if mechanism.platform in bare:
-        balls = [leg.platform_joint != "" for leg in mechanism.legs]
-        B = mechanism.B_platform
-        away = _away(mechanism.home.apply(B), mechanism, 1.0)
+    if machine.base in bare:
+        away = _away(machine.A_base, machine, -1.0)
+        below = 0.0 if machine.spatial else _POST_LENGTH + _PLATE_THICKNESS + _GAP
+        added += _end(machine.base, machine.A_base, radii, [True] * len(radii), away, below)
+    if machine.platform in bare:
+        balls = [leg.platform_joint != "" for leg in machine.legs]
+        B = machine.B_platform
+        away = _away(machine.home.apply(B), machine, 1.0)
         if away is not None:
-            away = mechanism.home.rotation.inv().apply(away)
-        added += _end(mechanism.platform, B, radii, balls, away)
+            away = machine.home.rotation.inv().apply(away)
+        added += _end(machine.platform, B, radii, balls, away)
     return (*shown, *added)
 
 
@@ -427,27 +427,27 @@ def _end(
     return solids
 
 
-def _away(joints_base: Array, mechanism: Mechanism, side: float) -> Array | None:
+def _away(joints_base: Array, machine: Machine, side: float) -> Array | None:
     """Return the normal of the plane of joint centres, away from the legs, in the base frame."""
-    if mechanism.base_normal is not None:
-        return -mechanism.base_normal
+    if machine.base_normal is not None:
+        return -machine.base_normal
     spread = joints_base - joints_base.mean(axis=0)
     _, sizes, axes = np.linalg.svd(spread)
     if len(joints_base) < 3 or sizes[1] < 0.05 * sizes[0]:
         return None
     normal = axes[2]
-    legs = (mechanism.home.apply(mechanism.B_platform) - mechanism.A_base).mean(axis=0)
+    legs = (machine.home.apply(machine.B_platform) - machine.A_base).mean(axis=0)
     cosine = float(normal @ legs) / max(float(np.linalg.norm(legs)), 1e-12)
     if abs(cosine) < _FLAT:  # the legs lie along the plates: one on each side
         cosine = float(normal[np.argmax(np.abs(normal))])
     return np.asarray(side * np.sign(cosine) * normal)
 
 
-def _radius(leg: Leg, mechanism: Mechanism) -> float:
+def _radius(leg: Leg, machine: Machine) -> float:
     """Return the radius of the thickest cylinder of a leg, or one that suits it [m]."""
     if leg.cylinders:
         return max(c.radius for c in leg.cylinders)
-    length = np.linalg.norm(mechanism.home.apply(leg.B) - leg.A)
+    length = np.linalg.norm(machine.home.apply(leg.B) - leg.A)
     return _DEFAULT_RADIUS * float(length)
 
 
@@ -491,7 +491,7 @@ class PosedMachine:
 
 
 def pose_machine(
-    mechanism: Mechanism, solids: Sequence[Solid], poses: Configurations
+    machine: Machine, solids: Sequence[Solid], poses: Configurations
 ) -> tuple[PosedMachine, ...]:
     """Return a machine in every pose."""
     meshes = [_triangles(solid.shape) for solid in solids]
@@ -500,19 +500,21 @@ def pose_machine(
         faces.append(mesh.faces + first)
         first += len(mesh.vertices)
     stacked = np.concatenate(faces)
-    machines = []
+    posed_machines = []
     for configuration, T in zip(poses.configurations, poses.poses, strict=True):
-        here = placed(solids, link_poses(mechanism, configuration))
+        here = placed(solids, link_poses(machine, configuration))
         vertices = [p.T_base_solid.apply(m.vertices) for p, m in zip(here, meshes, strict=True)]
-        B = np.asarray(T.apply(mechanism.B_platform))
-        machines.append(PosedMachine(mechanism.A_base, B, here, np.concatenate(vertices), stacked))
-    return tuple(machines)
+        B = np.asarray(T.apply(machine.B_platform))
+        posed_machines.append(
+            PosedMachine(machine.A_base, B, here, np.concatenate(vertices), stacked)
+        )
+    return tuple(posed_machines)
 
 
 @lru_cache(maxsize=8)  # many cameras may look at one machine, and thousands wait for theirs
-def _caster(machine: PosedMachine) -> RayMeshIntersector:
+def _caster(posed: PosedMachine) -> RayMeshIntersector:
     """Return what casts rays at a machine."""
-    return RayMeshIntersector(trimesh.Trimesh(machine.vertices, machine.faces, process=False))
+    return RayMeshIntersector(trimesh.Trimesh(posed.vertices, posed.faces, process=False))
 
 
 def _triangles(shape: Shape) -> Any:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import DidNotConverge, ModelError, OutOfClass, UsageError
 from legcal.machine import (
     Leg,
-    Mechanism,
+    Machine,
     UrdfPatch,
     check_closes,
     footed,
@@ -49,7 +49,7 @@ FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the t
 
 
 def draw_errors(
-    nominal: Mechanism, errors: ParameterErrors, rng: np.random.Generator
+    nominal: Machine, errors: ParameterErrors, rng: np.random.Generator
 ) -> tuple[Leg, ...]:
     """Return the legs of a machine with drawn errors, in R_b and R_e.
 
@@ -95,7 +95,7 @@ def _check(errors: ParameterErrors) -> None:
 
 
 def draw_radii(
-    nominal: Mechanism, spread: Spread, rng: np.random.Generator
+    nominal: Machine, spread: Spread, rng: np.random.Generator
 ) -> dict[tuple[str, int], float]:
     """Return the radii of the true legs."""
     if spread.size == 0.0:
@@ -132,8 +132,8 @@ def _check_radii(spread: Spread, thinnest: float) -> None:
 
 
 def write_true_model(
-    nominal: Mechanism, errors: ParameterErrors, rng: np.random.Generator, folder: Path
-) -> Mechanism:
+    nominal: Machine, errors: ParameterErrors, rng: np.random.Generator, folder: Path
+) -> Machine:
     """Write ``models/NAME.yaml`` and ``urdf/NAME.urdf`` of a machine with errors, and load it.
 
     Errors with which the machine does not close, or closes into another mechanism, are drawn again.
@@ -169,7 +169,7 @@ def write_true_model(
 
 
 def write_model_with(
-    nominal: Mechanism,
+    nominal: Machine,
     legs: Sequence[Leg],
     home: RigidTransform,
     folder: Path,
@@ -189,12 +189,12 @@ def write_model_with(
     return yaml_path
 
 
-def _places(nominal: Mechanism, folder: Path) -> tuple[Path, Path]:
+def _places(nominal: Machine, folder: Path) -> tuple[Path, Path]:
     """Return where the files of the true model stand."""
     name = model_name(nominal)
     return folder / "models" / f"{name}.yaml", folder / "urdf" / f"{name}.urdf"
 
 
-def _class_of(mechanism: Mechanism) -> tuple[object, ...]:
+def _class_of(machine: Machine) -> tuple[object, ...]:
     """Return what a machine is, whatever its numbers are."""
-    return mechanism.spatial, mechanism.mobility, tuple(leg.type for leg in mechanism.legs)
+    return machine.spatial, machine.mobility, tuple(leg.type for leg in machine.legs)

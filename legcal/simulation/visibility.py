@@ -96,20 +96,20 @@ class _Skin:
 
 def legs_in_image(
     legs: Sequence[Leg],
-    machine: PosedMachine,
+    posed: PosedMachine,
     camera: Camera,
     T_base_camera: RigidTransform,
     *,
     samples: int = SAMPLES,
 ) -> tuple[LegView, ...]:
     """Return what an image shows of every leg."""
-    length = np.linalg.norm(machine.B - machine.A, axis=-1)
-    u = (machine.B - machine.A) / length[:, None]
+    length = np.linalg.norm(posed.B - posed.A, axis=-1)
+    u = (posed.B - posed.A) / length[:, None]
     skins = [_skin(leg.cylinders, float(L), samples) for leg, L in zip(legs, length, strict=True)]
     s, radius = (np.array([getattr(skin, x) for skin in skins]) for x in ("s", "radius"))
     T_camera_base = T_base_camera.inv()
     u_camera = u @ T_camera_base.as_matrix()[:3, :3].T
-    A_camera = np.asarray(T_camera_base.apply(machine.A))
+    A_camera = np.asarray(T_camera_base.apply(posed.A))
     axis = A_camera[:, None] + s[..., None] * u_camera[:, None]
     from_axis = np.linalg.norm(np.cross(u_camera, A_camera), axis=-1)
     radius = np.where(from_axis[:, None] > _END_ON * radius, radius, 0.0)
@@ -119,7 +119,7 @@ def legs_in_image(
     beside = axis[:, :, None] + (1.0 + _ASIDE) * offsets
     margin = np.broadcast_to(_IN_FRONT * radius[..., None], tested.shape)
     free = tested.copy()
-    free[tested] = ~machine.hidden(
+    free[tested] = ~posed.hidden(
         T_base_camera.translation, T_base_camera.apply(beside[tested]), margin[tested]
     )
     both = np.all(free, axis=-1)
@@ -260,7 +260,7 @@ class Images:
 
 def take_images(
     legs: Sequence[Leg],
-    machines: Sequence[PosedMachine],
+    posed_machines: Sequence[PosedMachine],
     viewpoints: Sequence[Viewpoint],
     poses_of: Sequence[Sequence[int]],  # poses that each view sees
     n_images: int,  # of each pose in each view
@@ -273,8 +273,8 @@ def take_images(
     for v, (viewpoint, poses) in enumerate(zip(viewpoints, poses_of, strict=True)):
         progress("Views", v, len(viewpoints))
         camera, T = viewpoint.camera, viewpoint.T_base_camera
-        _refuse_inside(viewpoint, [machines[p] for p in poses])
-        views = [legs_in_image(legs, machines[p], camera, T) for p in poses]
+        _refuse_inside(viewpoint, [posed_machines[p] for p in poses])
+        views = [legs_in_image(legs, posed_machines[p], camera, T) for p in poses]
         if not any(leg.is_seen for view in views for leg in view):
             problems.append(_sees_nothing(viewpoint.name, legs, views))
         for p, view in zip(poses, views, strict=True):
@@ -287,10 +287,10 @@ def take_images(
     return Images(view_of_row, pose_of_row, repeat_of_row, tuple(shown))
 
 
-def _refuse_inside(viewpoint: Viewpoint, machines: Sequence[PosedMachine]) -> None:
+def _refuse_inside(viewpoint: Viewpoint, posed_machines: Sequence[PosedMachine]) -> None:
     """Raise UsageError if a camera is inside the machine in one of the poses."""
     centre = viewpoint.T_base_camera.translation
-    if any(machine.encloses(centre) for machine in machines):
+    if any(posed.encloses(centre) for posed in posed_machines):
         x, y, z = centre
         raise UsageError(
             f"view {viewpoint.name}: its camera could not be placed: found it inside the machine, "

@@ -32,7 +32,7 @@ from legcal.files import closest
 from legcal.machine import (
     DATASET_YAML,
     NEAR,
-    Mechanism,
+    Machine,
     geometries,
     legs_outside,
     load_mechanism,
@@ -88,7 +88,7 @@ def answer(
 
 
 def identifiability(
-    mechanism: Mechanism,
+    machine: Machine,
     views: Sequence[Sequence[str]] = (),
     images: int = 15,
     *,
@@ -99,7 +99,7 @@ def identifiability(
 
     Parameters
     ----------
-    mechanism : Mechanism
+    machine : Machine
         The nominal model.
     views : sequence of sequences of str
         Names of the legs that each camera position shows; without any, the smallest sets of
@@ -131,20 +131,20 @@ def identifiability(
     mean leg length (angles count at that length). Well-determined directions lie below a
     tenth of it, undetermined ones above a multiple.
     """
-    legs = read_views(views, mechanism.leg_names, images)
+    legs = read_views(views, machine.leg_names, images)
     if hand_held:
-        return _judge_hand_held(mechanism, legs, images, board=board)
+        return _judge_hand_held(machine, legs, images, board=board)
     recommendation = None
     if not legs:
-        recommendation = recommend(mechanism, images, board=board)
-        names = recommendation[0].views if recommendation else (mechanism.leg_names,)
-        legs = read_views(names, mechanism.leg_names, images)
-    session = planned_session(mechanism, legs, images, board=board)
+        recommendation = recommend(machine, images, board=board)
+        names = recommendation[0].views if recommendation else (machine.leg_names,)
+        legs = read_views(names, machine.leg_names, images)
+    session = planned_session(machine, legs, images, board=board)
     replanning = Replanning(
-        lambda more: planned_session(mechanism, legs, more, board=board),
-        lambda: recommend(mechanism, max(images, ENOUGH_IMAGES), board=board),
+        lambda more: planned_session(machine, legs, more, board=board),
+        lambda: recommend(machine, max(images, ENOUGH_IMAGES), board=board),
     )
-    return _judge(mechanism, Analysis(session), recommendation, replanning)
+    return _judge(machine, Analysis(session), recommendation, replanning)
 
 
 def identifiability_of_dataset(
@@ -160,11 +160,11 @@ def identifiability_of_dataset(
     twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
     session = recorded_session(dataset, twists=twists)
     analysis = Analysis(session, known=known_rows(session, choices))
-    report = _judge(dataset.mechanism, analysis, None, None)
+    report = _judge(dataset.machine, analysis, None, None)
     if dataset.axes is None:
         found = judge_intrinsics(analysis, orientations_of(dataset, session), cameras_of(dataset))
         report = replace(report, intrinsics=found)
-    if dataset.mechanism.is_determined:
+    if dataset.machine.is_determined:
         return report
     note = "The readings do not give the poses of the images: random ones stand for them."
     return replace(report, notes=(*report.notes, note))
@@ -200,7 +200,7 @@ def check_identifiable(
 
 
 def _judge_hand_held(
-    mechanism: Mechanism, legs: tuple[tuple[int, ...], ...], images: int, *, board: bool
+    machine: Machine, legs: tuple[tuple[int, ...], ...], images: int, *, board: bool
 ) -> Identifiability:
     """Return the report on images each of which has a place of its own."""
     if not board or not legs:
@@ -211,41 +211,41 @@ def _judge_hand_held(
             "that the images show; give --board and --view."
         )
     each = tuple(view for view in legs for _ in range(images))
-    session = planned_session(mechanism, each, 1, board=True)
-    return _judge(mechanism, Analysis(session), None, None)
+    session = planned_session(machine, each, 1, board=True)
+    return _judge(machine, Analysis(session), None, None)
 
 
 def _judge(
-    mechanism: Mechanism,
+    machine: Machine,
     analysis: Analysis,
     recommendation: tuple[Recommendation, ...] | None,
     replanning: Replanning | None,
 ) -> Identifiability:
     """Return the report on a session."""
     session = analysis.session
-    conditions = conditions_of(mechanism, session)
+    conditions = conditions_of(machine, session)
     board = judge_board(
         analysis,
-        *(conditions_of(mechanism, session.with_board(board=b)) for b in (False, True)),
+        *(conditions_of(machine, session.with_board(board=b)) for b in (False, True)),
     )
     staged, full = analysis.staged, analysis.full
     enough = staged.complete and full.complete
     notes = []
     if analysis.motion.why_not:
         why = "the machine is singular at poses inside its travel"
-        if not mechanism.is_determined:
+        if not machine.is_determined:
             why = (
-                f"{len(mechanism.motors)} motors do not determine the pose of a platform with "
-                f"mobility {mechanism.mobility}"
+                f"{len(machine.motors)} motors do not determine the pose of a platform with "
+                f"mobility {machine.mobility}"
             )
         notes.append(f"Platform errors are not predicted: {why}.")
-    notes += _machine_notes(mechanism)
+    notes += _machine_notes(machine)
     return Identifiability(
-        spatial=mechanism.spatial,
-        legs=mechanism.leg_names,
-        n=mechanism.n_legs,
-        n_d=len(mechanism.frame_legs),
-        r=sum(leg.base_joint == "R" for leg in mechanism.legs),
+        spatial=machine.spatial,
+        legs=machine.leg_names,
+        n=machine.n_legs,
+        n_d=len(machine.frame_legs),
+        r=sum(leg.base_joint == "R" for leg in machine.legs),
         n_ac=int(session.with_length.sum()),
         conditions=conditions,
         staged=staged,
@@ -262,30 +262,30 @@ def _judge(
     )
 
 
-def _machine_notes(mechanism: Mechanism) -> list[str]:
+def _machine_notes(machine: Machine) -> list[str]:
     """Return what is odd about a machine, whatever views show of it."""
-    hidden = [j for j, leg in enumerate(mechanism.legs) if not leg.cylinders]
+    hidden = [j for j, leg in enumerate(machine.legs) if not leg.cylinders]
     notes = []
     if hidden:
-        which = legs_in_words(hidden, mechanism.leg_names)
+        which = legs_in_words(hidden, machine.leg_names)
         notes.append(
             f"The model has no <visual> cylinder along {which}: they were taken as visible, with "
             f"{100 * THIN:g} % of the mean leg length as radius; add one to each."
         )
-    outside = list(legs_outside(mechanism, NEAR))
+    outside = list(legs_outside(machine, NEAR))
     if outside:
-        which = legs_in_words(outside, mechanism.leg_names)
+        which = legs_in_words(outside, machine.leg_names)
         stand = "stand outside their" if len(outside) > 1 else "stands outside its"
         notes.append(
             f"At home {which} {stand} travel by more than {100 * NEAR:g} % of it: poses between "
             "home and travel were judged too, which the machine may not reach; correct "
             "legcal.home or the limits."
         )
-    singular = singular_note(mechanism)
+    singular = singular_note(machine)
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
 
 
-def conditions_of(mechanism: Mechanism, session: Session) -> tuple[Condition, ...]:
+def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
     """Return the paper's conditions for a session.
 
     Counts are those of the views, as printed. Directions of a leg may differ between views that
@@ -308,7 +308,7 @@ def conditions_of(mechanism: Mechanism, session: Session) -> tuple[Condition, ..
             session.u[session.pose[image], leg],
             session.n_legs,
         ),
-        three_legs_at_once(session.views, geometries(mechanism), spatial=session.spatial),
+        three_legs_at_once(session.views, geometries(machine), spatial=session.spatial),
     )
 
 

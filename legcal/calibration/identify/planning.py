@@ -15,7 +15,7 @@ from legcal.geometry import Array, BoolArray
 from legcal.machine import (
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     Parametrization,
     geometries,
     main_cylinders,
@@ -36,7 +36,7 @@ THIN = 0.02  # radius of a leg without a visible cylinder, of the mean leg lengt
 
 
 def planned_session(
-    mechanism: Mechanism,
+    machine: Machine,
     views: Sequence[Sequence[int]],  # the legs that each view shows
     images: int = 15,  # and poses, a view
     *,
@@ -47,22 +47,22 @@ def planned_session(
     It is that of a machine whose every parameter is a micrometre or less from the nominal one, so
     that no symmetry by accident decides. Raises DidNotConverge if the machine cannot move.
     """
-    home = mechanism.T_base_Rb.inv() * mechanism.home * mechanism.T_platform_Re
-    legs, length, rng = machine_near(mechanism, home)
+    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+    legs, length, rng = machine_near(machine, home)
     A, B = joints_at(legs, home)
     n_poses = images * len(views)
     R, t = random_poses(
-        legs, mechanism.frame_legs, home, travel_of(mechanism), max(n_poses, REACHED), rng
+        legs, machine.frame_legs, home, travel_of(machine), max(n_poses, REACHED), rng
     )
     seen = np.zeros((len(views), len(legs)), dtype=np.bool_)
     for v, view in enumerate(views):
         seen[v, list(view)] = True
     return Session(
-        leg_names=mechanism.leg_names,
+        leg_names=machine.leg_names,
         legs=legs,
-        frame_legs=mechanism.frame_legs,
-        parametrization=parametrization_of(mechanism),
-        radius=radii(mechanism.legs, length),
+        frame_legs=machine.frame_legs,
+        parametrization=parametrization_of(machine),
+        radius=radii(machine.legs, length),
         R=R[:n_poses],
         t=t[:n_poses],
         R_reached=R,
@@ -70,7 +70,7 @@ def planned_session(
         view=np.repeat(np.arange(len(views)), images),
         pose=np.arange(n_poses),
         seen=seen,
-        camera=default_cameras(A, B, views, mechanism.spatial, rng),
+        camera=default_cameras(A, B, views, machine.spatial, rng),
         focal=np.full(len(views), FOCAL_PX),
         sigma_q=SIGMA_Q,
         board=np.full(len(views), board, dtype=np.bool_),
@@ -90,43 +90,43 @@ def recorded_session(
 
     Raises DatasetError if readings are out of reach of the model by more than its errors may be.
     """
-    mechanism, m = dataset.mechanism, dataset.measurements
-    to_Rb, from_Re = mechanism.T_base_Rb.inv(), mechanism.T_platform_Re
-    home = to_Rb * mechanism.home * from_Re
-    legs, length, rng = machine_near(mechanism, home)
-    if mechanism.is_determined:
-        R, t = Frames.of(nominal_poses(mechanism, m)[0])
+    machine, m = dataset.machine, dataset.measurements
+    to_Rb, from_Re = machine.T_base_Rb.inv(), machine.T_platform_Re
+    home = to_Rb * machine.home * from_Re
+    legs, length, rng = machine_near(machine, home)
+    if machine.is_determined:
+        R, t = Frames.of(nominal_poses(machine, m)[0])
     else:
-        travel = travel_of(mechanism)
-        R, t = random_poses(legs, mechanism.frame_legs, home, travel, m.n_poses, rng)
-    parametrization = parametrization_of(mechanism, twists=twists)
+        travel = travel_of(machine)
+        R, t = random_poses(legs, machine.frame_legs, home, travel, m.n_poses, rng)
+    parametrization = parametrization_of(machine, twists=twists)
     R_reached, t_reached = R, t
     if 3 * len(t) < len(parametrization):  # too few to tell what no pose would show
         more = random_poses(
-            legs, mechanism.frame_legs, home, travel_of(mechanism), REACHED - len(t), rng
+            legs, machine.frame_legs, home, travel_of(machine), REACHED - len(t), rng
         )
         R_reached, t_reached = np.concatenate([R, more[0]]), np.concatenate([t, more[1]])
     used = np.unique(m.view)
     views = [m.views[v] for v in used]
     seen = np.array(
-        [[view.legs is None or name in view.legs for name in mechanism.leg_names] for view in views]
+        [[view.legs is None or name in view.legs for name in machine.leg_names] for view in views]
     )
     if dataset.axes is not None:
-        shown_legs = np.zeros((len(m.views), len(mechanism.leg_names)), dtype=np.bool_)
+        shown_legs = np.zeros((len(m.views), len(machine.leg_names)), dtype=np.bool_)
         shown_legs[m.view[dataset.axes.row], dataset.axes.leg] = True
         seen = shown_legs[used]
     A, B = joints_at(legs, home)
     shown = [np.flatnonzero(row).tolist() for row in seen]
-    camera = default_cameras(A, B, shown, mechanism.spatial, rng)
+    camera = default_cameras(A, B, shown, machine.spatial, rng)
     for v, view in enumerate(views):
         if view.T_base_camera is not None:
             camera[v] = (to_Rb * view.T_base_camera).translation
     return Session(
-        leg_names=mechanism.leg_names,
+        leg_names=machine.leg_names,
         legs=legs,
-        frame_legs=mechanism.frame_legs,
+        frame_legs=machine.frame_legs,
         parametrization=parametrization,
-        radius=radii(mechanism.legs, length),
+        radius=radii(machine.legs, length),
         R=R,
         t=t,
         R_reached=R_reached,
@@ -146,7 +146,7 @@ def orientations_of(dataset: Dataset, session: Session) -> Array:
 
     Cameras whose place the dataset does not give look at the legs.
     """
-    to_Rb, views = dataset.mechanism.T_base_Rb.inv(), dataset.measurements.views
+    to_Rb, views = dataset.machine.T_base_Rb.inv(), dataset.measurements.views
     found = looking_at(session)
     for v, view in enumerate(views[i] for i in np.unique(dataset.measurements.view).tolist()):
         if view.T_base_camera is not None:
@@ -227,14 +227,14 @@ def _axis(A: Array, B: Array) -> Array:
 
 
 def machine_near(
-    mechanism: Mechanism, home: RigidTransform
+    machine: Machine, home: RigidTransform
 ) -> tuple[tuple[Leg, ...], float, np.random.Generator]:
     """Return legs near the nominal ones, their mean length at home [m], and a source of chance."""
     rng = np.random.default_rng(_SEED)
-    nominal = geometries(mechanism)
+    nominal = geometries(machine)
     A, B = joints_at(nominal, home)
     length = float(np.linalg.norm(B - A, axis=1).mean())
-    return perturbed(nominal, parametrization_of(mechanism), length, rng), length, rng
+    return perturbed(nominal, parametrization_of(machine), length, rng), length, rng
 
 
 def perturbed(
@@ -265,10 +265,10 @@ def joints_at(legs: Sequence[Leg], T: RigidTransform) -> tuple[Array, Array]:
     return A, np.asarray(T.apply(B))
 
 
-def travel_of(mechanism: Mechanism) -> Array:
+def travel_of(machine: Machine) -> Array:
     """Return shortest and longest length of each leg, (n_legs, 2) [m]."""
     lengths = []
-    for leg in mechanism.legs:
+    for leg in machine.legs:
         ends = [leg.sign * q + leg.q0 for q in leg.travel]
         lengths.append([leg.q0, leg.q0] if leg.kind is LegKind.CONSTANT else sorted(ends))
     return np.array(lengths)

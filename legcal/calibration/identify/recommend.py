@@ -14,7 +14,7 @@ from legcal.calibration.identify.ranks import Analysis, PlatformError, missing
 from legcal.calibration.identify.session import legs_around, neighbours
 from legcal.calibration.identify.steps import base_by_frames, offsets_from_distances, scattered
 from legcal.geometry import Array
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 from legcal.paper import count_conditions, three_legs_at_once
 
 _CAMERA = 6  # unknowns of its pose
@@ -34,7 +34,7 @@ class Recommendation:
 
 
 def recommend(
-    mechanism: Mechanism,
+    machine: Machine,
     images: int,
     *,
     board: bool = False,  # whether a calibration board on the base ties the cameras to each other
@@ -48,8 +48,8 @@ def recommend(
     Empty where no set was found.
     """
     found = list[Recommendation]()
-    candidates = _Candidates(mechanism, images, board=board)
-    most = mechanism.n_legs + 1
+    candidates = _Candidates(machine, images, board=board)
+    most = machine.n_legs + 1
     for n_views in range(1, _MOST_VIEWS + 1):
         for size in range(1, most):
             best = candidates.best(n_views, size)
@@ -63,9 +63,9 @@ def recommend(
 class _Candidates:
     """Views of neighbouring legs, and what each says."""
 
-    def __init__(self, mechanism: Mechanism, images: int, *, board: bool) -> None:
-        self.mechanism, self.images = mechanism, images
-        self.session = planned_session(mechanism, [range(mechanism.n_legs)], images, board=board)
+    def __init__(self, machine: Machine, images: int, *, board: bool) -> None:
+        self.machine, self.images = machine, images
+        self.session = planned_session(machine, [range(machine.n_legs)], images, board=board)
         self.every = Analysis(self.session)
         self.motion = self.every.motion
         self.ring = legs_around(self.session)
@@ -93,8 +93,8 @@ class _Candidates:
 
     def windows(self, size: int) -> list[tuple[int, ...]]:
         """Return neighbours around the base; several cameras where all legs are neighbours."""
-        if size >= self.mechanism.n_legs:
-            return [tuple(range(self.mechanism.n_legs))] * _MOST_VIEWS
+        if size >= self.machine.n_legs:
+            return [tuple(range(self.machine.n_legs))] * _MOST_VIEWS
         views = neighbours(self.ring, size)
         return views[:: -(-len(views) // _MOST_WINDOWS)]
 
@@ -131,7 +131,7 @@ class _Candidates:
         """Return what each view of so many legs says alone."""
         if size not in self.of_size:
             views = self.windows(size)
-            seen = np.zeros((len(views), self.mechanism.n_legs), dtype=np.bool_)
+            seen = np.zeros((len(views), self.machine.n_legs), dtype=np.bool_)
             for row, legs in zip(seen, views, strict=True):
                 row[list(legs)] = True
             camera = cameras_for(self.session, views)

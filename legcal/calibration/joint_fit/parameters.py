@@ -15,7 +15,7 @@ from legcal.files import closest
 from legcal.machine import (
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     free_coordinates,
     geometries,
     parametrization_of,
@@ -111,15 +111,15 @@ class KnownParameters:
 
 
 def known_parameters(
-    mechanism: Mechanism,
+    machine: Machine,
     views: Sequence[View],
     *,
     axes_given: bool = False,
     with_board: bool = False,
 ) -> KnownParameters:
     """Return the parameters of a machine and of the cameras of its views."""
-    by_name, others = _kinematic(mechanism), _no_parameters(mechanism)
-    seen: dict[str, KnownParameter] = dict(_radii(mechanism))
+    by_name, others = _kinematic(machine), _no_parameters(machine)
+    seen: dict[str, KnownParameter] = dict(_radii(machine))
     intrinsics, synonyms = _intrinsics(views)
     seen |= intrinsics
     board = (
@@ -132,9 +132,9 @@ def known_parameters(
     return KnownParameters(by_name | seen | board, others, synonyms)
 
 
-def _kinematic(mechanism: Mechanism) -> dict[str, KnownParameter]:
+def _kinematic(machine: Machine) -> dict[str, KnownParameter]:
     """Return the kinematic parameters with their nominal values."""
-    legs, found = geometries(mechanism), parametrization_of(mechanism, twists=True)
+    legs, found = geometries(machine), parametrization_of(machine, twists=True)
     values = vector_of(found, legs, legs)
     metres = np.array(found.units) == "m"
     size = float(np.abs(values[metres]).max())
@@ -149,9 +149,9 @@ def _kinematic(mechanism: Mechanism) -> dict[str, KnownParameter]:
     return known
 
 
-def _radii(mechanism: Mechanism) -> Iterator[tuple[str, KnownParameter]]:
+def _radii(machine: Machine) -> Iterator[tuple[str, KnownParameter]]:
     """Yield the radii of the visible parts of the legs."""
-    for leg in mechanism.legs:
+    for leg in machine.legs:
         for part, radius in leg.radius_of_part.items():
             limits = radius / _RATIO, radius * _RATIO
             yield radius_name(leg.name, part), KnownParameter(radius, "m", "radius", *limits)
@@ -181,18 +181,18 @@ def _intrinsics(views: Sequence[View]) -> tuple[dict[str, KnownParameter], dict[
     return known, synonyms
 
 
-def _no_parameters(mechanism: Mechanism) -> dict[str, str]:
+def _no_parameters(machine: Machine) -> dict[str, str]:
     """Return the names that look like parameters of a machine and are none, and why."""
-    free = free_coordinates(len(mechanism.legs), mechanism.frame_legs)
-    known = parametrization_of(mechanism, twists=True).names
+    free = free_coordinates(len(machine.legs), machine.frame_legs)
+    known = parametrization_of(machine, twists=True).names
     others: dict[str, str] = {}
-    for j, leg in enumerate(mechanism.legs):
+    for j, leg in enumerate(machine.legs):
         for side, frame in (("base", "R_b"), ("platform", "R_e")):
             for axis, letter in enumerate("xyz"):
                 name = f"{leg.name}.{side}.{letter}"
                 if name in known:
                     continue
-                is_zero = not free[j, axis] and (axis < 2 or len(mechanism.frame_legs) == 3)
+                is_zero = not free[j, axis] and (axis < 2 or len(machine.frame_legs) == 3)
                 others[name] = (
                     f"a coordinate that is zero by the definition of {frame}"
                     if is_zero

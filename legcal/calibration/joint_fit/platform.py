@@ -20,7 +20,7 @@ from legcal.geometry import Array
 from legcal.machine import (
     Leg,
     LegKind,
-    Mechanism,
+    Machine,
     Parametrization,
     geometries,
     platform_in_base,
@@ -144,7 +144,7 @@ class PlatformAccuracy:
 
 
 def platform_accuracy(
-    mechanism: Mechanism,
+    machine: Machine,
     legs: Sequence[Leg],
     parametrization: Parametrization,
     covariance: Array,
@@ -159,16 +159,16 @@ def platform_accuracy(
     NotIdentifiable
         If the readings of a pose do not determine it: the machine is singular there.
     """
-    if not mechanism.is_determined:
+    if not machine.is_determined:
         return None
 
     def follow(poses: Sequence[RigidTransform]) -> Array:
         """Return how calibrated poses move with the parameters."""
-        return platform_by_parameters(legs, parametrization, mechanism.frame_legs, poses)
+        return platform_by_parameters(legs, parametrization, machine.frame_legs, poses)
 
-    calibrated = poses_at_readings(mechanism, legs, q, T_Rb_Re)
-    nominal = poses_at_readings(mechanism, geometries(mechanism), q, T_Rb_Re)
-    here, poses = follow(calibrated), _workspace_poses(mechanism, legs)
+    calibrated = poses_at_readings(machine, legs, q, T_Rb_Re)
+    nominal = poses_at_readings(machine, geometries(machine), q, T_Rb_Re)
+    here, poses = follow(calibrated), _workspace_poses(machine, legs)
     everywhere = None if poses is None else follow(poses)
     judged = here if everywhere is None else everywhere
     return PlatformAccuracy(
@@ -179,37 +179,35 @@ def platform_accuracy(
     )
 
 
-def _workspace_poses(mechanism: Mechanism, legs: Sequence[Leg]) -> Sequence[RigidTransform] | None:
+def _workspace_poses(machine: Machine, legs: Sequence[Leg]) -> Sequence[RigidTransform] | None:
     """Return where calibrated legs put the platform at readings all over the travel."""
     try:
-        drawn = workspace(mechanism)
+        drawn = workspace(machine)
     except DidNotConverge:  # travel or home of the model forbid it, which harms no calibration
         return None
-    nearby = [platform_in_base(mechanism, T) for T in drawn.poses]
-    poses = poses_at_readings(mechanism, legs, drawn.readings, nearby)
+    nearby = [platform_in_base(machine, T) for T in drawn.poses]
+    poses = poses_at_readings(machine, legs, drawn.readings, nearby)
     reached = [
-        T for T, q in zip(poses, drawn.readings, strict=True) if _is_reached(mechanism, legs, q, T)
+        T for T, q in zip(poses, drawn.readings, strict=True) if _is_reached(machine, legs, q, T)
     ]
     return reached or None
 
 
-def _is_reached(
-    mechanism: Mechanism, legs: Sequence[Leg], q: Array, T_Rb_Re: RigidTransform
-) -> bool:
+def _is_reached(machine: Machine, legs: Sequence[Leg], q: Array, T_Rb_Re: RigidTransform) -> bool:
     """Say whether legs have the lengths of readings (n_legs,) at a pose: some have them nowhere."""
     return all(
         abs(np.linalg.norm(T_Rb_Re.apply(leg.B) - leg.A) - sign * reading - leg.q0) < _REACHED
-        for leg, sign, reading in zip(legs, mechanism.sign, q, strict=True)
+        for leg, sign, reading in zip(legs, machine.sign, q, strict=True)
         if leg.kind is LegKind.ACTUATED
     )
 
 
 def poses_at_readings(
-    mechanism: Mechanism,
+    machine: Machine,
     legs: Sequence[Leg],
     q: Array,
     nearby: Sequence[RigidTransform],
 ) -> tuple[RigidTransform, ...]:
     """Return T_Rb_Re of legs at readings (n_poses, n_legs), near known poses."""
     q0 = [np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs]
-    return platform_poses(legs, mechanism.sign * q + q0, nearby, mechanism.frame_legs)
+    return platform_poses(legs, machine.sign * q + q0, nearby, machine.frame_legs)

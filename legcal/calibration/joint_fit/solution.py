@@ -278,17 +278,17 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     Solution
         B of legs that are fixed to the platform is where models put it.
     """
-    mechanism, measurements = dataset.mechanism, dataset.measurements
+    machine, measurements = dataset.machine, dataset.measurements
     legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
-    origin = np.asarray(mechanism.T_platform_Re.inv().translation)
+    origin = np.asarray(machine.T_platform_Re.inv().translation)
     geometry = footed([solution.legs[j] for j in legs], origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
     with_board = dataset.board is not None
-    known = known_parameters(mechanism, measurements.views, with_board=with_board).by_name
+    known = known_parameters(machine, measurements.views, with_board=with_board).by_name
     ordered = [name for name in known if name in solution.values]
     names = tuple(name for name in ordered if name in solution.names)
-    names_of_legs, frame_legs = mechanism.leg_names, mechanism.frame_legs
+    names_of_legs, frame_legs = machine.leg_names, machine.frame_legs
     parametrization = parametrize(names_of_legs, geometry, frame_legs, twists=True)
     where = _places(names, solution.names)
     steps = _places(parametrization.names, solution.parametrization.names)

@@ -13,7 +13,7 @@ from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     Leg,
-    Mechanism,
+    Machine,
     Parametrization,
     geometries,
     moved_legs,
@@ -130,16 +130,16 @@ class FittedLegs:
         return vector_of(self.parametrization, legs, self.nominal)
 
 
-def fitted_legs(mechanism: Mechanism) -> FittedLegs:
+def fitted_legs(machine: Machine) -> FittedLegs:
     """Return the fit's view of the legs of a mechanism."""
     return FittedLegs(
-        tuple(leg.name for leg in mechanism.legs),
-        geometries(mechanism),
-        np.array([leg.sign for leg in mechanism.legs], dtype=np.intp),
-        tuple(mechanism.frame_legs),
+        tuple(leg.name for leg in machine.legs),
+        geometries(machine),
+        np.array([leg.sign for leg in machine.legs], dtype=np.intp),
+        tuple(machine.frame_legs),
         {
             (i, part): r
-            for i, leg in enumerate(mechanism.legs)
+            for i, leg in enumerate(machine.legs)
             for part, r in leg.radius_of_part.items()
         },
     )

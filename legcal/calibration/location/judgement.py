@@ -43,7 +43,7 @@ def judge(
     if too_large:
         status = "doubtful"
     return Location(
-        model=str(problem.mechanism.yaml_path),
+        model=str(problem.machine.yaml_path),
         poses=name,
         T_world_base=base,
         T_platform_tool=tool,

@@ -21,7 +21,7 @@ from legcal.calibration.location.table import LARGEST_ANGLE, read_tool_poses
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import describe
 from legcal.geometry import Array
-from legcal.machine import Mechanism, load_mechanism
+from legcal.machine import Machine, load_mechanism
 
 MOST_LEFT_OUT = 4  # a row of so many may disagree, and one of few
 SUSPICIOUS = 0.05  # residuals in parts of the spread of positions, and [rad]
@@ -37,7 +37,7 @@ _ROUNDS = 3  # of frames and what readings do to the tool
 
 
 def locate(
-    model: str | Path | Mechanism,
+    model: str | Path | Machine,
     poses: str | Path | ToolPoses,
     *,
     position_sigma: float | None = None,
@@ -52,7 +52,7 @@ def locate(
 
     Parameters
     ----------
-    model : str, Path or Mechanism
+    model : str, Path or Machine
         The machine, as for :func:`legcal.load_mechanism`. Where it lies in the result folder of a
         calibration, the covariance of its parameters counts.
     poses : str, Path or ToolPoses
@@ -78,11 +78,11 @@ def locate(
         If the poses leave open what other poses of the machine would tell.
     """
     _check_numbers(position_sigma, angle_sigma, encoder_sigma, tool_position)
-    mechanism = model if isinstance(model, Mechanism) else load_mechanism(model)
+    machine = model if isinstance(model, Machine) else load_mechanism(model)
     name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
-    measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), mechanism)
+    measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
     problem = build_problem(
-        mechanism,
+        machine,
         measured,
         name,
         position_sigma=position_sigma,

@@ -220,7 +220,7 @@ def _open_at(problem: Problem, found: Fit, k: int, frames: Frames) -> Array:
 
 def _workspace(problem: Problem) -> PosePairs:
     """Return poses all over the workspace, as if each had been measured."""
-    drawn = random_configurations(problem.mechanism, WORKSPACE, SEED)
+    drawn = random_configurations(problem.machine, WORKSPACE, SEED)
     matrices = np.array([T.as_matrix() for T in drawn.poses])
     return PosePairs(
         R=matrices[:, :3, :3],

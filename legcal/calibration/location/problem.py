@@ -23,7 +23,7 @@ from legcal.calibration.result import MODEL_NAME, RESULT_NAME
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import Array, BoolArray, IntArray, cross_matrices
 from legcal.machine import (
-    Mechanism,
+    Machine,
     forward_kinematics_many,
     freedoms,
     geometries,
@@ -45,7 +45,7 @@ _START_FACTOR = 1e-2  # of the length, and [rad]: where unknown scatter starts
 class Problem:
     """Measured poses with all that is known of their errors."""
 
-    mechanism: Mechanism  # the machine
+    machine: Machine  # the machine
     poses: ToolPoses  # as measured
     T_base_platform: tuple[RigidTransform, ...]  # at the readings
     pairs: PosePairs  # both as arrays
@@ -82,7 +82,7 @@ class Problem:
 
 
 def build_problem(
-    mechanism: Mechanism,
+    machine: Machine,
     poses: ToolPoses,
     name: str,  # what they are called in messages
     *,
@@ -102,7 +102,7 @@ def build_problem(
     fewest = FEWEST if oriented else FEWEST_POSITIONS
     check_count(poses, name, fewest)
     try:
-        T = forward_kinematics_many(mechanism, poses.q)
+        T = forward_kinematics_many(machine, poses.q)
     except (DidNotConverge, UsageError) as error:
         raise type(error)([f"{name}: {problem}" for problem in error.problems]) from error
     matrices = np.array([pose.as_matrix() for pose in T])
@@ -112,20 +112,20 @@ def build_problem(
         M=poses.rotation,
         p=poses.position,
         oriented=poses.oriented,
-        length=SIZE * leg_scale(mechanism, mechanism.home),
+        length=SIZE * leg_scale(machine, machine.home),
     )
-    result = _calibration_of(mechanism)
+    result = _calibration_of(machine)
     return Problem(
-        mechanism=mechanism,
+        machine=machine,
         poses=poses,
         T_base_platform=tuple(T),
         pairs=pairs,
         noise=_noise(poses, position_sigma, angle_sigma, pairs.length, name),
         encoder_sigma=encoder_sigma,
-        by_readings=motions_by_readings(mechanism, T, encoder_sigma) if encoder_sigma else None,
+        by_readings=motions_by_readings(machine, T, encoder_sigma) if encoder_sigma else None,
         by_model=None
         if result is None
-        else motions_by_parameters(mechanism, T, result.names, result.covariance),
+        else motions_by_parameters(machine, T, result.names, result.covariance),
         result=result,
         fewest=fewest,
     )
@@ -179,9 +179,9 @@ def _noise(
     return Noise(sigma, factor, (stated[0], stated[1]))
 
 
-def _calibration_of(mechanism: Mechanism) -> EarlierResult | None:
+def _calibration_of(machine: Machine) -> EarlierResult | None:
     """Return the calibration that a model lies in the result folder of, or None."""
-    path = Path(mechanism.yaml_path)
+    path = Path(machine.yaml_path)
     if path.name != MODEL_NAME or not os.path.isfile(path.parent / RESULT_NAME):
         return None
     try:
@@ -214,50 +214,48 @@ class PlatformMotions:
 
 
 def motions_by_parameters(
-    mechanism: Mechanism,
+    machine: Machine,
     poses: Sequence[RigidTransform],
     # (p): parameters of :func:`legcal.machine.parameters.parametrization_of` with twists
     names: Sequence[str],
     covariance: Array,  # (p, p): their covariance [m, rad]
 ) -> PlatformMotions:
     """Return what the errors of a calibrated model do to the platform at some poses."""
-    known = parametrization_of(mechanism, twists=True)
-    R, t = _joint_frames(mechanism, poses)
-    by_parameters = pose_sensitivity(geometries(mechanism), known, mechanism.frame_legs, R, t)
+    known = parametrization_of(machine, twists=True)
+    R, t = _joint_frames(machine, poses)
+    by_parameters = pose_sensitivity(geometries(machine), known, machine.frame_legs, R, t)
     values, vectors = np.linalg.eigh(covariance)
     kept = values > _NEGLIGIBLE * max(float(values[-1]), 0.0)
     root = vectors[:, kept] * np.sqrt(values[kept])
     columns = [known.names.index(name) for name in names]
-    return _of_link(mechanism, poses, by_parameters[:, :, columns] @ root)
+    return _of_link(machine, poses, by_parameters[:, :, columns] @ root)
 
 
 def motions_by_readings(
-    mechanism: Mechanism,
+    machine: Machine,
     poses: Sequence[RigidTransform],
     sigma_q: float,  # standard deviation of a reading [m]
 ) -> PlatformMotions:
     """Return what an error of each reading does to the platform at some poses."""
-    R, t = _joint_frames(mechanism, poses)
-    equations = pose_equations(geometries(mechanism), R, t)
-    columns = list(freedoms(mechanism.frame_legs))
+    R, t = _joint_frames(machine, poses)
+    equations = pose_equations(geometries(machine), R, t)
+    columns = list(freedoms(machine.frame_legs))
     inverse = np.linalg.pinv(equations.by_pose[:, :, columns])[:, :, equations.measured]
     moved = np.zeros((len(poses), 6, inverse.shape[2]))
     moved[:, columns] = sigma_q * inverse  # the sign of a reading does not matter
-    return _of_link(mechanism, poses, moved)
+    return _of_link(machine, poses, moved)
 
 
-def _joint_frames(mechanism: Mechanism, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
+def _joint_frames(machine: Machine, poses: Sequence[RigidTransform]) -> tuple[Array, Array]:
     """Return rotations and positions of R_e in R_b."""
-    matrices = np.array([platform_in_base(mechanism, T).as_matrix() for T in poses])
+    matrices = np.array([platform_in_base(machine, T).as_matrix() for T in poses])
     return matrices[:, :3, :3], matrices[:, :3, 3]
 
 
-def _of_link(
-    mechanism: Mechanism, poses: Sequence[RigidTransform], moved: Array
-) -> PlatformMotions:
+def _of_link(machine: Machine, poses: Sequence[RigidTransform], moved: Array) -> PlatformMotions:
     """Return motions of R_e in R_b (n, 6, k) as those of the platform link in the base link."""
-    to_base = mechanism.T_base_Rb.rotation.as_matrix()
+    to_base = machine.T_base_Rb.rotation.as_matrix()
     turn = to_base @ moved[:, :3]
-    origin = mechanism.T_platform_Re.translation
+    origin = machine.T_platform_Re.translation
     arms = cross_matrices(np.array([T.rotation.apply(-origin) for T in poses]))
     return PlatformMotions(turn, to_base @ moved[:, 3:] - arms @ turn)

@@ -18,7 +18,7 @@ from legcal.calibration.location.result import ToolPoses
 from legcal.data import reading_columns, readings_in
 from legcal.files import QUATERNION_TOLERANCE, Column, Table, read_table
 from legcal.geometry import Array, BoolArray
-from legcal.machine import Mechanism
+from legcal.machine import Machine
 
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -66,7 +66,7 @@ COLUMNS = (
 _ANGLES = re.compile(r"[rw][xyz]|[abc]|roll|pitch|yaw|phi|theta|psi", re.IGNORECASE)
 
 
-def read_tool_poses(path: Path, mechanism: Mechanism) -> ToolPoses:
+def read_tool_poses(path: Path, machine: Machine) -> ToolPoses:
     """Return the measured tool poses of a file.
 
     Raises DatasetError with one sentence for each thing that is wrong, naming row and column.
@@ -76,11 +76,11 @@ def read_tool_poses(path: Path, mechanism: Mechanism) -> ToolPoses:
         path,
         "table of tool poses",
         "row",
-        [*reading_columns(mechanism.legs), *COLUMNS],
+        [*reading_columns(machine.legs), *COLUMNS],
         needed="a row for each pose; measure some",
         unknown=_about_angles,
     )
-    readings, notes = readings_in(table, mechanism.legs)
+    readings, notes = readings_in(table, machine.legs)
     position = table.numbers(POSITION)
     rotation, oriented, worst = _orientations(table)
     if "angle_sigma" in table:
@@ -90,7 +90,7 @@ def read_tool_poses(path: Path, mechanism: Mechanism) -> ToolPoses:
                 "quaternions, needed qx, qy, qz, qw beside it; add the columns."
             )
         table.need(["angle_sigma"], oriented)
-    joints = [column.name for column in reading_columns(mechanism.legs)]
+    joints = [column.name for column in reading_columns(machine.legs)]
     same = table.numbers([*joints, *(name for name in numbers[:7] if name in table)])
     table.once(
         [
@@ -100,8 +100,8 @@ def read_tool_poses(path: Path, mechanism: Mechanism) -> ToolPoses:
         "the same readings and the same pose",
     )  # one measurement would count as two
     table.check()
-    q = np.full((len(table), mechanism.n_legs), math.nan)
-    q[:, list(mechanism.motors)] = readings
+    q = np.full((len(table), machine.n_legs), math.nan)
+    q[:, list(machine.motors)] = readings
     if worst > _ROUNDED:
         notes = (
             *notes,

@@ -16,7 +16,7 @@ from legcal.calibration.location.result import Location
 from legcal.errors import ModelError, UsageError
 from legcal.files import existing_parent, is_plain_name, temporary_folder
 from legcal.geometry import roll_pitch_yaw
-from legcal.machine import Mechanism, Urdf, UrdfPatch, load_mechanism, write_model
+from legcal.machine import Machine, Urdf, UrdfPatch, load_mechanism, write_model
 
 WORLD = "world"
 TOOL = "tool"
@@ -24,7 +24,7 @@ _SAME = 1e-12  # [m, rad]: rounding of the analysis
 
 
 def write_located_model(
-    mechanism: Mechanism,  # the machine that was located
+    machine: Machine,  # the machine that was located
     location: Location,
     folder: Path,  # gets ``models`` and ``urdf``; nothing there is replaced
     *,
@@ -38,16 +38,16 @@ def write_located_model(
     Raises UsageError if files of these names are there, or the links have another meaning in the
     URDF; ModelError if the URDF does not let a link carry the machine.
     """
-    content = with_frames(mechanism, location, world=world, tool=tool)
-    located = replace(mechanism, urdf=replace(mechanism.urdf, content=content))
+    content = with_frames(machine, location, world=world, tool=tool)
+    located = replace(machine, urdf=replace(machine.urdf, content=content))
     with temporary_folder(existing_parent(folder / "x"), "located") as temporary:
         written, _ = write_model(located, temporary)
-        check_same(mechanism, load_mechanism(written))
+        check_same(machine, load_mechanism(written))
     return write_model(located, folder)
 
 
 def with_frames(
-    mechanism: Mechanism, location: Location, *, world: str = WORLD, tool: str = TOOL
+    machine: Machine, location: Location, *, world: str = WORLD, tool: str = TOOL
 ) -> bytes:
     """Return the URDF of a mechanism with the located frames in it."""
     for name in (world, tool):
@@ -61,15 +61,15 @@ def with_frames(
             f"The frames could not be written: found '{world}' for world and tool, needed two "
             "names; give another one."
         )
-    urdf = mechanism.urdf
-    T_root_base = _from_root(urdf, mechanism.base)
+    urdf = machine.urdf
+    T_root_base = _from_root(urdf, machine.base)
     patch = UrdfPatch(urdf.content)
 
     def place(joint: str, T: RigidTransform) -> None:
         patch.set_origin(joint, np.asarray(T.translation), roll_pitch_yaw(T.rotation.as_matrix()))
 
     if world in urdf.links:
-        joint = _joint_of_world(mechanism, world)
+        joint = _joint_of_world(machine, world)
         T_child_base = urdf.joints[joint].T_parent_origin.inv() * T_root_base
         place(joint, location.T_world_base * T_child_base.inv())
     else:
@@ -78,10 +78,10 @@ def with_frames(
             world, urdf.root, world, _unused_joint(urdf, world, urdf.root), T_world_root
         )
     if tool in urdf.links:
-        place(_joint_of_tool(mechanism, tool), location.T_platform_tool)
+        place(_joint_of_tool(machine, tool), location.T_platform_tool)
     else:
-        joint = _unused_joint(urdf, mechanism.platform, tool)
-        patch.add_frame(mechanism.platform, tool, tool, joint, location.T_platform_tool)
+        joint = _unused_joint(urdf, machine.platform, tool)
+        patch.add_frame(machine.platform, tool, tool, joint, location.T_platform_tool)
     return patch.content()
 
 
@@ -101,11 +101,11 @@ def _from_root(urdf: Urdf, base: str) -> RigidTransform:
     return T
 
 
-def _joint_of_world(mechanism: Mechanism, world: str) -> str:
+def _joint_of_world(machine: Machine, world: str) -> str:
     """Return the fixed joint below a world link that carries all the rest."""
-    urdf = mechanism.urdf
+    urdf = machine.urdf
     below = [joint for joint in urdf.joints.values() if joint.parent == world]
-    if world == urdf.root != mechanism.base and len(below) == 1 and not below[0].moves:
+    if world == urdf.root != machine.base and len(below) == 1 and not below[0].moves:
         return below[0].name
     raise UsageError(
         f"{urdf.path}: the world could not be written: found a link '{world}' that is not a root "
@@ -114,23 +114,23 @@ def _joint_of_world(mechanism: Mechanism, world: str) -> str:
     )
 
 
-def _joint_of_tool(mechanism: Mechanism, tool: str) -> str:
+def _joint_of_tool(machine: Machine, tool: str) -> str:
     """Return the fixed joint between the platform and a tool link that carries nothing."""
-    urdf = mechanism.urdf
+    urdf = machine.urdf
     joint = next((joint for joint in urdf.joints.values() if joint.child == tool), None)
-    frames = {name for c in mechanism.chain.closures for name in (c.frame_1, c.frame_2)}
+    frames = {name for c in machine.chain.closures for name in (c.frame_1, c.frame_2)}
     carries = any(other.parent == tool for other in urdf.joints.values())
     if (
         joint is not None
         and not joint.moves
-        and joint.parent == mechanism.platform
+        and joint.parent == machine.platform
         and not carries
         and frames.isdisjoint((tool, joint.name))
     ):
         return joint.name
     raise UsageError(
         f"{urdf.path}: the tool could not be written: found a link '{tool}' that is not at the end "
-        f"of a fixed joint on the platform '{mechanism.platform}', needed such a link or a free "
+        f"of a fixed joint on the platform '{machine.platform}', needed such a link or a free "
         "name; give another name (--tool-link)."
     )
 
@@ -143,7 +143,7 @@ def _unused_joint(urdf: Urdf, parent: str, child: str) -> str:
     return joint
 
 
-def check_same(before: Mechanism, after: Mechanism) -> None:
+def check_same(before: Machine, after: Machine) -> None:
     """Check that a model with frames is the same machine.
 
     Raises ModelError if its analysis differs by more than rounding.
