@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +33,7 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.progress import Report, no_progress
 from legcal.vision import (
     CALIBRATED,
+    DISTORTION_MODELS,
     Board,
     Camera,
     DistortionModel,
@@ -323,12 +324,6 @@ def _named(paths: Sequence[Path]) -> str:
 N_STEPS = 60
 HUBER = Huber(3.0)  # standard deviations from which a corner counts less and less
 WEAK_PIXELS = 10.0  # image widths: prior of focal lengths and principal point
-# Prior of each coefficient of distortion; those of the rational model may cancel each other.
-WEAK_COEFFICIENT: Mapping[DistortionModel, float] = {
-    "plumb_bob": 100.0,
-    "rational_polynomial": 1.0,
-    "equidistant": 100.0,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,7 +377,7 @@ def adjust(
         np.where(
             pixel,
             WEAK_PIXELS * max(camera.width, camera.height),
-            WEAK_COEFFICIENT[camera.model],
+            DISTORTION_MODELS[camera.model].prior_sigma,
         ),
     )
 
@@ -468,7 +463,7 @@ def adjusted_anyhow(seen: SeenCorners, size: ImageSize, model: DistortionModel) 
     model : {"plumb_bob", "rational_polynomial", "equidistant"}
         How the lens distorts.
     """
-    start = None if model == "equidistant" else _by_opencv(seen, size, model)
+    start = None if DISTORTION_MODELS[model].is_fisheye else _by_opencv(seen, size, model)
     start = start or _by_straight_lines(seen, size, model)
     if start is None:
         return None
@@ -481,11 +476,12 @@ def _by_straight_lines(
 ) -> tuple[Camera, list[RigidTransform]] | None:
     """Return the camera without distortion before which boards are flattest, of several."""
     centre = 0.5 * (size.width - 1.0), 0.5 * (size.height - 1.0)
+    no_distortion = np.zeros(len(DISTORTION_MODELS[model].coefficients))
     cameras = []
     for part in np.geomspace(*FOCAL_LENGTHS).tolist():
         f = part * max(size.width, size.height)
         K = np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
-        cameras.append(Camera(K, size.width, size.height, _no_distortion(model), model))
+        cameras.append(Camera(K, size.width, size.height, no_distortion, model))
     best = min(cameras, key=lambda camera: _bend(camera, seen))
     poses = []
     for a, b in pairwise(_bounds(seen)):
@@ -499,7 +495,7 @@ def _by_straight_lines(
 def _bend(camera: Camera, seen: SeenCorners) -> float:
     """Return how far the corners of boards are from any plane before a camera (rms) [px]."""
     angle = np.linalg.norm(seen.px - camera.K[:2, 2], axis=1) / camera.K[0, 0]
-    if camera.model == "equidistant" and angle.max() > _WIDEST:
+    if DISTORTION_MODELS[camera.model].is_fisheye and angle.max() > _WIDEST:
         return np.inf
     xy = camera.undistort(seen.px)
     off = []
@@ -539,17 +535,13 @@ def _by_opencv(
     numbers = np.concatenate([np.ravel(K), np.ravel(distortion), np.ravel(turns), np.ravel(shifts)])
     if not np.all(np.isfinite(numbers)) or min(K[0, 0], K[1, 1]) < 1.0:
         return None
-    coefficients = _no_distortion(model)
+    coefficients = np.zeros(len(DISTORTION_MODELS[model].coefficients))
     coefficients[:2] = np.ravel(distortion)[:2]
     poses = [
         RigidTransform.from_components(np.ravel(t), Rotation.from_rotvec(np.ravel(w)))
         for w, t in zip(turns, shifts, strict=True)
     ]
     return Camera(np.asarray(K), size.width, size.height, coefficients, model), poses
-
-
-def _no_distortion(model: DistortionModel) -> Array:
-    return np.zeros(len(intrinsic_names(Camera(np.eye(3), 1, 1, np.zeros(0), model))) - 4)
 
 
 N_ROUNDS = 6

@@ -7,6 +7,7 @@ from .board import charuco_board as charuco_board
 from .board import described_board as described_board
 from .board import dictionary as dictionary
 from .board import read_board as read_board
+from .camera import DISTORTION_MODELS as DISTORTION_MODELS
 from .camera import Camera as Camera
 from .camera import DistortionModel as DistortionModel
 from .camera import camera_numbers as camera_numbers

@@ -1,12 +1,15 @@
-"""The camera: a pinhole with the distortions of OpenCV, and its numbers by their names.
+"""The camera: a pinhole with a distortion model of OpenCV, and its intrinsics by their names.
 
-A fit may look for the numbers. Views whose cameras have the same ones are taken to show one camera:
-they share its intrinsics, named after the first of them in the order of names.
+A distortion model is one entry of ``DISTORTION_MODELS`` and its name in ``DistortionModel``: files,
+fits and the calibration of cameras take from there what they need of it.
+
+Views whose cameras have the same intrinsics are taken to show one camera: they share these, named
+after the first of them in the order of names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -19,6 +22,75 @@ DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
 _STEP = 1e-6  # of the central differences of undistortion, in units of the sensor plane
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """A distortion model: what its coefficients are called, and its functions.
+
+    The functions take a camera matrix K and all coefficients; points are (n, 1, 2).
+    """
+
+    coefficients: tuple[str, ...]  # in OpenCV's order
+    counts: tuple[int, ...]  # numbers of coefficients that a file may give; the others are zero
+    prior_sigma: float  # of a coefficient of which nothing is known
+    distort: Callable[[Array, Array, Array], Array]  # (x, y) of the sensor plane to pixels
+    undistort: Callable[[Array, Array, Array], Array]  # pixels to (x, y)
+    derivatives: Callable[[Array, Array, Array], Array]  # of pixels (2 n, 4 + m) by intrinsics
+    kalibr: tuple[str, ...] = ()  # its names in a camchain; these list four coefficients
+    is_fisheye: bool = False  # distorts with all coefficients zero
+
+
+def _polynomial_distort(xy: Array, K: Array, coefficients: Array) -> Array:
+    rays = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1)
+    zero = np.zeros(3)
+    return np.asarray(cv2.projectPoints(rays, zero, zero, K, coefficients)[0])
+
+
+def _polynomial_undistort(pixels: Array, K: Array, coefficients: Array) -> Array:
+    identity = np.eye(3)
+    return np.asarray(
+        cv2.undistortPointsIter(pixels, K, coefficients, identity, identity, _UNDISTORT_CRITERIA)
+    )
+
+
+def _polynomial_derivatives(xy: Array, K: Array, coefficients: Array) -> Array:
+    rays = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
+    zero = np.zeros(3)
+    jacobian = cv2.projectPoints(rays, zero, zero, K, coefficients)[1]
+    return np.asarray(jacobian[:, 6:])  # behind those by rotation and translation
+
+
+def _fisheye_distort(xy: Array, K: Array, coefficients: Array) -> Array:
+    return np.asarray(cv2.fisheye.distortPoints(xy, K, coefficients))
+
+
+def _fisheye_undistort(pixels: Array, K: Array, coefficients: Array) -> Array:
+    return np.asarray(
+        cv2.fisheye.undistortPoints(pixels, K, coefficients, criteria=_UNDISTORT_CRITERIA)
+    )
+
+
+def _fisheye_derivatives(xy: Array, K: Array, coefficients: Array) -> Array:
+    rays = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
+    zero = np.zeros(3)
+    return np.asarray(cv2.fisheye.projectPoints(rays, zero, zero, K, coefficients)[1])
+
+
+_POLYNOMIAL = _polynomial_distort, _polynomial_undistort, _polynomial_derivatives
+_FISHEYE = _fisheye_distort, _fisheye_undistort, _fisheye_derivatives
+DISTORTION_MODELS: Mapping[DistortionModel, Distortion] = {
+    "plumb_bob": Distortion(
+        ("k1", "k2", "p1", "p2", "k3"), (0, 4, 5), 100.0, *_POLYNOMIAL, kalibr=("radtan", "none")
+    ),
+    # The coefficients of numerator and denominator may cancel each other.
+    "rational_polynomial": Distortion(
+        ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), (8,), 1.0, *_POLYNOMIAL
+    ),
+    "equidistant": Distortion(
+        ("k1", "k2", "k3", "k4"), (4,), 100.0, *_FISHEYE, kalibr=("equidistant",), is_fisheye=True
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +109,7 @@ class Camera:
     @property
     def has_distortion(self) -> bool:
         """Whether any distortion coefficient differs from zero."""
-        return bool(np.any(self.distortion != 0.0)) or self.model == "equidistant"
+        return bool(np.any(self.distortion != 0.0)) or DISTORTION_MODELS[self.model].is_fisheye
 
     def project(
         self,
@@ -52,12 +124,7 @@ class Camera:
         if not self.has_distortion:
             return np.asarray(xy @ self.K[:2, :2].T + self.K[:2, 2])
         flat = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 1, 2)
-        if self.model == "equidistant":
-            pixels = cv2.fisheye.distortPoints(flat, self.K, self.distortion)
-        else:
-            rays = np.concatenate([flat[:, 0], np.ones((len(flat), 1))], axis=1)
-            zero = np.zeros(3)
-            pixels, _ = cv2.projectPoints(rays, zero, zero, self.K, self.distortion)
+        pixels = DISTORTION_MODELS[self.model].distort(flat, self.K, self.distortion)
         return np.asarray(pixels, dtype=np.float64).reshape(xy.shape)
 
     def undistort(self, pixels: Array) -> Array:
@@ -66,14 +133,7 @@ class Camera:
             centred = pixels - self.K[:2, 2]
             return np.asarray(centred @ np.linalg.inv(self.K[:2, :2]).T)
         flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
-        if self.model == "equidistant":
-            xy = cv2.fisheye.undistortPoints(
-                flat, self.K, self.distortion, criteria=_UNDISTORT_CRITERIA
-            )
-        else:
-            xy = cv2.undistortPointsIter(
-                flat, self.K, self.distortion, np.eye(3), np.eye(3), _UNDISTORT_CRITERIA
-            )
+        xy = DISTORTION_MODELS[self.model].undistort(flat, self.K, self.distortion)
         return np.asarray(xy, dtype=np.float64).reshape(pixels.shape)
 
     def pixels_per_unit(
@@ -105,45 +165,43 @@ class Camera:
 
 
 _PINHOLE = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # places in K
-_COEFFICIENTS: Mapping[DistortionModel, tuple[str, ...]] = {  # in OpenCV's order
-    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
-    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "equidistant": ("k1", "k2", "k3", "k4"),
-}
-_OF_DISTORTION = {name for names in _COEFFICIENTS.values() for name in names}
+
+
+def _coefficients(camera: Camera) -> tuple[str, ...]:
+    return DISTORTION_MODELS[camera.model].coefficients
 
 
 def intrinsic_names(camera: Camera) -> tuple[str, ...]:
-    """Return the names of a camera's numbers: ``fx fy cx cy``, then its distortion.
+    """Return the names of a camera's intrinsics: ``fx fy cx cy``, then its distortion.
 
     A plumb_bob camera has all five coefficients, also where its file leaves some out as
     zero. OpenCV's distortion knows no skew: a camera with skew and without distortion has none.
     """
     if camera.K[0, 1] != 0.0 and not camera.has_distortion:
         return tuple(_PINHOLE)
-    return (*_PINHOLE, *_COEFFICIENTS[camera.model])
+    return (*_PINHOLE, *_coefficients(camera))
 
 
 def intrinsic_unit(name: str) -> str:
     """Return the unit of an intrinsic: ``px``, or nothing for a coefficient of distortion."""
-    return "" if name in _OF_DISTORTION else "px"
+    return "px" if name in _PINHOLE else ""
 
 
 def intrinsic_values(camera: Camera) -> Array:
-    """Return the numbers of :func:`intrinsic_names`, (n,) [px; distortion without unit]."""
+    """Return the values of :func:`intrinsic_names`, (n,) [px; distortion without unit]."""
     pinhole = [camera.K[place] for place in _PINHOLE.values()]
     return np.array([*pinhole, *_padded(camera)])[: len(intrinsic_names(camera))]
 
 
 def with_intrinsics(camera: Camera, values: Mapping[str, float]) -> Camera:
-    """Return a camera with some of its numbers replaced."""
+    """Return a camera with some of its intrinsics replaced."""
     K, distortion = camera.K.copy(), _padded(camera)
     for name, value in values.items():
         if name in _PINHOLE:
             K[_PINHOLE[name]] = value
         else:
-            distortion[_COEFFICIENTS[camera.model].index(name)] = value
-    if _OF_DISTORTION.isdisjoint(values):
+            distortion[_coefficients(camera).index(name)] = value
+    if values.keys() <= _PINHOLE.keys():
         distortion = camera.distortion
     return replace(camera, K=K, distortion=distortion)
 
@@ -153,9 +211,9 @@ def undistort_derivatives(
     pixels: Array,  # (..., 2) pixels
     names: Sequence[str],
 ) -> Array:
-    """Return how the points of the sensor plane seen at pixels move with a camera's numbers.
+    """Return how the points of the sensor plane seen at pixels move with a camera's intrinsics.
 
-    A pixel stays where it is, so that d(u, v)/d(x, y) d(x, y) + d(u, v)/d(number) = 0.
+    A pixel stays where it is, so that d(u, v)/d(x, y) d(x, y) + d(u, v)/d(intrinsic) = 0.
     """
     flat = pixels.reshape(-1, 2)
     if len(flat) == 0:  # OpenCV refuses to project nothing
@@ -191,20 +249,15 @@ def _identity(camera: Camera) -> tuple[object, ...]:
 
 def _padded(camera: Camera) -> Array:
     """Return all the coefficients of a camera's model, those that are left out being zero."""
-    distortion = np.zeros(len(_COEFFICIENTS[camera.model]))
+    distortion = np.zeros(len(_coefficients(camera)))
     distortion[: len(camera.distortion)] = camera.distortion
     return distortion
 
 
 def distort_derivatives(camera: Camera, xy: Array, names: Sequence[str]) -> Array:
-    """Return the derivative of pixels of points (n, 2) by a camera's numbers, (n, 2, n_names)."""
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1).reshape(-1, 1, 3)
-    zero, distortion = np.zeros(3), _padded(camera)
-    if camera.model == "equidistant":
-        _, jacobian = cv2.fisheye.projectPoints(rays, zero, zero, camera.K, distortion)
-    else:
-        _, jacobian = cv2.projectPoints(rays, zero, zero, camera.K, distortion)
-        jacobian = jacobian[:, 6:]  # behind those by rotation and translation
-    known = (*_PINHOLE, *_COEFFICIENTS[camera.model])
+    """Return the derivative of pixels of points (n, 2) by intrinsics, (n, 2, n_names)."""
+    known = (*_PINHOLE, *_coefficients(camera))
+    derivatives = DISTORTION_MODELS[camera.model].derivatives
+    jacobian = derivatives(xy.reshape(-1, 1, 2), camera.K, _padded(camera))
     columns = [known.index(name) for name in names]
     return np.asarray(jacobian[:, columns].reshape(len(xy), 2, len(names)))

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from legcal.errors import DatasetError
 from legcal.files import FileSchema, parse_yaml, read_text, validate
 from legcal.geometry import Array
-from legcal.vision.camera import Camera, DistortionModel, intrinsic_names
+from legcal.vision.camera import DISTORTION_MODELS, Camera, DistortionModel, intrinsic_names
 from legcal.vision.image_file import quiet_opencv
 
 Pixels = Annotated[int, Field(gt=0)]
@@ -71,7 +71,7 @@ class RosEntry(_OpenSchema):
     image_width: Pixels
     image_height: Pixels
     camera_matrix: CameraMatrix
-    distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
+    distortion_model: DistortionModel = "plumb_bob"
     distortion_coefficients: MatrixEntry
     legcal_camera: CalibratedEntry | None = None
 
@@ -96,11 +96,6 @@ class KalibrEntry(_OpenSchema):
     resolution: tuple[Pixels, Pixels]
 
 
-_COUNTS: Mapping[DistortionModel, tuple[int, ...]] = {
-    "plumb_bob": (0, 4, 5),
-    "rational_polynomial": (8,),
-    "equidistant": (4,),
-}
 _OPENCV_MARKS = re.compile(rb"\A\s*(%YAML:1\.0|<\?xml|<opencv_storage)|opencv-matrix")
 _OPENCV_KEYS = {
     "image_width": ("image_width", "image_Width"),
@@ -183,9 +178,7 @@ def _from_kalibr(found: Mapping[str, Any], cameras: Sequence[str], path: Path) -
     prefix = cameras[0] if cameras else ""
     entry = validate(KalibrEntry, found[prefix] if cameras else found, path, prefix)
     fx, fy, cx, cy = entry.intrinsics
-    model: DistortionModel = (
-        "equidistant" if entry.distortion_model == "equidistant" else "plumb_bob"
-    )
+    model = next(m for m, d in DISTORTION_MODELS.items() if entry.distortion_model in d.kalibr)
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     coefficients = entry.distortion_coeffs
     problems = []
@@ -259,8 +252,9 @@ def _checked(
     distortion = np.array(coefficients, dtype=np.float64)
     if model == "rational_polynomial" and len(distortion) in (12, 14) and not distortion[8:].any():
         distortion = distortion[:8]  # OpenCV pads with the thin prism and tilt that it did not fit
-    if len(distortion) not in _COUNTS[model]:
-        needed = " or ".join(str(n) for n in _COUNTS[model])
+    counts = DISTORTION_MODELS[model].counts
+    if len(distortion) not in counts:
+        needed = " or ".join(str(n) for n in counts)
         problems.append(_wrong_count(path, model, len(distortion), needed))
     problems += _matrix_problems(path, K, size)
     if not np.all(np.isfinite(distortion)):
