@@ -1,4 +1,4 @@
-"""Files appear complete or not at all, whatever interrupts the writing."""
+"""Folders of files appear complete or not at all; quantities carry their unit."""
 
 import os
 import signal
@@ -13,9 +13,19 @@ from typing import Any
 import pytest
 
 from legcal.errors import UsageError
-from legcal.files.folder import check_destination, output_path, result_folder, write_atomically
+from legcal.files import (
+    ANGLE,
+    LENGTH,
+    PIXELS,
+    check_destination,
+    output_path,
+    parse_quantity,
+    result_folder,
+    write_atomically,
+)
 
 RESULT = '{"legcal_result": 1}'
+REPLACED = {"calibrated.urdf": "new", "notes.txt": "mine", "result.json": RESULT}
 
 
 def fill(folder: Path, text: str) -> None:
@@ -23,15 +33,11 @@ def fill(folder: Path, text: str) -> None:
     (folder / "calibrated.urdf").write_text(text)
 
 
-def write_result(destination: Path, at_the_end: Callable[[], None]) -> None:
+def write_result(destination: Path, at_the_end: Callable[[Path], None] | None = None) -> None:
     with result_folder(destination) as folder:
         fill(folder, "new")
-        (folder / "another.txt").write_text("new")
-        at_the_end()
-
-
-def raise_(error: type[BaseException]) -> None:
-    raise error
+        if at_the_end is not None:
+            at_the_end(folder)
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -49,55 +55,45 @@ def out(tmp_path: Path) -> Path:
     return out
 
 
-def test_file_is_replaced_by_its_new_content(tmp_path: Path) -> None:
+def test_a_file_is_replaced_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.csv"
     for content in (b"old", b"new"):
         write_atomically(path, content)
         assert path.read_bytes() == content
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_file_that_cannot_be_replaced_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a.csv"
-    path.write_bytes(b"old")
 
     def fail(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="No space left"):
-        write_atomically(path, b"new")
-    assert path.read_bytes() == b"old"
+        write_atomically(path, b"newer")
+    assert path.read_bytes() == b"new"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_result_appears_when_the_block_ends(tmp_path: Path) -> None:
+def test_a_result_appears_when_the_block_ends(tmp_path: Path) -> None:
     out = tmp_path / "new" / "out"
     with result_folder(out) as folder:
         fill(folder, "new")
         (folder / "sub").mkdir()
         (folder / "sub" / "a.txt").write_text("deep")
         assert not out.parent.exists()
-    assert contents(out) == {
-        "calibrated.urdf": "new",
-        "result.json": RESULT,
-        "sub/a.txt": "deep",
-    }
+    assert contents(out) == {"calibrated.urdf": "new", "result.json": RESULT, "sub/a.txt": "deep"}
     assert [p.name for p in tmp_path.iterdir()] == ["new"]
     assert out.stat().st_mode & 0o077 == (tmp_path / "new").stat().st_mode & 0o077
 
 
-def test_earlier_result_is_replaced_and_other_files_are_kept(out: Path) -> None:
+def test_an_earlier_result_is_replaced_and_other_files_are_kept(out: Path) -> None:
     with result_folder(out) as folder:
         fill(folder, "new")
         assert contents(out)["calibrated.urdf"] == "old"
-    assert contents(out) == {"calibrated.urdf": "new", "notes.txt": "mine", "result.json": RESULT}
+    assert contents(out) == REPLACED
     assert list(out.parent.iterdir()) == [out]
 
 
-def test_folder_on_another_file_system_is_filled(
+def test_a_folder_on_another_file_system_is_filled(
     out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     replace, stat = os.replace, os.stat
@@ -117,60 +113,60 @@ def test_folder_on_another_file_system_is_filled(
 
     monkeypatch.setattr(os, "replace", refuses_to_cross)
     monkeypatch.setattr(os, "stat", mounted)
-    with result_folder(out) as folder:
-        fill(folder, "new")
-    assert contents(out) == {"calibrated.urdf": "new", "notes.txt": "mine", "result.json": RESULT}
-
-
-def test_what_a_killed_run_left_behind_does_not_make_a_folder_foreign(tmp_path: Path) -> None:
-    (tmp_path / ".out.x.legcal-part").mkdir()
-    check_destination(tmp_path)
+    write_result(out)
+    assert contents(out) == REPLACED
 
 
 @pytest.mark.parametrize("name", [".", "out"])
 def test_empty_and_current_folders_are_filled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    (tmp_path / "here" / "out").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path / "here" / "out" if name == "." else tmp_path / "here")
-    with result_folder(Path(name)) as folder:
-        fill(folder, "new")
-    assert contents(tmp_path / "here" / "out")["calibrated.urdf"] == "new"
+    here = tmp_path / "here"
+    (here / "out").mkdir(parents=True)
+    monkeypatch.chdir(here / "out" if name == "." else here)
+    write_result(Path(name))
+    assert contents(here / "out")["calibrated.urdf"] == "new"
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, ValueError])
-def test_interrupted_block_leaves_everything_as_it_was(
+def test_an_interrupted_block_leaves_everything_as_it_was(
     out: Path, stop: type[BaseException]
 ) -> None:
+    def interrupt(_: Path) -> None:
+        raise stop
+
     before = contents(out)
     for destination in (out, out.parent / "none" / "deep"):
         with pytest.raises(stop):
-            write_result(destination, lambda: raise_(stop))
+            write_result(destination, interrupt)
     assert contents(out) == before
     assert list(out.parent.iterdir()) == [out]
 
 
 @pytest.mark.parametrize("after", [0, 1, 2])
-def test_interrupted_move_leaves_everything_as_it_was(
+def test_an_interrupted_move_leaves_everything_as_it_was(
     out: Path, monkeypatch: pytest.MonkeyPatch, after: int
 ) -> None:
     before, replace = contents(out), os.replace
     moved: list[Path] = []
 
     def interrupted(source: Path, target: Path) -> None:
-        if len(moved) == after:
-            moved.append(target)
-            raise KeyboardInterrupt
         moved.append(target)
+        if len(moved) == after + 1:
+            raise KeyboardInterrupt
         replace(source, target)
 
+    def begin(folder: Path) -> None:
+        (folder / "another.txt").write_text("new")
+        monkeypatch.setattr(os, "replace", interrupted)
+
     with pytest.raises(KeyboardInterrupt):
-        write_result(out, lambda: monkeypatch.setattr(os, "replace", interrupted))
+        write_result(out, begin)
     assert contents(out) == before
     assert list(out.parent.iterdir()) == [out]
 
 
-def test_killed_run_leaves_everything_as_it_was_and_does_not_disturb_the_next(out: Path) -> None:
+def test_a_killed_run_leaves_everything_as_it_was_and_does_not_disturb_the_next(out: Path) -> None:
     before = contents(out)
     script = textwrap.dedent(
         f"""
@@ -192,59 +188,79 @@ def test_killed_run_leaves_everything_as_it_was_and_does_not_disturb_the_next(ou
         run.wait(timeout=10.0)
     assert contents(out) == before
     start = time.monotonic()
-    with result_folder(out) as folder:
-        assert contents(folder) == {}
-        fill(folder, "new")
+    write_result(out)
     assert time.monotonic() - start < 1.0
-    assert contents(out)["calibrated.urdf"] == "new"
+    assert contents(out) == REPLACED
 
 
-def test_file_is_refused_as_output_folder(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    with (
-        pytest.raises(UsageError, match="found a file of that name, needed a folder"),
-        result_folder(tmp_path / "out"),
-    ):
-        raise AssertionError("the block must not run")
-    assert (tmp_path / "out").read_text() == "mine"
+def test_what_a_killed_run_left_behind_does_not_make_a_folder_foreign(tmp_path: Path) -> None:
+    (tmp_path / ".out.x.legcal-part").mkdir()
+    check_destination(tmp_path)
 
 
-@pytest.mark.parametrize("result", [None, "{", "[]", '{"other": 1}'])
-def test_folder_with_other_files_is_refused(tmp_path: Path, result: str | None) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    if result is not None:
-        (tmp_path / "result.json").write_text(result)
-    with pytest.raises(UsageError, match=r"found a folder with other files and no result\.json"):
-        check_destination(tmp_path)
-    assert (tmp_path / "notes.txt").read_text() == "mine"
+REFUSED: dict[str, tuple[dict[str, str | None], str, str]] = {  # files, destination, named
+    "a file": ({"out": "mine"}, "out", "out: .*found a file"),
+    "below a file": ({"file": "mine"}, "file/out", "file is a file"),
+    "other files": ({"notes.txt": "mine"}, "", r"other files and no result\.json"),
+    "no JSON": ({"notes.txt": "mine", "result.json": "{"}, "", r"no result\.json"),
+    "other JSON": ({"notes.txt": "mine", "result.json": '{"a": 1}'}, "", r"no result\.json"),
+    "a list": ({"notes.txt": "mine", "result.json": "[]"}, "", r"no result\.json"),
+    "a folder in the way": (
+        {"out/result.json": RESULT, "out/calibrated.urdf/a.txt": "mine"},
+        "out",
+        r"calibrated\.urdf, which is a folder",
+    ),
+    "a broken link": ({"link": None}, "link", "a broken link"),
+}
 
 
-def test_path_below_a_file_and_broken_link_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(UsageError, match="file is a file, needed a path"):
-        check_destination(tmp_path / "file" / "out")
-    (tmp_path / "link").symlink_to(tmp_path / "none")
-    with pytest.raises(UsageError, match="found a broken link"):
-        check_destination(tmp_path / "link")
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_place_that_is_not_free_is_refused_and_stays(case: str, tmp_path: Path) -> None:
+    files, destination, named = REFUSED[case]
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if text is None:
+            path.symlink_to(tmp_path / "none")
+        else:
+            path.write_text(text)
+    before = contents(tmp_path)
+    with pytest.raises(UsageError, match=named):
+        write_result(tmp_path / destination)
+    assert contents(tmp_path) == before
 
 
-def test_folder_without_permission_is_refused(
+def test_folders_without_permission_and_without_a_name_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    with pytest.raises(UsageError, match="an empty text, needed the path of a folder"):
+        output_path("")
+    assert output_path(".") == Path()
     monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(UsageError, match="cannot be written to, needed permission to create"):
+    with pytest.raises(UsageError, match="needed permission"):
         check_destination(tmp_path / "out")
 
 
-def test_an_empty_text_is_no_output_folder() -> None:
-    with pytest.raises(UsageError, match="found an empty text, needed the path of a folder"):
-        output_path("")
-    assert output_path(".") == Path()
+@pytest.mark.parametrize(
+    ("text", "units", "value"),
+    [
+        ("2mm", LENGTH, 2e-3),
+        ("2 um", LENGTH, 2e-6),
+        ("1e-3m", LENGTH, 1e-3),
+        (".5cm", LENGTH, 5e-3),
+        ("180deg", ANGLE, 3.141592653589793),
+        ("2mrad", ANGLE, 2e-3),
+        ("0.1px", PIXELS, 0.1),
+        ("0", LENGTH, 0.0),
+    ],
+)
+def test_quantities_are_in_si(text: str, units: dict[str, float], value: float) -> None:
+    assert parse_quantity(text, units, "--x") == pytest.approx(value, rel=1e-15)
 
 
-def test_a_folder_in_the_place_of_a_file_is_refused(out: Path) -> None:
-    (out / "calibrated.urdf").unlink()
-    (out / "calibrated.urdf").mkdir()
-    with pytest.raises(UsageError, match=r"found calibrated\.urdf, which is a folder"):
-        write_result(out, lambda: None)
-    assert (out / "calibrated.urdf").is_dir()
+@pytest.mark.parametrize(
+    "text", ["2", "2deg", "mm", "", "2 mm mm", "nan mm", "inf", "1e999m", "-2mm"]
+)
+def test_a_quantity_without_its_unit_or_below_zero_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"--x .*(number and its unit.*0\.5mm|negative '-2mm')"):
+        parse_quantity(text, LENGTH, "--x")
