@@ -96,7 +96,7 @@ def test_tables_fit_80_columns_and_say_the_verdict(
     assert run(monkeypatch, name, *options(chosen)) == 0
     out = capsys.readouterr().out
     assert max(len(line) for line in out.splitlines()) <= 80
-    assert "dentifiable: everything at once" in out or "NOT identifiable" in out
+    assert "dentifiable: the joint fit" in out or "NOT identifiable" in out
     assert ("smallest sets of views" in out) == (not views)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from legcal.errors import OutOfResources
+from legcal.errors import OutOfResources, UsageError
 from legcal.processors import processors
 
 MOST_WORKERS = 4  # processes that search images; each takes about 150 MB
@@ -30,9 +30,24 @@ DatasetArgument = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")
 ]
+
+
+def _at_least_one(workers: int | None) -> int | None:
+    if workers is not None and workers < 1:
+        raise UsageError(
+            f"--workers could not be used: found {workers}, needed 1 or more processes; give "
+            "another number or leave it out."
+        )
+    return workers
+
+
 WorkersOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Processes that search images; by default as many as calibrate."),
+    typer.Option(
+        callback=_at_least_one,
+        help="Processes: as many as there are cores (for images at most "
+        f"{MOST_WORKERS}) without it. Results do not depend on it.",
+    ),
 ]
 
 
@@ -40,9 +55,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
-def image_workers(asked: int | None = None) -> int:
-    """Return in how many processes to search images."""
-    return asked or min(processors(), MOST_WORKERS)
+def image_workers(workers: int | None = None) -> int:
+    """Return the number of processes that search images, by default few: each takes memory."""
+    return workers or min(processors(), MOST_WORKERS)
 
 
 def show(
@@ -73,7 +88,7 @@ def print_json(document: dict[str, Any]) -> None:
 
 @contextmanager
 def _writing_to_stdout() -> Iterator[None]:
-    """Say what keeps the output from being written; a reader that has left is none of that."""
+    """Refuse a stdout that cannot be written to; a reader that has left raises BrokenPipeError."""
     found = "that it is closed"
     if sys.stdout is not None:
         try:
@@ -91,7 +106,7 @@ def _writing_to_stdout() -> Iterator[None]:
 
 
 def _leave_stdout() -> None:
-    """Let what is left in the buffer of stdout go nowhere, so that nothing fails there again."""
+    """Discard what is left in the buffer of stdout, so that nothing fails there again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.stdout = None
 

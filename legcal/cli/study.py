@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from legcal.cli.options import JsonOption, print_json, print_table
+from legcal.cli.options import JsonOption, WorkersOption, print_json, print_table
 from legcal.errors import UsageError
 from legcal.processors import processors
 
 RunsOption = Annotated[int, typer.Option(help="Number of runs.")]
 SeedOption = Annotated[int, typer.Option(help="Seed of all runs.")]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option(help="Processes; all cores without it. Results do not depend on it."),
-]
 OutputOption = Annotated[
     Path | None,
     typer.Option(
@@ -33,18 +30,22 @@ MachineOption = Annotated[
     typer.Option(
         "--machine",
         metavar="NAME",
-        help="6-spu-noncoplanar, 6-spu-coplanar, 3-upu-tilted or 3-rpr; may be repeated, all "
-        "without it.",
+        help="A machine of the benchmark; may be repeated, all without it.",
     ),
 ]
-ModelOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--machine",
-        metavar="NAME",
-        help="The name of a shipped model; may be repeated, all without it.",
+
+_BENCHMARKS = {  # studies of earlier versions: the program, its number of runs, what it measures
+    "bound": (
+        "bound.py", 2000, "errors of a calibration, and its sigmas, beside the Cramer-Rao bound"
     ),
-]
+    "convergence": (
+        "convergence.py", 100, "where calibrations end that start 5 mm and 3 deg off in everything"
+    ),
+    "classes": (
+        "classes_study.py", 200, "shipped machines by the four steps and by the fit, beside the "
+        "bound"
+    ),
+}  # fmt: skip
 
 study = typer.Typer(
     help="Measure on many simulated machines what is claimed; their truth is known.",
@@ -73,7 +74,7 @@ def paper(
             PaperStudy(noise),
             runs,
             seed=seed,
-            workers=processors() if workers is None else workers,
+            workers=workers or processors(),
             output=output,
             progress=progress,
         )
@@ -87,67 +88,31 @@ def paper(
     print_table(Group(result.summary.table(), *where))
 
 
-@study.command()
-def bound(
-    runs: RunsOption = 2000,
-    machine: MachineOption = None,
-    seed: SeedOption = 0,
-    workers: WorkersOption = None,
-    output: OutputOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Name the benchmark: errors of a calibration, and its sigmas, beside the Cramer-Rao bound."""
-    raise _moved("bound", "bound.py", runs, machine, seed, workers, output, as_json=as_json)
+def _name_benchmark(name: str, program: str, n_runs: int) -> Callable[..., None]:
+    """Return the command of a study that is a benchmark now: it takes the options and names it."""
+
+    def command(
+        runs: RunsOption = n_runs,
+        machine: MachineOption = None,
+        seed: SeedOption = 0,
+        workers: WorkersOption = None,
+        output: OutputOption = None,
+        as_json: JsonOption = False,
+    ) -> None:
+        words = ["python", f"benchmarks/{program}", "--runs", f"{runs}", "--seed", f"{seed}"]
+        words += [word for one in machine or () for word in ("--machine", one)]
+        words += [] if workers is None else ["--workers", f"{workers}"]
+        words += [] if output is None else ["-o", str(output)]
+        words += ["--json"] * as_json
+        raise UsageError(
+            f"The study {name} could not be run: found a command of an earlier version, needed the "
+            f"benchmark of the source tree; run {shlex.join(words)}."
+        )
+
+    return command
 
 
-@study.command()
-def convergence(
-    runs: RunsOption = 100,
-    machine: MachineOption = None,
-    seed: SeedOption = 0,
-    workers: WorkersOption = None,
-    output: OutputOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Name the benchmark: where calibrations end that start 5 mm and 3 deg off in everything."""
-    raise _moved(
-        "convergence", "convergence.py", runs, machine, seed, workers, output, as_json=as_json
-    )
-
-
-@study.command()
-def classes(
-    runs: RunsOption = 200,
-    machine: ModelOption = None,
-    seed: SeedOption = 0,
-    workers: WorkersOption = None,
-    output: OutputOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Name the benchmark: shipped machines by the four steps and by the fit, beside the bound."""
-    raise _moved(
-        "classes", "classes_study.py", runs, machine, seed, workers, output, as_json=as_json
-    )
-
-
-def _moved(
-    name: str,
-    program: str,
-    runs: int,
-    machines: list[str] | None,
-    seed: int,
-    workers: int | None,
-    output: Path | None,
-    *,
-    as_json: bool,
-) -> UsageError:
-    """Return that a study is a benchmark, with the command line that runs it as asked for."""
-    words = ["python", f"benchmarks/{program}", "--runs", f"{runs}", "--seed", f"{seed}"]
-    words += [word for machine in machines or () for word in ("--machine", machine)]
-    words += [] if workers is None else ["--workers", f"{workers}"]
-    words += [] if output is None else ["-o", str(output)]
-    words += ["--json"] * as_json
-    return UsageError(
-        f"The study {name} could not be run: found a command of an earlier version, needed the "
-        f"benchmark of the source tree; run {shlex.join(words)}."
+for _name, (_program, _n_runs, _what) in _BENCHMARKS.items():
+    study.command(_name, help=f"Name the benchmark: {_what}.")(
+        _name_benchmark(_name, _program, _n_runs)
     )

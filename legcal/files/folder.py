@@ -112,8 +112,8 @@ class OutputKind:
     """A kind of output folder."""
 
     noun: str  # what the folder holds
-    marker: str  # the JSON document that legcal leaves in such a folder, and a key in it
-    key: str  # the JSON document that legcal leaves in such a folder, and a key in it
+    marker: str  # the JSON document that legcal leaves in such a folder
+    key: str  # a key of that document
 
     def is_in(self, folder: Path) -> bool:
         """Say whether a folder holds an output of this kind that legcal wrote."""

@@ -79,6 +79,7 @@ from .parameters import vector_of as vector_of
 from .urdf import Urdf as Urdf
 from .urdf import UrdfPatch as UrdfPatch
 from .urdf import number_list as number_list
+from .urdf import origin_of as origin_of
 from .urdf import parse_robot as parse_robot
 from .written import Axes as Axes
 from .written import calibrated_axis as calibrated_axis

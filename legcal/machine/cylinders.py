@@ -4,20 +4,18 @@ In a plane the kinematics say nothing of heights, and joint origins may stand an
 axes. A camera sees the legs where their cylinders are.
 """
 
-import io
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, product
 from legcal.machine.bodies import Bodies
 from legcal.machine.classification import LegChain, Step
 from legcal.machine.leg import Cylinder, Leg
-from legcal.machine.urdf import Urdf, parse_robot
+from legcal.machine.urdf import Urdf, origin_of, parse_robot
 
 PARALLEL = 1e-6
 COAXIAL = 1e-4  # [m], at both ends of a cylinder
@@ -66,44 +64,15 @@ def visual_cylinders(urdf: Urdf) -> list[VisualCylinder]:
     """Return the visual cylinders of a tree."""
     if not urdf.has_cylinders:
         return []
-    from yourdfpy import URDF  # half a second: only where there is something to read
-
-    robot: Any = URDF.load(
-        io.BytesIO(_cylinders_alone(urdf)), build_scene_graph=False, load_meshes=False
-    ).robot
     found = []
-    for link in robot.links:
-        for visual in link.visuals:
-            cylinder = visual.geometry.cylinder
-            if cylinder is not None:
-                T = np.eye(4) if visual.origin is None else np.asarray(visual.origin)
-                pose = RigidTransform.from_matrix(T)
-                size = float(cylinder.radius), float(cylinder.length)
-                found.append(VisualCylinder(str(link.name), pose, *size))
-    return found
-
-
-def _cylinders_alone(urdf: Urdf) -> bytes:
-    """Return the file with nothing but its cylinders: the rest may hold anything."""
-    alone = etree.Element("robot", {"name": "cylinders"})
     for link in parse_robot(urdf.path, urdf.content).findall("link"):
-        kept = etree.SubElement(alone, "link", {"name": link.get("name", "")})
         for visual in link.findall("visual"):
             cylinder = visual.find("geometry/cylinder")
             if cylinder is not None:
-                shown = etree.SubElement(kept, "visual")
-                origin = visual.find("origin")
-                if origin is not None:
-                    etree.SubElement(shown, "origin", _attributes(origin, "xyz", "rpy"))
-                geometry = etree.SubElement(shown, "geometry")
-                size = _attributes(cylinder, "radius", "length")
-                etree.SubElement(geometry, "cylinder", size)
-    return etree.tostring(alone)
-
-
-def _attributes(element: etree._Element, *names: str) -> dict[str, str]:
-    """Return those attributes that an element has."""
-    return {name: value for name in names if (value := element.get(name)) is not None}
+                radius, length = (float(cylinder.get(name, "")) for name in ("radius", "length"))
+                name = link.get("name", "")
+                found.append(VisualCylinder(name, origin_of(visual), radius, length))
+    return found
 
 
 def _along(

@@ -346,9 +346,6 @@ def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> 
     limits = _limits(element, kind, problems, travel_needed)
     if len(problems) > n_before:
         return None
-    origin = element.find("origin")
-    xyz = _vector(origin, "xyz", (0.0, 0.0, 0.0))
-    rpy = _vector(origin, "rpy", (0.0, 0.0, 0.0))
     ends = [element.find(tag) for tag in ("parent", "child")]
     parent, child = ("" if end is None else end.get("link", "") for end in ends)
     return UrdfJoint(
@@ -356,10 +353,19 @@ def _joint(element: etree._Element, problems: Problems, travel_needed: bool) -> 
         type=cast("JointType", kind),
         parent=parent,
         child=child,
-        T_parent_origin=motion_of(Rotation.from_euler("xyz", rpy).as_matrix(), xyz),
+        T_parent_origin=origin_of(element),
         axis=axis,
         limits=limits,
         line=cast("int", element.sourceline),
+    )
+
+
+def origin_of(element: etree._Element) -> RigidTransform:
+    """Return the pose that the ``<origin>`` of a joint or a visual gives."""
+    origin = element.find("origin")
+    rpy = _vector(origin, "rpy", (0.0, 0.0, 0.0))
+    return motion_of(
+        Rotation.from_euler("xyz", rpy).as_matrix(), _vector(origin, "xyz", (0.0, 0.0, 0.0))
     )
 
 

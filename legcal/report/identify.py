@@ -48,9 +48,9 @@ _FAR, _HALF_TURN = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 def identify_table(report: Identifiability) -> RenderableType:
     """Return an identifiability report as people read it, on 80 columns."""
-    weak = [("step by step", report.staged), ("everything at once", report.full)]
+    weak = [("step by step", report.staged), ("by the joint fit", report.full)]
     if _directions(report.staged) == _directions(report.full):
-        weak = [("step by step or at once", report.full)]
+        weak = [("step by step or by the joint fit", report.full)]
     return blocks(
         _heading(report),
         None if report.recommendation is None else _recommendation(report),
@@ -112,14 +112,14 @@ def _conditions(report: Identifiability) -> Table:
 
 
 def _ranks(report: Identifiability) -> Table:
-    """Return the ranks of the steps and of everything at once."""
+    """Return the ranks of the steps and of the joint fit."""
     by_name = {(s.name, s.criteria): s for s in report.steps}
     rows = []
     for name, title in _STEPS.items():
         default, printed = by_name[name, "default"], by_name[name, "literal"]
         other = f"{printed.rank} of {printed.of}"
         rows.append((title, str(default.rank), str(default.of), other))
-    for title, ranks in (("the four steps", report.staged), ("everything at once", report.full)):
+    for title, ranks in (("the four steps", report.staged), ("the joint fit", report.full)):
         rows.append((title, str(ranks.rank), str(ranks.of), ""))
     return table("rank of the equations", ">rank", ">of", "as printed", rows=rows)
 
@@ -171,7 +171,7 @@ def _board(board: BoardReport, of: int) -> str:
         text = f"{subject}{where} is needed for {needed}; it raises"
     text += (
         f" the ranks from {before.staged_rank} to {after.staged_rank} of {of} step by step, and "
-        f"from {before.full_rank} to {after.full_rank} at once"
+        f"from {before.full_rank} to {after.full_rank} in the joint fit"
     )
     if not board.mends:
         return f"{text}."
@@ -204,7 +204,7 @@ def _remedies(report: Identifiability) -> Table:
         )
         for r in report.remedies
     ]
-    return table("what would mend it", ">steps", ">at once", "", rows=rows)
+    return table("what would mend it", ">steps", ">joint fit", "", rows=rows)
 
 
 def _verdict(report: Identifiability) -> list[str | RenderableType]:
@@ -213,7 +213,7 @@ def _verdict(report: Identifiability) -> list[str | RenderableType]:
     lines: list[str | RenderableType] = []
     if report.identifiable:
         rest = f", but for {harmless} directions that do not move the platform" if harmless else ""
-        lines.append(f"Identifiable: everything at once determines all parameters{rest}.")
+        lines.append(f"Identifiable: the joint fit determines all parameters{rest}.")
         if not report.staged.complete:
             lines.append("The steps alone do not: calibration starts from the nominal model.")
     else:

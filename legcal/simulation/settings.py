@@ -479,12 +479,15 @@ def _refuse_other_levels(request: Request) -> None:
     problems = []
     for option in fields(request):
         level = option.metadata["only"]
-        given = level not in (None, request.level) and getattr(request, option.name) is not None
+        value = getattr(request, option.name)
         of_corners = request.level is Level.AXES and request.board is not None
-        if given and not (option.name == "pixel_noise" and of_corners):
+        if level in (None, request.level) or value is None:
+            continue
+        if not (option.name == "pixel_noise" and of_corners):
             flags = option.metadata["option"]["flags"] or (f"--{option.name.replace('_', '-')}",)
+            given = flags[0].split("/")[1 if value is False else 0]
             problems.append(
-                f"{flags[0].replace('/', ' or ')} could not be used: found --level "
+                f"{given} could not be used: found --level "
                 f"{request.level}, needed --level {level}, the only one that it has an effect on; "
                 "leave it out or give that level."
             )

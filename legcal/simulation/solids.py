@@ -17,7 +17,16 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from legcal.errors import ModelError
 from legcal.geometry import Array, BoolArray, IntArray, distance_to_line, product
-from legcal.machine import COAXIAL, Configurations, Leg, Machine, Urdf, number_list, parse_robot
+from legcal.machine import (
+    COAXIAL,
+    Configurations,
+    Leg,
+    Machine,
+    Urdf,
+    number_list,
+    origin_of,
+    parse_robot,
+)
 
 _SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",), "box": ("size",)}
 
@@ -136,31 +145,26 @@ def _check_mesh(urdf_path: Path, element: etree._Element) -> None:
 
 
 def _shown(urdf_path: Path, visual: etree._Element) -> tuple[Shape, RigidTransform]:
-    """Return the shape of a visual and T_link_shape, as yourdfpy has them.
+    """Return the shape of a visual and T_link_shape; the vertices of a mesh are in the link.
 
-    A mesh is scaled and placed by yourdfpy, its vertices are those in the link. ValueError says
-    what was found and needed where its file holds none.
+    ValueError says what was found and needed where its file holds none.
     """
-    from yourdfpy import URDF  # half a second: only where there is something to read
-
-    if visual.find("geometry/mesh") is not None:
+    shape = visual.find("geometry")[0]  # type: ignore[index]
+    if shape.tag == "mesh":
         return _mesh(urdf_path, visual), RigidTransform.identity()
-    alone = io.BytesIO(_alone(visual))
-    robot: Any = URDF.load(alone, build_scene_graph=False, load_meshes=False).robot
-    (read,) = robot.links[0].visuals
-    T = RigidTransform.from_matrix(np.asarray(read.origin, dtype=float))
-    cylinder, sphere = read.geometry.cylinder, read.geometry.sphere
-    if cylinder is not None:
-        return Cylinder(float(cylinder.radius), float(cylinder.length)), T
-    if sphere is not None:
-        return Sphere(float(sphere.radius)), T
-    x, y, z = (float(side) for side in read.geometry.box.size)
+    numbers = [float(x) for name in _SIZES[str(shape.tag)] for x in shape.get(name, "").split()]
+    T = origin_of(visual)
+    if shape.tag == "cylinder":
+        return Cylinder(*numbers), T
+    if shape.tag == "sphere":
+        return Sphere(*numbers), T
+    x, y, z = numbers
     return Box((x, y, z)), T
 
 
 def _mesh(urdf_path: Path, visual: etree._Element) -> Mesh:
     """Return the triangles of a mesh file in the link, from the scene that yourdfpy makes of it."""
-    from yourdfpy import URDF
+    from yourdfpy import URDF  # half a second: only where there is a mesh
 
     name = visual.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
     try:

@@ -45,11 +45,20 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 _DEEP, _FULL = 12, 16  # bits of the data in files of 16
 _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I"}  # struct's letters by the type numbers of TIFF
+_TIFF_FORMATS = {2: "signed", 3: "floating-point"}  # of samples, others than unsigned
 _TIFF_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}  # others have one
 
 
+_COMPLETE = "a complete PNG, JPEG or TIFF file"
+_LEVELS = "8 or 16 bit grey levels or colours"
+
+
 class _BadImage(ValueError):
-    """What is wrong with the bytes of an image file, as the 'found' part of a sentence."""
+    """What is wrong with the bytes of an image file: found and needed, as parts of a sentence."""
+
+    def __init__(self, found: str, needed: str = _COMPLETE) -> None:
+        super().__init__(found)
+        self.needed = needed
 
 
 @dataclass(frozen=True)
@@ -72,7 +81,7 @@ def read_image(path: Path, camera: Camera, where: str = "") -> Image:
         pixels = None
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         found = "data that cannot be decoded" if pixels is None else f"{pixels.dtype} pixels"
-        raise DatasetError(_problem(path, where, found, "8 or 16 bit grey levels or colours"))
+        raise DatasetError(_problem(path, where, found, _LEVELS))
     levels = pixels.astype(np.float32)
     if pixels.dtype == np.uint16:
         levels *= np.float32(255.0 / (2 ** _depth(pixels) - 1))
@@ -113,17 +122,16 @@ def image_size(content: bytes) -> ImageSize:
 
 def _complete_content(path: Path, camera: Camera, where: str) -> tuple[bytes, str | None]:
     """Return the bytes of an image file, and what is wrong with them if anything."""
-    needed = "a complete PNG, JPEG or TIFF file"
     if not os.path.isfile(path):
         found = "something that is not a file" if os.path.exists(path) else "no such file"
-        return b"", _problem(path, where, found, needed, "correct the path or remove the row")
+        return b"", _problem(path, where, found, _COMPLETE, "correct the path or remove the row")
     try:
         content = path.read_bytes()
         size = image_size(content)
     except OSError as error:
         return b"", _problem(path, where, f"'{error.strerror}'", "a readable file")
-    except ValueError as error:
-        return b"", _problem(path, where, str(error), needed)
+    except _BadImage as error:
+        return b"", _problem(path, where, str(error), error.needed)
     if (size.width, size.height) != (camera.width, camera.height):
         return b"", _problem(
             path,
@@ -201,6 +209,10 @@ def _tiff_size(content: bytes) -> ImageSize:
         raise _BadImage(f"a TIFF cut off after {len(content)} bytes")
     if not (starts and lengths and tags.get(256) and tags.get(257)):
         raise _BadImage("a TIFF without a picture")
+    bits, form = max(tags.get(258, (1,))), max(tags.get(339, (1,)))
+    if bits > _FULL or form in _TIFF_FORMATS:
+        kind = _TIFF_FORMATS.get(form, "integer")
+        raise _BadImage(f"a TIFF of {bits} bit {kind} pixels", _LEVELS)
     return ImageSize(tags[256][0], tags[257][0])
 
 

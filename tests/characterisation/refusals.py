@@ -213,6 +213,12 @@ def picture(name: str, width: int, height: int) -> Edit:
     return edit
 
 
+def floating(name: str) -> Edit:
+    """Write a grey TIFF of floating-point pixels."""
+    image = np.full((48, 64), 90.0, dtype=np.float32)
+    return text(name, cv2.imencode(".tiff", image)[1].tobytes())
+
+
 def cut(name: str, by: int) -> Edit:
     """Cut off the end of a file."""
 
@@ -262,7 +268,7 @@ def _use() -> Iterable[Refusal]:
         ("empty-study", "study paper -o ''", ("-o",)),
         ("criteria", "calibrate x -o {out} --criteria best", ("--criteria", "best", "literal")),
         ("transformation", "calibrate x -o {out} --transformation q", ("--transformation",)),
-        ("workers", "detect x -o {out} --workers 0", ("--workers",)),
+        ("workers", "detect x -o {out} --workers 0", ("--workers", "found 0")),
         ("noise-nowhere", "noise nowhere", ("nowhere",)),
         ("detect-nowhere", "detect nowhere -o {out}", ("nowhere",)),
         ("identify-nowhere", "identify nowhere.yaml", ("nowhere.yaml",)),
@@ -347,7 +353,9 @@ def _options() -> Iterable[Refusal]:
         ("photographs-noise", "--pixel-noise 0.2px", ("--pixel-noise", "outlines")),
         ("axes-blur", "--level axes --blur 1", ("--blur", "axes", "photographs")),
         ("outlines-table", "--level outlines --table-noise radians", ("--table-noise", "axes")),
-        ("outlines-gamma", "--level outlines --no-gamma", ("--no-gamma", "photographs")),
+        ("outlines-gamma", "--level outlines --no-gamma", ("--no-gamma could", "photographs")),
+        ("outlines-gamma-given", "--level outlines --gamma", ("--gamma could", "photographs")),
+        ("axes-grey", "--level axes --grey", ("--grey could", "photographs")),
         ("bits", "--bits 12", ("12", "8", "16")),
         ("blur", "--blur -1", ("blur", "-1")),
         ("clutter", "--clutter -2", ("clutter", "-2")),
@@ -362,7 +370,7 @@ def _options() -> Iterable[Refusal]:
     study: list[tuple[str, str, tuple[str, ...]]] = [
         ("runs", "convergence --runs 0", ("0",)),
         ("seed", "bound --seed -1", ("-1",)),
-        ("workers", "paper --workers 0", ("0",)),
+        ("workers", "paper --workers 0", ("--workers", "found 0")),
         ("machine", "bound --machine 4-rpr", ("4-rpr", "3-rpr")),
         ("class", "classes --machine 6-spu-coplanar", ("6-spu-coplanar", "hexapod")),
     ]
@@ -578,6 +586,11 @@ def _measurements() -> Iterable[Refusal]:
         ("gif", text("images/c1_1.png", b"GIF89a"), ("row 1", "c1_1.png", "PNG")),
         ("empty-image", text("images/c1_1.png", b""), ("row 1", "c1_1.png")),
         ("cut-image", cut("images/c1_2.png", 30), ("row 2", "c1_2.png")),
+        (
+            "float-image",
+            (floating("images/c1_2.png"), remove("images/c1_1.png")),
+            ("row 1", "row 2", "c1_2.png", "32 bit floating-point", "8 or 16"),
+        ),
         ("image-size", picture("images/c2_1.png", 63, 48), ("row 3", "63 x 48", "64 x 48")),
         (
             "images-at-once",
