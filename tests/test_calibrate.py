@@ -270,7 +270,7 @@ def test_an_interrupted_run_leaves_nothing_behind(
     def interrupted(*args: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("legcal.calibration.result.write_observations", interrupted)
+    monkeypatch.setattr("legcal.calibration.result_folder.write_observations", interrupted)
     with pytest.raises(KeyboardInterrupt):
         calibrate(example_run.folder, output=tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from legcal import calibrate, check
 from legcal.calibration import Result
-from legcal.calibration.fitting import Found, observe_and_fit
+from legcal.calibration.pipeline import Estimate, estimate_session
 from legcal.cli.app import app
 from legcal.errors import DatasetError, LegcalError, NotVisible, UsageError
 from legcal.machine import geometries, load_mechanism, moved_legs, parametrization_of, vector_of
@@ -272,10 +272,12 @@ def test_what_is_said_of_the_images_is_passed_on(
     left_out = "view c1, image k01: was left out: the image is black; take it again."
     doubt = "view c1, image k02: its reading does not agree with its outlines."
 
-    def noted(*arguments: Any) -> Found:
-        return replace(observe_and_fit(*arguments), notes=(left_out, doubt), doubts=(doubt,))
+    def noted(*arguments: Any) -> Estimate:
+        return replace(
+            estimate_session(*arguments), image_notes=(left_out, doubt), fit_notes=(doubt,)
+        )
 
-    monkeypatch.setattr("legcal.calibration.checking.observe_and_fit", noted)
+    monkeypatch.setattr("legcal.calibration.verification.estimate_session", noted)
     found = check(images, result)
     assert [note for note in found.notes if "view c1, image" in note] == [left_out, doubt]
     assert set(found.document()["notes"]) >= {left_out, doubt, *found.solution.notes}

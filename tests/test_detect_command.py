@@ -146,7 +146,7 @@ def test_legs_are_drawn_by_the_radii_that_were_searched_by(
         wrong = replace(photographs, machine=photographs.machine.with_cylinders(cylinders))
         return replace(observe(photographs, *others), photographs=wrong)
 
-    monkeypatch.setattr("legcal.calibration.detecting.observe", thicker)
+    monkeypatch.setattr("legcal.calibration.outline_detection.observe", thicker)
     found = detect(one_image.path)
     legs = {leg.leg: leg for leg in found.predicted(0)}
     assert len(legs) == 6

@@ -13,11 +13,10 @@ from hexapod_example import Run
 from spoiled import Picture, Spoiled, spoiled
 
 from legcal import calibrate, detect, load_dataset
-from legcal.calibration.disagreement import disagreeing_images
-from legcal.calibration.fitting import rough_scene
-from legcal.calibration.joint_fit.parameters import Choices
 from legcal.calibration.joint_fit.rounds import DISAGREES
-from legcal.calibration.run import CalibrationRun, start_run
+from legcal.calibration.outlier_images import outlier_images
+from legcal.calibration.pipeline import nominal_scene
+from legcal.calibration.session import Session, start_session
 from legcal.errors import NotIdentifiable
 from legcal.perception.diagnostics import (
     NOTHING_LIKE,
@@ -171,14 +170,14 @@ def test_nothing_else_is_said_and_the_other_images_are_used(
             assert detected.outlines.used[own].mean() > 0.5
 
 
-def _work(made: Spoiled) -> CalibrationRun:
+def _work(made: Spoiled) -> Session:
     dataset = load_dataset(made.write())
-    return start_run(dataset, in_turn, no_progress, Choices(), use_cache=False)
+    return start_session(dataset, in_turn, no_progress)
 
 
 def _observed(made: Spoiled) -> Observed:
     work = _work(made)
-    scene, _ = rough_scene(work)
+    scene, _ = nominal_scene(work)
     return observe(work.photographs, scene, no_progress)
 
 
@@ -186,7 +185,7 @@ def test_images_are_read_once_to_be_looked_at_and_once_to_be_measured(tmp_path: 
     made = spoiled(tmp_path / "read", 4, ("c1", "c2"))
     del made.entry["views"]["c2"]["T_base_camera"]
     work = _work(made)
-    scene, _ = rough_scene(work)
+    scene, _ = nominal_scene(work)
     photographs, read = work.photographs, list[int]()
 
     def load(row: int) -> Any:
@@ -227,7 +226,7 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
     (alone,) = np.flatnonzero(view == 1)[:1].tolist()
     found = {row: OutlineCount(11, 12) for row in np.flatnonzero(view == 0).tolist()}
     found[alone] = OutlineCount(1, 12)
-    search = photographs.search(rough_scene(work)[0])
+    search = photographs.search(nominal_scene(work)[0])
     usual = _usual(search, observed.placement, found, [alone], in_turn)
     assert usual[1] > 0.3
     reason, note = judged(work.measurements, alone, Explanation(0.0), usual, found)
@@ -353,7 +352,7 @@ def test_a_reading_that_the_outlines_contradict_is_named(
         for is_out, why in zip(out.tolist(), o.reason, strict=True)
     )
     fit = replace(solution, outlines=replace(o, used=o.used & ~out, reason=reason))
-    notes = disagreeing_images(replace(measurements, q=q), dataset.machine, fit)
+    notes = outlier_images(replace(measurements, q=q), dataset.machine, fit)
     assert list(notes) == [row]
     assert notes[row].startswith("view c1, image images/c1_k02.jpg: ")
     assert re.search(words, notes[row]), notes

@@ -19,7 +19,6 @@ from hexapod_session import (
 from simulated import settings
 
 import legcal
-from legcal.calibration.detecting import detect
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.gammas import (
     FEIGNED,
@@ -31,6 +30,7 @@ from legcal.calibration.joint_fit.gammas import (
     next_gammas,
 )
 from legcal.calibration.joint_fit.observations import known_gammas
+from legcal.calibration.outline_detection import detect
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines

@@ -35,10 +35,10 @@ def test_the_asked_part_of_the_images_is_kept_aside_view_by_view(
 ) -> None:
     dataset = _example()
     split = split_images(dataset, fraction)
-    assert len(split.kept_aside) == count
-    both = np.concatenate([split.fitted, split.kept_aside])
+    assert len(split[1]) == count
+    both = np.concatenate([split[0], split[1]])
     assert sorted(both.tolist()) == list(range(45))
-    aside = np.bincount(dataset.measurements.view[split.kept_aside], minlength=3)
+    aside = np.bincount(dataset.measurements.view[split[1]], minlength=3)
     assert aside.max() <= np.ceil(15 * fraction)
 
 
@@ -46,8 +46,8 @@ def test_images_of_one_pose_stay_together() -> None:
     m = _example().measurements
     shared = replace(m, pose=np.tile(np.arange(15), 3), q=np.tile(m.q[:15], (3, 1)))
     split = split_images(_with(shared), 0.2)
-    assert len(split.kept_aside) == 9
-    assert len(set(shared.pose[split.kept_aside].tolist())) == 3
+    assert len(split[1]) == 9
+    assert len(set(shared.pose[split[1]].tolist())) == 3
 
 
 def test_the_choice_does_not_depend_on_the_order_of_the_rows() -> None:
@@ -56,7 +56,7 @@ def test_the_choice_does_not_depend_on_the_order_of_the_rows() -> None:
     order = Order(rows, np.array([2, 0, 1]), np.arange(6))
     other = _with(reorder_measurements(given.measurements, order))
     chosen = split_images(given, 0.2), split_images(other, 0.2)
-    assert _names(given, chosen[0].kept_aside) == _names(other, chosen[1].kept_aside)
+    assert _names(given, chosen[0][1]) == _names(other, chosen[1][1])
 
 
 def test_a_leg_that_few_images_show_stays_in_them() -> None:
@@ -66,14 +66,14 @@ def test_a_leg_that_few_images_show_stays_in_them() -> None:
     table = replace(table, used=~rare)
     for fraction in (0.2, 0.6):
         split = split_images(replace(dataset, observations=table), fraction)
-        assert 4 in split.fitted  # alone in its view
-        assert set(split.fitted.tolist()) & {20, 21}
+        assert 4 in split[0]  # alone in its view
+        assert set(split[0].tolist()) & {20, 21}
 
 
 def test_the_part_that_is_fitted_is_a_dataset_of_its_own() -> None:
     dataset = _example()
     table = outlines_of(2, range(45), legs=(0, 1))
-    rows = split_images(dataset, 0.2).fitted
+    rows = split_images(dataset, 0.2)[0]
     part = dataset_at(replace(dataset, observations=table), rows)
     assert part.measurements.n_rows == 36
     assert part.measurements.pose.tolist() == list(range(36))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from legcal.calibration.changes import (
+from legcal.calibration.change_detection import (
     Change,
     Movement,
     difference,

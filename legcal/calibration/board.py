@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.joint_fit import SeenBoard, Solution
-from legcal.calibration.run import CalibrationRun
+from legcal.calibration.session import Session
 from legcal.data import (
     CORNERS_NAME,
     LEAST_CORNERS,
@@ -96,7 +96,7 @@ class BoardViews:
         )
 
 
-def observe_board(run: CalibrationRun) -> BoardViews | None:
+def observe_board(session: Session) -> BoardViews | None:
     """Return what the images of a session show of its board, None if it has none.
 
     Raises
@@ -106,17 +106,17 @@ def observe_board(run: CalibrationRun) -> BoardViews | None:
     DatasetError
         If what is shown cannot be the board that the dataset describes, or it has moved.
     """
-    dataset, measurements = run.dataset, run.measurements
+    dataset, measurements = session.dataset, session.measurements
     if dataset.board is None:
         return None
     used = [measurements.views[v] for v in np.unique(measurements.view).tolist()]
     needed = {view.name for view in used if view.hand_held}
     if dataset.corners is not None:
-        corners = run.order.reorder(dataset.corners)
+        corners = session.order.reorder(dataset.corners)
     else:
         rows = [row for row, image in enumerate(measurements.image) if image]
-        load = dataset.image_reader(run.order.rows.tolist())
-        corners = detect_corners(dataset.board, load, rows, run.pool, run.progress)
+        load = dataset.image_reader(session.order.rows.tolist())
+        corners = detect_corners(dataset.board, load, rows, session.pool, session.progress)
         shown = needed if len(corners) else {view.name for view in used}
         require_board(dataset.board, corners, load, measurements, shown)
     poses = camera_poses(corners, dataset.board, measurements, needed)

@@ -15,7 +15,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from legcal.calibration.canny import canny_parts
-from legcal.calibration.joint_fit import Choices
 from legcal.calibration.repeatability import (
     OUTLINE,
     QUANTITIES,
@@ -27,7 +26,7 @@ from legcal.calibration.repeatability import (
     leg_orientations,
     pool,
 )
-from legcal.calibration.run import start_run
+from legcal.calibration.session import start_session
 from legcal.data import Dataset, Measurements, Outlines, load_dataset, no_outlines
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
 from legcal.files import Document
@@ -345,14 +344,14 @@ def measure_noise(
     """
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     with worker_pool(workers) as pool_of_workers:
-        run = start_run(dataset, pool_of_workers, progress, Choices(), use_cache=False)
-        machine, measurements = run.machine, run.measurements
-        paths = [dataset.image_path(row) for row in run.order.rows.tolist()]
+        session = start_session(dataset, pool_of_workers, progress)
+        machine, measurements = session.machine, session.measurements
+        paths = [dataset.image_path(row) for row in session.order.rows.tolist()]
         has_image = np.array(
             [path is not None and os.path.exists(path) for path in paths], dtype=np.bool_
         )
         repeats = find_repeats(measurements, has_image, dataset.table_path)
-        every = replace(run.photographs, detect=np.flatnonzero(has_image), keep=no_outlines())
+        every = replace(session.photographs, detect=np.flatnonzero(has_image), keep=no_outlines())
         placement, outlines = _search(every, repeats, progress)
     methods = []
     for name, table in outlines.items():

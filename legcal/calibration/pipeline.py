@@ -1,48 +1,88 @@
-"""From photographs and readings to a calibrated mechanism: the whole method in one place."""
+"""From photographs and readings to a calibrated mechanism: the whole method in one place.
+
+1. Load the dataset; refuse it if its images cannot determine the parameters (section 2).
+2. Recognise: the legs are recognised in the images and each view's camera is placed by them.
+   Measure: the outlines of the legs are measured near where that has them (section 3.1).
+3. Four steps: joint centres, offsets and axes (3.2 to 3.5), where the images suffice.
+4. Joint fit of all parameters, started from the nominal model and from the steps.
+5. Measure again: all photographs are searched close to that fit and measured with all care, so
+   that nothing depends on where the search began, and 3 and 4 are repeated; once more where
+   outlines show the gamma of a camera that is not given.
+6. Judge what the platform gains, and write the result.
+
+Where a dataset has a table of axes in place of images, 2 and 5 have nothing to do. Held-out images
+are searched like the others, and not fitted. Everything from 2 to 5 works in canonical order;
+:meth:`Estimate.in_file_order` is where a result gets back the order of the files.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from legcal.calibration.board import board_notes
-from legcal.calibration.fitting import Found, observe_and_fit
+from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
+from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.judge import check_identifiable
 from legcal.calibration.joint_fit import (
     DEFAULT_SETTINGS,
+    ROUNDS,
     Choices,
+    EstimatedGamma,
     HeldOut,
     Prior,
     Solution,
     compare_held_out,
     in_file_order,
+    known_gammas,
     known_parameters,
+    next_gammas,
+    refine_from_best,
     resolve,
 )
-from legcal.calibration.result import write_result
-from legcal.calibration.run import CalibrationRun, start_run
+from legcal.calibration.outlier_images import outlier_images
+from legcal.calibration.result_folder import write_result
+from legcal.calibration.session import Options, Session, start_session
 from legcal.calibration.verdict import Calibration, judge
 from legcal.data import (
+    Corners,
     Dataset,
+    Outlines,
     Override,
-    Split,
     dataset_at,
+    fingerprint,
     load_dataset,
     overrides_of_call,
+    plan_dataset,
     reject_unused_legs,
     split_images,
+    store_outlines,
 )
-from legcal.errors import UsageError
+from legcal.errors import NotIdentifiable, NotVisible, UsageError
 from legcal.files import check_destination, output_path
 from legcal.geometry import IntArray
+from legcal.machine import Machine
 from legcal.paper import Criteria, Transformation
+from legcal.perception import (
+    Observed,
+    Placement,
+    detection_settings,
+    given_outlines,
+    hint_notes,
+    measure_photographs,
+    nominal_placement,
+    observe,
+)
 from legcal.progress import Report, no_progress
 from legcal.workers import worker_pool
 
 TWIST_SIGMA = float(np.radians(1.0))  # of the twist of a leg about its nominal one [rad]
+# Of all outlines that are measured in photographs: light at the limb that no model of shading
+# predicts looks like other radii, so that residuals never show it [px].
+LIMB_BIAS = {"bias of many edges": 0.02}
+MIN_FOUND_AGAIN = 0.5  # of the outlines of an image
 
 
 def calibrate(
@@ -89,7 +129,7 @@ def calibrate(
         Names or patterns of parameters to estimate that are fixed otherwise (intrinsics), and of
         radii and twists to estimate without a prior.
     holdout : float, optional
-        Keep this part of the images aside, and tell how well the fit of the others predicts them.
+        Hold out this part of the images, and compare them with what the fit of the others predicts.
 
     Returns
     -------
@@ -115,49 +155,300 @@ def calibrate(
     overrides = overrides_of_call(priors, fixed, free)
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
     choices = _choices(dataset, overrides)
-    split = _split(dataset, holdout)
-    fitted = dataset_at(dataset, split.fitted)
-    left_open = check_identifiable(fitted, choices)
+    fitted, held_out = _split(dataset, holdout)
+    identify_notes = check_identifiable(dataset_at(dataset, fitted), choices)
+
+    key = outline_key(dataset, choices)
     with worker_pool(workers) as pool:
-        run = start_run(
-            dataset,
-            pool,
-            progress,
-            choices,
-            use_cache=use_cache,
-            criteria=criteria,
-            transformation=transformation,
-        )
-        found = observe_and_fit(run, split.fitted)
-    kept = [] if found.other_radii else run.keep_outlines(found.outlines, found.notes)
-    # From here on in the order of the files.
-    solution = in_file_order(found.solution, found.part.own_order, fitted)
-    corners = None if found.corners is None else run.order.restore(found.corners)
-    notes = (
+        session = start_session(dataset, pool, progress, fingerprint=key if use_cache else "")
+        estimate = estimate_session(session, fitted, Options(choices, criteria, transformation))
+    cache_notes = _store_outlines(session, estimate, key)
+    prediction = _compare_held_out(session, estimate, held_out) if len(held_out) else None
+
+    found = estimate.in_file_order()
+    notes = [
         *dataset.notes,
-        *found.notes,
-        *found.doubts,
+        *found.image_notes,
+        *found.fit_notes,
         *choices.notes,
-        *left_open,
-        *kept,
+        *identify_notes,
+        *cache_notes,
         *found.part.unreached_notes(),
-        *board_notes(dataset, solution, corners),
-        *solution.notes,
-        *_camera_notes(dataset, solution),
-    )
-    held_out = _compare_held_out(run, found, split.kept_aside) if len(split.kept_aside) else None
-    steps = found.steps.in_file_order(found.part.order)
-    calibration = replace(judge(fitted, solution, steps, notes), corners=corners, held_out=held_out)
+        *board_notes(dataset, found.solution, found.corners),
+        *found.solution.notes,
+        *_camera_notes(dataset, found.solution),
+    ]
+    calibration = judge(dataset_at(dataset, fitted), found.solution, found.steps, notes)
+    calibration = replace(calibration, corners=found.corners, held_out=prediction)
     if output is not None:
         write_result(calibration, Path(output))
     return calibration
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the images show and what was fitted to it, in canonical order."""
+
+    part: Session  # the images that were fitted
+    outlines: Outlines  # of all images
+    steps: Steps
+    solution: Solution
+    corners: Corners | None  # of the calibration board in all images; None without a board
+    image_notes: tuple[str, ...] = ()  # on the images by themselves
+    fit_notes: tuple[str, ...] = ()  # on the images by the fit
+    other_radii: bool = False  # whether the images show other radii than the model has
+
+    def in_file_order(self) -> Estimate:
+        """Return the same with legs, views and images in the order of the files."""
+        fitted, order = self.part.part_of_files()
+        restore = self.part.order.restore  # of tables of all images
+        return replace(
+            self,
+            outlines=restore(self.outlines),
+            steps=self.steps.in_file_order(order),
+            solution=in_file_order(self.solution, order, fitted),
+            corners=None if self.corners is None else restore(self.corners),
+        )
+
+
+def estimate_session(session: Session, file_rows: IntArray, options: Options) -> Estimate:
+    """Recognise and measure all images, and fit some of them: phases 2 to 5 of the method.
+
+    Raises
+    ------
+    NotVisible, NotIdentifiable, DidNotConverge
+        As the phases.
+    """
+    rows = session.rows_of(file_rows)
+    try:
+        return _estimate(session, rows, options)
+    except NotIdentifiable:
+        if not session.plan.is_cached:
+            raise
+    # Outlines that an earlier run left do not always determine the cameras; images do.
+    session = replace(session, plan=plan_dataset(session.dataset, ""))
+    return _estimate(session, rows, options)
+
+
+def _estimate(session: Session, rows: IntArray, options: Options) -> Estimate:
+    """Search the images that have no outlines yet, and fit some."""
+    placement, board = nominal_scene(session)
+    # Outlines that are kept were measured with some gamma: others of their camera must be as well.
+    kept_gammas = known_gammas(session.photographs.keep, session.measurements)
+    photographs = session.photographs.with_gammas(kept_gammas)
+    if len(photographs.detect) == 0:  # outlines, or axes, are given
+        estimate = _fit(session.part(rows), given_outlines(photographs), placement, board, options)
+        return replace(
+            estimate, image_notes=session.plan.notes, fit_notes=_notes_on_images(estimate)
+        )
+    T_board_camera = None if board is None else board.T_board_camera
+    seen = observe(photographs, placement, session.progress, T_board_camera, together=False)
+    seen.placement.require_one()
+    other_radii = bool(seen.placement.radii.factor)
+    if other_radii:
+        session = replace(session, machine=seen.photographs.machine)
+    if options.every_leg and (seen.left_out or seen.placement.unplaced):
+        _refuse_too_few(session, rows, seen, options.choices)
+    first = _fit(session.part(rows), seen.outlines, seen.placement, board, options)
+    estimate = _measure_again(session, first, seen, board, options)
+    return replace(
+        estimate,
+        image_notes=(*seen.placement.all_notes, *_not_found_again(first, estimate)),
+        fit_notes=_notes_on_images(estimate),
+        other_radii=other_radii,
+    )
+
+
+def nominal_scene(session: Session) -> tuple[Placement, BoardViews | None]:
+    """Return where the nominal model has the legs, with rough cameras, and what shows the board."""
+    placement = nominal_placement(session.machine, session.measurements, session.T_base_platform)
+    board = observe_board(session)
+    if board is not None:
+        T_base_board = base_of_board(session.dataset, board, placement.T_base_camera)
+        if T_base_board is not None:
+            cameras = board.cameras(T_base_board, placement.T_base_camera)
+            placement = replace(placement, T_base_camera=cameras)
+    return placement, board
+
+
+def _fit(
+    part: Session,
+    outlines: Outlines,
+    placement: Placement,
+    board: BoardViews | None,
+    options: Options,
+) -> Estimate:
+    """Run the four steps, then the joint fit, with the outlines of all images."""
+    seen = outlines.at(part.rows)
+    seen = reject_unused_legs(seen, part.measurements, part.machine.leg_names)
+    if options.every_leg:
+        _refuse_unseen_legs(part, seen)
+    steps = four_steps(part, seen, board, options)
+    part.progress("Joint fit", 0, 1)
+    choices = options.choices
+    if any(part.measurements.image) and "detected" in seen.source:
+        choices = replace(choices, least_shared_px={**LIMB_BIAS, **choices.least_shared_px})
+    solution = refine_from_best(
+        part.fitted_legs,
+        part.measurements,
+        seen,
+        starts(part, seen, placement, steps, board),
+        axes=part.axes,
+        board=None if board is None else board.seen(part.rows),
+        choices=choices,
+    )
+    part.progress("Joint fit", 1, 1)
+    corners = None if board is None else board.judged(solution)
+    return Estimate(part, outlines, steps, solution, corners)
+
+
+def _measure_again(
+    session: Session, estimate: Estimate, seen: Observed, board: BoardViews | None, options: Options
+) -> Estimate:
+    """Search the photographs again close to the fit, and fit again."""
+    cameras, view = seen.placement.T_base_camera, session.measurements.view
+    rows = [
+        row
+        for row in seen.photographs.detect.tolist()
+        if cameras[view[row]] is not None and row not in seen.left_out
+    ]
+    if not rows:
+        return estimate
+    again = seen.photographs.narrowed(np.array(rows, dtype=np.intp), estimate.outlines)
+    again = replace(again, machine=_with_fitted_radii(again.machine, estimate.solution))
+    given = known_gammas(again.keep, again.measurements)
+    gammas: list[tuple[EstimatedGamma, ...]] = []
+    for _ in range(1 + ROUNDS):
+        placement = _fitted_placement(session, estimate.solution, seen)
+        outlines = measure_photographs(again, placement, session.progress)
+        estimate = _fit(estimate.part, outlines, placement, board, options)
+        gammas.append(estimate.solution.gammas)
+        others = {name: gamma for name, gamma in next_gammas(gammas).items() if name not in given}
+        if not others:
+            break
+        again = again.with_gammas(others)
+    return estimate
+
+
+def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
+    """Return the visible cylinders of the legs with the radii of a fit.
+
+    Cylinders of a leg that were equally thick stay so: they look like one.
+    """
+    cylinders = []
+    for j, leg in enumerate(machine.legs):
+        fitted = {
+            c.radius: solution.radii[j, c.link]
+            for c in leg.cylinders
+            if (j, c.link) in solution.radii
+        }
+        cylinders.append([replace(c, radius=fitted.get(c.radius, c.radius)) for c in leg.cylinders])
+    return machine.with_cylinders(cylinders)
+
+
+def _fitted_placement(session: Session, solution: Solution, seen: Observed) -> Placement:
+    """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
+    T_base_Rb = session.machine.T_base_Rb
+    A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
+    B = np.array([leg.B for leg in solution.legs])
+    placed = np.array([(T_base_Rb * T).apply(B) for T in session.poses_by(solution.legs)])
+    pose = session.measurements.pose
+    cameras = tuple(
+        None if known is None else T_base_Rb * T.inv()
+        for known, T in zip(seen.placement.T_base_camera, solution.T_camera_Rb, strict=True)
+    )
+    A_base = np.broadcast_to(A, placed.shape)[pose]
+    return Placement.of_fit(A_base, placed[pose], cameras, seen.blur)
+
+
+def _outlier_images(estimate: Estimate) -> dict[int, str]:
+    part = estimate.part
+    return outlier_images(part.measurements, part.machine, estimate.solution)
+
+
+def _not_found_again(first: Estimate, again: Estimate) -> list[str]:
+    """Return the notes of a first fit on images in which hardly anything is found near it."""
+    after, o = _outlier_images(again), again.solution.outlines
+    return [
+        note
+        for row, note in _outlier_images(first).items()
+        if row not in after and o.used[o.row == row].mean() < MIN_FOUND_AGAIN
+    ]
+
+
+def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
+    """Return rough camera poses that the fit contradicts, and images that contradict the fit."""
+    part, o = estimate.part, estimate.solution.outlines
+    shown = set(part.measurements.view[o.row[o.used]].tolist())
+    views = part.measurements.views
+    cameras = [
+        part.machine.T_base_Rb * T.inv() if v in shown else None
+        for v, T in enumerate(estimate.solution.T_camera_Rb)
+    ]
+    hints = hint_notes([view.name for view in views], [v.T_base_camera for v in views], cameras)
+    return (*hints, *_outlier_images(estimate).values())
+
+
+def _refuse_too_few(session: Session, rows: IntArray, seen: Observed, choices: Choices) -> None:
+    """Raise NotIdentifiable if the images that are left do not determine the parameters."""
+    cameras, notes = seen.placement.T_base_camera, seen.placement.all_notes
+    left = [
+        row
+        for row in rows.tolist()
+        if row not in seen.left_out and cameras[session.measurements.view[row]] is not None
+    ]
+    if not left:
+        raise NotVisible(list(notes))
+    try:
+        check_identifiable(session.part(np.array(left)).part_of_files()[0], choices)
+    except NotIdentifiable as failure:
+        raise NotIdentifiable([*failure.problems, *notes]) from None
+
+
+def _refuse_unseen_legs(part: Session, outlines: Outlines) -> None:
+    """Raise NotVisible if no image shows a leg that its view says it does."""
+    if part.axes is not None:
+        return
+    shown = set(outlines.leg[outlines.used].tolist())
+    views = [part.measurements.views[v] for v in np.unique(part.measurements.view).tolist()]
+    unseen = [
+        leg.name
+        for j, leg in enumerate(part.machine.legs)
+        if j not in shown
+        and leg.cylinders
+        and any(view.legs is None or leg.name in view.legs for view in views)
+    ]
+    if unseen:
+        raise NotVisible(
+            f"{part.dataset.folder}: the machine could not be calibrated: found no used outline of "
+            f"{', '.join(unseen)} in any image, needed some of every leg; add images that show it, "
+            "or name the legs of each view in dataset.yaml to leave it to the readings."
+        )
+
+
+def outline_key(dataset: Dataset, choices: Choices) -> str:
+    """Return the fingerprint of all that the outlines of a dataset depend on.
+
+    Images that disagree are searched again near the fit, which depends on the choices.
+    """
+    return fingerprint(dataset, detection_settings() | choices.document())
+
+
+def _store_outlines(session: Session, estimate: Estimate, key: str) -> list[str]:
+    """Leave outlines and notes on images beside the dataset; return a note if that fails."""
+    if estimate.other_radii or len(session.plan.detect) == 0:
+        return []
+    outlines = session.order.restore(estimate.outlines)
+    given, notes = session.plan.given, estimate.image_notes
+    note = store_outlines(session.dataset, outlines, key, given, notes)
+    return [note] if note else []
 
 
 def _choices(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
     """Return what dataset and call choose of the parameters.
 
     Twists that nobody chooses anything of are estimated with a prior: no leg is built without an
-    error of its twist, and one that was left at nominal would spoil the others.
+    error of its twist, and one that was left at nominal would bias the others.
     """
     known = known_parameters(
         dataset.machine,
@@ -176,11 +467,11 @@ def _choices(dataset: Dataset, overrides: Sequence[Override]) -> Choices:
     return replace(choices, priors={**twists, **choices.priors})
 
 
-def _split(dataset: Dataset, holdout: float | None) -> Split:
-    """Return which images to fit and which to keep aside."""
+def _split(dataset: Dataset, holdout: float | None) -> tuple[IntArray, IntArray]:
+    """Return the rows of images to fit and of held-out ones."""
     if holdout is None:
         rows = np.arange(dataset.measurements.n_rows)
-        return Split(rows, rows[:0])
+        return rows, rows[:0]
     if dataset.axes is not None:
         raise UsageError(
             f"{dataset.folder}: no images could be kept aside: found a table of axes, needed "
@@ -188,6 +479,17 @@ def _split(dataset: Dataset, holdout: float | None) -> Split:
             "--holdout."
         )
     return split_images(dataset, holdout)
+
+
+def _compare_held_out(session: Session, estimate: Estimate, file_rows: IntArray) -> HeldOut:
+    """Return how well the fit predicts the held-out images."""
+    held_out, solution = session.part(session.rows_of(file_rows)), estimate.solution
+    outlines = estimate.outlines.at(held_out.rows)
+    outlines = reject_unused_legs(outlines, held_out.measurements, held_out.machine.leg_names)
+    poses = held_out.poses_by(solution.legs)
+    return compare_held_out(
+        solution.posterior, held_out.measurements, outlines, poses, DEFAULT_SETTINGS.rejection
+    )
 
 
 def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
@@ -198,14 +500,3 @@ def _camera_notes(dataset: Dataset, solution: Solution) -> list[str]:
         f"{dataset.camera_paths[names.index(view)]}."
         for view in solution.doubtful_cameras
     ]
-
-
-def _compare_held_out(run: CalibrationRun, found: Found, file_rows: IntArray) -> HeldOut:
-    """Return what the images that were kept aside say of the fit."""
-    aside, solution = run.part(run.here(file_rows)), found.solution
-    outlines = found.outlines.at(aside.rows)
-    outlines = reject_unused_legs(outlines, aside.measurements, aside.machine.leg_names)
-    poses = aside.poses_by(solution.legs)
-    return compare_held_out(
-        solution.posterior, aside.measurements, outlines, poses, DEFAULT_SETTINGS.rejection
-    )

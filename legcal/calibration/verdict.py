@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.four_steps import Steps
 from legcal.calibration.joint_fit import (
     FOCAL_PART,
     HeldOut,
@@ -16,31 +16,9 @@ from legcal.calibration.joint_fit import (
     known_parameters,
     platform_accuracy,
 )
-from legcal.data import Corners, Dataset, Order, inverse
-from legcal.machine import Leg
+from legcal.data import Corners, Dataset
 
 TRUSTED_SIGMAS = 2.0  # the predicted improvement must exceed so many of its standard deviations
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """What the four steps give by themselves."""
-
-    legs: tuple[Leg, ...] | None  # in R_b and R_e; None if they did not reach the end
-    T_Rb_camera: tuple[RigidTransform | None, ...] | None  # of step 2; None if that failed
-    failure: str  # why they failed; "" if they did not
-    diagnostics: tuple[str, ...] = ()  # what they left out or at nominal, and why
-
-    def in_file_order(self, order: Order) -> Steps:
-        """Return the same with legs and views in the order of the files."""
-        legs, views = inverse(order.legs), inverse(order.views)
-        return replace(
-            self,
-            legs=None if self.legs is None else tuple(self.legs[j] for j in legs.tolist()),
-            T_Rb_camera=None
-            if self.T_Rb_camera is None
-            else tuple(self.T_Rb_camera[v] for v in views.tolist()),
-        )
 
 
 @dataclass(frozen=True)
@@ -71,7 +49,7 @@ class Calibration:
     notes : tuple of str
         What else a reader should know.
     held_out : HeldOut or None
-        What images that were kept aside say of the fit; None where there are none.
+        How well the fit predicts the held-out images; None without any.
     corners : Corners or None
         The corners of the calibration board in all images; None without a board.
     """

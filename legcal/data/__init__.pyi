@@ -20,7 +20,6 @@ from .dataset import OBSERVATIONS_NAME as OBSERVATIONS_NAME
 from .dataset import Dataset as Dataset
 from .dataset import ImageReader as ImageReader
 from .dataset import load_dataset as load_dataset
-from .holdout import Split as Split
 from .holdout import dataset_at as dataset_at
 from .holdout import split_images as split_images
 from .measurements import Measurements as Measurements

@@ -1,13 +1,13 @@
 """Held-out images: a fit that has not seen them must predict what they show.
 
-Whole poses are kept aside, since images of one pose share what is unknown of it. They are drawn
-by chance, in an order that does not depend on the files, and so that every leg in every view
-loses no more than its share.
+Whole poses are held out, since images of one pose share what is unknown of it. They are drawn at
+random, in an order that does not depend on the files, and so that every leg in every view loses no
+more than its share.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,37 +19,24 @@ from legcal.geometry import BoolArray, IntArray
 _SEED = 20020721
 
 
-@dataclass(frozen=True, eq=False)
-class Split:
-    """The images of a dataset that are fitted, and those that are kept aside."""
-
-    fitted: IntArray  # (n,) rows of the measurements, rising
-    kept_aside: IntArray  # (n,) rows of the measurements, rising
-
-
-def check_fraction(fraction: float) -> None:
-    """Refuse a part of the images that is none."""
+def split_images(dataset: Dataset, fraction: float) -> tuple[IntArray, IntArray]:
+    """Return the rows of images to fit and of held-out ones, both rising."""
     if not 0.0 < fraction < 1.0:
         raise UsageError(
             f"The images to keep aside could not be chosen: found the fraction {fraction:g}, "
             "needed a number between 0 and 1 (0.2 keeps a fifth aside); correct it."
         )
-
-
-def split_images(dataset: Dataset, fraction: float) -> Split:
-    """Return which images to fit and which to keep aside."""
-    check_fraction(fraction)
     measurements = dataset.measurements
     shown = _shown(dataset)
     wanted = max(1, round(fraction * measurements.n_rows))
     most = np.minimum(np.ceil(fraction * shown.sum(axis=0)), shown.sum(axis=0) - 1)
-    aside = np.zeros(measurements.n_rows, dtype=np.bool_)
+    held_out = np.zeros(measurements.n_rows, dtype=np.bool_)
     for pose in _poses_by_chance(dataset):
-        tried = aside | (measurements.pose == pose)
+        tried = held_out | (measurements.pose == pose)
         fits = np.all(shown[tried].sum(axis=0) <= np.maximum(most, 0.0))
         if fits and tried.sum() <= wanted:
-            aside = tried
-    if not aside.any():
+            held_out = tried
+    if not held_out.any():
         raise NotIdentifiable(
             f"{dataset.folder}: no images could be kept aside: found "
             f"{measurements.n_rows} image{'s' * (measurements.n_rows != 1)} of "
@@ -57,7 +44,7 @@ def split_images(dataset: Dataset, fraction: float) -> Split:
             f"a whole pose is {100 * fraction:g} % of them and every leg stays in every view that "
             "shows it; take more images or leave out --holdout."
         )
-    return Split(np.flatnonzero(~aside), np.flatnonzero(aside))
+    return np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
 
 def dataset_at(dataset: Dataset, rows: IntArray) -> Dataset:

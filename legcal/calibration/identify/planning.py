@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.calibration.identify.session import Session
-from legcal.calibration.run import nominal_poses
+from legcal.calibration.session import nominal_poses
 from legcal.data import Dataset
 from legcal.estimation import Frames
 from legcal.geometry import Array, BoolArray

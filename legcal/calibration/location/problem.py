@@ -16,10 +16,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.earlier import EarlierResult, read_result
 from legcal.calibration.location.frames import Frames, Noise, PosePairs
 from legcal.calibration.location.result import ToolPoses
-from legcal.calibration.result import MODEL_NAME, RESULT_NAME
+from legcal.calibration.result_folder import (
+    MODEL_NAME,
+    RESULT_NAME,
+    EarlierResult,
+    read_result,
+)
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import Array, BoolArray, IntArray, cross_matrices
 from legcal.machine import (

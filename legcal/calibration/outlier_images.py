@@ -27,7 +27,7 @@ SAME = 1e-3  # readings that are those of another image [m]
 SHOWN = 4  # legs that are named
 
 
-def disagreeing_images(
+def outlier_images(
     measurements: Measurements, machine: Machine, solution: Solution
 ) -> dict[int, str]:
     """Return a note on every fitted image most of which the fit has rejected, by row."""

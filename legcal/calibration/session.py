@@ -1,8 +1,7 @@
-"""A dataset in canonical order, from which every job on photographs starts.
+"""A session: the images and readings of a dataset in canonical order, where every job starts.
 
-Rows, views and legs are sorted once, here, so that no result depends on the order of the files.
-Everything after this works in canonical order; what is written is put back into that of the files
-at the end of each job.
+Rows, views and legs are sorted once, here, so that no result depends on the order of the files, and
+never reordered after. A job puts its result back into the order of the files where it ends.
 """
 
 from __future__ import annotations
@@ -14,27 +13,20 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.joint_fit import (
-    Choices,
-    FittedLegs,
-    fitted_legs,
-    start_from,
-)
+from legcal.calibration.joint_fit import Choices, FittedLegs, fitted_legs, start_from
 from legcal.data import (
     Dataset,
     DetectionPlan,
     LegAxes,
     Measurements,
     Order,
-    Outlines,
     canonical_order,
-    fingerprint,
+    dataset_at,
     inverse,
     measurements_at,
     plan_dataset,
     reorder_measurements,
     row_names,
-    store_outlines,
 )
 from legcal.errors import DatasetError
 from legcal.geometry import Array, IntArray, components
@@ -48,32 +40,37 @@ from legcal.machine import (
     solve_poses,
 )
 from legcal.paper import Criteria, Transformation
-from legcal.perception import Photographs, detection_settings
+from legcal.perception import Photographs
 from legcal.progress import Report
 from legcal.workers import Run
 
-MOST_MISSED = 0.03  # of the mean leg length: errors of a nominal model, but not of readings
-_SAID = 3  # images that a note names
+MAX_NOMINAL_RESIDUAL = 0.03  # of the mean leg length: errors of a nominal model, not of readings
+_MAX_NAMED = 3  # images in a note
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationRun:
-    """A dataset in canonical order, and how it is to be worked on."""
+class Options:
+    """What is estimated of a session, and how."""
 
-    dataset: Dataset  # in the order of its files
-    order: Order  # from the files to the canonical order
-    plan: DetectionPlan  # which images are still to be searched, by their rows in the files
-    fingerprint: str  # of all that detected outlines depend on
-    machine: Machine  # from here on in canonical order
-    measurements: Measurements
-    axes: LegAxes | None
-    rows: IntArray  # of all images, those that are here
-    pool: Run
-    progress: Report
-    choices: Choices
+    choices: Choices  # of the parameters
     criteria: Criteria | None = None  # of the four steps; None leaves them out
     transformation: Transformation | None = None  # how they solve (18); None for as the criteria
     every_leg: bool = True  # whether every leg must be seen that views say they show
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """A dataset in canonical order, with all of its images or some."""
+
+    dataset: Dataset  # all images, in the order of its files
+    order: Order  # from the files to the canonical order
+    plan: DetectionPlan  # which images are to be searched, by their rows in the files
+    pool: Run
+    progress: Report
+    machine: Machine  # from here on in canonical order
+    measurements: Measurements
+    axes: LegAxes | None
+    rows: IntArray  # the images that are here, among all of them
 
     @cached_property
     def photographs(self) -> Photographs:
@@ -108,17 +105,17 @@ class CalibrationRun:
         return [self.machine.T_base_Rb * T * back for T in self.T_Rb_Re]
 
     def unreached_notes(self) -> list[str]:
-        """Return what a reader should know of poses that the nominal model does not reach."""
-        missed = self._nominal[1]
-        off = np.flatnonzero(missed > 0.0).tolist()
+        """Return a note on the poses that the nominal model does not reach, if there are any."""
+        residual = self._nominal[1]
+        off = np.flatnonzero(residual > 0.0).tolist()
         if not off:
             return []
-        names = [_image_of(self.measurements, pose) for pose in off[:_SAID]]
-        if len(off) > _SAID:
-            names.append(f"{len(off) - _SAID} more")
+        names = [_image_of(self.measurements, pose) for pose in off[:_MAX_NAMED]]
+        if len(off) > _MAX_NAMED:
+            names.append(f"{len(off) - _MAX_NAMED} more")
         return [
             f"The nominal model does not reach the readings of {joined(names)}: its legs "
-            f"miss them by up to {1e3 * float(missed.max()):.2f} mm at the nearest pose, from "
+            f"miss them by up to {1e3 * float(residual.max()):.2f} mm at the nearest pose, from "
             "which the fit started."
         ]
 
@@ -126,7 +123,11 @@ class CalibrationRun:
         """Return T_Rb_Re of every pose by the readings and other legs, in R_b and R_e."""
         return start_from(legs, self.measurements, self.fitted_legs, (), self.T_Rb_Re, "").T_Rb_Re
 
-    def part(self, rows: IntArray) -> CalibrationRun:
+    def rows_of(self, file_rows: IntArray) -> IntArray:
+        """Return the rows here of images that are given by their rows in the files."""
+        return np.sort(inverse(self.order.rows)[file_rows])
+
+    def part(self, rows: IntArray) -> Session:
         """Return some of the images, by their rows here, rising."""
         return replace(
             self,
@@ -135,76 +136,48 @@ class CalibrationRun:
             rows=self.rows[rows],
         )
 
-    def here(self, file_rows: IntArray) -> IntArray:
-        """Return the rows of images that are told by their rows in the files."""
-        return np.sort(inverse(self.order.rows)[file_rows])
-
-    @property
-    def own_order(self) -> Order:
-        """The order of the images that are here, as if the files had no others."""
-        return replace(self.order, rows=inverse(np.argsort(self.order.rows[self.rows])))
-
-    def searched_anew(self) -> CalibrationRun:
-        """Return the same without the outlines that an earlier run left."""
-        return replace(self, plan=plan_dataset(self.dataset, ""))
-
-    def keep_outlines(self, outlines: Outlines, notes: Sequence[str]) -> list[str]:
-        """Leave outlines and notes on images beside the dataset; return a note if that fails."""
-        if len(self.plan.detect) == 0:
-            return []
-        restored = self.order.restore(outlines)
-        note = store_outlines(self.dataset, restored, self.fingerprint, self.plan.given, notes)
-        return [note] if note else []
+    def part_of_files(self) -> tuple[Dataset, Order]:
+        """Return the images that are here in the order of the files, and the order of these."""
+        file_rows = self.order.rows[self.rows]
+        order = replace(self.order, rows=inverse(np.argsort(file_rows)))
+        return dataset_at(self.dataset, np.sort(file_rows)), order
 
 
-def start_run(
-    dataset: Dataset,
-    pool: Run,
-    progress: Report,
-    choices: Choices,
-    *,
-    use_cache: bool,
-    criteria: Criteria | None = None,
-    transformation: Transformation | None = None,
-    every_leg: bool = True,
-) -> CalibrationRun:
-    """Put a dataset into canonical order, and see which images are still to be searched."""
+def start_session(
+    dataset: Dataset, pool: Run, progress: Report, *, fingerprint: str = ""
+) -> Session:
+    """Put a dataset into canonical order, and see which images are to be searched.
+
+    Outlines that an earlier run stored are used if they have this fingerprint.
+    """
     names = dataset.machine.leg_names
     order = canonical_order(dataset.measurements, names)
-    # Doubtful images are searched again near the fit, which depends on the choices.
-    current = fingerprint(dataset, detection_settings() | choices.document())
-    return CalibrationRun(
+    return Session(
         dataset=dataset,
         order=order,
-        plan=plan_dataset(dataset, current if use_cache else ""),
-        fingerprint=current,
+        plan=plan_dataset(dataset, fingerprint),
+        pool=pool,
+        progress=progress,
         machine=dataset.machine.with_leg_order([names[leg] for leg in order.legs]),
         measurements=reorder_measurements(dataset.measurements, order),
         axes=None if dataset.axes is None else order.reorder(dataset.axes),
         rows=np.arange(dataset.measurements.n_rows),
-        pool=pool,
-        progress=progress,
-        choices=choices,
-        criteria=criteria,
-        transformation=transformation,
-        every_leg=every_leg,
     )
 
 
 def nominal_poses(
     machine: Machine, measurements: Measurements
 ) -> tuple[tuple[RigidTransform, ...], Array]:
-    """Return T_Rb_Re of a nominal model at the readings, and what its legs miss (n_poses,) [m].
+    """Return T_Rb_Re of a nominal model at the readings, and its largest residual (n_poses,) [m].
 
     Errors of the model can put a pose out of its reach that the machine took, near a singular one
-    or where its legs are stretched out. The pose with the least squares of what the legs miss
-    stands for it. Where motors do not determine the pose, all are those of least squares from home.
+    or where its legs are stretched out. The pose with the least squared residuals of leg lengths
+    stands for it. Where motors do not determine the pose, all are least-squares poses from home.
 
     Raises
     ------
     DatasetError
-        With one sentence for each image whose readings the legs would miss by more than 3 % of the
-        mean leg length.
+        With one sentence for each image whose residual is more than 3 % of the mean leg length.
     """
     q = measurements.q[measurements.first_rows]
     if not machine.is_determined:
@@ -213,29 +186,29 @@ def nominal_poses(
     followed = list(followed_poses(machine, q))
     T = [platform_in_base(machine, pose) for pose, _ in followed]
     off = [k for k, (_, failure) in enumerate(followed) if failure is not None]
-    missed = np.zeros(len(q))
+    residual = np.zeros(len(q))
     if off:
-        nearest, missed[off] = _least_squares(machine, q[off], [T[k] for k in off])
+        nearest, residual[off] = _least_squares(machine, q[off], [T[k] for k in off])
         for k, pose in zip(off, nearest, strict=True):
             T[k] = pose
     B = machine.home.apply(machine.B_platform)
-    most = MOST_MISSED * float(np.linalg.norm(B - machine.A_base, axis=1).mean())
+    most = MAX_NOMINAL_RESIDUAL * float(np.linalg.norm(B - machine.A_base, axis=1).mean())
     problems = [
         f"The readings of {_image_of(measurements, k)} could not be used: found that the legs of "
-        f"the nominal model miss them by {1e3 * missed[k]:.1f} mm at the nearest pose, needed at "
+        f"the nominal model miss them by {1e3 * residual[k]:.1f} mm at the nearest pose, needed at "
         f"most {1e3 * most:.1f} mm; check these readings and legcal.home, or take the image out."
         for k in off
-        if not missed[k] <= most
+        if not residual[k] <= most
     ]
     if problems:
         raise DatasetError(problems)
-    return tuple(T), missed
+    return tuple(T), residual
 
 
 def _least_squares(
     machine: Machine, q: Array, nearby: list[RigidTransform]
 ) -> tuple[tuple[RigidTransform, ...], Array]:
-    """Return the poses at which the legs miss least, and the largest miss of each [m]."""
+    """Return the least-squares poses, and the largest residual of a leg length of each [m]."""
     R, t = components(nearby)
     found = solve_poses(geometries(machine), machine.frame_legs, R, t, machine.sign * q)
     poses = RigidTransform.from_components(found.t, Rotation.from_matrix(found.R))

@@ -1,4 +1,4 @@
-"""Has it moved? A few new images of a machine against the result of an earlier calibration."""
+"""Verification: a few new images of a machine against the result of an earlier calibration."""
 
 from __future__ import annotations
 
@@ -9,28 +9,32 @@ from typing import Any
 
 import numpy as np
 
-from legcal.calibration.changes import (
+from legcal.calibration.change_detection import (
     Movement,
     difference,
     judge_movement,
     noise_dof,
     possible_changes,
 )
-from legcal.calibration.earlier import EarlierResult, read_result
-from legcal.calibration.fitting import observe_and_fit
+from legcal.calibration.documents import (
+    CheckDocument,
+    CheckResiduals,
+    ExplanationBlock,
+    MovedPlatform,
+)
 from legcal.calibration.joint_fit import (
     Choices,
     PlatformPair,
     Prior,
     Solution,
-    in_file_order,
     known_parameters,
 )
-from legcal.calibration.run import start_run
+from legcal.calibration.pipeline import estimate_session, outline_key
+from legcal.calibration.result_folder import EarlierResult, read_result
+from legcal.calibration.session import Options, start_session
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.estimation import Frames, NoiseModel
-from legcal.files import Document
 from legcal.geometry import Array
 from legcal.machine import (
     Machine,
@@ -47,55 +51,6 @@ from legcal.workers import worker_pool
 SIGNIFICANCE = 0.01
 _LARGEST_SIGNIFICANCE = 0.5
 _PLAUSIBLE = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
-
-
-class ExplanationBlock(Document):
-    """What may have changed, by how much, and what it leaves unexplained."""
-
-    what: str
-    components: list[str]
-    units: list[str]
-    values: list[float]
-    sigma: list[float]
-    remaining: float
-    p_value: float
-
-
-class MovedPlatform(Document):
-    """How far the platform is from where the earlier result has it."""
-
-    dX_m: float
-    dE_rad: float
-    sigma_dX_m: float
-    sigma_dE_rad: float
-
-
-class CheckResiduals(Document):
-    """What was left of the new observations."""
-
-    chi2: float
-    dof: int
-    rms_px: float | None
-
-
-class CheckDocument(Document):
-    """What ``legcal calibrate --check --json`` prints."""
-
-    legcal_check: int
-    result: str
-    moved: bool
-    significance: float
-    p_value: float
-    statistic: float
-    dof: int
-    of: int
-    noise_dof: int
-    verdict: str
-    explanations: list[ExplanationBlock]
-    platform: MovedPlatform
-    images: int
-    residuals: CheckResiduals
-    notes: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,17 +188,18 @@ def check(
     prior = _Prior.of(dataset.machine, earlier)
     choices = _choices(dataset, earlier, prior)
     with worker_pool(workers) as pool:
-        run = start_run(dataset, pool, progress, choices, use_cache=True, every_leg=False)
-        found = observe_and_fit(run, np.arange(dataset.measurements.n_rows))
+        session = start_session(dataset, pool, progress, fingerprint=outline_key(dataset, choices))
+        every_row = np.arange(dataset.measurements.n_rows)
+        found = estimate_session(session, every_row, Options(choices, every_leg=False))
     if dataset.axes is None and not found.outlines.used.any():
         refusal = (
             f"{dataset.folder}: the earlier result could not be tested: found no used outline in "
             "any image, needed some; take images that show the legs."
         )
-        raise NotVisible([refusal, *found.notes])
-    solution = in_file_order(found.solution, found.part.own_order, dataset)
+        raise NotVisible([refusal, *found.image_notes])
+    solution = found.in_file_order().solution
     tested = _compare(dataset, earlier, solution, prior, significance)
-    notes = (*dataset.notes, *found.notes, *found.doubts, *solution.notes)
+    notes = (*dataset.notes, *found.image_notes, *found.fit_notes, *solution.notes)
     return replace(tested, notes=tuple(dict.fromkeys(notes)))
 
 

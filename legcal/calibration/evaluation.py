@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.documents import ComparedParameter, EvaluationDocument
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DidNotConverge, ModelError
-from legcal.files import Document
 from legcal.geometry import Array
 from legcal.machine import (
     WORKSPACE_POSES,
@@ -31,27 +31,8 @@ from legcal.machine import (
     vector_of,
 )
 
-_ROUNDS = 20  # of drawing again what the reference does not reach
-_HOPELESS = 10  # poses that it does not reach, if they are the first
-
-
-class ComparedParameter(Document):
-    """A parameter of the model and of the reference [m, rad]."""
-
-    name: str
-    value: float
-    reference: float
-    difference: float
-
-
-class EvaluationDocument(Document):
-    """What ``legcal evaluate --json`` prints; null where no pose is compared."""
-
-    dX_m: float | None
-    dE_rad: float | None
-    dX_max_m: float | None
-    poses: int
-    parameters: list[ComparedParameter]
+MAX_DRAWS = 20  # of poses in place of those that the reference does not reach
+FIRST_POSES = 10  # of the first draw: if the reference reaches none of them, there is no other
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,10 +190,10 @@ def _random_poses(
     rng = np.random.default_rng(WORKSPACE_SEED)
     poses: list[RigidTransform] = []
     reference_poses: list[RigidTransform] = []
-    for turn in range(_ROUNDS):
+    for turn in range(MAX_DRAWS):
         if turn > 0 and not poses:
             break
-        count = WORKSPACE_POSES - len(poses) if turn > 0 else _HOPELESS
+        count = WORKSPACE_POSES - len(poses) if turn > 0 else FIRST_POSES
         drawn = random_configurations(machine, count, rng)
         for q, T in zip(drawn.readings, drawn.poses, strict=True):
             try:

@@ -1,0 +1,337 @@
+"""The documents of the jobs: ``result.json``, and what ``check`` and ``evaluate`` print.
+
+:class:`Result` is ``result.json``: its fields are the keys, in their order, and the schema by which
+an earlier result is read (formats, section 4).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    StrictFloat,
+    StrictInt,
+    StrictStr,
+    model_serializer,
+)
+
+from legcal.errors import DatasetError
+from legcal.files import Document, Number, Version, describe, read_text, validate
+
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Axes = dict[str, Vector]  # unit vectors by leg
+Matrix = list[list[Number]]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
+
+
+class Pose(Document):
+    """A rigid motion."""
+
+    xyz: Vector
+    quat_xyzw: Annotated[list[Number], Field(min_length=4, max_length=4)]
+
+
+class Legs(Document):
+    """The legs in R_b and R_e [m, rad]."""
+
+    base_joints: list[Vector]
+    platform_joints: list[Vector]
+    offsets: list[Number | None]  # the length of a constant leg, null for a passive one
+    base_axes: Axes  # of axes that are parameters
+    platform_axes: Axes
+    twists: dict[str, Number]
+
+
+class ParameterRow(Document):
+    """One parameter."""
+
+    name: str
+    value: Number  # [unit]; axes are turns of the nominal ones
+    nominal: Number  # in the model or camera file
+    sigma: Positive | None  # None where it was not estimated
+    unit: str  # m, rad, px, or nothing for coefficients of distortion
+    status: Literal["estimated", "fixed", "weak"]  # weak: part of a direction that is held
+
+
+class Kinematic(Document):
+    """What is known of all kinematic parameters."""
+
+    names: list[str]
+    covariance: Matrix  # zero where they are fixed and along what is held
+    held: Matrix  # how they change along each held direction, by a metre
+
+
+class WeakCombination(Document):
+    """A combination of parameters that is known badly."""
+
+    direction: str
+    parameters: list[str]
+    components: list[Number]
+    sigma_m: Number
+
+
+class ViewPose(Document):
+    """The camera pose of a view."""
+
+    T_base_camera: Pose
+
+
+class Gamma(Document):
+    """The gamma that outlines show of a camera."""
+
+    views: list[str]
+    gamma: Number
+    sigma: Number
+
+
+class Staged(Legs):
+    """What the four steps gave."""
+
+    diagnostics: list[str]
+
+
+class NoSteps(Document):
+    """Why the four steps gave nothing."""
+
+    failure: str
+
+
+class Stages(Document):
+    """What single parts of the method gave."""
+
+    staged: Staged | NoSteps
+
+
+class Noise(Document):
+    """The noise of the outlines."""
+
+    scale: Positive
+    bias_px: NotNegative
+    tilt_px: NotNegative
+
+
+class Residuals(Document):
+    """What was left of the observations."""
+
+    chi2: Number
+    dof: int
+    rms_px: Number | None
+    rms_axes: Number | None
+    noise: Noise
+    shared_px: dict[str, NotNegative]
+
+
+class BoardPose(Document):
+    """The pose of the calibration board, R_b laid on the nominal one."""
+
+    T_base_board: Pose
+    given: Pose | None
+    scale: Number
+    rms_px: Number | None
+
+
+class PoseAccuracy(Document):
+    """Change and predicted error at one pose."""
+
+    pose: str | None
+    images: list[str]
+    change_dX_m: Number
+    change_dE_rad: Number
+    sigma_dX_m: Number
+    sigma_dE_rad: Number
+
+
+class WorkspaceAccuracy(Document):
+    """The predicted error all over the travel."""
+
+    poses: int
+    sigma_dX_m: Number
+    sigma_dE_rad: Number
+    sigma_dX_max_m: Number
+    sigma_dE_max_rad: Number
+
+
+class SensitivityRow(Document):
+    """What an error in what counts as known would do to the platform."""
+
+    what: str
+    dX_m: Number
+    dE_rad: Number
+    dX_max_m: Number
+    dE_max_rad: Number
+
+
+class PlatformBlock(Document):
+    """Change and predicted error of the platform, means and maxima over poses."""
+
+    poses: int
+    change_dX_m: Number
+    change_dE_rad: Number
+    sigma_dX_m: Number
+    sigma_dE_rad: Number
+    sigma_dX_max_m: Number
+    sigma_dE_max_rad: Number
+    per_pose: list[PoseAccuracy]
+    workspace: WorkspaceAccuracy | None
+    sensitivities: list[SensitivityRow]
+
+
+class HoldoutPlatform(Document):
+    """The pose by readings against that by an image alone, root mean squares."""
+
+    poses: int
+    dX_m: Number
+    expected_dX_m: Number
+    dE_rad: Number
+    expected_dE_rad: Number
+
+
+class Holdout(Document):
+    """How well the fit predicts the held-out images."""
+
+    images: int
+    poses: int
+    outlines: int
+    wrong: int
+    rms_px: Number | None
+    expected_px: Number | None
+    views: dict[str, Number]
+    platform: HoldoutPlatform | None
+
+
+class Result(Document):
+    """``result.json``."""
+
+    legcal_result: Version
+    status: Literal["converged"]
+    verdict: str
+    trustworthy: bool
+    legs: list[str]  # the order of what follows
+    base_joints: list[Vector]
+    platform_joints: list[Vector]
+    offsets: list[Number | None]
+    base_axes: Axes
+    platform_axes: Axes
+    twists: dict[str, Number]
+    nominal_axes: dict[str, Axes]  # that turns count from, by side
+    parameters: Annotated[list[ParameterRow], Field(min_length=1)]
+    covariance: Matrix  # of the estimated parameters, in their order
+    kinematic: Kinematic
+    weakest: list[WeakCombination]
+    held: list[str]
+    views: dict[str, ViewPose]
+    cameras: dict[str, dict[str, StrictInt | StrictFloat | StrictStr]]  # as they came
+    gammas: list[Gamma]
+    stages: Stages
+    residuals: Residuals
+    board: BoardPose | None = None  # left out without a board
+    start: str
+    platform: PlatformBlock | None
+    holdout: Holdout | None = None  # left out without held-out images
+    notes: list[str]
+
+    @model_serializer(mode="wrap")
+    def _without_absent_blocks(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found: dict[str, Any] = handler(self)
+        absent = [key for key in ("board", "holdout") if found[key] is None]
+        return {key: value for key, value in found.items() if key not in absent}
+
+    @classmethod
+    def read(cls, path: Path) -> Result:
+        """Return the result in a file.
+
+        Raises
+        ------
+        DatasetError
+            If it is missing, or no such document.
+        """
+        content = read_text(path, "result of an earlier calibration")
+        try:
+            found = json.loads(content)
+        except (ValueError, RecursionError) as error:
+            raise unreadable(path, "no JSON", "the document of a calibration") from error
+        if not isinstance(found, dict) or "legcal_result" not in found:
+            what = "another document" if isinstance(found, dict) else describe(found)
+            raise unreadable(path, what, "one with 'legcal_result: 1'")
+        return validate(cls, found, path)
+
+
+def unreadable(path: Path, found: str, needed: str) -> DatasetError:
+    """Return why an earlier result could not be read."""
+    return DatasetError(
+        f"{path}: the result of the earlier calibration could not be read: found {found}, needed "
+        f"{needed}; give the folder that legcal calibrate wrote."
+    )
+
+
+class ExplanationBlock(Document):
+    """What may have changed, by how much, and what it leaves unexplained."""
+
+    what: str
+    components: list[str]
+    units: list[str]
+    values: list[float]
+    sigma: list[float]
+    remaining: float
+    p_value: float
+
+
+class MovedPlatform(Document):
+    """How far the platform is from where the earlier result has it."""
+
+    dX_m: float
+    dE_rad: float
+    sigma_dX_m: float
+    sigma_dE_rad: float
+
+
+class CheckResiduals(Document):
+    """What was left of the new observations."""
+
+    chi2: float
+    dof: int
+    rms_px: float | None
+
+
+class CheckDocument(Document):
+    """What ``legcal calibrate --check --json`` prints."""
+
+    legcal_check: int
+    result: str
+    moved: bool
+    significance: float
+    p_value: float
+    statistic: float
+    dof: int
+    of: int
+    noise_dof: int
+    verdict: str
+    explanations: list[ExplanationBlock]
+    platform: MovedPlatform
+    images: int
+    residuals: CheckResiduals
+    notes: list[str]
+
+
+class ComparedParameter(Document):
+    """A parameter of the model and of the reference [m, rad]."""
+
+    name: str
+    value: float
+    reference: float
+    difference: float
+
+
+class EvaluationDocument(Document):
+    """What ``legcal evaluate --json`` prints; null where no pose is compared."""
+
+    dX_m: float | None
+    dE_rad: float | None
+    dX_max_m: float | None
+    poses: int
+    parameters: list[ComparedParameter]

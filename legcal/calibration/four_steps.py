@@ -1,0 +1,133 @@
+"""The four steps of a session (sections 3.2 to 3.5), and the starts of its joint fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from scipy.spatial.transform import RigidTransform
+
+from legcal.calibration.board import BoardViews, Poses, in_one_camera
+from legcal.calibration.joint_fit import Start, start_from
+from legcal.calibration.session import Options, Session
+from legcal.data import Order, Outlines, axes_from_outlines, few_views, inverse
+from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
+from legcal.machine import Leg, geometries
+from legcal.paper import nominal_mechanism, run_base_steps, run_platform_steps
+from legcal.perception import Placement
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What the four steps give by themselves."""
+
+    legs: tuple[Leg, ...] | None  # in R_b and R_e; None if they did not reach the end
+    T_Rb_camera: tuple[RigidTransform | None, ...] | None  # of step 2; None if that failed
+    failure: str  # why they failed; "" if they did not
+    diagnostics: tuple[str, ...] = ()  # what they left out or at nominal, and why
+
+    def in_file_order(self, order: Order) -> Steps:
+        """Return the same with legs and views in the order of the files."""
+        legs, cameras = self.legs, self.T_Rb_camera
+        return replace(
+            self,
+            legs=legs and tuple(legs[j] for j in inverse(order.legs).tolist()),
+            T_Rb_camera=cameras and tuple(cameras[v] for v in inverse(order.views).tolist()),
+        )
+
+
+def four_steps(
+    part: Session, outlines: Outlines, board: BoardViews | None, options: Options
+) -> Steps:
+    """Return what the four steps give, or why they give nothing: the joint fit may do without.
+
+    Cameras alone where only the later steps fail.
+    """
+    if options.criteria is None:
+        return Steps(None, None, "They were left out.")
+    part.progress("Four steps", 0, 1)
+    axes, measurements = part.axes, part.measurements
+    try:
+        nominal = nominal_mechanism(part.machine)
+        if axes is None:
+            radii = {p: r for leg in part.machine.legs for p, r in leg.radius_of_part.items()}
+            axes = axes_from_outlines(outlines, measurements, radii)
+        if board is not None:
+            axes, measurements, T_first_camera, new_view = in_one_camera(
+                axes, measurements, board.T_board_camera
+            )
+        base = run_base_steps(nominal, axes, measurements, criteria=options.criteria)
+        cameras = tuple(base.T_Rb_camera)
+        if board is not None:
+            moved = zip([cameras[v] for v in new_view.tolist()], T_first_camera, strict=True)
+            cameras = tuple(T if T is None or own is None else T * own for T, own in moved)
+        try:
+            found = run_platform_steps(
+                nominal,
+                axes,
+                measurements,
+                base,
+                criteria=options.criteria,
+                transformation=options.transformation,
+                free_twists=any(name.endswith(".twist") for name in options.choices.free),
+            )
+        except (NotIdentifiable, DidNotConverge) as failure:
+            return Steps(None, cameras, str(failure))
+        return Steps(found.legs, cameras, "", found.diagnostics)
+    except (NotIdentifiable, NotVisible, DidNotConverge) as failure:
+        return Steps(None, None, str(failure))
+    finally:
+        part.progress("Four steps", 1, 1)
+
+
+def starts(
+    part: Session,
+    outlines: Outlines,
+    placement: Placement,
+    steps: Steps,
+    board: BoardViews | None,
+) -> list[Start]:
+    """Return the starts of the joint fit: nominal, and the steps where they gave a result.
+
+    Raises
+    ------
+    NotIdentifiable
+        If neither placement nor steps locate a camera that is needed.
+    """
+    machine = part.machine
+    rough = [None if T is None else T.inv() * machine.T_base_Rb for T in placement.T_base_camera]
+    staged = [None if T is None else T.inv() for T in steps.T_Rb_camera or [None] * len(rough)]
+    by_label = {"nominal": (geometries(machine), rough, staged)}
+    if steps.legs is not None:
+        by_label["staged"] = (steps.legs, staged, rough)
+    found = []
+    for label, (legs, first, second) in by_label.items():
+        cameras = _start_cameras(part, outlines, first, second, steps)
+        start = start_from(legs, part.measurements, part.fitted_legs, cameras, part.T_Rb_Re, label)
+        if board is not None:
+            T_Rb_board = board.placed([T.inv() for T in cameras])
+            start = start if T_Rb_board is None else replace(start, T_Rb_board=T_Rb_board)
+        found.append(start)
+    return found
+
+
+def _start_cameras(
+    part: Session, outlines: Outlines, first: Poses, second: Poses, steps: Steps
+) -> list[RigidTransform]:
+    """Return a camera pose for every view, the first choice where there is one."""
+    cameras = [a if a is not None else b for a, b in zip(first, second, strict=True)]
+    shown = outlines.row[outlines.used] if part.axes is None else part.axes.row
+    needed = set(part.measurements.view[shown].tolist())
+    unknown = [
+        view.name
+        for v, view in enumerate(part.measurements.views)
+        if v in needed and cameras[v] is None
+    ]
+    if unknown:
+        raise NotIdentifiable(
+            f"{few_views(unknown)}: no camera could be placed: found no "
+            "T_base_camera, and the four steps do not locate it "
+            f"({steps.failure or 'fewer than three base joints are seen'}); needed one of them; "
+            "add a rough T_base_camera to dataset.yaml"
+            + (", or T_base_board to its block board." if part.dataset.board else ".")
+        )
+    return [T if T is not None else RigidTransform.identity() for T in cameras]
