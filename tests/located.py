@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.location.frames import Frames, PosePairs, predicted
-from legcal.calibration.location.result import ToolPoses
+from legcal import ToolPoses
+from legcal.calibration.location.frames import PosePairs, predicted, transforms
 from legcal.geometry import rotation_matrices
 from legcal.geometry.types import Array
 from legcal.machine import (
@@ -89,10 +89,9 @@ def located(
     return Located(machine, BASE, TOOL, platform, poses)
 
 
-def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> Frames:
-    """Return two rigid motions as frames."""
-    base, tool = T_world_base.as_matrix(), T_platform_tool.as_matrix()
-    return Frames(base[:3, :3], base[:3, 3], tool[:3, :3], tool[:3, 3])
+def frames_of(T_world_base: RigidTransform, T_platform_tool: RigidTransform) -> Array:
+    """Return two rigid motions as frames (2, 3, 4)."""
+    return np.array([T.as_matrix()[:3] for T in (T_world_base, T_platform_tool)])
 
 
 def pairs_at(base: RigidTransform, tool: RigidTransform, n: int = 8, seed: int = 0) -> PosePairs:
@@ -114,9 +113,9 @@ def noisy(pairs: PosePairs, chance: np.random.Generator) -> PosePairs:
     )
 
 
-def frame_errors(frames: Frames, base: RigidTransform, tool: RigidTransform) -> Array:
+def frame_errors(frames: Array, base: RigidTransform, tool: RigidTransform) -> Array:
     """Return the step from the truth to frames, (12,)."""
-    found = frames.transforms()
+    found = transforms(frames)
     return np.concatenate(
         [motion_error(T, true) for T, true in zip(found, (base, tool), strict=True)]
     )

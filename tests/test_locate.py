@@ -1,10 +1,17 @@
-"""``legcal.locate``: what poses of real machines determine, wrong rows, mistakes, refusals."""
+"""``legcal locate``: what poses of real machines determine, outliers, the table, the files."""
 
+import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
+import yaml
 from located import (
     BASE,
     SIGMA_ANGLE,
@@ -14,345 +21,507 @@ from located import (
     located,
     motion_error,
     shipped,
+    write_poses,
+    write_rows,
 )
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal import locate
-from legcal.calibration.location.result import ToolPoses
-from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
-from legcal.geometry import rotation_matrices
-from legcal.geometry.types import Array
+from legcal import (
+    Location,
+    ToolPoses,
+    cli,
+    load_location,
+    load_mechanism,
+    locate,
+    write_location,
+)
+from legcal.calibration import location_document, write_located_model
+from legcal.errors import (
+    DatasetError,
+    DidNotConverge,
+    LegcalError,
+    ModelError,
+    NotIdentifiable,
+    UsageError,
+)
+from legcal.geometry import Array, rotation_matrices
+from legcal.machine import platform_pose
+
+KNOWN = {"position_sigma": SIGMA_POSITION, "angle_sigma": SIGMA_ANGLE}
 
 
-def near_home(name: str, steps: Array) -> list[RigidTransform]:
-    """Return poses displaced and turned from home, (n, 6) [m, rad]."""
-    home = shipped(name).home
-    return [
-        RigidTransform.from_components(
-            home.translation + step[:3], Rotation.from_rotvec(step[3:]) * home.rotation
-        )
-        for step in steps
-    ]
-
-
-def steps(n: int, size: float, turn: tuple[float, float, float]) -> Array:
-    chance = np.random.default_rng(2)
+def near_home(name: str, n: int, size: float, turn: tuple[float, float, float]) -> Located:
+    """Return a machine measured at poses displaced and turned a little from home."""
+    chance, home = np.random.default_rng(2), shipped(name).home
     moves = chance.uniform(-size, size, (n, 3))
-    return np.hstack([moves, chance.uniform(-0.2, 0.2, (n, 3)) * np.array(turn)])
+    turns = chance.uniform(-0.2, 0.2, (n, 3)) * np.array(turn)
+    poses = [
+        RigidTransform.from_components(
+            home.translation + x, Rotation.from_rotvec(w) * home.rotation
+        )
+        for x, w in zip(moves, turns, strict=True)
+    ]
+    return located(name, platform=poses)
+
+
+@cache
+def made(name: str, n: int, noise: float = 1.0) -> Located:
+    return located(name, n, noise=noise)
+
+
+def frames_error(found: Location) -> Array:
+    """Return the step from the truth to what was located, (12,)."""
+    return np.concatenate(
+        [motion_error(found.T_world_base, BASE), motion_error(found.T_platform_tool, TOOL)]
+    )
+
+
+def unoriented(poses: ToolPoses) -> ToolPoses:
+    return replace(poses, oriented=np.zeros(len(poses), dtype=np.bool_))
 
 
 @pytest.mark.parametrize(
     "name", ["hexapod", *(pytest.param(n, marks=pytest.mark.slow) for n in ("3-rps", "tricept"))]
 )
 def test_base_and_tool_are_found_as_well_as_is_said(name: str) -> None:
-    made = located(name)
-    found = locate(made.machine, made.poses)
-    error = np.concatenate(
-        [motion_error(found.T_world_base, BASE), motion_error(found.T_platform_tool, TOOL)]
-    )
-    assert found.status == "located"
-    assert found.held == ()
+    found = locate(made(name, 20).machine, made(name, 20).poses)
+    error = frames_error(found)
+    assert (found.status, found.held, found.p_value) == ("located", (), None)
     assert error @ np.linalg.solve(found.covariance, error) < 33.0  # chi2 of 12 at 0.1 %
     assert found.noise.position == pytest.approx(SIGMA_POSITION, rel=0.35)
     assert found.noise.angle == pytest.approx(SIGMA_ANGLE, rel=0.35)
     assert all(row.used for row in found.rows)
-    assert found.p_value is None
-
-
-@pytest.mark.parametrize("name", ["hexapod", pytest.param("3-upu", marks=pytest.mark.slow)])
-def test_exact_poses_give_exact_frames_and_the_measured_poses_again(name: str) -> None:
-    made = located(name, 8, noise=0.0)
-    found = locate(made.machine, made.poses, tool_position=TOOL.translation.tolist())
-    assert np.abs(motion_error(found.T_world_base, BASE)).max() < 1e-8
-    assert np.abs(motion_error(found.T_platform_tool, TOOL)).max() < 1e-8
-    assert found.rms_position < 1e-9
-
-
-def test_a_machine_that_only_translates_gets_what_is_determined_and_a_sentence_on_the_rest() -> (
-    None
-):
-    made = located("3-upu", 10)
-    found = locate(made.machine, made.poses)
-    assert found.status == "located in part"
-    assert "the platform of this machine does not turn" in found.sentence
-    (tool,) = [held for held in found.held if held.frame == "tool"]
-    assert (tool.kind, len(tool.directions)) == ("position", 3)
-    np.testing.assert_allclose(found.T_platform_tool.translation, 0.0, atol=1e-9)
-    assert np.all(found.sigma[6:9] == pytest.approx(0.0, abs=1e-12))
-    for T, true, first in ((found.T_world_base, BASE, 3), (found.T_platform_tool, TOOL, 9)):
-        turn = motion_error(T, true)[3:]
-        assert np.all(np.abs(turn) < 5.0 * found.sigma[first : first + 3])
-    for T in made.platform:
-        where = found.T_world_base * T * found.T_platform_tool
-        assert np.linalg.norm(motion_error(where, BASE * T * TOOL)[:3]) < 0.05e-3
-
-
-def test_a_planar_machine_keeps_one_height_open() -> None:
-    made = located("3-rpr", 10)
-    at = (0.0, 0.0, float(TOOL.translation[2]))
-    found = locate(made.machine, made.poses, tool_position=at)
-    assert found.status == "located in part"
-    parts = {(h.frame, h.kind): h.directions for h in found.held}
-    assert set(parts) == {("base", "position"), ("tool", "position")}
-    np.testing.assert_allclose(parts["tool", "position"], [[0.0, 0.0, 1.0]], atol=1e-6)
-    error = np.concatenate(
-        [motion_error(found.T_world_base, BASE), motion_error(found.T_platform_tool, TOOL)]
-    )
-    assert abs(error[8]) < 1e-12  # held at its true value
-    kept = np.delete(np.arange(12), 8)
-    part = found.covariance[np.ix_(kept, kept)]
-    assert error[kept] @ np.linalg.solve(part, error[kept]) < 31.3
 
 
 def test_positions_alone_find_all_but_the_orientation_of_the_tool() -> None:
-    made = located("hexapod")
-    only = replace(made.poses, oriented=np.zeros(20, dtype=np.bool_))
-    found = locate(made.machine, only)
+    found = locate(shipped("hexapod"), unoriented(made("hexapod", 20).poses))
     assert not found.has_tool_orientation
     assert found.noise.angle is None
-    assert "its position only" in found.sentence
-    error = np.concatenate(
-        [motion_error(found.T_world_base, BASE), motion_error(found.T_platform_tool, TOOL)[:3]]
+    assert (
+        found.dof
+        == 60 - 9
+        == locate(
+            shipped("hexapod"), unoriented(made("hexapod", 20).poses), position_sigma=1e-5
+        ).dof
     )
+    error = frames_error(found)[:9]
     assert error @ np.linalg.solve(found.covariance[:9, :9], error) < 27.9
     assert np.all(found.covariance[9:] == 0.0)
 
 
-@pytest.mark.parametrize("stated", [(None, None), (SIGMA_POSITION, SIGMA_ANGLE)])
-def test_wrong_rows_are_named_and_left_out(stated: tuple[float | None, float | None]) -> None:
-    made = located("hexapod")
-    position = made.poses.position.copy()
+@pytest.mark.parametrize(
+    ("name", "fixed"),
+    [("hexapod", []), pytest.param("3-upu", [6, 7, 8]), ("3-rpr", [8])],
+)
+def test_exact_poses_give_exact_frames_where_the_open_part_is_fixed_at_its_truth(
+    name: str, fixed: list[int]
+) -> None:
+    """A machine that only translates, and a planar one: held parts have no variance."""
+    exact = made(name, 8, 0.0)
+    found = locate(exact.machine, exact.poses, tool_position=TOOL.translation.tolist())
+    assert np.abs(frames_error(found)).max() < 1e-8
+    assert found.rms_position < 1e-9
+    assert found.status == ("located in part" if fixed else "located")
+    assert np.flatnonzero(found.sigma < 1e-12).tolist() == fixed
+    tools = {h.kind: h.directions for h in found.held if h.frame == "tool"}
+    assert [len(d) for d in tools.values()] == ([len(fixed)] if fixed else [])
+    noisy = located(name, 10)
+    found = locate(noisy.machine, noisy.poses, tool_position=TOOL.translation.tolist())
+    kept = np.setdiff1d(np.arange(12), fixed)
+    error = frames_error(found)
+    assert np.abs(error[fixed]).max(initial=0.0) < 1e-9
+    assert error[kept] @ np.linalg.solve(found.covariance[np.ix_(kept, kept)], error[kept]) < 33.0
+
+
+def test_where_the_tool_is_in_the_world_does_not_depend_on_what_is_fixed() -> None:
+    translating = made("3-upu", 10)
+    one, other = (
+        locate(translating.machine, translating.poses, tool_position=at)
+        for at in (None, (0.01, 0.02, 0.3))
+    )
+    np.testing.assert_allclose(one.T_platform_tool.translation, 0.0, atol=1e-9)
+    for T in translating.platform:
+        there = [x.T_world_base * T * x.T_platform_tool for x in (one, other)]
+        assert np.abs(motion_error(*there)).max() < 1e-8
+        assert np.linalg.norm(motion_error(there[0], BASE * T * TOOL)[:3]) < 0.05e-3
+
+
+@pytest.mark.parametrize("stated", [{}, KNOWN])
+def test_outliers_are_named_and_left_out(stated: dict[str, float]) -> None:
+    hexapod = made("hexapod", 20)
+    position = hexapod.poses.position.copy()
     position[6] += 1e-3
     position[[2, 11]] = position[[11, 2]]
-    found = locate(
-        made.machine,
-        replace(made.poses, position=position),
-        position_sigma=stated[0],
-        angle_sigma=stated[1],
-    )
+    found = locate(hexapod.machine, replace(hexapod.poses, position=position), **stated)
     assert [row.row for row in found.rows if not row.used] == [3, 7, 12]
     assert found.trustworthy
-    assert "Rows 3, 7, 12 disagree with the others and were left out" in found.sentence
+    assert "3, 7, 12" in found.sentence
     assert found.rows[6].reason.startswith("1.7")
-    assert np.abs(motion_error(found.T_world_base, BASE)[:3]).max() < 0.2e-3
+    assert np.abs(frames_error(found)[:3]).max() < 0.2e-3
 
 
 def test_right_rows_are_not_left_out_for_what_is_stated_of_the_measurement() -> None:
-    made = located("hexapod", 6)
-    found = locate(made.machine, made.poses, position_sigma=1e-6, angle_sigma=1e-6)
-    assert all(row.used for row in found.rows)
-    assert found.status == "doubtful"
-    assert not found.trustworthy
-    assert "times as much as was stated" in found.sentence
-
-
-def test_stated_sigmas_are_taken_and_tested() -> None:
-    made = located("hexapod", 8)
-    found = locate(made.machine, made.poses, position_sigma=SIGMA_POSITION, angle_sigma=SIGMA_ANGLE)
-    assert found.noise.position == pytest.approx(SIGMA_POSITION)
-    assert found.p_value is not None
-    assert found.p_value > 1e-3
-    assert found.dof == 36
-    wide = locate(made.machine, made.poses, position_sigma=1e-3, angle_sigma=SIGMA_ANGLE)
+    hexapod = made("hexapod", 8)
+    small = locate(hexapod.machine, hexapod.poses, position_sigma=1e-6, angle_sigma=1e-6)
+    assert all(row.used for row in small.rows)
+    assert (small.status, small.trustworthy) == ("doubtful", False)
+    right = locate(hexapod.machine, hexapod.poses, **KNOWN)
+    assert right.noise.position == pytest.approx(SIGMA_POSITION)
+    assert right.p_value is not None
+    assert right.p_value > 1e-3
+    assert right.dof == 36
+    wide = locate(hexapod.machine, hexapod.poses, position_sigma=1e-3, angle_sigma=SIGMA_ANGLE)
     assert any("look too large: positions" in note for note in wide.notes)
-
-
-def test_errors_of_readings_make_the_answer_less_certain() -> None:
-    made = located("hexapod", 8)
-    without, beside = (
-        locate(
-            made.machine,
-            made.poses,
-            position_sigma=SIGMA_POSITION,
-            angle_sigma=SIGMA_ANGLE,
-            encoder_sigma=sigma,
-        )
-        for sigma in (0.0, 50e-6)
-    )
-    assert np.all(beside.sigma > without.sigma)
+    beside = locate(hexapod.machine, hexapod.poses, **KNOWN, encoder_sigma=50e-6)
+    assert np.all(beside.sigma > right.sigma)
     assert beside.noise.reading == 50e-6
 
 
-def test_what_is_known_badly_is_named() -> None:
-    made = located("hexapod", platform=near_home("hexapod", steps(12, 0.02, (0.01, 0.01, 1.0))))
-    found = locate(made.machine, made.poses)
-    assert any(
-        note.startswith("Known badly is the position of the tool in the platform along")
-        for note in found.notes
-    )
+def test_a_row_that_is_stated_to_be_worse_counts_less() -> None:
+    hexapod = made("hexapod", 8)
+    position, sigma = hexapod.poses.position.copy(), np.full(8, SIGMA_POSITION)
+    position[0] += 2e-3
+    sigma[0] = 2e-3
+    poses = replace(hexapod.poses, position=position, position_sigma=sigma)
+    found = locate(hexapod.machine, poses, angle_sigma=SIGMA_ANGLE)
+    assert all(row.used for row in found.rows)
+    assert np.linalg.norm(frames_error(found)[:3]) < 0.2e-3
 
 
-@pytest.mark.parametrize(
-    ("turn", "size", "match"),
-    [
-        ((0, 0, 1), 0.02, r"the tool in the platform along \(0, 0, 1\).*all turn about one axis, "
-         r"\(0, 0, 1\).*needed rotations about two axes; add poses that are tilted"),
-        ((0, 0, 0), 0.02, "poses that do not turn and move in space, needed rotations about two"),
-        ((0, 0, 1), 0.0, "all turn about one axis.*stay in place, needed rotations about two"),
-    ],
-)  # fmt: skip
-def test_poses_without_two_rotation_axes_are_refused(
-    turn: tuple[float, float, float], size: float, match: str
-) -> None:
-    made = located("hexapod", platform=near_home("hexapod", steps(10, size, turn)))
-    with pytest.raises(NotIdentifiable, match=match) as refused:
-        locate(made.machine, made.poses)
-    assert len(refused.value.problems) == 1
-
-
-def test_a_translating_machine_that_moves_along_a_line_only_is_asked_for_other_directions() -> None:
-    moves = np.zeros((6, 6))
-    moves[:, 2] = np.linspace(-0.03, 0.03, 6)
-    made = located("3-upu", platform=near_home("3-upu", moves))
-    with pytest.raises(NotIdentifiable, match="needed displacements in 3 directions"):
-        locate(made.machine, made.poses)
-
-
-def test_too_few_poses_are_refused() -> None:
-    made = located("hexapod")
-    with pytest.raises(NotIdentifiable, match="found 1 pose, needed at least 3 poses"):
-        locate(made.machine, made.rows([0]))
-    with pytest.raises(NotIdentifiable, match="found 5 rows at 1 different reading, needed"):
-        locate(made.machine, made.rows([0] * 5))
-    three = made.rows(range(3))
-    only = replace(three, oriented=np.zeros(3, dtype=np.bool_))
-    with pytest.raises(NotIdentifiable, match="needed at least 4 poses of which only positions"):
-        locate(made.machine, only)
-    found = locate(made.machine, three)
-    assert any("A wrong row among the 3 poses could not have been" in n for n in found.notes)
-
-
-def test_a_scatter_that_nothing_tells_is_asked_for() -> None:
-    made = located("hexapod")
-    one = replace(made.poses, oriented=np.arange(20) == 4)
-    with pytest.raises(NotIdentifiable, match=r"orientations of 20 rows.*state.*--angle-sigma"):
-        locate(made.machine, one)
-    found = locate(made.machine, one, angle_sigma=SIGMA_ANGLE)
+def test_few_poses_and_weak_directions_are_noted() -> None:
+    weak = near_home("hexapod", 12, 0.02, (0.01, 0.01, 1.0))
+    notes = locate(weak.machine, weak.poses).notes
+    assert any("the position of the tool in the platform along" in note for note in notes)
+    hexapod = made("hexapod", 20)
+    notes = locate(hexapod.machine, hexapod.rows(range(3))).notes
+    assert any("A wrong row among the 3 poses" in note for note in notes)
+    one = replace(hexapod.poses, oriented=np.arange(20) == 4)
+    found = locate(hexapod.machine, one, angle_sigma=SIGMA_ANGLE)
     assert found.has_tool_orientation
     assert found.sigma[9:].max() > 0.9 * SIGMA_ANGLE
 
 
-def test_rows_with_too_much_scatter_for_their_number_are_refused() -> None:
-    made = located("hexapod", 4)
-    position = made.poses.position.copy()
-    position[2] += 5e-3
-    with pytest.raises(NotIdentifiable, match=r"with a scatter of .* needed more or better ones"):
-        locate(made.machine, replace(made.poses, position=position))
+def _position(change: Callable[[Array], Array], n: int = 6, **more: Any) -> Located:
+    hexapod = located("hexapod", n)
+    position = change(hexapod.poses.position)
+    return replace(hexapod, poses=replace(hexapod.poses, position=position, **more))
 
 
-def _millimetres(made: Located) -> ToolPoses:
-    return replace(made.poses, position=1e3 * made.poses.position)
+def _displaced(p: Array) -> Array:
+    return p + 5e-3 * (np.arange(len(p)) == 2)[:, None]
 
 
-def _reordered(made: Located) -> ToolPoses:
-    quaternions = Rotation.from_matrix(made.poses.rotation).as_quat()
+def _mirrored() -> Located:
+    hexapod, S = located("hexapod", 6), np.diag([1.0, -1.0, 1.0])
+    p = hexapod.poses
+    poses = replace(p, position=p.position @ S, rotation=S @ p.rotation @ S)
+    return replace(hexapod, poses=poses)
+
+
+def _w_first() -> Located:
+    hexapod = located("hexapod", 6)
+    quaternions = Rotation.from_matrix(hexapod.poses.rotation).as_quat()
     wrong = Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()
-    return replace(made.poses, rotation=wrong)
+    return replace(hexapod, poses=replace(hexapod.poses, rotation=wrong))
 
 
-def _mirrored(made: Located) -> ToolPoses:
-    S = np.diag([1.0, -1.0, 1.0])
-    return replace(
-        made.poses, position=made.poses.position @ S, rotation=S @ made.poses.rotation @ S
-    )
+def _inverse() -> Located:
+    hexapod = located("hexapod", 6)
+    back = np.swapaxes(hexapod.poses.rotation, 1, 2)
+    there = -np.einsum("nij,nj->ni", back, hexapod.poses.position)
+    return replace(hexapod, poses=replace(hexapod.poses, rotation=back, position=there))
 
 
-def _mirrored_positions(made: Located) -> ToolPoses:
-    return replace(made.poses, position=made.poses.position * [1.0, 1.0, -1.0])
-
-
-def _inverse(made: Located) -> ToolPoses:
-    back = np.swapaxes(made.poses.rotation, 1, 2)
-    there = -np.einsum("nij,nj->ni", back, made.poses.position)
-    return replace(made.poses, rotation=back, position=there)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "match"),
-    [
-        (_millimetres, "look like positions in millimetres.*divide x, y and z by 1000"),
-        (_reordered, "quaternions in the order w, x, y, z"),
-        (_mirrored, "left-handed axes, a mirror image"),
-        pytest.param(
-            _mirrored_positions,
-            r"positions along left-handed axes \(z reversed\)",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(_inverse, "poses of the world in the tool", marks=pytest.mark.slow),
-    ],
-)
-def test_common_mistakes_are_told_by_name(
-    spoil: Callable[[Located], ToolPoses], match: str
-) -> None:
-    made = located("hexapod", 6)
-    with pytest.raises(DatasetError, match=match) as refused:
-        locate(made.machine, spoil(made))
-    assert len(refused.value.problems) == 1
-
-
-def test_poses_of_other_readings_are_refused() -> None:
-    made = located("hexapod", 6)
-    rolled = replace(
-        made.poses,
-        position=np.roll(made.poses.position, 1, axis=0),
-        rotation=np.roll(made.poses.rotation, 1, axis=0),
-    )
-    with pytest.raises(DatasetError, match=r"whatever the frames.*check that rows belong together"):
-        locate(made.machine, rolled)
-
-
-def test_too_many_rows_that_disagree_are_refused_and_named() -> None:
-    made = located("hexapod", 12)
-    chance = np.random.default_rng(7)
-    position, rotation = made.poses.position.copy(), made.poses.rotation.copy()
+def _four_of_twelve() -> Located:
+    chance, hexapod = np.random.default_rng(7), located("hexapod", 12)
+    position, rotation = hexapod.poses.position.copy(), hexapod.poses.rotation.copy()
     position[:4] += chance.normal(size=(4, 3)) * 5e-3
     rotation[:4] = rotation_matrices(0.02 * chance.normal(size=(4, 3))) @ rotation[:4]
-    with pytest.raises(DatasetError, match=r"4 of 12 rows that disagree.*\(1, 2, 3, 4\)"):
-        locate(made.machine, replace(made.poses, position=position, rotation=rotation))
+    return replace(hexapod, poses=replace(hexapod.poses, position=position, rotation=rotation))
 
 
-def test_readings_that_the_machine_cannot_have_are_refused() -> None:
-    made = located("hexapod", 4)
-    q = made.poses.q.copy()
-    q[1] = [0.0, 0.14, 0.0, 0.14, 0.0, 0.14]
-    q[1, 0] = 2.0
-    with pytest.raises(DidNotConverge, match=r"The tool poses: .*row 2"):
-        locate(made.machine, replace(made.poses, q=q))
+def _rolled() -> Located:
+    p, hexapod = located("hexapod", 6).poses, located("hexapod", 6)
+    position, rotation = (np.roll(x, 1, axis=0) for x in (p.position, p.rotation))
+    return replace(hexapod, poses=replace(p, position=position, rotation=rotation))
+
+
+def _rows(rows: list[int], *, oriented: bool = True) -> Located:
+    hexapod = made("hexapod", 20)
+    poses = hexapod.rows(rows)
+    return replace(hexapod, poses=poses if oriented else unoriented(poses))
+
+
+def _along_a_line() -> Located:
+    home = shipped("3-upu").home
+    shifts = [RigidTransform.from_translation([0, 0, z]) for z in np.linspace(-0.03, 0.03, 6)]
+    return located("3-upu", platform=[shift * home for shift in shifts])
+
+
+def _unreachable() -> Located:
+    hexapod = located("hexapod", 4)
+    q = hexapod.poses.q.copy()
+    q[1] = [2.0, 0.14, 0.0, 0.14, 0.0, 0.14]
+    return replace(hexapod, poses=replace(hexapod.poses, q=q))
+
+
+def _loose() -> Located:
+    hexapod = located("hexapod", 4)
+    return replace(hexapod, machine=replace(hexapod.machine, mobility=7))
+
+
+SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    ("numbers", "match"),
+    ("spoiled", "options", "kind", "named"),
     [
-        ({"position_sigma": 0.0}, "position sigma could not be used: found 0 m"),
-        ({"angle_sigma": 0.5}, "angle sigma could not be used: found 0.5 rad"),
-        ({"encoder_sigma": float("nan")}, "encoder sigma could not be used: found nan"),
-        ({"tool_position": (0.0, 1.0)}, "tool position could not be used.*needed three numbers"),
-        ({"tool_position": (0.0, 0.0, float("inf"))}, "tool position could not be used"),
+        (lambda: near_home("hexapod", 10, 0.02, (0, 0, 1)), {}, NotIdentifiable,
+         ("tool in the platform along (0, 0, 1)", "two axes", "tilted")),
+        (lambda: near_home("hexapod", 10, 0.02, (0, 0, 0)), {}, NotIdentifiable, ("do not turn",)),
+        (lambda: near_home("hexapod", 10, 0.0, (0, 0, 1)), {}, NotIdentifiable,
+         ("all turn about one axis", "stay in place")),
+        (_along_a_line, {}, NotIdentifiable, ("displacements in 3 directions",)),
+        (lambda: _rows([0]), {}, NotIdentifiable, ("1 pose", "3 poses")),
+        (lambda: _rows([0] * 5), {}, NotIdentifiable, ("5 rows at 1 different reading",)),
+        (lambda: _rows([0, 1, 2], oriented=False), {}, NotIdentifiable, ("4 poses", "positions")),
+        (lambda: _position(np.copy, 20, oriented=np.arange(20) == 4), {}, NotIdentifiable,
+         ("orientations of 20 rows", "--angle-sigma")),
+        (lambda: _position(_displaced, 4), {}, NotIdentifiable, ("scatter of",)),
+        (lambda: _position(lambda p: 1e3 * p), {}, DatasetError,
+         ("millimetres", "1000")),
+        (_w_first, {}, DatasetError, ("w, x, y, z",)),
+        (_mirrored, {}, DatasetError, ("left-handed axes", "mirror")),
+        pytest.param(lambda: _position(lambda p: p * [1, 1, -1.0]), {},
+                     DatasetError, ("left-handed axes (z reversed)",), marks=SLOW),
+        pytest.param(_inverse, {}, DatasetError, ("world in the tool",), marks=SLOW),
+        (_rolled, {}, DatasetError, ("whatever the frames", "rows belong together")),
+        (_four_of_twelve, {}, DatasetError, ("4 of 12 rows", "(1, 2, 3, 4)")),
+        (_unreachable, {}, DidNotConverge, ("The tool poses", "row 2")),
+        (_loose, {}, LegcalError, ("the pose cannot be computed from readings",)),
+        (lambda: _rows([0, 1, 2]), {"position_sigma": 0.0}, UsageError, ("position sigma", "0 m")),
+        (lambda: _rows([0, 1, 2]), {"angle_sigma": 0.5}, UsageError, ("angle sigma", "0.5 rad")),
+        (lambda: _rows([0, 1, 2]), {"encoder_sigma": float("nan")}, UsageError, ("nan",)),
+        (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 1.0)}, UsageError, ("three numbers",)),
+        (lambda: _rows([0, 1, 2]), {"tool_position": (0.0, 0.0, float("inf"))}, UsageError,
+         ("tool position",)),
+        (lambda: _position(np.copy, 4, position_sigma=np.full(4, 1e-5)),
+         {"position_sigma": 1e-5}, UsageError, ("column position_sigma", "option")),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_located_is_refused_with_what_is_wrong(
+    spoiled: Callable[[], Located],
+    options: dict[str, Any],
+    kind: type[LegcalError],
+    named: tuple[str, ...],
+) -> None:
+    given = spoiled()
+    with pytest.raises(kind) as refused:
+        locate(given.machine, given.poses, **options)
+    assert len(refused.value.problems) == 1
+    assert [word for word in named if word not in str(refused.value)] == []
+
+
+def test_a_table_says_the_same_as_arrays(tmp_path: Path) -> None:
+    """In any order of columns, with sigmas, and orientations of some rows only."""
+    hexapod, path = located("hexapod", 5), tmp_path / "poses.csv"
+    rows = write_poses(path, hexapod)
+    more = {"position_sigma": "2e-5", "angle_sigma": "1e-4", "name": "first"}
+    rows = [dict(reversed(list((more | row).items()))) for row in rows]
+    rows[2].update(qx="", qy="", qz="", qw="", angle_sigma="")
+    write_rows(path, rows)
+    poses = replace(
+        hexapod.poses,
+        oriented=np.arange(5) != 2,
+        position_sigma=np.full(5, 2e-5),
+        angle_sigma=np.full(5, 1e-4),
+    )
+    read, given = (locate(hexapod.machine, x) for x in (path, poses))
+    np.testing.assert_allclose(read.covariance, given.covariance, rtol=1e-9)
+    np.testing.assert_allclose(frames_error(read), frames_error(given), atol=1e-12)
+    assert [row.rotation is None for row in read.rows] == [False, False, True, False, False]
+    assert read.notes == given.notes
+    short = [
+        {name: f"{float(text):.4f}" if name[0] == "q" else text for name, text in row.items()}
+        for row in write_poses(path, hexapod)
+    ]
+    write_rows(path, short)
+    assert "quaternions were made unit" in locate(hexapod.machine, path, angle_sigma=1e-3).notes[0]
+
+
+@pytest.mark.parametrize(
+    ("cells", "named"),
+    [
+        ({"position_sigma": "0"}, ("position_sigma", "'0'")),
+        ({"position_sigma": ""}, ("position_sigma", "empty cell")),
     ],
 )
-def test_numbers_that_cannot_be_meant_are_refused(numbers: dict[str, float], match: str) -> None:
-    made = located("hexapod", 4)
-    with pytest.raises(UsageError, match=match):
-        locate(made.machine, made.poses, **numbers)  # type: ignore[arg-type]
+def test_sigmas_of_a_table_are_read_strictly(
+    tmp_path: Path, cells: dict[str, str], named: tuple[str, ...]
+) -> None:
+    rows = write_poses(tmp_path / "poses.csv", made("hexapod", 4))
+    write_rows(tmp_path / "poses.csv", [row | cells for row in rows])
+    with pytest.raises(DatasetError) as refused:
+        locate(shipped("hexapod"), tmp_path / "poses.csv")
+    assert [word for word in named if word not in str(refused.value)] == []
 
 
-def test_sigmas_that_are_stated_twice_are_refused() -> None:
-    made = located("hexapod", 4)
-    twice = replace(made.poses, position_sigma=np.full(4, 1e-5))
-    with pytest.raises(UsageError, match="found it in the column position_sigma and as an option"):
-        locate(made.machine, twice, position_sigma=1e-5)
+@pytest.fixture(scope="module")
+def found() -> Location:
+    return locate(shipped("hexapod"), made("hexapod", 5).poses)
 
 
-def test_a_row_that_is_stated_to_be_worse_counts_less() -> None:
-    made = located("hexapod", 8)
-    position = made.poses.position.copy()
-    position[0] += 2e-3
-    sigma = np.full(8, SIGMA_POSITION)
-    sigma[0] = 2e-3
-    found = locate(
-        made.machine,
-        replace(made.poses, position=position, position_sigma=sigma),
-        angle_sigma=SIGMA_ANGLE,
+@pytest.fixture(scope="module")
+def in_part() -> Location:
+    return locate(shipped("3-rpr"), unoriented(made("3-rpr", 6).poses))
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["legcal", "locate", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert isinstance(stop.value.code, int)
+    return stop.value.code
+
+
+def test_the_command_writes_what_it_prints_and_ends_with_1_where_it_doubts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hexapod = made("hexapod", 5)
+    position = hexapod.poses.position.copy()
+    position[4] += 0.05
+    write_poses(tmp_path / "poses.csv", hexapod, replace(hexapod.poses, position=position))
+    words: list[str | Path] = ["hexapod", tmp_path / "poses.csv", "-o", tmp_path / "a.yaml"]
+    assert run(monkeypatch, *words, "--urdf", tmp_path / "out", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    names = [Path(p).relative_to(tmp_path).as_posix() for p in document.pop("written")]
+    assert names == ["out/models/hexapod.yaml", "out/urdf/hexapod.urdf", "a.yaml"]
+    assert yaml.safe_load((tmp_path / "a.yaml").read_text()) == document
+    assert run(monkeypatch, *words, "--encoder-sigma", "1um", "--tool-position", "0,0,5mm") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for words_shown in ("Row 5 was left out: 8", "errors of the readings", "was not needed"):
+        assert words_shown in shown
+    assert run(monkeypatch, *words, "--position-sigma", "0.001mm") == 1
+    assert "Doubtful" in capsys.readouterr().out
+    assert load_location(tmp_path / "a.yaml").status == "doubtful"
+
+
+@pytest.mark.parametrize("which", ["found", "in_part"])
+def test_a_location_comes_back_from_its_file(
+    which: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    location: Location = request.getfixturevalue(which)
+    write_location(location, str(tmp_path / "a.yaml"))
+    again = load_location(tmp_path / "a.yaml")
+    before, after = location_document(location), location_document(again)
+    for frame in ("T_world_base", "T_platform_tool"):
+        one, two = before.pop(frame), after.pop(frame)
+        np.testing.assert_allclose(one.pop("quat_xyzw"), two.pop("quat_xyzw"), atol=1e-15)
+        assert one == two
+    assert before == after
+    np.testing.assert_array_equal(again.covariance, location.covariance)
+    assert (again.rows, again.held) == (location.rows, location.held)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"covariance": {"names": ["x"], "matrix": [[1.0]]}}, ("covariance", "another matrix")),
+        ({"status": "fine"}, ("status", "'fine'")),
+        ({"residuals": {}}, ("residuals.chi2",)),
+        ({"more": 1}, ("more", "unknown key")),
+        ({"legcal_location": None}, ("'legcal_location'",)),
+    ],
+)
+def test_files_that_are_no_location_are_refused_and_kept(
+    found: Location, tmp_path: Path, change: dict[str, Any], named: tuple[str, ...]
+) -> None:
+    path = tmp_path / "a.yaml"
+    document = {k: v for k, v in (location_document(found) | change).items() if v is not None}
+    path.write_text(yaml.safe_dump(document))
+    with pytest.raises(DatasetError) as refused:
+        load_location(path)
+    assert [word for word in named if word not in str(refused.value)] == []
+    if "legcal_location" in change:
+        before = path.read_text()
+        for place in (path, tmp_path):
+            with pytest.raises(UsageError, match="found a"):
+                write_location(found, place)
+        assert path.read_text() == before
+
+
+@pytest.mark.parametrize("name", ["hexapod", "3-rpr", "tricept"])
+def test_the_written_urdf_is_the_same_machine_with_world_and_tool_in_it(
+    name: str, found: Location, tmp_path: Path
+) -> None:
+    """Against Pinocchio; frames of an earlier location are replaced, all else stays."""
+    first, second = (replace(found, T_world_base=B, T_platform_tool=T) for B, T in (
+        (BASE * TOOL, TOOL.inv()), (BASE, TOOL)))  # fmt: skip
+    earlier, _ = write_located_model(shipped(name), first, tmp_path / "first")
+    for k, machine in enumerate((shipped(name), load_mechanism(earlier))):
+        model, urdf = write_located_model(machine, second, tmp_path / str(k))
+        old = shipped(name).urdf.content.decode().splitlines()
+        new = urdf.read_text().splitlines()
+        assert [line for line in new if line in old] == old
+        assert len(new) == len(old) + 4
+        written = load_mechanism(model)
+        np.testing.assert_allclose(written.A_base, shipped(name).A_base, atol=1e-14)
+        pin_model = pin.buildModelFromUrdf(str(urdf))
+        data = pin_model.createData()
+        pin.framesForwardKinematics(pin_model, data, written.home_configuration)
+        tip, world = (data.oMf[pin_model.getFrameId(link)] for link in ("tool", "world"))
+        T = RigidTransform.from_matrix((world.inverse() * tip).homogeneous)
+        expected = BASE * platform_pose(written, written.home_configuration) * TOOL
+        assert np.abs(motion_error(T, expected)).max() < 1e-12
+    with pytest.raises(UsageError, match="already there"):
+        write_located_model(shipped(name), found, tmp_path / "0")
+
+
+def _machine_with(folder: Path, extra: str) -> Path:
+    """Write the hexapod with more in its URDF."""
+    machine = shipped("hexapod")
+    for name in ("models", "urdf"):
+        (folder / name).mkdir()
+    text = machine.urdf.content.decode().replace("</robot>", extra + "</robot>")
+    (folder / "urdf/hexapod.urdf").write_bytes(text.encode())
+    (folder / "models/hexapod.yaml").write_bytes(machine.yaml_path.read_bytes())
+    return folder / "models/hexapod.yaml"
+
+
+JOINT = '<joint name="{0}_j" type="fixed"><parent link="{1}"/><child link="{0}"/>{2}</joint>\n'
+
+
+def test_links_of_another_meaning_are_refused_and_other_names_taken(
+    found: Location, in_part: Location, tmp_path: Path
+) -> None:
+    links = [f'<link name="{x}"/>' + JOINT.format(x, "base", "") for x in ("world", "tool")]
+    machine = load_mechanism(_machine_with(tmp_path, "".join(links)))
+    for k, (world, tool, named) in enumerate([
+        ("world", "tcp", "--world-link"), ("cell", "tool", "--tool-link"),
+        ("a b", "tcp", "'a b'"), ("same", "same", "'same'"),
+    ]):  # fmt: skip
+        with pytest.raises(UsageError, match=named):
+            write_located_model(machine, found, tmp_path / str(k), world=world, tool=tool)
+    _, urdf = write_located_model(machine, found, tmp_path / "out", world="cell", tool="tcp")
+    assert urdf.read_text().index("".join(links).rstrip()) < urdf.read_text().index('"cell"')
+    with pytest.raises(ModelError, match="below the joint 'platform_free', which moves"):
+        write_located_model(replace(shipped("hexapod"), base="platform"), found, tmp_path / "x")
+    _, urdf = write_located_model(shipped("3-rpr"), in_part, tmp_path / "in part")
+    assert not in_part.has_tool_orientation
+    assert 'rpy="0.0 0.0 0.0"/></joint>\n</robot>' in urdf.read_text().replace("-0.0", "0.0")
+
+
+def test_the_world_goes_above_a_root_that_carries_the_base(found: Location, tmp_path: Path) -> None:
+    """And is placed through the table, in a file that has one already."""
+    origin = '<origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/>'
+    table = '<link name="table"/>' + JOINT.format("base", "table", origin)
+    model = _machine_with(tmp_path, table)
+    on_table = RigidTransform.from_components(
+        [0.1, 0.2, 0.3], Rotation.from_euler("xyz", [0.4, 0.5, 0.6])
     )
-    assert all(row.used for row in found.rows)
-    assert np.linalg.norm(motion_error(found.T_world_base, BASE)[:3]) < 0.2e-3
+    for there in (replace(found, T_world_base=TOOL), found):
+        folder = tmp_path / str(there is found)
+        model, _ = write_located_model(load_mechanism(model), there, folder)
+    joint = load_mechanism(model).urdf.joints["world_table_frame"]
+    error = motion_error(joint.T_parent_origin * on_table, found.T_world_base)
+    assert np.abs(error).max() < 1e-14

@@ -33,12 +33,12 @@ from .joint_fit.state import FittedLegs as FittedLegs
 from .joint_fit.state import RefinementSettings as RefinementSettings
 from .joint_fit.state import Start as Start
 from .location.document import LOCATION_FILE as LOCATION_FILE
+from .location.document import Location as Location
 from .location.document import load_location as load_location
 from .location.document import location_document as location_document
 from .location.document import write_location as write_location
 from .location.locate import locate as locate
-from .location.result import Location as Location
-from .location.result import ToolPoses as ToolPoses
+from .location.observations import ToolPoses as ToolPoses
 from .location.urdf import write_located_model as write_located_model
 from .noise import CALLED as CALLED
 from .noise import LegNoise as LegNoise

@@ -76,6 +76,7 @@ from .parameters import turn_of as turn_of
 from .parameters import turn_slope as turn_slope
 from .parameters import twist_after as twist_after
 from .parameters import vector_of as vector_of
+from .solver import solve as solve
 from .urdf import Urdf as Urdf
 from .urdf import UrdfPatch as UrdfPatch
 from .urdf import number_list as number_list

@@ -1,21 +1,16 @@
-"""The location file: written, checked and read back."""
+"""A location, its undetermined parts in words, and the location file: written and read back."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
 from pydantic import BeforeValidator, Field
+from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.location.result import (
-    NAMES,
-    Location,
-    MeasurementNoise,
-    OpenPart,
-    RowResidual,
-)
 from legcal.errors import DatasetError
 from legcal.files import (
     FileSchema,
@@ -28,16 +23,197 @@ from legcal.files import (
     read_text,
     validate,
 )
+from legcal.geometry import Array
 
-WHAT = "location file"
-KEY = "legcal_location"
-LOCATION_FILE = OwnYaml("the location", WHAT, KEY, "a new file or an earlier location")
-_SYMMETRIC = 1e-9  # relative
-_NONE = 1e-12  # below zero: rounding
+Frame = Literal["base", "tool"]
+Kind = Literal["position", "orientation"]
+Direction = tuple[float, float, float]
+Status = Literal["located", "located in part", "doubtful"]
+NAMES = tuple(
+    f"{frame}.{component}"
+    for frame in ("T_world_base", "T_platform_tool")
+    for component in ("x", "y", "z", "rx", "ry", "rz")
+)
+_WHAT = "location file"
+_KEY = "legcal_location"
+LOCATION_FILE = OwnYaml("the location", _WHAT, _KEY, "a new file or an earlier location")
+_SYMMETRY_TOLERANCE = 1e-9  # relative
+_NEGATIVE_TOLERANCE = 1e-12  # of eigenvalues below zero, relative
 _Vector = Annotated[
     tuple[Number, Number, Number], BeforeValidator(lambda v: tuple(v) if type(v) is list else v)
 ]
 _Size = Annotated[Number, Field(ge=0.0)]
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """The result of :func:`legcal.locate`.
+
+    Attributes
+    ----------
+    model, poses : str
+        The files it comes from.
+    T_world_base : RigidTransform
+        The base link in the world [m].
+    T_platform_tool : RigidTransform
+        The tool in the platform link [m]; its rotation is the identity where the orientation of
+        the tool was not measured.
+    has_tool_orientation : bool
+        Whether the orientation of the tool in the platform is known.
+    covariance : (12, 12) array
+        Of ``NAMES``: displacements [m] and rotation vectors [rad] of the base about world axes and
+        of the tool about platform axes, T_true = (exp r, t + x) applied from the left. What is
+        held, and an orientation that is not known, counts as zero.
+    held : tuple of OpenPart
+        What the machine leaves open.
+    held_at : tuple of float
+        The tool position in the platform whose components are taken where it is open [m].
+    held_words : str
+        The same for people; "" where everything is determined.
+    noise : MeasurementNoise
+        Of the measurement.
+    rows : tuple of RowResidual
+        In the order of the file.
+    chi2, dof, p_value : float, int, float or None
+        Sum of squared residuals in standard deviations, degrees of freedom, and the probability of
+        a larger sum; None where all standard deviations come from the residuals.
+    tool_position_sigma, tool_angle_sigma : float, float or None
+        How well both frames together put the tool in the world at the measured poses: one standard
+        deviation of the vector, rms over the poses [m], [rad].
+    status : {"located", "located in part", "doubtful"}
+        The verdict in a word.
+    sentence : str
+        The verdict.
+    notes : tuple of str
+        What else a reader should know.
+    """
+
+    model: str
+    poses: str
+    T_world_base: RigidTransform
+    T_platform_tool: RigidTransform
+    has_tool_orientation: bool
+    covariance: Array
+    held: tuple[OpenPart, ...]
+    held_at: tuple[float, float, float]
+    held_words: str
+    noise: MeasurementNoise
+    rows: tuple[RowResidual, ...]
+    chi2: float
+    dof: int
+    p_value: float | None
+    tool_position_sigma: float
+    tool_angle_sigma: float | None
+    status: Status
+    sentence: str
+    notes: tuple[str, ...]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation of each of ``NAMES``, (12,) [m, rad]."""
+        return np.asarray(np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0)))
+
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the poses are explained as well as they claim to be measured."""
+        return self.status != "doubtful"
+
+    @property
+    def rms_position(self) -> float:
+        """Root mean square of the position residuals of the rows used, a component [m]."""
+        return _rms([row.position for row in self.rows if row.used])
+
+    @property
+    def rms_angle(self) -> float | None:
+        """The same of orientations [rad]; None where none was measured."""
+        turns = [row.rotation for row in self.rows if row.used and row.rotation is not None]
+        return _rms(turns) if turns else None
+
+
+@dataclass(frozen=True)
+class RowResidual:
+    """A row of the measured poses, and how far it is from the located frames."""
+
+    row: int  # its number in the file, from 1
+    # measured minus predicted position of the tool, in the world [m]
+    position: tuple[float, float, float]
+    # the same of its orientation as a rotation vector about world axes [rad]; None where it was not
+    # measured
+    rotation: tuple[float, float, float] | None
+    reason: str = ""  # why it was left out; "" if it was used
+
+    @property
+    def used(self) -> bool:
+        """Whether the frames rest on it."""
+        return not self.reason
+
+
+@dataclass(frozen=True)
+class MeasurementNoise:
+    """How precise the measured poses are."""
+
+    # position, angle: standard deviation of a component [m], [rad], rms over the rows; None of
+    # orientations that were not measured
+    position: float
+    angle: float | None
+    # position_stated, angle_stated: whether it was stated or comes from the residuals
+    position_stated: bool
+    angle_stated: bool
+    reading: float  # standard deviation of a reading that was stated [m]; zero if none was
+    model: bool  # whether the covariance of a calibrated model was counted in
+
+
+@dataclass(frozen=True)
+class OpenPart:
+    """A part of the frames that poses do not tell, or hardly."""
+
+    frame: Frame  # {"base", "tool"}: whose
+    kind: Kind  # {"position", "orientation"}: of what
+    # unit vectors: of the base in the base link, of the tool in the platform link
+    directions: tuple[Direction, ...]
+
+    @property
+    def words(self) -> str:
+        """What is open, for people."""
+        whose = "the base in the world" if self.frame == "base" else "the tool in the platform"
+        link = "the base" if self.frame == "base" else "the platform"
+        start = f"the {self.kind} of {whose}"
+        if len(self.directions) == 3:
+            return start
+        if len(self.directions) == 2:
+            normal = np.cross(*np.array(self.directions))
+            return f"{start} across {direction_words(normal)} of {link}"
+        link = "its own axes" if self.frame == "base" else link
+        how = "along" if self.kind == "position" else "about"
+        return f"{start} {how} {direction_words(self.directions[0])} of {link}"
+
+
+def joined(parts: list[OpenPart]) -> str:
+    """Return parts in one phrase, the tool's first."""
+    words = [part.words for part in sorted(parts, key=lambda part: part.frame != "tool")]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def direction_words(v: Array | tuple[float, ...]) -> str:
+    """Return a direction with two digits."""
+    v = _signed(np.asarray(v) / np.linalg.norm(v))
+    return "(" + ", ".join(f"{x:.3g}" for x in np.round(v, 2) + 0.0) + ")"
+
+
+def direction_of(v: Array) -> Direction:
+    """Return a unit vector (3,) with its largest component positive, as numbers."""
+    x, y, z = _signed(v).tolist()
+    return x, y, z
+
+
+def _signed(v: Array) -> Array:
+    """Return a direction with its largest component positive."""
+    return np.asarray(v if v[np.argmax(np.abs(v))] > 0.0 else -v)
+
+
+def _rms(vectors: list[tuple[float, float, float]]) -> float:
+    """Return the root mean square of components."""
+    return float(np.sqrt(np.mean(np.square(vectors))))
 
 
 class _Frame(MotionEntry):
@@ -139,7 +315,7 @@ def location_document(location: Location) -> dict[str, Any]:
     if not location.has_tool_orientation:
         tool["sigma_rotation"] = None
     return {
-        KEY: 1,
+        _KEY: 1,
         "status": location.status,
         "verdict": location.sentence,
         "model": location.model,
@@ -223,10 +399,10 @@ def load_location(file: str | Path) -> Location:
         If it is missing or damaged.
     """
     path = Path(file)
-    found = parse_yaml(read_text(path, WHAT), path, WHAT)
-    if KEY not in found:
+    found = parse_yaml(read_text(path, _WHAT), path, _WHAT)
+    if _KEY not in found:
         raise DatasetError(
-            f"{path}: the {WHAT} could not be read: found no key '{KEY}', needed a file that "
+            f"{path}: the {_WHAT} could not be read: found no key '{_KEY}', needed a file that "
             "legcal locate wrote; give that file."
         )
     document = validate(_Document, found, path)
@@ -254,15 +430,15 @@ def load_location(file: str | Path) -> Location:
     )
 
 
-def _matrix(path: Path, found: _Covariance) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _matrix(path: Path, found: _Covariance) -> Array:
     """Return the covariance, refused where it is none."""
     n = len(NAMES)
     is_square = len(found.matrix) == n and all(len(row) == n for row in found.matrix)
     if tuple(found.names) == NAMES and is_square:
         matrix = np.array(found.matrix)
         largest = float(np.abs(matrix).max())
-        symmetric = np.abs(matrix - matrix.T).max() <= _SYMMETRIC * largest
-        if symmetric and float(np.linalg.eigvalsh(matrix)[0]) >= -_NONE * largest:
+        symmetric = np.abs(matrix - matrix.T).max() <= _SYMMETRY_TOLERANCE * largest
+        if symmetric and float(np.linalg.eigvalsh(matrix)[0]) >= -_NEGATIVE_TOLERANCE * largest:
             return matrix
     raise DatasetError(
         f"{path}: covariance could not be read: found another matrix, needed a covariance of the "

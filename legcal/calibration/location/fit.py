@@ -1,8 +1,12 @@
-"""The most likely frames, and how precise the measurement is (restricted maximum likelihood).
+"""The most likely frames, how precise the measurement is, and which rows are inliers.
 
-Frames and variances are estimated in turn: frames by Gauss-Newton with the covariance of the rows;
+Frames and variances are estimated in turn: frames by least squares with the covariance of the rows;
 the standard deviations that nobody stated, and errors of the model that all rows share, so that
-residuals are most likely given what the frames take away (REML).
+residuals are most likely given what the frames take away (restricted maximum likelihood).
+
+Outliers are found from the inside out (forward search): the search starts at the rows that agree
+best and takes in one after the other, the next best first, as long as it lies where those inside
+predict it, at the scatter that they show. One wrong row never decides about another.
 """
 
 from __future__ import annotations
@@ -11,47 +15,59 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from legcal import estimation
 from legcal.calibration.location.frames import (
-    N_FRAME,
-    Frames,
-    Noise,
+    N_STEP,
     PosePairs,
+    frames_from,
     jacobian,
+    moved,
     residuals,
+    tool_motions,
 )
-from legcal.calibration.location.problem import PlatformMotions
-from legcal.estimation import Factor, GaussianPrior, Rows, Variables, all_free, minimise
-from legcal.geometry import Array
+from legcal.calibration.location.observations import Noise, Observations
+from legcal.calibration.location.search import kept_rows
+from legcal.estimation import (
+    Factor,
+    Frames,
+    GaussianPrior,
+    Problem,
+    Rows,
+    Variables,
+    all_free,
+    minimise,
+)
+from legcal.geometry import Array, BoolArray, IntArray
 
-System = Callable[[Frames], tuple[Array, Array]]
-HOLD_STEPS = 60
-_SMALL = 1e-12
-_RESOLVED = 1e-3  # of a unit direction
-ROUNDS = 30  # of frames and variances in turn
-REML_STEPS = 300
-SINGULAR = 1e-9  # of the largest singular value: what is below is open
-_SAME_FACTOR = 1e-7
-_LARGEST_TURN = (0.5, 0.5, 0.5, np.inf, np.inf, np.inf)  # [rad] in one step
-_TURN_FIRST = [3, 4, 5, 0, 1, 2]
+RANK_TOLERANCE = 1e-9  # of the largest singular value: what is below is open
+_MAX_ROUNDS = 30  # of frames and variances in turn
+_READING_ROUNDS = 3  # of frames and what errors of the readings do to the tool
+_MAX_REML_ITERATIONS = 300
+_FACTOR_TOLERANCE = 1e-7
+_MAX_STEP = (0.5, 0.5, 0.5, np.inf, np.inf, np.inf)  # turn [rad], displacement [m]
+_TURN_FIRST = [3, 4, 5, 0, 1, 2]  # components of a step as those of estimation.Frames
+_MAX_HOLD_ROUNDS = 60
+_HOLD_TOLERANCE = 1e-12
+FALSE_ALARM = 1e-3  # probability that a row of a good file is left out
+_LIKELY = 0.05  # rows at least as likely come in together
+_UNKNOWN = 1e-15  # of the largest information: of directions that those inside do not know
+_MIN_DOF = 1.0  # for a scatter
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The most likely frames."""
 
-    frames: Frames  # where the base and the tool are
+    frames: Array  # (2, 3, 4)
     noise: Noise  # with the factors that were stated or estimated
-    # (n, 6): what is left of the rows, along world axes [m, rad], errors of the model taken out
-    residuals: Array
-    whitened: Array  # (n, 6): the same in standard deviations
+    whitened: Array  # (n, 6): residuals in standard deviations, errors of the model taken out
     # (n * 6 + k, 12 + k): whitened derivative by a step in units of ``pairs.scale``, and by the k
     # errors of the model, whose priors are the last rows
     design: Array
     chi2: float  # sum of the squares of whitened residuals and errors of the model
-    dof: int  # measured numbers less those found
+    dof: int  # measured numbers less those estimated
     # (2,): degrees of freedom that the variances of positions and of orientations rest on
     kind_dof: Array
 
@@ -67,50 +83,56 @@ class Fit:
         return np.asarray(F.T @ F)
 
 
+def fit_observations(observations: Observations, start: Array) -> Fit:
+    """Return the most likely frames of observations, from a start.
+
+    Errors of the readings move the tool through the frames that are estimated: their covariance
+    follows the frames.
+    """
+    o = observations
+    found = fit(o.pairs, start, o.noise_at(start), o.by_model)
+    for _ in range(_READING_ROUNDS if o.by_readings is not None else 0):
+        found = fit(o.pairs, found.frames, o.noise_at(found.frames), o.by_model)
+    return found
+
+
 def fit(
     pairs: PosePairs,
     # within the basin of the answer; where the rows leave a direction open it stays there
-    start: Frames,
+    start: Array,
     noise: Noise,  # standard deviations; factors of kinds that are not stated are estimated
-    motions: PlatformMotions | None = None,  # what errors of the model do
+    motions: Array | None = None,  # (n, 6, k): platform motions by errors of the model
 ) -> Fit:
     """Return the most likely frames near a start.
 
     Raises DidNotConverge if the steps do not end.
     """
     frames = start
-    is_free = not all(noise.stated)
-    for _ in range(ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         frames = _most_likely(pairs, frames, noise, motions)
-        if not is_free:
+        if all(noise.stated):
             break
-        factor, _ = variances(pairs, frames, noise, motions)
-        settled = np.abs(factor / noise.factor - 1.0).max() < _SAME_FACTOR
+        factor, _ = _variances(pairs, frames, noise, motions)
+        converged = np.abs(factor / noise.factor - 1.0).max() < _FACTOR_TOLERANCE
         noise = noise.scaled(factor)
-        if settled:
+        if converged:
             break
-    return finished(pairs, frames, noise, motions)
+    return fit_at(pairs, frames, noise, motions)
 
 
-def finished(
-    pairs: PosePairs, frames: Frames, noise: Noise, motions: PlatformMotions | None = None
-) -> Fit:
-    """Return the fit that has come to rest at frames and noise."""
-    y, A = system(pairs, frames, noise, motions)
-    n = 6 * len(pairs)
-    found = _least_squares(A, y)
-    left = y - A @ found
-    _, dof = variances(pairs, frames, replace(noise, stated=(True, True)), motions)
+def fit_at(pairs: PosePairs, frames: Array, noise: Noise, motions: Array | None = None) -> Fit:
+    """Return the fit at frames and noise that are most likely already."""
+    y, A = _whitened(
+        *_unweighted(pairs, frames, motions), noise.whitening(pairs.oriented)
+    )  # errors of the model are not yet known
+    left = y - A @ np.linalg.lstsq(A, y, rcond=RANK_TOLERANCE)[0]
+    _, dof = _variances(pairs, frames, replace(noise, stated=(True, True)), motions)
     s = np.linalg.svd(A, compute_uv=False)
-    rank = int(np.sum(s > SINGULAR * s[0])) - (A.shape[1] - N_FRAME)
-    r = residuals(frames, pairs)
-    if motions is not None:
-        r = r - (motions.of_tool(frames, pairs) @ found[N_FRAME:])
+    rank = int(np.sum(s > RANK_TOLERANCE * s[0])) - (A.shape[1] - N_STEP)
     return Fit(
         frames=frames,
         noise=noise,
-        residuals=r,
-        whitened=left[:n].reshape(-1, 6),
+        whitened=left[: 6 * len(pairs)].reshape(-1, 6),
         design=A,
         chi2=float(left @ left),
         dof=3 * len(pairs) + 3 * int(pairs.oriented.sum()) - rank,
@@ -120,65 +142,73 @@ def finished(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What the fit moves: T_world_base, T_platform_tool, errors of the model in their sigmas."""
+    """T_world_base, T_platform_tool, errors of the model in their standard deviations."""
 
-    base: estimation.Frames
-    tool: estimation.Frames
+    base: Frames
+    tool: Frames
     errors: Array
 
 
 def _most_likely(
-    pairs: PosePairs, frames: Frames, noise: Noise, motions: PlatformMotions | None
-) -> Frames:
-    """Return the frames of least squares, variances held; open directions stay where they are."""
+    pairs: PosePairs,
+    frames: Array,
+    noise: Noise,
+    motions: Array | None,
+    fixed: Array | None = None,  # (12, k): directions in units of ``pairs.scale`` that do not move
+) -> Array:
+    """Return the frames of least squares at given variances; open directions stay."""
     n = len(pairs)
+    k = 0 if motions is None else motions.shape[-1]
 
-    def frames_of(state: _State) -> Frames:
-        return Frames(state.base.R[0], state.base.t[0], state.tool.R[0], state.tool.t[0])
+    def frames_in(state: _State) -> Array:
+        return frames_from(state.base.R[0], state.base.t[0], state.tool.R[0], state.tool.t[0])
 
     def rows_of(state: _State) -> Rows:
-        there = frames_of(state)
-        r, J = -residuals(there, pairs), jacobian(there, pairs)
-        by_model = np.zeros((n, 6, 0)) if motions is None else motions.of_tool(there, pairs)
-        turned_first = J[..., :6][..., _TURN_FIRST], J[..., 6:][..., _TURN_FIRST]
-        return Rows.of(
-            r + by_model @ state.errors, np.concatenate([*turned_first, by_model], axis=-1)
-        )
+        there = frames_in(state)
+        J = jacobian(there, pairs)
+        by_model = np.zeros((n, 6, 0)) if motions is None else tool_motions(motions, there, pairs)
+        blocks = J[..., :6][..., _TURN_FIRST], J[..., 6:][..., _TURN_FIRST], by_model
+        r = by_model @ state.errors - residuals(there, pairs)
+        return Rows.of(r, np.concatenate(blocks, axis=-1))
 
-    k = 0 if motions is None else motions.of_tool(frames, pairs).shape[-1]
     one, whole = np.zeros(n, dtype=np.intp), slice(None)
-    every = np.tile(np.arange(k, dtype=np.intp), (n, 1))
-    standard = GaussianPrior(np.arange(k, dtype=np.intp), np.zeros(k), np.ones(k))
-    problem = estimation.Problem[_State](
+    errors = np.arange(k, dtype=np.intp)
+    held = np.zeros((0, N_STEP))
+    if fixed is not None:
+        held = (fixed / pairs.scale[:, None]).T.reshape(-1, 2, 6)[..., _TURN_FIRST]
+    problem = Problem[_State](
         variables=(
-            Variables("errors", all_free(k, 1), prior=standard),
-            Variables("base", all_free(1, 6), estimation.Frames.moved, largest=_LARGEST_TURN),
-            Variables("tool", all_free(1, 6), estimation.Frames.moved, largest=_LARGEST_TURN),
+            Variables("base", all_free(1, 6), Frames.moved, largest=_MAX_STEP),
+            Variables("tool", all_free(1, 6), Frames.moved, largest=_MAX_STEP),
+            Variables(
+                "errors", all_free(k, 1), prior=GaussianPrior(errors, np.zeros(k), np.ones(k))
+            ),
         ),
         eliminated=None,
         factors=(
             Factor(
                 "poses",
                 rows_of,
-                (("base", one, whole), ("tool", one, whole), ("errors", every, whole)),
+                (
+                    ("base", one, whole),
+                    ("tool", one, whole),
+                    ("errors", np.tile(errors, (n, 1)), whole),
+                ),
                 n,
                 6,
                 whitening=noise.whitening(pairs.oriented),
             ),
         ),
+        held=held.reshape(-1, N_STEP),
         name="fit of the frames",
         remedy="check that readings and poses belong together",
     )
-    start = _State(
-        estimation.Frames(frames.R_base[None], frames.t_base[None]),
-        estimation.Frames(frames.R_tool[None], frames.t_tool[None]),
-        np.zeros(k),
-    )
-    return frames_of(minimise(problem, start).state)
+    base, tool = (Frames(F[None, :, :3], F[None, :, 3]) for F in frames)
+    return frames_in(minimise(problem, _State(base, tool, np.zeros(k))).state)
 
 
-def variances(
-    pairs: PosePairs, frames: Frames, noise: Noise, motions: PlatformMotions | None = None
+def _variances(
+    pairs: PosePairs, frames: Array, noise: Noise, motions: Array | None
 ) -> tuple[Array, Array]:
     """Return the factors of restricted likelihood (2,), and their degrees of freedom (2,).
 
@@ -188,13 +218,12 @@ def variances(
     """
     factor, dof = noise.factor, np.zeros(2)
     base = np.repeat(noise.sigma, 3, axis=1)
-    floor = noise.floor
     raw = _unweighted(pairs, frames, motions)
-    for _ in range(REML_STEPS):
+    for _ in range(_MAX_REML_ITERATIONS):
         W = noise.scaled(factor).whitening(pairs.oriented)
         y, A = _whitened(*raw, W)
         U, s, _ = np.linalg.svd(A, full_matrices=False)
-        U = U[:, s > SINGULAR * s[0]]
+        U = U[:, s > RANK_TOLERANCE * s[0]]
         left = (y - U @ (U.T @ y))[: base.size].reshape(base.shape)
         back = np.swapaxes(W, 1, 2)
         Py = (back @ left[:, :, None])[:, :, 0] * base
@@ -206,108 +235,143 @@ def variances(
         ratio = np.sqrt(squares / np.maximum(traces, 1e-300))
         ratio[list(noise.stated)] = 1.0
         ratio[dof < 1e-6] = 1.0
-        after = np.maximum(factor * ratio, np.where(noise.stated, factor, floor))
-        done = bool(np.abs(after / factor - 1.0).max() < 0.1 * _SAME_FACTOR)
+        after = np.maximum(factor * ratio, np.where(noise.stated, factor, noise.min_factor))
+        converged = bool(np.abs(after / factor - 1.0).max() < 0.1 * _FACTOR_TOLERANCE)
         factor = after
-        if done:
+        if converged:
             break
     return factor, dof
 
 
-def system(
-    pairs: PosePairs, frames: Frames, noise: Noise, motions: PlatformMotions | None = None
-) -> tuple[Array, Array]:
-    """Return whitened residuals and their design, priors of errors of the model below."""
-    return _whitened(*_unweighted(pairs, frames, motions), noise.whitening(pairs.oriented))
+def frame_design_at(pairs: PosePairs, frames: Array, noise: Noise, motions: Array | None) -> Array:
+    """Return the whitened columns (m, 12) of the frames, errors of the model eliminated."""
+    raw = _unweighted(pairs, frames, motions)
+    return frame_design(_whitened(*raw, noise.whitening(pairs.oriented))[1])
 
 
 def frame_design(design: Array) -> Array:
     """Return the columns (m, 12) of the frames without what errors of the model can explain."""
-    F, E = design[:, :N_FRAME], design[:, N_FRAME:]
+    F, E = design[:, :N_STEP], design[:, N_STEP:]
     if E.shape[1] == 0:
         return F
     Q, _ = np.linalg.qr(E)
     return np.asarray(F - Q @ (Q.T @ F))
 
 
-def _unweighted(
-    pairs: PosePairs, frames: Frames, motions: PlatformMotions | None
-) -> tuple[Array, Array]:
+def _unweighted(pairs: PosePairs, frames: Array, motions: Array | None) -> tuple[Array, Array]:
     """Return residuals (n, 6) and their design (n, 6, 12 + k)."""
     design = jacobian(frames, pairs) * pairs.scale
     if motions is not None:
-        design = np.concatenate([design, motions.of_tool(frames, pairs)], axis=2)
+        design = np.concatenate([design, tool_motions(motions, frames, pairs)], axis=2)
     return residuals(frames, pairs), design
 
 
 def _whitened(r: Array, design: Array, W: Array) -> tuple[Array, Array]:
     """Return residuals and design in standard deviations, with the priors below."""
     y, A = (W @ r[:, :, None]).ravel(), (W @ design).reshape(r.size, -1)
-    k = A.shape[1] - N_FRAME
+    k = A.shape[1] - N_STEP
     if k == 0:
         return y, A
-    priors = np.hstack([np.zeros((k, N_FRAME)), np.eye(k)])
+    priors = np.hstack([np.zeros((k, N_STEP)), np.eye(k)])
     return np.concatenate([y, np.zeros(k)]), np.vstack([A, priors])
 
 
-def _least_squares(A: Array, y: Array) -> Array:
-    """Return the smallest solution of least squares; open directions do not move."""
-    return np.asarray(np.linalg.lstsq(A, y, rcond=SINGULAR)[0])
-
-
 def hold_tool(
-    frames: Frames,
-    pairs: PosePairs,
-    basis_at: Callable[[Frames], Array],  # returns the open directions (12, k) at frames
-    system: System,  # returns whitened residuals (m,) and design (m, 12 + p) at frames
+    observations: Observations,
+    found: Fit,
+    open_at: Callable[[Array], Array],  # returns the open directions (12, k) at frames
     tool_position: Array,  # (3,): in the platform [m]
-) -> Frames:
+) -> Fit:
     """Return the most likely frames whose open part is that of a tool at a given position.
 
     Along open directions the tool is brought as near to the given position, and to the axes of the
     platform, as they allow; all else stays most likely.
     """
-    for _ in range(HOLD_STEPS):
-        N = basis_at(frames)
-        turn = Rotation.from_matrix(frames.R_tool).inv().as_rotvec()
-        away = np.concatenate([(tool_position - frames.t_tool) / pairs.length, turn])
-        slide = N @ np.linalg.lstsq(N[6:], away, rcond=None)[0]
-        y, A = system(frames)
-        Z = kept_directions(N)
-        A_kept = np.hstack([A[:, :N_FRAME] @ Z, A[:, N_FRAME:]])
-        found = np.linalg.lstsq(A_kept, y - A[:, :N_FRAME] @ slide, rcond=None)[0]
-        step = slide + Z @ found[: Z.shape[1]]
-        size = float(np.linalg.norm(step[[3, 4, 5, 9, 10, 11]]))
-        frames = frames.moved(step * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
-        if np.abs(step).max() < _SMALL:
+    pairs, frames = observations.pairs, found.frames
+    for _ in range(_MAX_HOLD_ROUNDS):
+        basis = open_at(frames)
+        turn = Rotation.from_matrix(frames[1, :, :3]).inv().as_rotvec()
+        away = np.concatenate([(tool_position - frames[1, :, 3]) / pairs.length, turn])
+        slide = basis @ np.linalg.lstsq(basis[6:], away, rcond=None)[0]
+        size = float(np.linalg.norm(slide[[3, 4, 5, 9, 10, 11]]))
+        frames = moved(frames, slide * min(1.0, 0.5 / max(size, 1e-300)) * pairs.scale)
+        of_tool = np.concatenate([np.zeros_like(basis[:6]), basis[6:]])
+        frames = _most_likely(pairs, frames, found.noise, observations.by_model, of_tool)
+        if np.abs(slide).max() < _HOLD_TOLERANCE:
             break
-    return frames
+    return fit_at(pairs, frames, found.noise, observations.by_model)
 
 
-def is_resolved_by_the_tool(basis: Array) -> bool:
-    """Say whether every open direction (12, k) moves the tool, so that holding it closes all."""
-    s = np.linalg.svd(basis[6:], compute_uv=False)
-    return bool(np.all(s > _RESOLVED)) and len(s) >= basis.shape[1]
+@dataclass(frozen=True, eq=False)
+class Inliers:
+    """Which rows agree, and how far off the others are."""
+
+    is_inlier: BoolArray  # (n,): the rows to use
+    # distance, angle: (n,): how far each row is from where the inliers predict it [m, rad]
+    distance: Array
+    angle: Array
+    frames: Array  # by the inliers
+    factor: Array  # (2,): the scatter of the inliers, as a factor of :class:`Noise`
 
 
-def kept_directions(basis: Array) -> Array:
-    """Return the directions (12, 12 - k) that do not move the held part of the tool."""
-    held = basis.copy()
-    held[:6] = 0.0
-    U, s, _ = np.linalg.svd(held, full_matrices=True)
-    return np.asarray(U[:, int(np.sum(s > 0.0)) :])
+def find_inliers(observations: Observations, start: Array) -> Inliers:
+    """Return which rows agree with each other, from frames that most rows agree with.
+
+    A row is never left out for what stated standard deviations allow.
+    """
+    pairs, noise = observations.pairs, observations.noise
+    n = len(pairs)
+    distance = ((residuals(start, pairs) * pairs.unit) ** 2).sum(axis=1)
+    inside = np.zeros(n, dtype=np.bool_)
+    inside[np.argsort(distance, kind="stable")[: kept_rows(n, observations.fewest)]] = True
+    frames = start
+    while True:
+        found = _fit_to(pairs.of(inside), frames, noise.of(inside))
+        frames = found.frames
+        outside: IntArray = np.flatnonzero(~inside)
+        if not len(outside):
+            break
+        likely = _probability(pairs.of(outside), noise.of(outside), found, noise.stated)
+        best = int(np.argmax(likely))
+        if likely[best] < FALSE_ALARM / n:
+            break
+        inside[outside[likely > _LIKELY]] = True
+        inside[outside[best]] = True
+    r = residuals(frames, pairs)
+    return Inliers(
+        inside,
+        np.linalg.norm(r[:, :3], axis=1),
+        np.linalg.norm(r[:, 3:], axis=1),
+        frames,
+        found.noise.factor,
+    )
 
 
-def covariance_with(
-    information: Array,  # (12, 12): of a step in the same units
-    basis: Array,  # (12, k): open directions
-    *,
-    oriented: bool,  # whether the orientation of the tool is known; else its rows are zero
-) -> Array:
-    """Return the covariance (12, 12) of a step, what is held counted as known."""
-    Z = kept_directions(basis) if basis.shape[1] else np.eye(N_FRAME)
-    if not oriented:
-        U, s, _ = np.linalg.svd(Z[:9], full_matrices=False)
-        Z = np.zeros((N_FRAME, int(np.sum(s > _RESOLVED))))
-        Z[:9] = U[:, s > _RESOLVED]
-    return np.asarray(Z @ np.linalg.solve(Z.T @ information @ Z, Z.T))
+def _fit_to(pairs: PosePairs, start: Array, noise: Noise) -> Fit:
+    """Return the fit of some rows at the scatter that they show, at least at the stated one."""
+    found = fit(pairs, start, replace(noise, stated=(False, False), readings=None))
+    least = np.where(noise.stated, noise.factor, 0.0)
+    return replace(found, noise=found.noise.scaled(np.maximum(found.noise.factor, least)))
+
+
+def _probability(pairs: PosePairs, noise: Noise, found: Fit, stated: tuple[bool, bool]) -> Array:
+    """Return how probable rows as far off as these are, given those of a fit, (n,)."""
+    sigma = noise.scaled(found.noise.factor).standard_deviations()
+    H = found.information
+    H = H + _UNKNOWN * float(np.linalg.norm(H, 2)) * np.eye(len(H))
+    J = jacobian(found.frames, pairs) * pairs.scale
+    covariance = J @ np.linalg.solve(H, np.swapaxes(J, 1, 2))
+    covariance[:, range(6), range(6)] += sigma**2
+    r = residuals(found.frames, pairs)
+    least = np.ones(len(pairs))
+    for kind, rows in enumerate((slice(0, 3), slice(3, 6))):
+        dof = float(found.kind_dof[kind])
+        at_stated = stated[kind] and bool(found.noise.factor[kind] <= noise.factor[kind])
+        if dof < _MIN_DOF and not at_stated:
+            continue
+        part = np.linalg.solve(covariance[:, rows, rows], r[:, rows, None])[:, :, 0]
+        distance = (part * r[:, rows]).sum(axis=1)
+        # Not F with infinite degrees of freedom: SciPy has no number for that.
+        here = stats.chi2.sf(distance, 3) if at_stated else stats.f.sf(distance / 3.0, 3, dof)
+        least = np.minimum(least, np.where(pairs.oriented | (kind == 0), here, 1.0))
+    return np.minimum(1.0, 2.0 * least)

@@ -1,58 +1,25 @@
-"""The two frames that are looked for, and how measured poses depend on them.
+"""Two unknown frames: T_world_tool = T_world_base T_base_platform(q) T_platform_tool.
 
-T_world_tool = T_world_base T_base_platform(q) T_platform_tool
+Frames are arrays (..., 2, 3, 4): rotation beside position [m] of T_world_base and T_platform_tool;
+leading dimensions make a batch. They move by steps (..., 12): displacement of the base in the world
+[m], its rotation vector about world axes [rad], and the same of the tool in the platform.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, BoolArray, IntArray, cross_matrices, rotation_matrices
 
-N_FRAME = 12  # displacement and rotation of both frames
-SMALLEST = 1e-9  # [m, rad]; nobody measures better, and files round
-
-
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """The base in the world and the tool in the platform; leading dimensions make a batch."""
-
-    R_base: Array  # R_base, t_base: (..., 3, 3) and (..., 3): T_world_base [m]
-    t_base: Array
-    R_tool: Array  # R_tool, t_tool: (..., 3, 3) and (..., 3): T_platform_tool [m]
-    t_tool: Array
-
-    def at(self, i: int | IntArray) -> Frames:
-        """Return one of a batch, or several."""
-        return Frames(self.R_base[i], self.t_base[i], self.R_tool[i], self.t_tool[i])
-
-    def moved(self, step: Array) -> Frames:
-        """Return the frames after a step (..., 12).
-
-        A step holds the displacement of the base in the world [m], its rotation vector about
-        world axes [rad], and the same of the tool in the platform.
-        """
-        return Frames(
-            rotation_matrices(step[..., 3:6]) @ self.R_base,
-            self.t_base + step[..., :3],
-            rotation_matrices(step[..., 9:]) @ self.R_tool,
-            self.t_tool + step[..., 6:9],
-        )
-
-    def transforms(self) -> tuple[RigidTransform, RigidTransform]:
-        """Return T_world_base and T_platform_tool."""
-        return (
-            RigidTransform.from_components(self.t_base, Rotation.from_matrix(self.R_base)),
-            RigidTransform.from_components(self.t_tool, Rotation.from_matrix(self.R_tool)),
-        )
+N_STEP = 12
 
 
 @dataclass(frozen=True, eq=False)
 class PosePairs:
-    """Measured tool poses and the platform poses that the readings give."""
+    """Measured tool poses and the platform poses at their readings."""
 
     R: Array  # R, t: (n, 3, 3) and (n, 3): T_base_platform [m]
     t: Array
@@ -60,47 +27,64 @@ class PosePairs:
     M: Array
     p: Array
     oriented: BoolArray  # (n,): whether the orientation of the tool was measured
-    length: float  # A length of the machine, which rotations are weighed against [m]
+    length: float  # of the machine, which rotations are weighed against [m]
 
     def __len__(self) -> int:
         return len(self.t)
 
     def of(self, rows: BoolArray | IntArray) -> PosePairs:
         """Return some of the pairs."""
-        return PosePairs(
-            self.R[rows],
-            self.t[rows],
-            self.M[rows],
-            self.p[rows],
-            self.oriented[rows],
-            self.length,
-        )
+        R, t, M, p = (x[rows] for x in (self.R, self.t, self.M, self.p))
+        return PosePairs(R, t, M, p, self.oriented[rows], self.length)
 
     @property
     def scale(self) -> Array:
         """What one unit of each component of a step means, (12,): the length, or one radian."""
         return np.tile(np.repeat([self.length, 1.0], 3), 2)
 
+    @property
+    def unit(self) -> Array:
+        """What residuals (..., 6) are multiplied with to have no unit, (6,)."""
+        return np.repeat([1.0 / self.length, 1.0], 3)
 
-def stacked(several: list[Frames]) -> Frames:
-    """Return several frames as one batch."""
-    return Frames(
-        np.array([f.R_base for f in several]),
-        np.array([f.t_base for f in several]),
-        np.array([f.R_tool for f in several]),
-        np.array([f.t_tool for f in several]),
+
+def frames_from(R_base: Array, t_base: Array, R_tool: Array, t_tool: Array) -> Array:
+    """Return frames (..., 2, 3, 4) from rotations (..., 3, 3) and positions (..., 3)."""
+    base = np.concatenate([R_base, t_base[..., None]], axis=-1)
+    return np.stack([base, np.concatenate([R_tool, t_tool[..., None]], axis=-1)], axis=-3)
+
+
+def components_of(frames: Array) -> tuple[Array, Array, Array, Array]:
+    """Return R_base, t_base, R_tool, t_tool of frames."""
+    base, tool = frames[..., 0, :, :], frames[..., 1, :, :]
+    return base[..., :3], base[..., 3], tool[..., :3], tool[..., 3]
+
+
+def transforms(frames: Array) -> tuple[RigidTransform, RigidTransform]:
+    """Return T_world_base and T_platform_tool of frames (2, 3, 4)."""
+    base, tool = (
+        RigidTransform.from_components(F[:, 3], Rotation.from_matrix(F[:, :3])) for F in frames
     )
+    return base, tool
 
 
-def predicted(frames: Frames, pairs: PosePairs) -> tuple[Array, Array]:
+def moved(frames: Array, step: Array) -> Array:
+    """Return frames after steps (..., 12)."""
+    steps = step.reshape(*step.shape[:-1], 2, 6)
+    R = rotation_matrices(steps[..., 3:]) @ frames[..., :3]
+    return np.concatenate([R, (frames[..., 3] + steps[..., :3])[..., None]], axis=-1)
+
+
+def predicted(frames: Array, pairs: PosePairs) -> tuple[Array, Array]:
     """Return orientations (..., n, 3, 3) and positions (..., n, 3) [m] of the tool in the world."""
-    tip = np.einsum("nij,...j->...ni", pairs.R, frames.t_tool) + pairs.t
-    p = np.einsum("...ij,...nj->...ni", frames.R_base, tip) + frames.t_base[..., None, :]
-    M = frames.R_base[..., None, :, :] @ pairs.R @ frames.R_tool[..., None, :, :]
+    R_base, t_base, R_tool, t_tool = components_of(frames)
+    tip = np.einsum("nij,...j->...ni", pairs.R, t_tool) + pairs.t
+    p = np.einsum("...ij,...nj->...ni", R_base, tip) + t_base[..., None, :]
+    M = R_base[..., None, :, :] @ pairs.R @ R_tool[..., None, :, :]
     return M, p
 
 
-def residuals(frames: Frames, pairs: PosePairs) -> Array:
+def residuals(frames: Array, pairs: PosePairs) -> Array:
     """Return measured minus predicted poses, (..., n, 6): position [m], rotation vector [rad].
 
     Both are along world axes; a rotation that was not measured counts as zero.
@@ -112,13 +96,13 @@ def residuals(frames: Frames, pairs: PosePairs) -> Array:
     return np.concatenate([pairs.p - p, turn], axis=-1)
 
 
-def jacobian(frames: Frames, pairs: PosePairs) -> Array:
+def jacobian(frames: Array, pairs: PosePairs) -> Array:
     """Return the derivative of predicted poses by a step, (..., n, 6, 12)."""
-    n = len(pairs)
-    tip = np.einsum("nij,...j->...ni", pairs.R, frames.t_tool) + pairs.t
-    arm = np.einsum("...ij,...nj->...ni", frames.R_base, tip)
-    carried = frames.R_base[..., None, :, :] @ pairs.R
-    J = np.zeros((*frames.t_base.shape[:-1], n, 6, N_FRAME))
+    R_base, t_base, _, t_tool = components_of(frames)
+    tip = np.einsum("nij,...j->...ni", pairs.R, t_tool) + pairs.t
+    arm = np.einsum("...ij,...nj->...ni", R_base, tip)
+    carried = R_base[..., None, :, :] @ pairs.R
+    J = np.zeros((*t_base.shape[:-1], len(pairs), 6, N_STEP))
     J[..., :3, :3] = np.eye(3)
     J[..., :3, 3:6] = -cross_matrices(arm)
     J[..., :3, 6:9] = carried
@@ -127,46 +111,14 @@ def jacobian(frames: Frames, pairs: PosePairs) -> Array:
     return J
 
 
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """Standard deviations of the rows."""
+def tool_motions(motions: Array, frames: Array, pairs: PosePairs) -> Array:
+    """Return how platform motions move the tool in the world, (n, 6, k): displacement, rotation.
 
-    sigma: Array  # (n, 2): of position [m] and orientation [rad] of each row, up to ``factor``
-    factor: Array  # (2,): what all of a kind are multiplied with
-    # whether the standard deviations of positions and of orientations were stated; the factor of
-    # those that were not is estimated
-    stated: tuple[bool, bool]
-    # (n, 6, 6): covariance of the tool pose by errors of the readings [m, rad]; None without any
-    readings: Array | None = None
-
-    def of(self, rows: BoolArray | IntArray) -> Noise:
-        """Return that of some rows."""
-        readings = None if self.readings is None else self.readings[rows]
-        return replace(self, sigma=self.sigma[rows], readings=readings)
-
-    def scaled(self, factor: Array) -> Noise:
-        """Return the same with other factors."""
-        return replace(self, factor=factor)
-
-    @property
-    def floor(self) -> Array:
-        """The smallest factor of each kind that can be meant."""
-        return np.asarray(SMALLEST / self.sigma.min(axis=0))
-
-    def standard_deviations(self) -> Array:
-        """Return those of each row and component without the readings', (n, 6) [m, rad]."""
-        return np.repeat(self.sigma * self.factor, 3, axis=1)
-
-    def whitening(self, oriented: BoolArray) -> Array:
-        """Return matrices W (n, 6, 6) with W^T W the inverse covariance; zero where unmeasured."""
-        sigma = self.standard_deviations()
-        if self.readings is None:
-            W = np.zeros((*sigma.shape, 6))
-            W[:, range(6), range(6)] = 1.0 / sigma
-        else:
-            S = self.readings.copy()
-            S[~oriented, 3:, :3] = S[~oriented, :3, 3:] = 0.0
-            S[:, range(6), range(6)] += sigma**2
-            W = np.linalg.inv(np.linalg.cholesky(S))
-        W[~oriented, 3:] = 0.0
-        return np.asarray(W)
+    *motions* (n, 6, k) are rotation vectors [rad] and displacements of the platform link [m] in the
+    base link.
+    """
+    R_base, _, _, t_tool = components_of(frames)
+    arm = cross_matrices(pairs.R @ t_tool)
+    shift = R_base @ (motions[:, 3:] - arm @ motions[:, :3])
+    turn = R_base @ motions[:, :3] * pairs.oriented[:, None, None]
+    return np.concatenate([shift, turn], axis=1)

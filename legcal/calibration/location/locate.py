@@ -1,4 +1,4 @@
-"""Locating base and tool: search, rows that agree, most likely frames, what stays open."""
+"""Base in the world and tool in the platform from measured tool poses: ``legcal locate``."""
 
 from __future__ import annotations
 
@@ -7,33 +7,40 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
+from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.location.agreement import Agreement, find_agreement
-from legcal.calibration.location.fit import Fit, fit
-from legcal.calibration.location.frames import SMALLEST, Frames
-from legcal.calibration.location.judgement import judge
-from legcal.calibration.location.mistakes import likely_mistake
-from legcal.calibration.location.open import Determinacy, determine, hold
-from legcal.calibration.location.problem import Problem, build_problem
-from legcal.calibration.location.result import Location, ToolPoses
-from legcal.calibration.location.search import Candidates, search
-from legcal.calibration.location.table import LARGEST_ANGLE, read_tool_poses
+from legcal.calibration.location.determinacy import Determinacy, determine, hold
+from legcal.calibration.location.document import Location, MeasurementNoise, RowResidual, Status
+from legcal.calibration.location.fit import Fit, Inliers, find_inliers, fit, fit_observations
+from legcal.calibration.location.frames import jacobian, residuals, transforms
+from legcal.calibration.location.observations import (
+    MAX_ANGLE_SIGMA,
+    MIN_SIGMA,
+    Observations,
+    ToolPoses,
+    observations_of,
+    read_tool_poses,
+)
+from legcal.calibration.location.search import Candidates, likely_mistake, search
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable, UsageError
 from legcal.files import describe
 from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism
 
-MOST_LEFT_OUT = 4  # a row of so many may disagree, and one of few
-SUSPICIOUS = 0.05  # residuals in parts of the spread of positions, and [rad]
-HOPELESS = 0.2
-ENOUGH = 1.0  # degrees of freedom
-LARGEST = 1.0  # [m]
-LARGEST_TOOL = 100.0  # [m]
-_SAME_FIT = 30.0  # of chi2: two answers that explain the poses alike
-_ALIKE = 25.0  # times the cost of the best
+_MAX_OUTLIERS = 4  # a row of so many may disagree, and one of few
+_SUSPICIOUS = 0.05  # residuals in parts of the spread of positions, and [rad]
+_MAX_RESIDUAL = 0.2  # the same
+_MIN_DOF = 1.0  # for a scatter
+_MAX_SIGMA = 1.0  # [m]
+_MAX_TOOL = 100.0  # [m]
+_SAME_CHI2 = 30.0  # two answers that explain the poses alike
+_SAME_COST = 25.0  # times the cost of the best
 _ROUNDING = 1e-20
-_APART = 0.02  # [rad], and of the length: two answers
-_ROUNDS = 3  # of frames and what readings do to the tool
+_SAME_FRAMES = 0.02  # [rad], and of the length
+_MIN_P, _MAX_P = 1e-3, 1.0 - 1e-4  # probabilities of residuals as large as these
+_FIXED_TOLERANCE = 1e-12  # [m, rad]
+_KINDS = ("positions", "orientations")
 
 
 def locate(
@@ -59,7 +66,7 @@ def locate(
         The table of measured tool poses.
     position_sigma, angle_sigma : float, optional
         Standard deviations of the measurement, a component [m], [rad]; where neither they nor the
-        table tell, they are estimated from the residuals.
+        table are given, they are estimated from the residuals.
     encoder_sigma : float
         Standard deviation of a reading [m].
     tool_position : (3,) sequence of float, optional
@@ -75,13 +82,13 @@ def locate(
     DatasetError
         If the table is malformed, or contradicts the machine.
     NotIdentifiable
-        If the poses leave open what other poses of the machine would tell.
+        If the poses leave open what other poses of the machine would determine.
     """
     _check_numbers(position_sigma, angle_sigma, encoder_sigma, tool_position)
     machine = model if isinstance(model, Machine) else load_mechanism(model)
     name = "The tool poses" if isinstance(poses, ToolPoses) else str(poses)
     measured = poses if isinstance(poses, ToolPoses) else read_tool_poses(Path(poses), machine)
-    problem = build_problem(
+    observations = observations_of(
         machine,
         measured,
         name,
@@ -89,31 +96,17 @@ def locate(
         angle_sigma=angle_sigma,
         encoder_sigma=encoder_sigma,
     )
-    candidates = search(problem.pairs, problem.fewest)
-    _check_plausible(problem, candidates, name)
-    agreement = find_agreement(
-        problem.pairs, candidates.frames.at(0), problem.noise, problem.fewest
-    )
-    _check_agreement(problem, candidates, agreement, name)
-    used = problem.of(agreement.agrees)
-    found = most_likely(used, agreement.frames)
+    candidates = search(observations.pairs, observations.fewest)
+    _check_plausible(observations, candidates, name)
+    inliers = find_inliers(observations, candidates.frames[0])
+    _check_outliers(observations, candidates, inliers, name)
+    used = observations.of(inliers.is_inlier)
+    found = fit_observations(used, inliers.frames)
     _check_scatter(used, found, name)
     at = np.zeros(3) if tool_position is None else np.asarray(tool_position, dtype=np.float64)
     determined = determine(used, found, at, name)
     _check_unique(used, determined, candidates, at, name)
-    return judge(problem, name, agreement, determined, at, is_given=tool_position is not None)
-
-
-def most_likely(problem: Problem, start: Frames) -> Fit:
-    """Return the maximum likelihood fit of a problem, from a start.
-
-    Errors of the readings move the tool through the frames that are looked for: their covariance
-    follows the frames.
-    """
-    found = fit(problem.pairs, start, problem.noise_at(start), problem.by_model)
-    for _ in range(_ROUNDS if problem.by_readings is not None else 0):
-        found = fit(problem.pairs, found.frames, problem.noise_at(found.frames), problem.by_model)
-    return found
+    return _judge(observations, name, inliers, determined, at, is_given=tool_position is not None)
 
 
 def _check_numbers(
@@ -124,9 +117,9 @@ def _check_numbers(
 ) -> None:
     """Refuse numbers that cannot be meant."""
     for what, value, least, most, unit in (
-        ("position sigma", position_sigma, SMALLEST, LARGEST, "m"),
-        ("angle sigma", angle_sigma, SMALLEST, LARGEST_ANGLE, "rad"),
-        ("encoder sigma", encoder_sigma, 0.0, LARGEST, "m"),
+        ("position sigma", position_sigma, MIN_SIGMA, _MAX_SIGMA, "m"),
+        ("angle sigma", angle_sigma, MIN_SIGMA, MAX_ANGLE_SIGMA, "rad"),
+        ("encoder sigma", encoder_sigma, 0.0, _MAX_SIGMA, "m"),
     ):
         if value is not None and not least <= value <= most:
             raise UsageError(
@@ -134,29 +127,29 @@ def _check_numbers(
                 f"{most:g} {unit}; correct it."
             )
     if tool_position is not None and not (
-        len(tool_position) == 3 and bool(np.all(np.abs(tool_position) <= LARGEST_TOOL))
+        len(tool_position) == 3 and bool(np.all(np.abs(tool_position) <= _MAX_TOOL))
     ):
         raise UsageError(
             f"The tool position could not be used: found {describe(list(tool_position))}, needed "
-            f"three numbers within {LARGEST_TOOL:g} m; give x, y, z in the platform."
+            f"three numbers within {_MAX_TOOL:g} m; give x, y, z in the platform."
         )
 
 
-def _check_plausible(problem: Problem, candidates: Candidates, name: str) -> None:
+def _check_plausible(observations: Observations, candidates: Candidates, name: str) -> None:
     """Refuse poses that no frames explain, with the mistake that would explain them.
 
     The rows that agree best are looked at: most are right, or all are wrong in one way.
     """
-    pairs = problem.pairs
+    pairs = observations.pairs
     spread = float(np.sqrt(pairs.p.var(axis=0).sum()))
     left = float(np.sqrt(candidates.cost[0]))  # in lengths of the machine, and [rad]
     part = left / min(1.0, spread / pairs.length + 1e-12)
-    if part <= SUSPICIOUS:
+    if part <= _SUSPICIOUS:
         return
-    _refuse_mistakes(problem, candidates, name)
-    if part > HOPELESS:
+    _refuse_mistakes(observations, candidates, name)
+    if part > _MAX_RESIDUAL:
         size = f"{1e3 * left * pairs.length:.3g} mm"
-        turn = f" or {np.degrees(left):.3g} deg" * problem.is_oriented
+        turn = f" or {np.degrees(left):.3g} deg" * observations.is_oriented
         raise DatasetError(
             f"{name}: base and tool could not be located: found poses about {size}{turn} from "
             "where the readings put them, whatever the frames, needed poses measured at these "
@@ -164,9 +157,9 @@ def _check_plausible(problem: Problem, candidates: Candidates, name: str) -> Non
         )
 
 
-def _refuse_mistakes(problem: Problem, candidates: Candidates, name: str) -> None:
+def _refuse_mistakes(observations: Observations, candidates: Candidates, name: str) -> None:
     """Refuse poses that a common mistake explains."""
-    mistake = likely_mistake(problem.pairs, float(candidates.cost[0]), problem.fewest)
+    mistake = likely_mistake(observations.pairs, float(candidates.cost[0]), observations.fewest)
     if mistake is not None:
         raise DatasetError(
             f"{name}: base and tool could not be located: found poses that look like {mistake[0]}, "
@@ -175,16 +168,16 @@ def _refuse_mistakes(problem: Problem, candidates: Candidates, name: str) -> Non
         )
 
 
-def _check_agreement(
-    problem: Problem, candidates: Candidates, agreement: Agreement, name: str
+def _check_outliers(
+    observations: Observations, candidates: Candidates, inliers: Inliers, name: str
 ) -> None:
     """Refuse poses of which too many disagree."""
-    n, n_out = len(problem.pairs), int(np.sum(~agreement.agrees))
-    most = max(1, n // MOST_LEFT_OUT)
+    n, n_out = len(observations.pairs), int(np.sum(~inliers.is_inlier))
+    most = max(1, n // _MAX_OUTLIERS)
     if n_out <= most:
         return
-    _refuse_mistakes(problem, candidates, name)
-    rows = ", ".join(str(i) for i in problem.poses.numbers[~agreement.agrees])
+    _refuse_mistakes(observations, candidates, name)
+    rows = ", ".join(str(i) for i in observations.poses.numbers[~inliers.is_inlier])
     raise DatasetError(
         f"{name}: base and tool could not be located: found {n_out} of {n} rows that disagree with "
         f"the others ({rows}), needed at most {most}; check that readings and poses of these rows "
@@ -192,58 +185,246 @@ def _check_agreement(
     )
 
 
-def _check_scatter(problem: Problem, found: Fit, name: str) -> None:
+def _check_scatter(observations: Observations, found: Fit, name: str) -> None:
     """Refuse to estimate a scatter from rows that leave nothing over."""
     for kind, (what, option) in enumerate(
         (("positions", "--position-sigma"), ("orientations", "--angle-sigma"))
     ):
-        if not problem.noise.stated[kind] and found.kind_dof[kind] < ENOUGH:
+        if not observations.noise.stated[kind] and found.kind_dof[kind] < _MIN_DOF:
             raise NotIdentifiable(
                 f"{name}: the uncertainty could not be estimated: found {what} of "
-                f"{len(problem.pairs)} rows that leave {found.kind_dof[kind]:.2g} degrees of "
-                f"freedom, needed at least {ENOUGH:g}; measure more poses, or state how precise "
+                f"{len(observations.pairs)} rows that leave {found.kind_dof[kind]:.2g} degrees of "
+                f"freedom, needed at least {_MIN_DOF:g}; measure more poses, or state how precise "
                 f"they are with {option}."
             )
 
 
 def _check_unique(
-    problem: Problem, determined: Determinacy, candidates: Candidates, at: Array, name: str
+    observations: Observations,
+    determined: Determinacy,
+    candidates: Candidates,
+    at: Array,
+    name: str,
 ) -> None:
     """Refuse where other frames explain the poses as well."""
     best = determined.fit
     noise = replace(best.noise, stated=(True, True))
     for i in range(1, len(candidates.cost)):
-        start = candidates.frames.at(i)
-        if candidates.cost[i] > _ALIKE * candidates.cost[0] + _ROUNDING:
+        start = candidates.frames[i]
+        if candidates.cost[i] > _SAME_COST * candidates.cost[0] + _ROUNDING:
             break
-        if not determined.held and _are_one(best.frames, start, problem.pairs.length):
+        if not determined.held and _are_one(best.frames, start, observations.pairs.length):
             continue
         try:
-            other = fit(problem.pairs, start, noise, problem.by_model)
-            other = hold(problem, other, at)
+            other = fit(observations.pairs, start, noise, observations.by_model)
+            other = hold(observations, other, at)
         except (DidNotConverge, np.linalg.LinAlgError):
             continue
-        is_other = not _are_one(best.frames, other.frames, problem.pairs.length)
-        if is_other and other.chi2 < best.chi2 + _SAME_FIT:
+        is_other = not _are_one(best.frames, other.frames, observations.pairs.length)
+        if is_other and other.chi2 < best.chi2 + _SAME_CHI2:
             shift, turn = _apart(best.frames, other.frames)
             raise NotIdentifiable(
                 f"{name}: base and tool could not be located: found two answers, "
                 f"{1e3 * shift:.3g} mm and {np.degrees(turn):.3g} deg apart, that explain the "
-                f"{len(problem.pairs)} poses equally well, needed one; add poses from all over "
-                "the workspace."
+                f"{len(observations.pairs)} poses equally well, needed one; add poses from all "
+                "over the workspace."
             )
 
 
-def _are_one(one: Frames, other: Frames, length: float) -> bool:
+def _are_one(one: Array, other: Array, length: float) -> bool:
     """Say whether the frames of two answers are the same but for noise."""
     shift, turn = _apart(one, other)
-    return shift <= _APART * length and turn <= _APART
+    return shift <= _SAME_FRAMES * length and turn <= _SAME_FRAMES
 
 
-def _apart(one: Frames, other: Frames) -> tuple[float, float]:
+def _apart(one: Array, other: Array) -> tuple[float, float]:
     """Return how far the frames of two answers are apart, the worse of base and tool [m, rad]."""
-    shifts = (one.t_base - other.t_base, one.t_tool - other.t_tool)
+    apart = one - other
     # The matrices of two orientations are sqrt(8) sin(turn / 2) apart.
-    chords = (one.R_base - other.R_base, one.R_tool - other.R_tool)
-    half = min(1.0, max(float(np.linalg.norm(chord)) for chord in chords) / np.sqrt(8.0))
-    return max(float(np.linalg.norm(shift)) for shift in shifts), 2.0 * float(np.arcsin(half))
+    chord = float(np.linalg.norm(apart[:, :, :3], axis=(1, 2)).max())
+    shift = float(np.linalg.norm(apart[:, :, 3], axis=1).max())
+    return shift, 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0))))
+
+
+def _judge(
+    observations: Observations,
+    name: str,  # what the poses are called
+    inliers: Inliers,  # the rows that the frames rest on
+    determined: Determinacy,
+    at: Array,  # (3,): the tool position in the platform that was held where it is open [m]
+    *,
+    is_given: bool,
+) -> Location:
+    """Return the location with its verdict."""
+    found = determined.fit
+    p_value, too_large, too_small = _tested(found)
+    base, tool = transforms(found.frames)
+    if not observations.is_oriented:
+        tool = RigidTransform.from_translation(tool.translation)
+    tool_position, tool_angle = _at_the_tool(observations, determined)
+    left_out = observations.poses.numbers[~inliers.is_inlier].tolist()
+    status: Status = "located in part" if determined.held else "located"
+    if too_large:
+        status = "doubtful"
+    return Location(
+        model=str(observations.machine.yaml_path),
+        poses=name,
+        T_world_base=base,
+        T_platform_tool=tool,
+        has_tool_orientation=observations.is_oriented,
+        covariance=0.5 * (determined.covariance + determined.covariance.T),
+        held=determined.held,
+        held_at=(float(at[0]), float(at[1]), float(at[2])),
+        held_words=determined.words,
+        noise=_noise(observations, found),
+        rows=tuple(_rows(observations, inliers, found)),
+        chi2=found.chi2,
+        dof=found.dof,
+        p_value=p_value,
+        tool_position_sigma=tool_position,
+        tool_angle_sigma=tool_angle,
+        status=status,
+        sentence=_sentence(observations, determined, left_out, too_large),
+        notes=tuple(_notes(observations, determined, inliers, too_small, is_given=is_given)),
+    )
+
+
+def _tested(found: Fit) -> tuple[float | None, str, str]:
+    """Return the probability of larger residuals, and what is too large or too small in words."""
+    noise = found.noise
+    kinds = [k for k in range(2) if noise.stated[k] and found.kind_dof[k] > 0.5]
+    if not kinds:
+        return None, "", ""
+    squares = (found.whitened**2).reshape(-1, 2, 3).sum(axis=(0, 2))
+    if len(kinds) == 2 or found.kind_dof.min() <= 0.5:
+        total, dof = found.chi2, float(found.dof)
+    else:
+        total, dof = float(squares[kinds[0]]), float(found.kind_dof[kinds[0]])
+    p_value = float(stats.chi2.sf(total, dof))
+    large, small = list[str](), list[str]()
+    for k in kinds:
+        ratio = float(np.sqrt(squares[k] / found.kind_dof[k]))
+        words = f"{_KINDS[k]} scatter {ratio:.2g} times as much as was stated of them"
+        (large if ratio > 1.0 else small).append(words)
+    too_small = " and ".join(small) if p_value > _MAX_P else ""
+    return p_value, " and ".join(large) if p_value < _MIN_P else "", too_small
+
+
+def _noise(observations: Observations, found: Fit) -> MeasurementNoise:
+    """Return what was stated or found of the measurement."""
+    rms = found.noise.rms
+    oriented = observations.is_oriented
+    return MeasurementNoise(
+        position=float(rms[0]),
+        angle=float(rms[1]) if oriented else None,
+        position_stated=observations.noise.stated[0],
+        angle_stated=observations.noise.stated[1] and oriented,
+        reading=observations.encoder_sigma,
+        model=observations.by_model is not None,
+    )
+
+
+def _rows(observations: Observations, inliers: Inliers, found: Fit) -> list[RowResidual]:
+    """Return the residuals of all rows; errors of the model are not taken out of them."""
+    pairs = observations.pairs
+    r = residuals(found.frames, pairs)
+    rows = []
+    for i, number in enumerate(observations.poses.numbers.tolist()):
+        reason = "" if inliers.is_inlier[i] else _off(observations, inliers, i)
+        rows.append(
+            RowResidual(
+                number,
+                (float(r[i, 0]), float(r[i, 1]), float(r[i, 2])),
+                (float(r[i, 3]), float(r[i, 4]), float(r[i, 5])) if pairs.oriented[i] else None,
+                reason,
+            )
+        )
+    return rows
+
+
+def _off(observations: Observations, inliers: Inliers, i: int) -> str:
+    """Return how far a row is from where the others predict it."""
+    sigma = inliers.factor * observations.noise.sigma[i]
+    found = f"{1e3 * inliers.distance[i]:.3g} mm"
+    scatter = f"{1e3 * sigma[0]:.2g} mm"
+    if observations.pairs.oriented[i]:
+        found += f" and {np.degrees(inliers.angle[i]):.3g} deg"
+        scatter += f" and {np.degrees(sigma[1]):.2g} deg"
+    return f"{found} from where the other rows predict it, which scatter {scatter}"
+
+
+def _at_the_tool(observations: Observations, determined: Determinacy) -> tuple[float, float | None]:
+    """Return how well the frames put the tool in the world, rms over the poses [m], [rad]."""
+    J = jacobian(determined.fit.frames, observations.pairs)
+    variance = np.einsum("nij,jk,nik->ni", J, determined.covariance, J)
+    position = float(np.sqrt(variance[:, :3].sum(axis=1).mean()))
+    oriented = observations.pairs.oriented
+    if not oriented.any():
+        return position, None
+    return position, float(np.sqrt(variance[oriented, 3:].sum(axis=1).mean()))
+
+
+def _sentence(
+    observations: Observations, determined: Determinacy, left_out: Sequence[int], too_large: str
+) -> str:
+    """Return the verdict."""
+    used = len(observations.poses) - len(left_out)
+    sigma = np.sqrt(np.maximum(np.diagonal(determined.covariance), 0.0)).reshape(4, 3)
+    size = np.linalg.norm(sigma, axis=1)
+    base = f"{1e3 * size[0]:.2g} mm and {np.degrees(size[1]):.2g} deg"
+    known = [
+        f"{1e3 * size[2]:.2g} mm" * bool(size[2] > _FIXED_TOLERANCE),
+        f"{np.degrees(size[3]):.2g} deg"
+        * bool(observations.is_oriented and size[3] > _FIXED_TOLERANCE),
+    ]
+    tool = " and ".join(words for words in known if words)
+    tool = f", the tool in the platform to {tool}" if tool else ""
+    tool += "" if observations.is_oriented else " (its position only)"
+    rows = f"{used} of {len(observations.poses)} poses" if left_out else f"{used} poses"
+    out = ""
+    if left_out:
+        several = len(left_out) > 1
+        out = (
+            f" Row{'s' * several} {', '.join(map(str, left_out))} disagree{'s' * (not several)} "
+            f"with the others and {'were' if several else 'was'} left out."
+        )
+    if too_large:
+        return (
+            f"Doubtful: {too_large}, so that the standard deviations are too small; errors of the "
+            "model or of the readings may be the reason, or readings and poses that do not belong "
+            "together." + out
+        )
+    start = "Base and tool are located" + " in part" * bool(determined.held)
+    return (
+        f"{start} from {rows}: the base in the world to {base}{tool} "
+        f"(1 sigma{'' if observations.by_model is not None else ', if the model is right'})."
+        f"{' ' * bool(determined.words)}{determined.words}{out}"
+    )
+
+
+def _notes(
+    observations: Observations,
+    determined: Determinacy,
+    inliers: Inliers,
+    too_small: str,
+    *,
+    is_given: bool,
+) -> list[str]:
+    """Return what else a reader should know."""
+    notes = [*observations.poses.notes, *determined.weak]
+    if observations.by_model is None:
+        notes.append(
+            "Nothing is known of the errors of the model, which move all poses at once: the "
+            "standard deviations hold for a model without errors; locate the model in the folder "
+            "of its calibration, or state how precise the measurement is to have it tested."
+        )
+    if int(inliers.is_inlier.sum()) == observations.fewest:
+        notes.append(
+            f"A wrong row among the {observations.fewest} poses could not have been noticed; "
+            "measure more."
+        )
+    if too_small:
+        notes.append(f"The stated standard deviations look too large: {too_small}.")
+    if is_given and not determined.held:
+        notes.append("The given position of the tool was not needed: the poses determine it.")
+    return notes

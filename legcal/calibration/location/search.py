@@ -1,37 +1,61 @@
-"""The frames without a start: closed forms on subsets of rows, and the robust descent from them."""
+"""The frames without a start: closed forms on subsets of rows, and robust descent from them.
+
+Where no frames explain the poses, common mistakes (units, mirrored axes, orders) are undone one by
+one, to say which of them would.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.calibration.location.frames import (
-    N_FRAME,
-    Frames,
+    N_STEP,
     PosePairs,
+    frames_from,
     jacobian,
+    moved,
     residuals,
-    stacked,
 )
 from legcal.geometry import Array, BoolArray, IntArray, nearest_rotation
+from legcal.machine import solve
 
-MOST_ROWS = 40  # that starts are tried on
-SUBSETS = 30
-SUBSET = 4  # rows
-AT_FIRST = 8  # steps on the rows that a start came from, and for all starts
-MOST_PROMISING = 12  # starts that go on
-LAST_STEPS = 30
-_CONVERGED = 1e-9  # relative change of the cost
+_MAX_ROWS = 40  # that starts are tried on
+_SUBSETS = 30
+_SUBSET = 4  # rows
+_FIRST_ITERATIONS = 8  # on the rows that a start came from, and for all starts
+_N_CONTINUED = 12  # starts that go on
+_MAX_ITERATIONS = 30
+_MAX_TURN = 0.5  # [rad] in one step
+_MAX_STALLED = 4  # iterations that hardly lower the cost
+# Mistakes
+_BETTER = 10.0  # times smaller residuals
+_CLEAR = 0.01  # of the spread of positions: below, no further mistake is tried
+_MISTAKE_ROWS, _MISTAKE_SUBSETS = 12, 8
+_LENGTHS = (
+    (1e-3, "millimetres", "divide x, y and z by 1000"),
+    (1e-2, "centimetres", "divide x, y and z by 100"),
+    (0.0254, "inches", "multiply x, y and z by 0.0254"),
+)
+_MIRRORS = (
+    ("x reversed", np.diag([-1.0, 1.0, 1.0])),
+    ("y reversed", np.diag([1.0, -1.0, 1.0])),
+    ("z reversed", np.diag([1.0, 1.0, -1.0])),
+    ("x and y swapped", np.eye(3)[[1, 0, 2]]),
+    ("y and z swapped", np.eye(3)[[0, 2, 1]]),
+    ("x and z swapped", np.eye(3)[[2, 1, 0]]),
+)
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates:
+class Candidates(NamedTuple):
     """Where the search has ended, the best first."""
 
-    frames: Frames  # A batch
+    frames: Array  # (k, 2, 3, 4)
     # (k,): mean square over the rows that agree best, lengths in units of ``pairs.length``
     cost: Array
 
@@ -40,20 +64,19 @@ def search(
     pairs: PosePairs,
     fewest: int,  # rows that determine the frames
     *,
-    subsets: int = SUBSETS,  # how many starts come from a few rows each
+    subsets: int = _SUBSETS,  # how many starts come from a few rows each
 ) -> Candidates:
     """Return the frames that agree best with most rows, from starts all over the rotations."""
-    if len(pairs) > MOST_ROWS:
-        pairs = pairs.of(np.linspace(0, len(pairs) - 1, MOST_ROWS).astype(np.intp))
-    n = len(pairs)
-    n_kept = kept_rows(n, fewest)
-    start, chosen = _starts(pairs, fewest, subsets)
-    frames = _descend(pairs, start, AT_FIRST, chosen.astype(np.float64))
-    order = np.argsort(_trimmed(frames, pairs, n_kept), kind="stable")[:MOST_PROMISING]
-    frames = _descend(pairs, frames.at(order), LAST_STEPS, n_kept)
-    cost = _trimmed(frames, pairs, n_kept)
+    if len(pairs) > _MAX_ROWS:
+        pairs = pairs.of(np.linspace(0, len(pairs) - 1, _MAX_ROWS).astype(np.intp))
+    n_kept = kept_rows(len(pairs), fewest)
+    starts, rows = _starts(pairs, fewest, subsets)
+    frames = _descended(pairs, starts, rows.astype(np.float64), _FIRST_ITERATIONS)
+    order = np.argsort(_trimmed_cost(frames, pairs, n_kept), kind="stable")[:_N_CONTINUED]
+    frames = _descended(pairs, frames[order], n_kept, _MAX_ITERATIONS)
+    cost = _trimmed_cost(frames, pairs, n_kept)
     order = np.argsort(cost, kind="stable")
-    return Candidates(frames.at(order), cost[order] / n_kept)
+    return Candidates(frames[order], cost[order] / n_kept)
 
 
 def kept_rows(n: int, fewest: int) -> int:
@@ -61,37 +84,31 @@ def kept_rows(n: int, fewest: int) -> int:
     return max(min(n, fewest), (n + fewest + 1) // 2)
 
 
-def _starts(pairs: PosePairs, fewest: int, subsets: int) -> tuple[Frames, BoolArray]:
+def _starts(pairs: PosePairs, fewest: int, subsets: int) -> tuple[Array, BoolArray]:
     """Return starts and the rows (k, n) that each came from."""
     n = len(pairs)
-    chance = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     everywhere = Rotation.create_group("O").as_matrix()
-    everything = np.ones(n, dtype=np.bool_)
-    batch = with_positions(everywhere, tool_orientation(everywhere, pairs), pairs)
-    found = [batch.at(i) for i in range(len(everywhere))]
-    rows: list[BoolArray] = [everything] * len(found)
+    starts = list(with_positions(everywhere, _tool_orientation(everywhere, pairs), pairs))
     if pairs.oriented.any():
         closed = [solve_by_opencv(pairs), solve_by_kronecker(pairs)]
-        found += [frames for frames in closed if frames is not None]
-        rows += [everything] * (len(found) - len(rows))
-    size = max(SUBSET, fewest)
+        starts += [frames for frames in closed if frames is not None]
+    rows: list[BoolArray] = [np.ones(n, dtype=np.bool_)] * len(starts)
+    size = max(_SUBSET, fewest)
     for k in range(subsets if n > size else 0):
-        chosen = np.sort(chance.choice(n, size, replace=False)).astype(np.intp)
-        found.append(_start_of(pairs.of(chosen), everywhere[k % len(everywhere)]))
+        chosen = np.sort(rng.choice(n, size, replace=False)).astype(np.intp)
+        some, R_base = pairs.of(chosen), everywhere[k % len(everywhere)]
+        if some.oriented.sum() >= 3:
+            starts.append(solve_by_kronecker(some))
+        else:
+            starts.append(with_positions(R_base, _tool_orientation(R_base, some), some))
         rows.append(np.isin(np.arange(n), chosen))
-    return stacked(found), np.array(rows)
-
-
-def _start_of(pairs: PosePairs, R_base: Array) -> Frames:
-    """Return a start from a few rows."""
-    if pairs.oriented.sum() >= 3:
-        return solve_by_kronecker(pairs)
-    return with_positions(R_base, tool_orientation(R_base, pairs), pairs)
+    return np.array(starts), np.array(rows)
 
 
 def solve_by_opencv(
     pairs: PosePairs,  # rows without an orientation are left out
-) -> Frames | None:
+) -> Array | None:
     """Return the frames that OpenCV finds, or None where it finds none or has no solver."""
     solver = getattr(cv2, "calibrateRobotWorldHandEye", None)
     rows = pairs.of(pairs.oriented)
@@ -112,13 +129,13 @@ def solve_by_opencv(
     if not all(np.isfinite(part).all() for part in (R_X, t_X, R_Z, t_Z)):
         return None
     R_tool = nearest_rotation(R_Z).T
-    return Frames(nearest_rotation(R_X), t_X.ravel(), R_tool, -R_tool @ t_Z.ravel())
+    return frames_from(nearest_rotation(R_X), t_X.ravel(), R_tool, -R_tool @ t_Z.ravel())
 
 
 def solve_by_kronecker(
     # rows without an orientation serve for positions only; one row has to have one
     pairs: PosePairs,
-) -> Frames:
+) -> Array:
     """Return the frames by the largest singular pair of sum_i R_i (x) M_i.
 
     From M_i R_tool^T R_i^T = R_base follows (R_i (x) M_i) vec(R_tool^T) = vec(R_base). Where
@@ -138,7 +155,7 @@ def with_positions(
     R_tool: Array,
     # what the positions are to agree with; the smallest ones where these leave some open
     pairs: PosePairs,
-) -> Frames:
+) -> Array:
     """Return frames of known orientations with the positions of linear least squares."""
     batch, n = R_base.shape[:-2], len(pairs)
     A = np.concatenate(
@@ -150,67 +167,45 @@ def with_positions(
     ).reshape(*batch, 3 * n, 6)
     b = (pairs.p - np.einsum("...ij,nj->...ni", R_base, pairs.t)).reshape(*batch, 3 * n, 1)
     x = (np.linalg.pinv(A, rcond=1e-9) @ b)[..., 0]
-    return Frames(R_base, x[..., :3], R_tool, x[..., 3:])
+    return frames_from(R_base, x[..., :3], R_tool, x[..., 3:])
 
 
-def tool_orientation(R_base: Array, pairs: PosePairs) -> Array:
+def _tool_orientation(R_base: Array, pairs: PosePairs) -> Array:
     """Return the orientations (..., 3, 3) of the tool in the platform, given the base's."""
     carried = R_base[..., None, :, :] @ pairs.R
     votes = np.swapaxes(carried, -1, -2) @ pairs.M * pairs.oriented[:, None, None]
     return nearest_rotation(votes.sum(axis=-3) + 1e-12 * np.eye(3))
 
 
-def _descend(pairs: PosePairs, frames: Frames, steps: int, rows: Array | int) -> Frames:
-    """Return each start after Levenberg-Marquardt on given rows, or on so many of its best."""
-    damping = np.full(len(frames.t_base), 1e-3)
-    r = _relative(frames, pairs)
-    settled = False
-    while steps > 0 and not settled:
+def _descended(pairs: PosePairs, frames: Array, rows: Array | int, max_iterations: int) -> Array:
+    """Return each start after damped steps on given rows (k, n), or on so many of its best."""
+
+    def equations(frames: Array) -> tuple[Array, Array]:
+        r = residuals(frames, pairs) * pairs.unit
         weight = _best(r, rows) if isinstance(rows, int) else rows
-        before = _cost(r, weight)
-        tried = frames.moved(_step(frames, pairs, r, weight, damping))
-        r_tried = _relative(tried, pairs)
-        cost = _cost(r_tried, weight)
-        better = cost <= before
-        settled = bool(np.all(np.abs(before - cost) <= _CONVERGED * before + 1e-26))
-        frames, r = _where(better, tried, frames), np.where(better[:, None, None], r_tried, r)
-        damping = np.where(better, np.maximum(0.1 * damping, 1e-14), np.minimum(10 * damping, 1e3))
-        steps -= 1
-    return frames
+        J = -jacobian(frames, pairs) * pairs.unit[:, None] * weight[..., None, None]
+        return (r * weight[..., None]).reshape(len(r), -1), J.reshape(len(r), -1, N_STEP)
+
+    def retract(frames: Array, step: Array) -> Array:
+        turn = np.linalg.norm(step[:, [3, 4, 5, 9, 10, 11]], axis=1)
+        return moved(frames, step * np.minimum(1.0, _MAX_TURN / np.maximum(turn, 1e-300))[:, None])
+
+    return solve(
+        equations,
+        retract,
+        frames,
+        met=0.0,
+        unit=pairs.scale,
+        far=True,
+        steps=max_iterations,
+        patience=_MAX_STALLED,
+    ).points
 
 
-def _step(frames: Frames, pairs: PosePairs, r: Array, weight: Array, damping: Array) -> Array:
-    """Return the damped steps (k, 12), none turning by more than half a radian."""
-    A = jacobian(frames, pairs) * _units(pairs)[:, None] * pairs.scale
-    A = (A * weight[:, :, None, None]).reshape(len(weight), -1, N_FRAME)
-    y = (r * weight[:, :, None]).reshape(len(weight), -1, 1)
-    H = np.swapaxes(A, 1, 2) @ A
-    size = np.trace(H, axis1=1, axis2=2) / N_FRAME
-    H += (damping * size)[:, None, None] * np.eye(N_FRAME)
-    change = np.linalg.solve(H, np.swapaxes(A, 1, 2) @ y)[..., 0] * pairs.scale
-    turn = np.linalg.norm(change[:, [3, 4, 5, 9, 10, 11]], axis=1)
-    return np.asarray(change * np.minimum(1.0, 0.5 / np.maximum(turn, 1e-300))[:, None])
-
-
-def _units(pairs: PosePairs) -> Array:
-    """Return what residuals are multiplied with, (6,)."""
-    return np.repeat([1.0 / pairs.length, 1.0], 3)
-
-
-def _relative(frames: Frames, pairs: PosePairs) -> Array:
-    """Return residuals without a unit, (k, n, 6)."""
-    return residuals(frames, pairs) * _units(pairs)
-
-
-def _trimmed(frames: Frames, pairs: PosePairs, n_kept: int) -> Array:
+def _trimmed_cost(frames: Array, pairs: PosePairs, n_kept: int) -> Array:
     """Return the sums of squares of the best rows, (k,)."""
-    r = _relative(frames, pairs)
-    return _cost(r, _best(r, n_kept))
-
-
-def _cost(r: Array, weight: Array) -> Array:
-    """Return the weighted sums of squares, (k,)."""
-    return np.asarray(np.einsum("kni,kni,kn->k", r, r, weight))
+    r = residuals(frames, pairs) * pairs.unit
+    return np.asarray(np.einsum("kni,kni,kn->k", r, r, _best(r, n_kept)))
 
 
 def _best(r: Array, n_kept: int) -> Array:
@@ -219,12 +214,63 @@ def _best(r: Array, n_kept: int) -> Array:
     return (rank < n_kept).astype(np.float64)
 
 
-def _where(chosen: BoolArray, one: Frames, other: Frames) -> Frames:
-    """Return some of a batch from one and the others from another."""
-    c = chosen[:, None]
-    return Frames(
-        np.where(c[..., None], one.R_base, other.R_base),
-        np.where(c, one.t_base, other.t_base),
-        np.where(c[..., None], one.R_tool, other.R_tool),
-        np.where(c, one.t_tool, other.t_tool),
-    )
+def likely_mistake(
+    pairs: PosePairs,
+    cost: float,  # of the best candidate for them
+    fewest: int,  # rows that determine the frames
+) -> tuple[str, str] | None:
+    """Return what the poses look like and what to do, or None."""
+    best, likely = cost / _spread(pairs) / _BETTER**2, None
+    few = pairs.of(np.linspace(0, len(pairs) - 1, min(len(pairs), _MISTAKE_ROWS)).astype(np.intp))
+    for changed, looks_like, remedy in _alternatives(few):
+        other = float(search(changed, fewest, subsets=_MISTAKE_SUBSETS).cost[0]) / _spread(changed)
+        if other < best:
+            best, likely = other / _BETTER**2, (looks_like, remedy)
+            if other < _CLEAR**2:
+                break
+    return likely
+
+
+def _spread(pairs: PosePairs) -> float:
+    """Return how far positions are apart, squared, in units of ``pairs.length``."""
+    return float(pairs.p.var(axis=0).sum()) / pairs.length**2 + 1e-300
+
+
+def _alternatives(pairs: PosePairs) -> Iterator[tuple[PosePairs, str, str]]:
+    """Yield the poses with each mistake undone, what they look like with it, and what to do."""
+    has_orientations = bool(pairs.oriented.any())
+    reordered = _reordered(pairs.M)
+    wrong_order = "quaternions in the order w, x, y, z", "write qx, qy, qz, qw under their names"
+    for size, unit, remedy in _LENGTHS:
+        metres = replace(pairs, p=size * pairs.p)
+        yield metres, f"positions in {unit}", remedy
+        if has_orientations:
+            both = replace(metres, M=reordered)
+            yield (
+                both,
+                f"positions in {unit} and {wrong_order[0]}",
+                f"{remedy}, and {wrong_order[1]}",
+            )
+    mirror = _MIRRORS[2][1]
+    name = "left-handed axes, a mirror image", "give poses in right-handed axes"
+    yield replace(pairs, p=pairs.p @ mirror, M=mirror @ pairs.M @ mirror), *name
+    if not has_orientations:
+        return
+    yield replace(pairs, M=reordered), *wrong_order
+    back = np.swapaxes(pairs.M, 1, 2)
+    inverse = "the orientation of the world in the tool", "invert the quaternions"
+    yield replace(pairs, M=back), *inverse
+    world = replace(pairs, M=back, p=-np.einsum("nij,nj->ni", back, pairs.p))
+    yield world, "poses of the world in the tool", "give those of the tool in the world"
+    for words, S in _MIRRORS:
+        yield (
+            replace(pairs, p=pairs.p @ S.T),
+            f"positions along left-handed axes ({words})",
+            "give positions and orientations along the same right-handed axes",
+        )
+
+
+def _reordered(M: Array) -> Array:
+    """Return orientations whose quaternions were read as x, y, z, w and are w, x, y, z."""
+    quaternions = Rotation.from_matrix(M).as_quat()
+    return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()

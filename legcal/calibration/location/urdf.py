@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.location.result import Location
+from legcal.calibration.location.document import Location
 from legcal.errors import ModelError, UsageError
 from legcal.files import existing_parent, is_plain_name, temporary_folder
 from legcal.geometry import roll_pitch_yaw
@@ -20,7 +20,7 @@ from legcal.machine import Machine, Urdf, UrdfPatch, load_mechanism, write_model
 
 WORLD = "world"
 TOOL = "tool"
-_SAME = 1e-12  # [m, rad]: rounding of the analysis
+_TOLERANCE = 1e-12  # [m, rad]: rounding of the analysis
 
 
 def write_located_model(
@@ -154,7 +154,7 @@ def check_same(before: Machine, after: Machine) -> None:
         and before.mobility == after.mobility
         and before.frame_legs == after.frame_legs
         and all(
-            np.abs(one - other).max() <= _SAME
+            np.abs(one - other).max() <= _TOLERANCE
             for one, other in (
                 (before.A_base, after.A_base),
                 (before.B_platform, after.B_platform),

@@ -1,4 +1,4 @@
-"""What the poses leave open: refused where other poses of the machine would show it, else held."""
+"""What the poses leave open: refused where other poses of the machine would show it, else fixed."""
 
 from __future__ import annotations
 
@@ -8,19 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.calibration.location.fit import (
-    SINGULAR,
-    Fit,
-    covariance_with,
-    finished,
-    frame_design,
-    hold_tool,
-    is_resolved_by_the_tool,
-    system,
-)
-from legcal.calibration.location.frames import N_FRAME, Frames, PosePairs, jacobian
-from legcal.calibration.location.problem import Problem
-from legcal.calibration.location.result import (
+from legcal.calibration.location.document import (
     Frame,
     Kind,
     OpenPart,
@@ -28,28 +16,36 @@ from legcal.calibration.location.result import (
     direction_words,
     joined,
 )
+from legcal.calibration.location.fit import (
+    RANK_TOLERANCE,
+    Fit,
+    frame_design_at,
+    hold_tool,
+)
+from legcal.calibration.location.frames import N_STEP, PosePairs, jacobian
+from legcal.calibration.location.observations import Observations
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray
 from legcal.machine import random_configurations
 
-OPEN = 0.1  # [rad], and of the length of the machine
-HARDLY = 2e-3  # of the best seen direction: what no pose of a machine shows better is its own
-_PART = 0.03  # of a unit direction: what is less is not named
-_SAME_AXIS = 0.02  # of the largest rotations: what is less is about the same axis
-BLOCKS: tuple[tuple[slice, Frame, Kind], ...] = (
+_MAX_SIGMA = 0.1  # [rad], and of the length of the machine: what is known worse is open
+_MACHINE_TOLERANCE = 2e-3  # of the best singular value: what no pose of a machine shows better
+_PART_TOLERANCE = 0.03  # of a unit direction: what is less is not named
+_AXIS_TOLERANCE = 0.02  # of the largest rotations: what is less is about the same axis
+_RESOLVED = 1e-3  # of a unit direction
+_N_POSES, _SEED = 30, 1  # of the workspace
+_WEAK = 25.0  # times worse known than by one measured pose
+_BLOCKS: tuple[tuple[slice, Frame, Kind], ...] = (
     (slice(0, 3), "base", "position"),
     (slice(3, 6), "base", "orientation"),
     (slice(6, 9), "tool", "position"),
     (slice(9, 12), "tool", "orientation"),
 )  # of a step
-WORKSPACE = 30  # poses
-SEED = 1
-WEAK = 25.0  # times worse known than one measured pose would tell
 
 
 @dataclass(frozen=True, eq=False)
 class Determinacy:
-    """Frames at rest, and how well each part of them is known."""
+    """The most likely frames, and how well each part of them is known."""
 
     fit: Fit  # at the frames, the open part held
     # (12, 12): of a step: displacement and rotation of the base about world axes, of the tool about
@@ -61,7 +57,7 @@ class Determinacy:
 
 
 def determine(
-    problem: Problem,
+    observations: Observations,
     found: Fit,
     # (3,): where the tool is taken in the platform where the machine leaves that open [m]
     tool_position: Array,
@@ -69,56 +65,51 @@ def determine(
 ) -> Determinacy:
     """Return what a fit determines.
 
-    Raises NotIdentifiable if other poses of the machine would tell what these leave open, or if
-    more than the tool would have to be held.
+    Raises NotIdentifiable if other poses of the machine would determine what these leave open, or
+    if more than the tool would have to be fixed.
     """
-    pairs, oriented = problem.pairs, problem.is_oriented
-    basis = open_directions(found.frame_design, oriented=oriented)
+    pairs, oriented = observations.pairs, observations.is_oriented
+    basis = _open_directions(found.frame_design, oriented=oriented)
     parts: list[OpenPart] = []
     words = ""
     if basis.shape[1]:
-        workspace = _workspace(problem)
-        _check_machine(problem, found, basis, workspace, name)
-        found = hold(problem, found, tool_position)
-        basis = _open_at(problem, found, basis.shape[1], found.frames)
-        parts = open_parts(basis, found.frames)
+        workspace = _workspace(observations)
+        _check_machine(observations, found, basis, workspace, name)
+        found = hold(observations, found, tool_position)
+        basis = _open_at(observations, found, basis.shape[1], found.frames)
+        parts = _open_parts(basis, found.frames)
         words = _held_words(parts, workspace, tool_position)
     scale = pairs.scale
-    unit = covariance_with(found.information, basis, oriented=oriented)
+    unit = _covariance_with(found.information, basis, oriented=oriented)
     covariance = unit * np.outer(scale, scale)
     return Determinacy(
         found, covariance, tuple(parts), words, _weak(covariance, found, pairs, oriented=oriented)
     )
 
 
-def hold(problem: Problem, found: Fit, tool_position: Array) -> Fit:
+def hold(observations: Observations, found: Fit, tool_position: Array) -> Fit:
     """Return a fit moved along what it leaves open until the tool is where it is held."""
-    k = open_directions(found.frame_design, oriented=problem.is_oriented).shape[1]
+    k = _open_directions(found.frame_design, oriented=observations.is_oriented).shape[1]
     if k == 0:
         return found
-    frames = hold_tool(
-        found.frames,
-        problem.pairs,
-        lambda frames: _open_at(problem, found, k, frames),
-        lambda frames: system(problem.pairs, frames, found.noise, problem.by_model),
-        tool_position,
+    return hold_tool(
+        observations, found, lambda frames: _open_at(observations, found, k, frames), tool_position
     )
-    return finished(problem.pairs, frames, found.noise, problem.by_model)
 
 
-def open_directions(
+def _open_directions(
     # (m, 12): whitened derivatives by a step in units of the machine's length and radians
     design: Array,
     *,
     # whether orientations of the tool were measured at all; without, that of the tool in the
-    # platform is not looked for
+    # platform is not estimated
     oriented: bool,
 ) -> Array:
     """Return an orthonormal basis (12, k) of the directions that a design leaves open."""
-    return _unseen(design, oriented, lambda s: (s < SINGULAR * s[0]) | (s * OPEN < 1.0))
+    return _unseen(design, oriented, lambda s: (s < RANK_TOLERANCE * s[0]) | (s * _MAX_SIGMA < 1.0))
 
 
-def beyond_the_machine(
+def _shown_elsewhere(
     basis: Array,  # (12, k): what the measured poses leave open
     # (m, 12): derivatives of poses all over the workspace by a step, both in units of the machine's
     # length and radians: geometry alone, whatever the noise
@@ -127,8 +118,8 @@ def beyond_the_machine(
     oriented: bool,
 ) -> Array:
     """Return those open directions (12, k) that the machine's workspace would show."""
-    own = _unseen(jacobian, oriented, lambda s: s < HARDLY * s[0])
-    U, s, _ = np.linalg.svd(basis - own @ (own.T @ basis), full_matrices=False)
+    never = _unseen(jacobian, oriented, lambda s: s < _MACHINE_TOLERANCE * s[0])
+    U, s, _ = np.linalg.svd(basis - never @ (never.T @ basis), full_matrices=False)
     return np.asarray(U[:, s > 0.5])
 
 
@@ -143,22 +134,22 @@ def _unseen(design: Array, oriented: bool, is_open: Callable[[Array], BoolArray]
     return basis
 
 
-def open_parts(basis: Array, frames: Frames) -> list[OpenPart]:
+def _open_parts(basis: Array, frames: Array) -> list[OpenPart]:
     """Return which parts of the frames some open directions (12, k) move."""
     parts = []
-    for block, frame, kind in BLOCKS:
+    for block, frame, kind in _BLOCKS:
         rows = basis[block]
         if frame == "base":
-            rows = frames.R_base.T @ rows
+            rows = frames[0, :, :3].T @ rows
         U, s, _ = np.linalg.svd(rows, full_matrices=False)
-        found = [direction_of(u) for u in U[:, s > _PART].T]
+        found = [direction_of(u) for u in U[:, s > _PART_TOLERANCE].T]
         if found:
             parts.append(OpenPart(frame, kind, tuple(found)))
     return parts
 
 
 @dataclass(frozen=True, eq=False)
-class Variety:
+class _PoseSpread:
     """How platform poses differ."""
 
     # (r, 3): independent axes that they are turned about, in the base link, the first ones first
@@ -180,18 +171,18 @@ class Variety:
         return f"{turns} and {shifts[self.n_shifts]}"
 
 
-def variety(R: Array, t: Array, length: float) -> Variety:
+def _pose_spread(R: Array, t: Array, length: float) -> _PoseSpread:
     """Return how poses R (n, 3, 3), t (n, 3) [m] differ; a length makes rotations comparable."""
     turns = (Rotation.from_matrix(R) * Rotation.from_matrix(R).mean().inv()).as_rotvec()
     _, s, Vt = np.linalg.svd(turns, full_matrices=False)
     size = np.sqrt(len(t))
-    axes = Vt[(s > _SAME_AXIS * s[0]) & (s / size > 1e-6)]
+    axes = Vt[(s > _AXIS_TOLERANCE * s[0]) & (s / size > 1e-6)]
     moves = np.linalg.svd(t - t.mean(axis=0), compute_uv=False)
-    n_shifts = int(np.sum((moves > _SAME_AXIS * moves[0]) & (moves / size > 1e-6 * length)))
-    return Variety(axes, n_shifts)
+    n_shifts = int(np.sum((moves > _AXIS_TOLERANCE * moves[0]) & (moves / size > 1e-6 * length)))
+    return _PoseSpread(axes, n_shifts)
 
 
-def needed_words(found: Variety, possible: Variety, scatter: str) -> str:
+def _needed_words(found: _PoseSpread, possible: _PoseSpread, scatter: str) -> str:
     """Return how the poses scatter if that matters, what they need and what to do."""
     if len(found.axes) < min(2, len(possible.axes)):
         several = "two axes" if len(possible.axes) > 1 else "an axis"
@@ -208,59 +199,58 @@ def needed_words(found: Variety, possible: Variety, scatter: str) -> str:
     )
 
 
-def _open_at(problem: Problem, found: Fit, k: int, frames: Frames) -> Array:
+def _open_at(observations: Observations, found: Fit, k: int, frames: Array) -> Array:
     """Return the k directions (12, k) that are known least at some frames."""
-    n = 12 if problem.is_oriented else 9
-    design = system(problem.pairs, frames, found.noise, problem.by_model)[1]
-    _, _, Vt = np.linalg.svd(frame_design(design)[:, :n], full_matrices=True)
+    n = 12 if observations.is_oriented else 9
+    design = frame_design_at(observations.pairs, frames, found.noise, observations.by_model)
+    _, _, Vt = np.linalg.svd(design[:, :n], full_matrices=True)
     basis = np.zeros((12, k))
     basis[:n] = Vt[n - k :].T
     return basis
 
 
-def _workspace(problem: Problem) -> PosePairs:
+def _workspace(observations: Observations) -> PosePairs:
     """Return poses all over the workspace, as if each had been measured."""
-    drawn = random_configurations(problem.machine, WORKSPACE, SEED)
-    matrices = np.array([T.as_matrix() for T in drawn.poses])
+    sampled = random_configurations(observations.machine, _N_POSES, _SEED)
+    matrices = np.array([T.as_matrix() for T in sampled.poses])
     return PosePairs(
         R=matrices[:, :3, :3],
         t=matrices[:, :3, 3],
-        M=np.tile(np.eye(3), (WORKSPACE, 1, 1)),
-        p=np.zeros((WORKSPACE, 3)),
-        oriented=np.full(WORKSPACE, problem.is_oriented),
-        length=problem.pairs.length,
+        M=np.tile(np.eye(3), (_N_POSES, 1, 1)),
+        p=np.zeros((_N_POSES, 3)),
+        oriented=np.full(_N_POSES, observations.is_oriented),
+        length=observations.pairs.length,
     )
 
 
 def _check_machine(
-    problem: Problem, found: Fit, basis: Array, workspace: PosePairs, name: str
+    observations: Observations, found: Fit, basis: Array, workspace: PosePairs, name: str
 ) -> None:
     """Refuse what other poses would tell, and what holding the tool does not close."""
-    pairs = problem.pairs
-    units = np.repeat([1.0 / pairs.length, 1.0], 3)[:, None]
-    seen = (jacobian(found.frames, workspace) * units * pairs.scale).reshape(-1, N_FRAME)
-    beyond = beyond_the_machine(basis, seen, oriented=problem.is_oriented)
-    here = variety(pairs.R, pairs.t, pairs.length)
-    there = variety(workspace.R, workspace.t, pairs.length)
+    pairs = observations.pairs
+    seen = jacobian(found.frames, workspace) * pairs.unit[:, None] * pairs.scale
+    beyond = _shown_elsewhere(basis, seen.reshape(-1, N_STEP), oriented=observations.is_oriented)
+    here = _pose_spread(pairs.R, pairs.t, pairs.length)
+    there = _pose_spread(workspace.R, workspace.t, pairs.length)
     start = f"{name}: base and tool could not be located, because"
     if beyond.shape[1]:
         raise NotIdentifiable(
-            f"{start} {joined(open_parts(beyond, found.frames))} cannot be told from the poses: "
+            f"{start} {joined(_open_parts(beyond, found.frames))} cannot be told from the poses: "
             f"found {len(pairs)} poses that {here.words}"
-            f"{needed_words(here, there, _scatter(problem, found))}."
+            f"{_needed_words(here, there, _scatter(observations, found))}."
         )
-    if not is_resolved_by_the_tool(basis):
+    if not _is_resolved_by_the_tool(basis):
         raise NotIdentifiable(
-            f"{start} no pose of this machine tells {joined(open_parts(basis, found.frames))}: "
+            f"{start} no pose of this machine tells {joined(_open_parts(basis, found.frames))}: "
             f"found a platform whose poses {there.words}, needed a part that holding the tool in "
             "the platform closes; measure orientations too, or the base itself."
         )
 
 
-def _scatter(problem: Problem, found: Fit) -> str:
+def _scatter(observations: Observations, found: Fit) -> str:
     """Return the standard deviations of a measured component."""
-    sigma = found.noise.factor * np.sqrt((found.noise.sigma**2).mean(axis=0))
-    turn = f" and {np.degrees(sigma[1]):.2g} deg" if problem.is_oriented else ""
+    sigma = found.noise.rms
+    turn = f" and {np.degrees(sigma[1]):.2g} deg" if observations.is_oriented else ""
     return f"{1e3 * sigma[0]:.2g} mm{turn}"
 
 
@@ -268,7 +258,7 @@ def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Arra
     """Return what is held and why."""
     tool = [part for part in parts if part.frame == "tool"]
     base = [part for part in parts if part.frame == "base"]
-    machine = variety(workspace.R, workspace.t, workspace.length)
+    machine = _pose_spread(workspace.R, workspace.t, workspace.length)
     if len(machine.axes) == 0:
         why = "the platform of this machine does not turn"
     elif len(machine.axes) == 1:
@@ -292,16 +282,16 @@ def _held_words(parts: list[OpenPart], workspace: PosePairs, tool_position: Arra
 
 def _weak(covariance: Array, found: Fit, pairs: PosePairs, *, oriented: bool) -> tuple[str, ...]:
     """Return which directions are known badly, one sentence for each part of the frames."""
-    position, angle = found.noise.factor * np.sqrt((found.noise.sigma**2).mean(axis=0))
-    one = max(float(position), float(angle) * pairs.length if oriented else 0.0)
+    position, angle = found.noise.rms.tolist()
+    one = max(position, angle * pairs.length if oriented else 0.0)
     sentences = []
-    for block, frame, kind in BLOCKS:
+    for block, frame, kind in _BLOCKS:
         values, vectors = np.linalg.eigh(covariance[block, block])
         sigma = float(np.sqrt(max(values[-1], 0.0)))
-        limit = WEAK * (one if kind == "position" else one / pairs.length)
+        limit = _WEAK * (one if kind == "position" else one / pairs.length)
         if sigma <= limit:
             continue
-        v = vectors[:, -1] if frame == "tool" else found.frames.R_base.T @ vectors[:, -1]
+        v = vectors[:, -1] if frame == "tool" else found.frames[0, :, :3].T @ vectors[:, -1]
         part = OpenPart(frame, kind, (direction_of(v),))
         known = f"{1e3 * sigma:.2g} mm" if kind == "position" else f"{np.degrees(sigma):.2g} deg"
         sentences.append(
@@ -309,3 +299,32 @@ def _weak(covariance: Array, found: Fit, pairs: PosePairs, *, oriented: bool) ->
             "rotations about several axes, would tell it better."
         )
     return tuple(sentences)
+
+
+def _is_resolved_by_the_tool(basis: Array) -> bool:
+    """Say whether every open direction (12, k) moves the tool, so that holding it closes all."""
+    s = np.linalg.svd(basis[6:], compute_uv=False)
+    return bool(np.all(s > _RESOLVED)) and len(s) >= basis.shape[1]
+
+
+def _kept_directions(basis: Array) -> Array:
+    """Return the directions (12, 12 - k) that do not move the held part of the tool."""
+    held = basis.copy()
+    held[:6] = 0.0
+    U, s, _ = np.linalg.svd(held, full_matrices=True)
+    return np.asarray(U[:, int(np.sum(s > 0.0)) :])
+
+
+def _covariance_with(
+    information: Array,  # (12, 12): of a step in the same units
+    basis: Array,  # (12, k): open directions
+    *,
+    oriented: bool,  # whether the orientation of the tool is known; else its rows are zero
+) -> Array:
+    """Return the covariance (12, 12) of a step, what is held counted as known."""
+    Z = _kept_directions(basis) if basis.shape[1] else np.eye(N_STEP)
+    if not oriented:
+        U, s, _ = np.linalg.svd(Z[:9], full_matrices=False)
+        Z = np.zeros((N_STEP, int(np.sum(s > _RESOLVED))))
+        Z[:9] = U[:, s > _RESOLVED]
+    return np.asarray(Z @ np.linalg.solve(Z.T @ information @ Z, Z.T))
