@@ -8,7 +8,7 @@ from layouts import Layout, LegLayout, write_machine
 from machines import of_types
 from thinned import thinned
 
-from legcal.calibration import accuracy
+from legcal.calibration import evaluation
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
 from legcal.machine import (
@@ -145,7 +145,7 @@ def test_machines_that_share_no_reading_are_given_up_early(monkeypatch: pytest.M
         tried.append(1)
         raise DidNotConverge("not there")
 
-    monkeypatch.setattr(accuracy, "forward_kinematics", never)
+    monkeypatch.setattr(evaluation, "forward_kinematics", never)
     with pytest.raises(DidNotConverge, match="only 0 of 100 random poses"):
-        accuracy.evaluate("hexapod", "hexapod")
+        evaluation.evaluate("hexapod", "hexapod")
     assert len(tried) == 10

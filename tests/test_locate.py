@@ -47,7 +47,7 @@ from legcal.errors import (
 from legcal.geometry import Array, rotation_matrices
 from legcal.machine import platform_pose
 
-KNOWN = {"position_sigma": SIGMA_POSITION, "angle_sigma": SIGMA_ANGLE}
+KNOWN: dict[str, Any] = {"position_sigma": SIGMA_POSITION, "angle_sigma": SIGMA_ANGLE}
 
 
 def near_home(name: str, n: int, size: float, turn: tuple[float, float, float]) -> Located:
@@ -147,7 +147,7 @@ def test_where_the_tool_is_in_the_world_does_not_depend_on_what_is_fixed() -> No
 
 
 @pytest.mark.parametrize("stated", [{}, KNOWN])
-def test_outliers_are_named_and_left_out(stated: dict[str, float]) -> None:
+def test_outliers_are_named_and_left_out(stated: dict[str, Any]) -> None:
     hexapod = made("hexapod", 20)
     position = hexapod.poses.position.copy()
     position[6] += 1e-3
@@ -208,7 +208,7 @@ def _position(change: Callable[[Array], Array], n: int = 6, **more: Any) -> Loca
 
 
 def _displaced(p: Array) -> Array:
-    return p + 5e-3 * (np.arange(len(p)) == 2)[:, None]
+    return np.asarray(p + 5e-3 * (np.arange(len(p)) == 2)[:, None])
 
 
 def _mirrored() -> Located:

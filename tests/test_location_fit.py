@@ -143,8 +143,8 @@ def test_a_search_ends_at_most_rows_where_others_are_wrong() -> None:
 def test_errors_of_readings_move_the_tool_as_the_machine_does(name: str) -> None:
     machine, sampled = shipped(name), workspace_poses(name, 3)
     h, frames = 1e-6, frames_of(BASE, TOOL)
-    R, t = (np.array([x(T) for T in sampled.poses]) for x in (
-        lambda T: T.rotation.as_matrix(), lambda T: T.translation))  # fmt: skip
+    matrices = np.array([T.as_matrix() for T in sampled.poses])
+    R, t = matrices[:, :3, :3], matrices[:, :3, 3]
     pairs = PosePairs(R, t, R, t, np.ones(len(t), dtype=np.bool_), 0.1)
     found = tool_motions(motions_by_readings(machine, sampled.poses, h), frames, pairs)
     for i, T in enumerate(sampled.poses):
