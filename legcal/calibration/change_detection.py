@@ -1,10 +1,10 @@
-"""Whether a machine is still the one that was calibrated, asked of a few new images.
+"""Change detection: whether a machine is still the one that was calibrated, by a few new images.
 
 The new images are fitted by themselves, with priors so wide that any plausible change fits, so
-that nothing which moved is taken for a wrong outline. What they say of the parameters is then
-compared with the earlier result: the difference has the covariance of both, and the weighted square
-of it has an F distribution if nothing moved. Directions of which the new images know less than the
-priors say nothing and do not count.
+that nothing which moved is taken for a wrong outline. Their estimate is then compared with the
+earlier result: the difference has the covariance of both, and its weighted square has an F
+distribution if nothing moved. Directions that the new images determine worse than the priors do not
+count.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def difference(
     covariance: Array,  # (p, p) theirs, priors included
     prior: Array,  # (p,) standard deviations of the priors, whose means are the earlier result
     old: Array,  # (p,) parameters of the earlier result
-    known: Array,  # (p, p) their covariance
-    worse: float = 1.0,  # times the variance of a few new images, which may look small by chance
+    old_covariance: Array,  # (p, p)
+    variance_factor: float = 1.0,  # of the new images: that of a few may be small by chance
 ) -> tuple[Array, Array, Array]:
     """Return directions (k, p) that the new images determine, differences along, covariance (k, k).
 
@@ -83,30 +83,31 @@ def difference(
     S = np.linalg.inv(scaled) - np.eye(len(prior))
     score = np.linalg.solve(scaled, (values - old) / prior)
     weight, vectors = np.linalg.eigh(0.5 * (S + S.T))
-    tells = weight > 1.0
-    if not tells.any():
+    is_determined = weight > 1.0
+    if not is_determined.any():
         raise NotIdentifiable(
             "The earlier result could not be tested: the new images determine no direction of the "
             "parameters better than it is known without them; take more images, of more legs at "
             "once and at other poses."
         )
-    directions = vectors[:, tells].T / prior
+    directions = vectors[:, is_determined].T / prior
     return (
         directions,
-        vectors[:, tells].T @ score / weight[tells],
-        np.diag(worse / weight[tells]) + directions @ known @ directions.T,
+        vectors[:, is_determined].T @ score / weight[is_determined],
+        np.diag(variance_factor / weight[is_determined])
+        + directions @ old_covariance @ directions.T,
     )
 
 
 def noise_dof(dof: int, covariance: Array, prior: Array) -> int:
-    """Return the degrees of freedom that tell of the noise in a fit with wide priors.
+    """Return the degrees of freedom of the noise in a fit with wide priors.
 
     ``dof`` are residuals, those of priors among them, less unknowns; ``covariance`` (p, p) is that
     of the parameters that have priors.
     """
-    # A prior that the images outdo has no residual of its own.
-    outdone = len(prior) - float(np.trace(covariance / prior**2))
-    return max(round(dof - outdone), 1)
+    # A prior that is much wider than what the images determine leaves no residual.
+    dominated = len(prior) - float(np.trace(covariance / prior**2))
+    return max(round(dof - dominated), 1)
 
 
 def judge_movement(
@@ -168,7 +169,9 @@ def possible_changes(
                 ends = [
                     vector_of(
                         parametrization,
-                        _in_own_frames([*legs[:j], moved(k, step), *legs[j + 1 :]], frame_legs),
+                        _in_frames_of_joints(
+                            [*legs[:j], moved(k, step), *legs[j + 1 :]], frame_legs
+                        ),
                         legs,
                     )
                     for step in (-_STEP, _STEP)
@@ -229,8 +232,8 @@ def _about(axis: Array, k: int, step: float) -> Rotation:
     return Rotation.from_rotvec(step * normal_basis(axis)[k])
 
 
-def _in_own_frames(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg, ...]:
-    """Return legs in the frames R_b and R_e that their own joint centres define."""
+def _in_frames_of_joints(legs: Sequence[Leg], frame_legs: Sequence[int]) -> tuple[Leg, ...]:
+    """Return legs in the frames R_b and R_e that their joint centres define."""
     frames = list(frame_legs)
     base = frame_on_points(np.array([leg.A for leg in legs])[frames]).inv()
     platform = frame_on_points(np.array([leg.B for leg in legs])[frames]).inv()

@@ -1,8 +1,8 @@
-"""Images most of which the joint fit rejects, and what is probably wrong with each.
+"""Outlier images: most of their outlines are rejected by the joint fit; the probable cause of each.
 
-The outlines of such an image alone give the platform's pose, and with it the readings that it
-shows: those of another image were exchanged with its own, one that differs is wrong, and where they
-suit it the camera was moved.
+The outlines of such an image alone give the platform's pose, and with it predicted readings. Where
+these are the readings of another image, two images were exchanged; where one differs, it is wrong;
+where all agree, the camera was moved.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from legcal.data import Measurements
 from legcal.geometry import Array, IntArray
 from legcal.machine import Machine
 
-MANY, SOME_LEGS = 0.34, 2  # of an image's outlines that the fit rejected, and legs altogether
-MOST = 0.67  # of them, if the readings suit the image
-SUITED = "its readings suit it, so check that nobody moved the camera"
-LEAST_OUTLINES, LEAST_LEGS = 6, 3  # by which a pose is known
-LEAST_NOISE = 5e-5  # of an outline at its leg [m]
-SURE = 5.0  # standard deviations
-LEAST_OFF = 3e-4  # of a reading, to be spoken of [m]
-SAME = 1e-3  # readings that are those of another image [m]
-SHOWN = 4  # legs that are named
+MIN_REJECTED = 0.34  # share of an image's outlines that the fit rejected
+MIN_REJECTED_LEGS = 2  # of which it rejected all outlines
+MIN_REJECTED_UNEXPLAINED = 0.67  # the share, if the readings agree with the image
+CAMERA_MOVED = "its readings suit it, so check that nobody moved the camera"
+MIN_OUTLINES, MIN_LEGS = 6, 3  # that determine a pose
+MIN_NOISE = 5e-5  # of an outline at its leg [m]
+SIGNIFICANT_SIGMAS = 5.0
+MIN_READING_ERROR = 3e-4  # [m]
+SAME_READING = 1e-3  # tolerance for the reading of another image [m]
+MAX_NAMED_LEGS = 4
 
 
 def outlier_images(
     measurements: Measurements, machine: Machine, solution: Solution
 ) -> dict[int, str]:
-    """Return a note on every fitted image most of which the fit has rejected, by row."""
+    """Return a note on every outlier image that was fitted, by row."""
     o = solution.outlines
     rejected = np.array([why.startswith(DISAGREES) for why in o.reason], dtype=np.bool_)
     notes = {}
@@ -40,17 +41,17 @@ def outlier_images(
         legs = [
             leg for leg in np.unique(o.leg[wrong]) if np.all(rejected[judged[o.leg[judged] == leg]])
         ]
-        if len(wrong) < MANY * len(judged) or len(legs) < SOME_LEGS:
+        if len(wrong) < MIN_REJECTED * len(judged) or len(legs) < MIN_REJECTED_LEGS:
             continue
         view = measurements.views[int(measurements.view[row])]
         name = f"view {view.name}, image {measurements.image[row] or f'of row {row + 1}'}"
         readings = _readings(measurements, machine, solution, row, judged)
         explanation = _explanation(measurements, machine, row, readings)
-        if not explanation and len(wrong) < MOST * len(judged):
-            continue  # what is wrong there is not of this image
+        if not explanation and len(wrong) < MIN_REJECTED_UNEXPLAINED * len(judged):
+            continue  # the outlines are wrong, not the image
         notes[row] = (
             f"{name}: {len(wrong)} of its {len(judged)} outlines disagree with the fit and were "
-            f"left out; {explanation or SUITED}."
+            f"left out; {explanation or CAMERA_MOVED}."
         )
     return notes
 
@@ -62,14 +63,14 @@ def _readings(
     row: int,
     chosen: IntArray,
 ) -> tuple[Array, Array] | None:
-    """Return the readings that the outlines of an image show and their sigmas (n_legs,) [m].
+    """Return the readings by the outlines of an image alone, and their sigmas (n_legs,) [m].
 
-    None if the outlines do not show the pose.
+    None if the outlines do not determine the pose.
     """
     o = solution.outlines
     chosen = chosen[np.isfinite(o.h[chosen]).all(axis=1)]
     legs = o.leg[chosen]
-    if len(chosen) < LEAST_OUTLINES or len(np.unique(legs)) < LEAST_LEGS:
+    if len(chosen) < MIN_OUTLINES or len(np.unique(legs)) < MIN_LEGS:
         return None
     T_camera_Rb = solution.T_camera_Rb[int(measurements.view[row])]
     begin = solution.T_Rb_Re[int(measurements.pose[row])]
@@ -89,12 +90,12 @@ def _readings(
     def lengths(x: Array) -> Array:
         return np.asarray(np.linalg.norm(moved(x) - A, axis=1))
 
-    solved = least_squares(residuals, np.zeros(6), loss="soft_l1", f_scale=4.0 * LEAST_NOISE)
+    solved = least_squares(residuals, np.zeros(6), loss="soft_l1", f_scale=4.0 * MIN_NOISE)
     J_outlines = np.asarray(solved.jac, dtype=np.float64)
     normal = J_outlines.T @ J_outlines
     if not solved.success or np.linalg.cond(normal) > 1e12:
         return None
-    noise = max(LEAST_NOISE, 1.48 * float(np.median(np.abs(residuals(solved.x)))))
+    noise = max(MIN_NOISE, 1.48 * float(np.median(np.abs(residuals(solved.x)))))
     step = 1e-6 * np.eye(6)
     J = np.stack([(lengths(solved.x + d) - lengths(solved.x - d)) / 2e-6 for d in step], axis=1)
     variance = np.einsum("ja,ab,jb->j", J, noise**2 * np.linalg.inv(normal), J)
@@ -109,14 +110,14 @@ def _explanation(
     row: int,
     readings: tuple[Array, Array] | None,
 ) -> str:
-    """Return what to check; nothing where the readings suit the image."""
+    """Return the probable cause and what to check; "" where the readings agree with the image."""
     motors = list(machine.motors)
     if readings is None or not motors:
         return "check its reading and that nobody moved camera or machine"
     given = measurements.q[row, motors]
     shown, sigma = readings[0][motors], readings[1][motors]
     off = shown - given
-    wrong = np.flatnonzero(np.abs(off) > np.maximum(SURE * sigma, LEAST_OFF))
+    wrong = np.flatnonzero(np.abs(off) > np.maximum(SIGNIFICANT_SIGMAS * sigma, MIN_READING_ERROR))
     if len(wrong) == 0:
         return ""
     distance = np.abs(measurements.q[:, motors] - shown)
@@ -125,7 +126,7 @@ def _explanation(
         for other in range(measurements.n_rows)
         if measurements.image[other]
         and measurements.pose[other] != measurements.pose[row]
-        and np.all(distance[other] < np.maximum(SURE * sigma, SAME))
+        and np.all(distance[other] < np.maximum(SIGNIFICANT_SIGMAS * sigma, SAME_READING))
     ]
     if alike:
         nearest = min(alike, key=lambda other: float(distance[other].max()))
@@ -141,8 +142,9 @@ def _explanation(
             f"given {1e3 * given[k]:.2f} mm; check that reading"
         )
     worst = 1e3 * float(np.abs(off[wrong]).max())
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    more = f" and {len(names) - MAX_NAMED_LEGS} more" if len(names) > MAX_NAMED_LEGS else ""
     return (
-        f"it shows another pose than its reading says, with readings of {', '.join(names[:SHOWN])}"
-        f"{more} off by up to {worst:.1f} mm; check that it was taken there"
+        "it shows another pose than its reading says, with readings of "
+        f"{', '.join(names[:MAX_NAMED_LEGS])}{more} off by up to "
+        f"{worst:.1f} mm; check that it was taken there"
     )

@@ -149,10 +149,10 @@ def _notes(session: Session, placement: Placement) -> list[str]:
     views = session.measurements.views
     hints = [view.T_base_camera for view in views]
     notes = hint_notes([view.name for view in views], hints, placement.T_base_camera, BEFORE_FIT)
-    untold = [view.name for view in views if not view.camera.gamma_is_given]
+    without_gamma = [view.name for view in views if not view.camera.gamma_is_given]
     gamma = (
-        f"The gamma of {few_views(untold)} is not told and was taken as 1: outlines of a camera "
-        "that encodes light lie off by up to half of the blur; write gamma of the views in "
+        f"The gamma of {few_views(without_gamma)} is not told and was taken as 1: outlines of a "
+        "camera that encodes light lie off by up to half of the blur; write gamma of the views in "
         "dataset.yaml, or let legcal calibrate estimate it."
     )
-    return [*notes, *placement.notes, *([gamma] if untold else [])]
+    return [*notes, *placement.notes, *([gamma] if without_gamma else [])]

@@ -49,8 +49,8 @@ from legcal.vision import camera_numbers, intrinsic_names
 from legcal.workers import worker_pool
 
 SIGNIFICANCE = 0.01
-_LARGEST_SIGNIFICANCE = 0.5
-_PLAUSIBLE = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
+MAX_SIGNIFICANCE = 0.5
+PRIOR_SIGMA = 0.009  # [rad], or of the mean leg length: less than what a fit holds at nominal
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,19 +86,19 @@ class Check:
         """The answer in words."""
         movement, pair = self.movement, self.at_platform
         p = "below 1e-6" if movement.p_value < 1e-6 else f"{movement.p_value:.2g}"
-        told = f"probability {p} if nothing did, significance {100 * movement.significance:g} %"
+        test = f"probability {p} if nothing did, significance {100 * movement.significance:g} %"
         known = (
             f"{1e3 * pair.expected_displacement:.3f} mm / "
             f"{np.degrees(pair.expected_rotation):.4f} deg (1 sigma)"
         )
         if not movement.moved:
             return (
-                f"Nothing has moved as far as these images can tell ({told}); they know the "
+                f"Nothing has moved as far as these images can tell ({test}); they know the "
                 f"platform against the earlier result to {known}."
             )
         found = f"{1e3 * pair.displacement:.3f} mm / {np.degrees(pair.rotation):.4f} deg"
         return (
-            f"Something has moved ({told}): the platform is {found} from where the earlier result "
+            f"Something has moved ({test}): the platform is {found} from where the earlier result "
             f"has it, known to {known}; calibrate again."
         )
 
@@ -176,10 +176,10 @@ def check(
     NotVisible, NotIdentifiable, DidNotConverge
         If the new images cannot be fitted, or say nothing.
     """
-    if not 0.0 < significance <= _LARGEST_SIGNIFICANCE:
+    if not 0.0 < significance <= MAX_SIGNIFICANCE:
         raise UsageError(
             f"The earlier result could not be tested: found the significance {significance:g}, "
-            f"needed a probability above 0 and up to {_LARGEST_SIGNIFICANCE:g} (0.01 gives one "
+            f"needed a probability above 0 and up to {MAX_SIGNIFICANCE:g} (0.01 gives one "
             "false alarm in a hundred checks); correct it."
         )
     earlier = read_result(result)
@@ -241,8 +241,8 @@ class _Prior:
     names: tuple[str, ...]
     old: Array  # (n,) earlier values
     covariance: Array  # (n, n) of these, with room along what was held
-    plausible: Array  # (n,) standard deviations that leave room for whatever moved [m, rad]
-    furthest: float  # the same along directions that are held [m]
+    sigma: Array  # (n,) standard deviations that leave room for whatever moved [m, rad]
+    held_sigma: float  # the same along directions that are held [m]
 
     @classmethod
     def of(cls, machine: Machine, earlier: EarlierResult) -> _Prior:
@@ -251,15 +251,15 @@ class _Prior:
         values = vector_of(found, legs, legs)
         chosen = [found.names.index(name) for name in earlier.names]
         at_home = machine.home.apply(machine.B_platform) - machine.A_base
-        furthest = _PLAUSIBLE * float(np.mean(np.linalg.norm(at_home, axis=1)))
-        plausible = np.array([furthest if found.units[i] == "m" else _PLAUSIBLE for i in chosen])
-        covariance = earlier.covariance + furthest**2 * earlier.held.T @ earlier.held
-        return cls(earlier.names, values[chosen], covariance, plausible, furthest)
+        held_sigma = PRIOR_SIGMA * float(np.mean(np.linalg.norm(at_home, axis=1)))
+        sigma = np.array([held_sigma if found.units[i] == "m" else PRIOR_SIGMA for i in chosen])
+        covariance = earlier.covariance + held_sigma**2 * earlier.held.T @ earlier.held
+        return cls(earlier.names, values[chosen], covariance, sigma, held_sigma)
 
 
 def _choices(dataset: Dataset, earlier: EarlierResult, prior: _Prior) -> Choices:
     """Return priors that leave room for whatever may have moved."""
-    means, sigmas = prior.old.tolist(), prior.plausible.tolist()
+    means, sigmas = prior.old.tolist(), prior.sigma.tolist()
     priors = {
         name: Prior(mean, sigma)
         for name, mean, sigma in zip(prior.names, means, sigmas, strict=True)
@@ -293,12 +293,14 @@ def _compare(
     values = np.array([solution.values[name] for name in prior.names])
     held = solution.held_basis[:, columns]
     covariance = solution.value_covariance[np.ix_(columns, columns)]
-    covariance = covariance + prior.furthest**2 * held.T @ held
-    worse = _earlier_noise(solution, earlier)
-    found = difference(values, covariance, prior.plausible, prior.old, prior.covariance, worse)
+    covariance = covariance + prior.held_sigma**2 * held.T @ held
+    variance_factor = _earlier_noise(solution, earlier)
+    found = difference(
+        values, covariance, prior.sigma, prior.old, prior.covariance, variance_factor
+    )
     dof = earlier.document.residuals.dof
-    if worse == 1.0:
-        dof = noise_dof(solution.dof, covariance, prior.plausible)
+    if variance_factor == 1.0:
+        dof = noise_dof(solution.dof, covariance, prior.sigma)
     legs = geometries(machine)
     changes = possible_changes(
         machine.leg_names, legs, machine.frame_legs, _only(parametrization, columns)
@@ -307,8 +309,8 @@ def _compare(
     poses = Frames.of(solution.T_Rb_Re)
     J = pose_sensitivity(legs, parametrization, machine.frame_legs, *poses)[:, :, columns]
     # Priors pull what was found to the earlier result by 1 - G.
-    G = np.eye(len(values)) - covariance / prior.plausible**2
-    spread = worse * G @ covariance + G @ prior.covariance @ G.T
+    G = np.eye(len(values)) - covariance / prior.sigma**2
+    spread = variance_factor * G @ covariance + G @ prior.covariance @ G.T
     shift = J @ (values - prior.old)
     variance = np.einsum("kia,ab,kib->ki", J, spread, J, optimize=True)
     at_platform = PlatformPair(
