@@ -49,7 +49,7 @@ def spoiled(rendered: RepeatedImages, tmp_path: Path) -> RepeatedImages:
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     """Run the command in this process, without others, and return its exit code."""
-    monkeypatch.setattr("legcal.cli.options.MOST_WORKERS", 1)
+    monkeypatch.setattr("legcal.cli.options.MAX_IMAGE_WORKERS", 1)
     monkeypatch.setattr(sys, "argv", ["legcal", "noise", *map(str, words)])
     with pytest.raises(SystemExit) as stop:
         cli.main()

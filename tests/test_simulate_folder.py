@@ -14,7 +14,8 @@ from simulated import files_of, settings, small_camera
 import legcal
 from legcal.data.outlines import format_observations
 from legcal.errors import OutOfResources, UsageError
-from legcal.simulation.dataset import simulate, summary_table
+from legcal.report import simulation_table
+from legcal.simulation.dataset import simulate, summary_document
 from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
 
 FEW = settings(poses=1, views=1)
@@ -197,7 +198,8 @@ def test_what_can_be_done_next_is_said(images: int, tmp_path: Path) -> None:
         level="photographs", poses=1, views=1, images=images, camera=small_camera(tmp_path)
     )
     console = Console(width=400, record=True, file=io.StringIO())
-    console.print(summary_table(simulate("hexapod", out, few)))
+    made = simulate("hexapod", out, few)
+    console.print(simulation_table(summary_document(made), repeated=images > 1))
     said = console.export_text()
     assert f"calibrate with: legcal calibrate '{out}' -o OUT\n" in said
     truth = out / "truth" / "models" / "hexapod.yaml"

@@ -28,7 +28,7 @@ from legcal.machine import (
     singularity,
 )
 from legcal.machine.mobility import side
-from legcal.simulation.poses import JITTER, Clearance, are_extreme, draw_poses, given_poses
+from legcal.simulation.poses import JITTER, Feasibility, are_extreme, draw_poses, given_poses
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel
@@ -222,18 +222,18 @@ def test_legs_do_not_run_through_each_other(tmp_path: Path) -> None:
 def test_cylinders_that_overlap_at_home_are_not_judged(tmp_path: Path) -> None:
     plump = _copy("hexapod", tmp_path, lambda text: re.sub(r'radius="[^"]*"', 'radius="0.2"', text))
     assert _penetration(plump, plump.home) > 0.0
-    assert Clearance(plump).touching(plump.home) is None
+    assert Feasibility(plump).collision(plump.home) is None
     assert len(_drawn(plump, 3)) == 3
 
 
 def test_two_legs_that_cross_are_named(tmp_path: Path) -> None:
     thick = _with_radius(0.037, tmp_path)
-    clearance = Clearance(thick)
-    assert clearance.touching(thick.home) is None
+    feasibility = Feasibility(thick)
+    assert feasibility.collision(thick.home) is None
     turned = RigidTransform.from_components(
         thick.home.translation, Rotation.from_euler("z", 150.0, degrees=True)
     )
-    touching = clearance.touching(turned)
+    touching = feasibility.collision(turned)
     assert touching is not None
     i, j = (thick.leg_names.index(name) for name in touching)
     assert _overlap(thick, turned, i, j) > 0.0

@@ -54,7 +54,7 @@ def test_leg_cylinders_stand_on_the_lines_of_their_legs(name: str) -> None:
     solids = solids_of(machine)
     A, B = machine.A_base, machine.home.apply(machine.B_platform)
     counted = {(j, c.link) for j, leg in enumerate(machine.legs) for c in leg.cylinders}
-    assert {(s.leg, s.part) for s in solids if s.leg is not None} == counted
+    assert {(s.leg, s.link) for s in solids if s.leg is not None} == counted
     for p in placed(solids, link_poses(machine, machine.home_configuration)):
         if p.solid.leg is not None:
             along = B[p.solid.leg] - A[p.solid.leg]

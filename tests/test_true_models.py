@@ -79,7 +79,7 @@ def _check(nominal: Machine, folder: Path, seed: int = 3) -> Machine:
     """Check that a true model has the numbers that were drawn, and meets them where it stands."""
     true = write_true_model(nominal, ALL, np.random.default_rng(seed), folder)
     rng = np.random.default_rng(seed)
-    draws = (draw_errors(nominal, ALL, rng) for _ in range(truth.DRAWS))
+    draws = (draw_errors(nominal, ALL, rng) for _ in range(truth.MAX_DRAWS))
     drawn = next(legs for legs in draws if max(map(_apart, legs, geometries(true))) < 1e-6)
     assert max(map(_apart, drawn, geometries(nominal))) > 5e-4
     assert max(map(_apart, drawn, geometries(true))) < 1e-12
@@ -286,7 +286,7 @@ def test_errors_that_leave_no_closed_machine_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nominal = load_mechanism(_five_parallel_rods(tmp_path / "nominal"))
-    monkeypatch.setattr(truth, "DRAWS", 3)
+    monkeypatch.setattr(truth, "MAX_DRAWS", 3)
     chance = np.random.default_rng(1)
     assert write_true_model(
         nominal, ParameterErrors(offsets=Spread(2e-3)), chance, tmp_path

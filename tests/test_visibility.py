@@ -10,10 +10,9 @@ from thinned import thinned
 import legcal
 from legcal.geometry.types import Array
 from legcal.machine import Configurations, Machine
-from legcal.simulation.cameras import look_at, sample_camera
-from legcal.simulation.places import cameras_around
+from legcal.simulation.cameras import cameras_around, look_at, sample_camera
 from legcal.simulation.solids import Box, PosedMachine, Solid, dressed, pose_machine, solids_of
-from legcal.simulation.visibility import SEEN, LegView, legs_in_image, take_images
+from legcal.simulation.visibility import MIN_SHARE, LegView, legs_in_image, take_images
 
 SHIPPED = (
     "hexapod", "3-rpr", "3-rps", "3-spr", "3-upu", "3-upu-tilted", "6-sps", "hexapod-rod",
@@ -78,7 +77,7 @@ def test_a_leg_counts_as_seen_from_40_percent_on() -> None:
     def view(share: float) -> LegView:
         return LegView(share, 100.0, seen_at_home()[3].stretches)
 
-    assert SEEN == 0.4
+    assert MIN_SHARE == 0.4
     assert view(0.41).is_seen
     assert not view(0.39).is_seen
 

@@ -17,7 +17,7 @@ from legcal.calibration.joint_fit import SeenBoard, Solution
 from legcal.calibration.session import Session
 from legcal.data import (
     CORNERS_NAME,
-    LEAST_CORNERS,
+    MIN_CORNERS,
     Corners,
     Dataset,
     LegAxes,
@@ -123,7 +123,7 @@ def observe_board(session: Session) -> BoardViews | None:
     if all(T is None for T in poses.views):
         raise NotVisible(
             f"{dataset.yaml_path}: the calibration board could not be used: found no image with "
-            f"{LEAST_CORNERS} of its corners or more, needed one; add corners to "
+            f"{MIN_CORNERS} of its corners or more, needed one; add corners to "
             f"{CORNERS_NAME}, or remove that table or the block board."
         )
     names = tuple(measurements.views[v].name for v in measurements.view.tolist())

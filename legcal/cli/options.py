@@ -15,7 +15,7 @@ import typer
 from legcal.errors import OutOfResources, UsageError
 from legcal.processors import processors
 
-MOST_WORKERS = 4  # processes that search images; each takes about 150 MB
+MAX_IMAGE_WORKERS = 4  # processes that search images; each takes about 150 MB
 
 ModelArgument = Annotated[
     str,
@@ -46,7 +46,7 @@ WorkersOption = Annotated[
     typer.Option(
         callback=_at_least_one,
         help="Processes: as many as there are cores (for images at most "
-        f"{MOST_WORKERS}) without it. Results do not depend on it.",
+        f"{MAX_IMAGE_WORKERS}) without it. Results do not depend on it.",
     ),
 ]
 
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 def image_workers(workers: int | None = None) -> int:
     """Return the number of processes that search images, by default few: each takes memory."""
-    return workers or min(processors(), MOST_WORKERS)
+    return workers or min(processors(), MAX_IMAGE_WORKERS)
 
 
 def show(

@@ -14,8 +14,7 @@ from legcal.cli.options import (
     JsonOption,
     ModelArgument,
     image_workers,
-    print_json,
-    print_table,
+    show,
 )
 from legcal.simulation import Request
 
@@ -39,8 +38,8 @@ def simulate(
     The default is 45 photographs: 3 views of 15 extreme poses each.
     """
     from legcal.machine import load_mechanism
-    from legcal.report import progress_on_stderr
-    from legcal.simulation import requested, summary_document, summary_table
+    from legcal.report import progress_on_stderr, simulation_table
+    from legcal.simulation import requested, summary_document
     from legcal.simulation import simulate as run
 
     nominal = load_mechanism(model)
@@ -48,10 +47,8 @@ def simulate(
     workers = image_workers()
     with progress_on_stderr() as progress:
         made = run(nominal, output, settings, force=force, workers=workers, progress=progress)
-    if as_json:
-        print_json(summary_document(made))
-    else:
-        print_table(summary_table(made))
+    document, repeated = summary_document(made), options["images"] > 1
+    show(as_json, lambda: document, lambda: simulation_table(document, repeated=repeated))
 
 
 def _requested() -> Iterator[inspect.Parameter]:

@@ -15,7 +15,7 @@ from .corners import write_corners as write_corners
 from .dataset import AXES_NAME as AXES_NAME
 from .dataset import CACHE_NAME as CACHE_NAME
 from .dataset import CORNERS_NAME as CORNERS_NAME
-from .dataset import LEAST_CORNERS as LEAST_CORNERS
+from .dataset import MIN_CORNERS as MIN_CORNERS
 from .dataset import OBSERVATIONS_NAME as OBSERVATIONS_NAME
 from .dataset import Dataset as Dataset
 from .dataset import ImageReader as ImageReader

@@ -38,11 +38,11 @@ from legcal.vision import (
 
 VALUES = ("psi", "theta", "x", "z")
 SIGMAS = tuple(f"sigma_{name}" for name in VALUES)
-LARGEST_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
+MAX_ANGLE = {"psi": 0.5 * math.pi, "theta": math.pi}  # [rad]
 ANGLE_ROUNDING = 1e-3  # [rad]; as of 3.142
-LARGEST_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
+MAX_DISTANCE = 1000.0  # [m] of M_LS from the camera centre
 SIGMA_RANGE = (1e-9, 1.0)  # [rad] or [m]: no axis is known better, and worse says nothing
-LEAST_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
+MIN_UPRIGHT = 1e-4  # component along the image y axis: M_LS is known, with less it runs away
 COLUMNS = (
     *(Column(name, "text") for name in ("view", "image", "leg")),
     *(
@@ -53,14 +53,14 @@ COLUMNS = (
             needed=f"an angle from {-most:.4f} to {most:.4f} rad",
             remedy="write radians, not degrees, or remove the row",
         )
-        for name, most in LARGEST_ANGLE.items()
+        for name, most in MAX_ANGLE.items()
     ),
     *(
         Column(
             name,
-            least=-LARGEST_DISTANCE,
-            most=LARGEST_DISTANCE,
-            needed=f"a coordinate from {-LARGEST_DISTANCE:g} to {LARGEST_DISTANCE:g} m",
+            least=-MAX_DISTANCE,
+            most=MAX_DISTANCE,
+            needed=f"a coordinate from {-MAX_DISTANCE:g} to {MAX_DISTANCE:g} m",
             remedy="correct it, write metres, or remove the row",
         )
         for name in ("x", "z")
@@ -351,7 +351,7 @@ def read_axes(path: Path, leg_names: Sequence[str], measurements: Measurements) 
     refuse_unknown_legs(table, leg, leg_names)
     values, sigmas = table.numbers(VALUES), table.numbers(SIGMAS)
     upright = np.cos(values[:, 0]) * np.cos(values[:, 1])
-    for i in np.flatnonzero(np.abs(upright) < LEAST_UPRIGHT).tolist():
+    for i in np.flatnonzero(np.abs(upright) < MIN_UPRIGHT).tolist():
         table.refuse(
             i,
             "an axis parallel to the plane of the camera's x and z axes",

@@ -41,7 +41,7 @@ AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
 OBSERVATIONS_NAME = "observations.csv"
 CACHE_NAME = ".legcal-cache.json"
-LEAST_CORNERS = 4  # in an image that must place its camera
+MIN_CORNERS = 4  # in an image that must place its camera
 ENCODER_SIGMAS = (1e-12, 1.0)  # [m]; no encoder is better, none worse
 GAMMAS = (0.2, 5.0)  # no camera encodes light more strongly
 
@@ -415,10 +415,10 @@ def rows_without_board(
     counts = np.bincount(corners.row[corners.used], minlength=measurements.n_rows)
     return [
         f"{table_path}, row {row + 1}: its camera could not be placed: found "
-        f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {LEAST_CORNERS} in "
+        f"{counts[row] or 'no'} corners of the board in {CORNERS_NAME}, needed {MIN_CORNERS} in "
         "every image of a camera that is held in the hand; add them or remove the row."
         for row in hand_held
-        if counts[row] < LEAST_CORNERS
+        if counts[row] < MIN_CORNERS
     ]
 
 

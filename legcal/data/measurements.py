@@ -21,10 +21,10 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import Leg, LegKind
 from legcal.vision import Camera
 
-MOST_NAMED = 5  # views or other things, in one sentence
+MAX_NAMED = 5  # views or other things, in one sentence
 TRAVEL_MARGIN = 0.05  # of the travel: a reading further outside is an error
-SAME_READING = 10.0  # sigma by which rows of one pose may differ
-_SHOWN = 3  # readings quoted in a sentence about many
+MAX_READING_SPREAD = 10.0  # sigma by which rows of one pose may differ
+_MAX_SHOWN = 3  # readings quoted in a sentence about many
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +132,8 @@ def refuse_unknown_legs(table: Table, leg: IntArray, leg_names: Sequence[str]) -
 
 def few(names: Sequence[str]) -> str:
     """Return names one after the other, not more than a few: ``c1, c2 and 3 more``."""
-    more = len(names) - MOST_NAMED
-    return ", ".join(names[:MOST_NAMED]) + f" and {more} more" * (more > 0)
+    more = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + f" and {more} more" * (more > 0)
 
 
 def few_views(names: Sequence[str]) -> str:
@@ -195,8 +195,8 @@ def _look_like_millimetres(readings: Array, lower: float, upper: float) -> bool:
 def _some(table: Table, column: Array, chosen: BoolArray) -> str:
     """Return the first of some readings with their rows, and how many more there are."""
     index = np.flatnonzero(chosen).tolist()
-    shown = ", ".join(f"{column[i]:g} m in {place_in(table.where[i])}" for i in index[:_SHOWN])
-    return shown + (f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else "")
+    shown = ", ".join(f"{column[i]:g} m in {place_in(table.where[i])}" for i in index[:_MAX_SHOWN])
+    return shown + (f" and {len(index) - _MAX_SHOWN} more" if len(index) > _MAX_SHOWN else "")
 
 
 def read_measurements(
@@ -290,12 +290,13 @@ def _shared_readings(
             continue
         first = int(members[0])
         spread = np.ptp(readings[members], axis=0)
-        for j in np.flatnonzero(spread > SAME_READING * sigma_q).tolist():
+        for j in np.flatnonzero(spread > MAX_READING_SPREAD * sigma_q).tolist():
+            most = MAX_READING_SPREAD
             table.refuse(
                 first,
                 f"readings of its {len(members)} rows that differ by {spread[j]:.3g} m",
-                f"one reading within {SAME_READING:g} sigma ({SAME_READING * sigma_q:.3g} m); give "
-                "rows of different poses different labels",
+                f"one reading within {most:g} sigma ({most * sigma_q:.3g} m); give rows of "
+                "different poses different labels",
                 joints[j],
                 what=f"pose {labels[first]}",
             )

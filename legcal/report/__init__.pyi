@@ -4,6 +4,7 @@ from .calibration import summary as summary
 from .identify import identify_table as identify_table
 from .images import camera_table as camera_table
 from .images import detection_table as detection_table
+from .images import simulation_table as simulation_table
 from .machine import inspect_table as inspect_table
 from .machine import location_table as location_table
 from .noise import noise_table as noise_table

@@ -41,9 +41,9 @@ _LEGEND = (
     "known length law: a leg with a reading (length = reading + offset), or constant"
 )
 _NEEDS = {"staged": "the four steps", "full": "the joint fit"}
-_MOST_WEAK = 6  # directions shown
-_MOST_MENDED = 3
-_FAR, _HALF_TURN = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
+_MAX_WEAK = 6  # directions shown
+_MAX_MENDED = 3
+_MAX_MM, _MAX_DEG = 1000.0, 180.0  # [mm], [deg]; beyond, a number says no more
 
 
 def identify_table(report: Identifiability) -> RenderableType:
@@ -126,9 +126,9 @@ def _ranks(report: Identifiability) -> Table:
 
 def _weak(title: str, ranks: Ranks) -> Table:
     """Return the directions that are not determined."""
-    rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MOST_WEAK]]
-    if len(ranks.weak) > _MOST_WEAK:
-        rows.append((f"and {len(ranks.weak) - _MOST_WEAK} more (see --json)", "", ""))
+    rows = [(weak.direction, *_hidden(weak)) for weak in ranks.weak[:_MAX_WEAK]]
+    if len(ranks.weak) > _MAX_WEAK:
+        rows.append((f"and {len(ranks.weak) - _MAX_WEAK} more (see --json)", "", ""))
     return table(f"not determined {title}", ">hides [mm]", ">[deg]", rows=rows)
 
 
@@ -145,8 +145,8 @@ def _hidden(weak: WeakDirection) -> tuple[str, str]:
         return "harmless", ""
     dX_mm, dE_deg = 1e3 * weak.dX_m, degrees(weak.dE_rad)
     return (
-        f"{dX_mm:.2f}" if dX_mm < _FAR else f"> {_FAR:.0f}",
-        f"{dE_deg:.3f}" if dE_deg < _HALF_TURN else f"> {_HALF_TURN:.0f}",
+        f"{dX_mm:.2f}" if dX_mm < _MAX_MM else f"> {_MAX_MM:.0f}",
+        f"{dE_deg:.3f}" if dE_deg < _MAX_DEG else f"> {_MAX_DEG:.0f}",
     )
 
 
@@ -175,9 +175,9 @@ def _board(board: BoardReport, of: int) -> str:
     )
     if not board.mends:
         return f"{text}."
-    shown = list(board.mends[:_MOST_MENDED])
-    if len(board.mends) > _MOST_MENDED:
-        shown.append(f"{len(board.mends) - _MOST_MENDED} more (see --json)")
+    shown = list(board.mends[:_MAX_MENDED])
+    if len(board.mends) > _MAX_MENDED:
+        shown.append(f"{len(board.mends) - _MAX_MENDED} more (see --json)")
     return f"{text}, and mends: {'; '.join(shown)}."
 
 

@@ -1,7 +1,8 @@
-"""What people read of what images show: a calibrated camera, and the outlines of the legs."""
+"""What people read of images: a calibrated camera, outlines of legs, a simulated dataset."""
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -82,4 +83,50 @@ def detection_table(document: dict[str, Any], output: Path) -> RenderableType:
             *(Text(f"note: {note}", style="dim") for note in document["notes"]),
             f"Look at {output / PAGE}.",
         ],
+    )
+
+
+def simulation_table(document: dict[str, Any], *, repeated: bool) -> RenderableType:
+    """Return the document of ``simulate``: how many images of each view show each leg."""
+    n_images, n_poses, left_out = (document[key] for key in ("images", "poses", "left_out"))
+    views = document["views"]
+    legs = list(dict.fromkeys(name for view in views.values() for name in view["legs"]))
+    rows = [
+        (name, str(view["images"]), *(str(n) for n in view["legs"].values()))
+        for name, view in views.items()
+    ]
+    folder = shlex.quote(document["dataset"])
+    is_noise = repeated and document["level"] == "photographs"
+    return report(
+        heading(
+            document["mechanism"],
+            f": {document['level']}, {n_images} image{'s' * (n_images != 1)} of {n_poses} "
+            f"pose{'s' * (n_poses != 1)}",
+        ),
+        table("view", ">images", *(f">{leg}" for leg in legs), rows=rows),
+        [
+            "Images of each view that show 40 % of a leg or more in one piece.",
+            _left_out(left_out) if left_out else "",
+            f"{document['extreme_poses']} of {n_poses} poses have every motor near an end of its "
+            "travel.",
+        ],
+        [
+            Text(line, overflow="fold")
+            for line in (
+                f"written: {document['dataset']}",
+                f"the true model: {document['truth']}",
+                f"calibrate with: legcal calibrate {folder} -o OUT",
+                f"judge with: legcal evaluate OUT/calibrated.yaml {shlex.quote(document['truth'])}",
+                *([f"measure noise with: legcal noise {folder}"] * is_noise),
+            )
+        ],
+    )
+
+
+def _left_out(n: int) -> str:
+    """Return how many images are left out, in words."""
+    return (
+        "1 image shows no leg and is left out."
+        if n == 1
+        else f"{n} images show no leg and are left out."
     )

@@ -15,7 +15,7 @@ from legcal.geometry import roll_pitch_yaw
 from legcal.report.render import heading, report, table
 
 _TURNS = ("roll, x", "pitch, y", "yaw, z")
-MOST_ROWS = 60  # of residuals; the file has them all
+_MAX_ROWS = 60  # of residuals; the file has them all
 
 
 def inspect_table(description: dict[str, Any]) -> RenderableType:
@@ -111,10 +111,10 @@ def location_table(location: Location, written: Sequence[str]) -> RenderableType
             "" if row.rotation is None else f"{np.degrees(np.linalg.norm(row.rotation)):.4f}",
             "used" if row.used else "left out",
         )
-        for row in location.rows[:MOST_ROWS]
+        for row in location.rows[:_MAX_ROWS]
     ]
-    if len(location.rows) > MOST_ROWS:
-        residuals.append(("...", "", "", f"{len(location.rows) - MOST_ROWS} more in the file"))
+    if len(location.rows) > _MAX_ROWS:
+        residuals.append(("...", "", "", f"{len(location.rows) - _MAX_ROWS} more in the file"))
     good = {"located": "bold green", "located in part": "bold yellow", "doubtful": "bold red"}
     return report(
         table("frame", "component", ">value", ">sigma", "unit", rows=frames),

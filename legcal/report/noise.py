@@ -22,7 +22,7 @@ from legcal.calibration import (
 from legcal.report.render import heading, report, table
 
 _CLAIMING = "detector"  # the method whose claims stand beside its axes
-_LEAST_NAME = 6  # characters of a leg's name that are never wrapped
+_MIN_NAME = 6  # characters of a leg's name that are never wrapped
 _TABLE_1 = {"psi": "psi [deg]", "theta": "theta [deg]", "x": "x [mm]", "z": "z [mm]"}
 _BY_DIRECTION = {
     "angle": "angle [deg]",
@@ -104,7 +104,7 @@ def _by_leg_and_method(
 ) -> Table:
     longest = max(len(leg.name) for leg in noise.methods[0].legs)
     names = ("leg", "method", *(f">{column}" for column in columns))
-    return table(*names, rows=rows, title=title, least={0: min(longest, _LEAST_NAME), 1: 8})
+    return table(*names, rows=rows, title=title, least={0: min(longest, _MIN_NAME), 1: 8})
 
 
 def _axis_table(noise: Noise, title: str, columns: dict[str, str]) -> Table:

@@ -1,10 +1,10 @@
 from .board import PlacedBoard as PlacedBoard
+from .cameras import cameras_around as cameras_around
 from .cameras import look_at as look_at
 from .cameras import mild_lens as mild_lens
 from .dataset import SimulatedDataset as SimulatedDataset
 from .dataset import simulate as simulate
 from .dataset import summary_document as summary_document
-from .dataset import summary_table as summary_table
 from .hexapod import RAISED as RAISED
 from .observe import OutlineNoise as OutlineNoise
 from .observe import Scene as Scene
@@ -12,7 +12,6 @@ from .observe import TableNoise as TableNoise
 from .observe import noisy_outlines as noisy_outlines
 from .observe import outlines_of as outlines_of
 from .paper import PaperStudy as PaperStudy
-from .places import cameras_around as cameras_around
 from .poses import draw_poses as draw_poses
 from .rendering.appearance import Appearance as Appearance
 from .request import Level as Level

@@ -35,11 +35,11 @@ TAG_BORDER = 2  # modules of the black frame of a tag, as Kalibr prints it
 
 _THICKNESS = 0.02  # of the longer side of the plate
 _RIM = 0.06  # of the longer side that stays white around the print
-_LEAST_COSINE = 0.42  # between the normal and the line of sight at which corners are seen
+_MIN_COSINE = 0.42  # between the normal and the line of sight at which corners are seen
 _BESIDE = 0.3  # of a square around a corner that must be seen with it
 _IN_FRONT = 0.2  # of the thickness before a corner from which on a hit hides it
-_LEAST_SHARE = 0.5  # of the corners that an image must show to count
-_LEAST_CORNERS = 8
+_MIN_SHARE = 0.5  # of the corners that an image must show to count
+_MIN_CORNERS = 8
 
 KINDS: tuple[BoardKind, ...] = ("chessboard", "charuco", "aprilgrid")
 _WIDTH = 0.42  # of the size of the machine
@@ -201,7 +201,7 @@ class PlacedBoard:
         sight = eye - points
         cosine = self.towards_viewer * sight[..., 2] / np.linalg.norm(sight, axis=-1)
         _, inside = pixels_in_image(camera, T_base_camera.inv().apply(base))
-        free = (inside & (cosine.ravel() > _LEAST_COSINE)).copy()
+        free = (inside & (cosine.ravel() > _MIN_COSINE)).copy()
         size = self.plate.solid.shape
         assert isinstance(size, Box)
         margin = np.full(int(free.sum()), _IN_FRONT * size.size[2])
@@ -214,7 +214,7 @@ class PlacedBoard:
 
     def is_enough(self, seen: BoolArray) -> bool:
         """Say whether so many corners, as :meth:`seen` returns them, place a camera well."""
-        return int(seen.sum()) >= max(_LEAST_SHARE * len(seen), min(_LEAST_CORNERS, len(seen)))
+        return int(seen.sum()) >= max(_MIN_SHARE * len(seen), min(_MIN_CORNERS, len(seen)))
 
     @cached_property
     def _watched(self) -> Array:

@@ -1,26 +1,62 @@
-"""Simulated cameras: their lenses, where they look, and how roughly their places are told."""
+"""Simulated cameras and the board: their files, and where they stand so that images show the legs.
+
+Places around a machine are scored by how long its legs are in the images. A board lies flat near
+the base joints, among the legs or beside them; for cameras with given poses it may also be raised
+and turned.
+"""
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.errors import DatasetError
+from legcal.errors import DatasetError, NotVisible
 from legcal.files import FileSchema, MotionEntry, PlainName, parse_yaml, read_text, validate
-from legcal.geometry import Array, motion_of
-from legcal.vision import Camera, read_camera
+from legcal.geometry import Array, motion_of, normal_basis
+from legcal.machine import Machine
+from legcal.progress import Report, no_progress
+from legcal.simulation.board import PlacedBoard
+from legcal.simulation.rendering.rays import in_view, surrounding_points
+from legcal.simulation.solids import PosedMachine
+from legcal.simulation.visibility import Viewpoint, field_of_view, legs_in_image
+from legcal.vision import Board, Camera, read_camera
 
-UPWARD = np.array([0.0, 0.0, 1.0])
+UP = np.array([0.0, 0.0, 1.0])
 
-_SHIFT = 0.015  # [m] at most; a dataset may be off by 2 cm and 2 degrees
-_TURN = float(np.deg2rad(1.5))
+_MAX_SHIFT = 0.015  # [m]; a dataset may be off by 2 cm and 2 degrees
+_MAX_TURN = float(np.deg2rad(1.5))
 
-MOST_SIDE, MOST_PIXELS = 65_535, 100_000_000  # what PNG files and memory hold
+_MAX_SIDE, _MAX_PIXELS = 65_535, 100_000_000  # what PNG files and memory hold
+
+_TURNS = (-0.35, -0.15, 0.0, 0.15, 0.35)  # within its sector, in sectors of a right angle at most
+_LIFTS = (0.1, 0.25, 0.45, 0.7, 0.95, 1.2)  # [rad] above the plane across the machine
+_LIFTS_PLANAR = (0.8, 0.95, 1.1, 1.25, 1.4)  # [rad] above the plane of motion
+_N_POSES = 5  # poses at which places are judged
+_SAMPLES = 32  # points of a leg in that
+_ROLL = 0.08  # [rad] by which cameras are not upright
+_EXTRA_DISTANCE = 0.08  # of the least distance, by which cameras stand further away
+_HAND_ROLL, _HAND_EXTRA_DISTANCE = 0.3, 0.25  # the same for cameras that are held in the hand
+_N_HAND_CANDIDATES = 3  # places that see board and legs, of which the best is taken
+MAX_HAND_DRAWS = 60
+_MARGIN = 0.03  # of the image that stays free at each side
+_CENTRING_STEPS = 3  # steps that bring the machine into the middle of the image
+_MIN_BOARD_SHARE = 0.75  # of the poses in which a camera must see the board
+_MIN_DISTANCE = 0.3  # machine sizes that lie between the camera and the machine, at least
+
+_N_BOARD_CANDIDATES = 2  # places of a board with cameras, of which the better is taken
+_SIDES = 4  # directions beside the machine
+_BOARD_DISTANCE = 1.05  # half diagonals of the board beyond the base joints
+_LEVELS = (0.0, -0.08, 0.25)  # of the size of the machine, above the base joints
+_TILTS = (0.0, 0.6, 1.1)  # [rad] from lying flat, towards cameras with given places
+_MIN_LEGS_SHARE = 0.9  # of what is seen of the legs that must stay seen
 
 
 def sample_camera() -> Camera:
@@ -35,9 +71,7 @@ def mild_lens() -> Camera:
     return replace(pinhole, distortion=np.array([-0.1, 0.03, 2e-4, -1e-4, 0.0]))
 
 
-def look_at(
-    position: Array, target: Array, roll: float = 0.0, *, up: Array = UPWARD
-) -> RigidTransform:
+def look_at(position: Array, target: Array, roll: float = 0.0, *, up: Array = UP) -> RigidTransform:
     """Return the pose of a camera that looks at a point, with its y axis down."""
     z = (target - position) / np.linalg.norm(target - position)
     x = np.cross(z, up)
@@ -48,8 +82,8 @@ def look_at(
 
 def rough_pose(T_base_camera: RigidTransform, rng: np.random.Generator) -> RigidTransform:
     """Return a camera pose that is up to 15 mm and 1.5 degrees off."""
-    shift = _SHIFT * rng.random() * _any_direction(rng)
-    turn = Rotation.from_rotvec(_TURN * rng.random() * _any_direction(rng))
+    shift = _MAX_SHIFT * rng.random() * _any_direction(rng)
+    turn = Rotation.from_rotvec(_MAX_TURN * rng.random() * _any_direction(rng))
     return RigidTransform.from_components(
         T_base_camera.translation + shift, turn * T_base_camera.rotation
     )
@@ -77,10 +111,10 @@ class CamerasEntry(FileSchema):
 def read_lens(path: Path) -> Camera:
     """Return the camera of a camera file, of a size that pictures can have."""
     camera = read_camera(path)
-    if max(camera.width, camera.height) > MOST_SIDE or camera.width * camera.height > MOST_PIXELS:
+    if max(camera.width, camera.height) > _MAX_SIDE or camera.width * camera.height > _MAX_PIXELS:
         raise DatasetError(
             f"{path}: the camera could not be simulated: found {camera.width} x {camera.height} "
-            f"px, needed at most {MOST_SIDE} px a side and {MOST_PIXELS // 10**6} million px; "
+            f"px, needed at most {_MAX_SIDE} px a side and {_MAX_PIXELS // 10**6} million px; "
             "correct its image size."
         )
     return camera
@@ -97,3 +131,287 @@ def read_cameras(path: Path, camera: Camera) -> dict[str, tuple[Camera, RigidTra
         )
         for name, view in entry.views.items()
     }
+
+
+def cameras_around(
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],  # in the poses that the cameras are to see
+    cameras: Mapping[str, Camera],
+    rng: np.random.Generator,  # of the first sector, roll and distance
+    progress: Report = no_progress,
+    board: PlacedBoard | None = None,  # that every camera must see, beside the machines
+) -> tuple[tuple[Viewpoint, ...], float]:
+    """Return cameras around a machine, each in a sector of its own, and how much they see.
+
+    That is the least mean length of the legs in the images of a view [px], zero if a camera does
+    not see the board.
+    """
+    reached, tried, up = _reached(posed_machines), _some(posed_machines), _upward(machine)
+    sector = 2.0 * np.pi / len(cameras)
+    first = rng.uniform(0.0, 2.0 * np.pi)
+    lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
+    found, least = [], np.inf
+    for v, (name, camera) in enumerate(cameras.items()):
+        progress("Cameras", v, len(cameras))
+        roll, further = rng.uniform(-_ROLL, _ROLL), 1.0 + _EXTRA_DISTANCE * rng.random()
+        candidates = [
+            _before(
+                _direction(up, first + v * sector + turn, lift), up, roll, further, reached, camera
+            )
+            for turn in min(sector, 0.5 * np.pi) * np.array(_TURNS)
+            for lift in lifts
+        ]
+        scores = [_score(machine, tried, camera, T, board) for T in candidates]
+        found.append(Viewpoint(name, camera, candidates[int(np.argmax(scores))]))
+        least = min(least, max(scores))
+    progress("Cameras", len(cameras), len(cameras))
+    return tuple(found), least
+
+
+def camera_in_hand(
+    machine: Machine,
+    posed: PosedMachine,  # in the pose that the image is to show, with the board
+    camera: Camera,
+    rng: np.random.Generator,
+    board: PlacedBoard,
+) -> RigidTransform | None:
+    """Return T_base_camera that shows board and legs, the best of a few; None if there is none."""
+    up, reached = _upward(machine), _reached([posed])
+    lifts = _LIFTS if machine.spatial else _LIFTS_PLANAR
+    good = []
+    for _ in range(MAX_HAND_DRAWS):
+        toward = _direction(up, rng.uniform(0.0, 2.0 * np.pi), rng.uniform(lifts[0], lifts[-1]))
+        roll, further = (
+            rng.uniform(-_HAND_ROLL, _HAND_ROLL),
+            1.0 + _HAND_EXTRA_DISTANCE * rng.random(),
+        )
+        T = _before(toward, up, roll, further, reached, camera)
+        score = _score(machine, [posed], camera, T, board)
+        if score > 0.0:
+            good.append((score, T))
+        if len(good) == _N_HAND_CANDIDATES:
+            break
+    return max(good, key=lambda found: found[0])[1] if good else None
+
+
+def board_and_cameras(
+    board: Board,
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
+    cameras: Mapping[str, Camera],
+    rng: np.random.Generator,
+    progress: Report = no_progress,
+) -> tuple[PlacedBoard, tuple[Viewpoint, ...]]:
+    """Return a board on the base of a machine, and cameras around both."""
+    good: list[tuple[float, PlacedBoard, tuple[Viewpoint, ...]]] = []
+    for placed in _lying(board, machine, _some(posed_machines)):
+        together = [placed.beside(posed) for posed in posed_machines]
+        views, score = cameras_around(
+            machine, together, cameras, copy.deepcopy(rng), progress, placed
+        )
+        if score > 0.0:
+            good.append((score, placed, views))
+        if len(good) == _N_BOARD_CANDIDATES:
+            break
+    if not good:
+        raise _nowhere(board, "every camera around the machine", "use a smaller board")
+    _, placed, views = max(good, key=lambda found: found[0])
+    return placed, views
+
+
+def board_before(
+    board: Board,
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
+    views: Sequence[Viewpoint],
+) -> PlacedBoard:
+    """Return a board where cameras whose places are given see it."""
+    tried = _some(posed_machines)
+    towards = np.mean([view.T_base_camera.translation for view in views], axis=0)
+    most, best = 0.0, None
+    for placed in _lying(board, machine, tried, towards):
+        together = [placed.beside(posed) for posed in tried]
+        seen = min(_share(placed, together, view) for view in views)
+        if seen > most and not any(_hides(machine, tried, together, view) for view in views):
+            most, best = seen, placed
+    if best is None:
+        raise _nowhere(
+            board, "all of the given cameras", "turn or move the cameras, or use another"
+        )
+    return best
+
+
+def _upward(machine: Machine) -> Array:
+    """Return the direction from base to platform at home, or the normal of the plane of motion."""
+    if machine.base_normal is not None:
+        return machine.base_normal
+    A, B = machine.A_base, machine.home.apply(machine.B_platform)
+    across = (B - A).mean(axis=0)
+    size = float(np.linalg.norm(across))
+    reach = float(np.ptp(A, axis=0).max())
+    return np.asarray(across / size) if size > 1e-3 * reach else UP
+
+
+def _direction(up: Array, turn: float, lift: float) -> Array:
+    """Return the unit direction at an angle around *up* and a height [rad]."""
+    x, y = normal_basis(up)
+    level = np.cos(turn) * x + np.sin(turn) * y
+    return np.asarray(np.cos(lift) * level + np.sin(lift) * up)
+
+
+def _some(posed_machines: Sequence[PosedMachine]) -> list[PosedMachine]:
+    """Return a machine in a few of its poses."""
+    return [
+        posed_machines[i]
+        for i in np.unique(np.linspace(0, len(posed_machines) - 1, _N_POSES).astype(int))
+    ]
+
+
+def _joints(posed_machines: Sequence[PosedMachine]) -> Array:
+    """Return the joint centres (n, 3) of a machine in all of its poses [m]."""
+    return np.concatenate([part for m in posed_machines for part in (m.A, m.B)])
+
+
+def _reached(posed_machines: Sequence[PosedMachine]) -> Array:
+    """Return points (n, 3) around a machine in all of its poses, without its walls and floors."""
+    joints = _joints(posed_machines)
+    size = float(np.linalg.norm(np.ptp(joints, axis=0)))
+    solids = [s for m in posed_machines for s in in_view(m.solids, RigidTransform.identity())]
+    around = [surrounding_points(s) for s in solids if s.reach < size]
+    points = np.concatenate([joints, *around])
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:  # all of them in a plane
+        return points
+
+
+def _before(
+    toward: Array, up: Array, roll: float, further: float, points: Array, camera: Camera
+) -> RigidTransform:
+    """Return the pose of a camera in a direction from which all points are in the image."""
+    target = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    rotation = look_at(target + toward, target, roll, up=up).rotation
+    low, high = field_of_view(camera)
+    low, high = (1.0 - 2.0 * _MARGIN) * low, (1.0 - 2.0 * _MARGIN) * high
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    p = rotation.inv().apply(points - target)
+    for _ in range(_CENTRING_STEPS):
+        needed = [np.max(p[:, :2] / limit - p[:, 2:]) for limit in (low, high)]
+        distance = float(max(*needed, _MIN_DISTANCE * size - p[:, 2].min()))
+        seen = p[:, :2] / (p[:, 2:] + distance)
+        middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0)) - 0.5 * (low + high)
+        aside = np.append(distance * middle, 0.0)
+        p = p - aside
+        target = target + rotation.apply(aside)
+    return look_at(target + further * distance * toward, target, roll, up=up)
+
+
+def _lengths(
+    machine: Machine, posed_machines: Sequence[PosedMachine], camera: Camera, T: RigidTransform
+) -> list[float]:
+    """Return the length of every leg in every image [px], zero where it does not count as seen."""
+    return [
+        leg.length_px if leg.is_seen else 0.0
+        for posed in posed_machines
+        for leg in legs_in_image(machine.legs, posed, camera, T, samples=_SAMPLES)
+    ]
+
+
+def _score(
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
+    camera: Camera,
+    T: RigidTransform,
+    board: PlacedBoard | None,
+) -> float:
+    """Return the mean length in the image [px] of all legs, those hidden counted as nothing.
+
+    It counts by the share of the poses in which the board is seen, which must be most of them.
+    """
+    share = 1.0
+    if board is not None:
+        shown = [board.is_enough(board.seen(posed, camera, T)) for posed in posed_machines]
+        share = float(np.mean(shown))
+        if share < _MIN_BOARD_SHARE:
+            return 0.0
+    return share * float(np.mean(_lengths(machine, posed_machines, camera, T)))
+
+
+def _lying(
+    board: Board,
+    machine: Machine,
+    posed_machines: Sequence[PosedMachine],
+    towards: Array | None = None,
+) -> Iterator[PlacedBoard]:
+    """Yield places near the base that the machine leaves free, also tilted towards a point."""
+    up, A = _upward(machine), machine.A_base
+    middle = A.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(_joints(posed_machines), axis=0)))
+    flat = A - middle - ((A - middle) @ up)[:, None] * up
+    reach = float(np.linalg.norm(flat, axis=1).max())
+    half = 0.5 * float(np.linalg.norm(np.ptp(board.extent, axis=0)))
+    x, y = normal_basis(up)
+    around = [np.cos(t) * x + np.sin(t) * y for t in 2.0 * np.pi * np.arange(_SIDES) / _SIDES]
+    feet = [(np.zeros(3), x), *(((reach + _BOARD_DISTANCE * half) * side, side) for side in around)]
+    for foot, side in feet:
+        places = (
+            PlacedBoard(board, _facing(board, place, _tilted(up, towards, place, tilt), side))
+            for place in (middle + foot + level * size * up for level in _LEVELS)
+            for tilt in (_TILTS if towards is not None else _TILTS[:1])
+        )
+        for placed in places:
+            if not any(placed.runs_through(posed) for posed in posed_machines):
+                yield placed
+                break  # one place at each foot
+
+
+def _tilted(up: Array, towards: Array | None, place: Array, tilt: float) -> Array:
+    """Return a direction that leans from *up* by an angle, from a place towards a point if any."""
+    if towards is None:
+        return up
+    level = towards - place - ((towards - place) @ up) * up
+    length = float(np.linalg.norm(level))
+    if length < 1e-9:
+        return up
+    return np.asarray(np.cos(tilt) * up + np.sin(tilt) * level / length)
+
+
+def _facing(board: Board, place: Array, normal: Array, side: Array) -> RigidTransform:
+    """Return T_base_board with the middle of the print at a place and its face along a normal."""
+    z = normal if board.kind == "aprilgrid" else -normal
+    y = side - (side @ z) * z
+    if np.linalg.norm(y) < 1e-6:
+        y = normal_basis(z)[0]
+    y = y / np.linalg.norm(y)
+    turn = Rotation.from_matrix(np.column_stack([np.cross(y, z), y, z]))
+    return RigidTransform.from_components(place - turn.apply(board.extent.mean(axis=0)), turn)
+
+
+def _share(placed: PlacedBoard, together: Sequence[PosedMachine], view: Viewpoint) -> float:
+    """Return the share of the corners that a view shows, zero if too few in one of the poses."""
+    shown = [placed.seen(posed, view.camera, view.T_base_camera) for posed in together]
+    return float(np.mean(shown)) if all(map(placed.is_enough, shown)) else 0.0
+
+
+def _hides(
+    machine: Machine,
+    alone: Sequence[PosedMachine],
+    together: Sequence[PosedMachine],
+    view: Viewpoint,
+) -> bool:
+    """Say whether a board beside a machine hides much of its legs from a view."""
+    free, left = (
+        sum(_lengths(machine, posed_machines, view.camera, view.T_base_camera))
+        for posed_machines in (alone, together)
+    )
+    return left < _MIN_LEGS_SHARE * free
+
+
+def _nowhere(board: Board, who: str, remedy: str) -> NotVisible:
+    """Return that a board has no place."""
+    width, height = np.ptp(board.extent, axis=0)[:2].tolist()
+    return NotVisible(
+        f"The board could not be placed: found no place near the base at which {who} would see a "
+        f"{board.kind} of {1000 * width:.0f} x {1000 * height:.0f} mm well enough, needed one in "
+        f"all images; {remedy}."
+    )

@@ -22,8 +22,8 @@ from legcal.simulation.visibility import Images, LegView, Stretch, Viewpoint, si
 from legcal.vision import Camera
 
 EXACT_PX = 1e-3  # standard deviation that outlines and corners without noise claim
-_SIDEWAYS = 1e-3  # component along the image y axis below which a leg has no point M_LS
-_LEAST_UPRIGHT = 1e-9  # the same, below which there are no numbers for it
+_MIN_UPRIGHT_AXIS = 1e-3  # component along the image y axis below which a leg has no point M_LS
+_MIN_UPRIGHT = 1e-9  # the same, below which there are no numbers for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ def axes_of(scene: Scene, noise: TableNoise, rng: np.random.Generator | None = N
     for r in range(len(scene.images)):
         for j in scene.images.seen(r):
             direction, joint = scene.leg_in_camera(r, j)
-            if abs(direction[1]) > _SIDEWAYS:
+            if abs(direction[1]) > _MIN_UPRIGHT_AXIS:
                 row.append(r)
                 leg.append(j)
                 u.append(direction)
@@ -253,7 +253,7 @@ def table_of_lines(u: Array, A: Array) -> Array:
     the line, M x u = A x u. The method finds the same by other ways, so that a mistake shows.
     """
     u_x, u_y, u_z = u.T
-    if np.any(np.abs(u_y) < _LEAST_UPRIGHT):
+    if np.any(np.abs(u_y) < _MIN_UPRIGHT):
         raise NotVisible(
             "The axis of a simulated leg could not be tabulated: found it parallel to the image x "
             "axis, needed a leg that crosses the plane y = 0 of its camera; turn the camera."

@@ -18,7 +18,17 @@ from legcal.errors import NotVisible, OutOfResources
 from legcal.machine import Configurations, Machine
 from legcal.progress import Report, no_progress
 from legcal.simulation.board import PlacedBoard, chosen_board
-from legcal.simulation.cameras import mild_lens, read_cameras, read_lens, rough_pose
+from legcal.simulation.cameras import (
+    MAX_HAND_DRAWS,
+    board_and_cameras,
+    board_before,
+    camera_in_hand,
+    cameras_around,
+    mild_lens,
+    read_cameras,
+    read_lens,
+    rough_pose,
+)
 from legcal.simulation.observe import (
     EVERY_PIXEL,
     AxisTable,
@@ -27,13 +37,6 @@ from legcal.simulation.observe import (
     axes_of,
     corners_of,
     outlines_of,
-)
-from legcal.simulation.places import (
-    HAND_TRIES,
-    board_and_cameras,
-    board_before,
-    camera_in_hand,
-    cameras_around,
 )
 from legcal.simulation.poses import commanded_poses, given_poses
 from legcal.simulation.rendering.appearance import Appearance
@@ -49,8 +52,8 @@ Streams = Mapping[str, np.random.Generator]
 
 _PURPOSES = ("errors", "poses", "cameras", "readings", "hints", "observations", "photographs",
              "corners")  # fmt: skip
-_LEAST_SIGMA_Q = 1e-9  # [m] that readings without noise claim
-_OFTEN = 0.5  # of the photographs of a view that show a leg which its hint names
+_MIN_SIGMA_Q = 1e-9  # [m] that readings without noise claim
+_MIN_SEEN = 0.5  # of the photographs of a view that show a leg which its hint names
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # for colours; grey levels are written faster without
 
 
@@ -150,7 +153,9 @@ def simulate_session(
         corners = corners_of(scene, posed_machines, placed, settings.sigma_px, chance["corners"])
     width = max(2, len(str(len(poses.poses))))
     labels = tuple(f"p{k + 1:0{width}d}" for k in range(len(poses.poses)))
-    measurements = _recorded(truth, poses, labels, scene, settings, chance, told=not groups)
+    measurements = _recorded(
+        truth, poses, labels, scene, settings, chance, hints=settings.hints and not groups
+    )
     return Session(
         measurements, outlines, axes, corners, truth, poses, labels, posed_machines, scene,
         len(images) - len(rows), placed, groups,
@@ -198,7 +203,7 @@ def _in_hand(
             if T is None:
                 raise NotVisible(
                     f"view {name}: a camera in the hand could not be placed: found none of "
-                    f"{HAND_TRIES} places from which image {k + 1} shows the board and a leg, "
+                    f"{MAX_HAND_DRAWS} places from which image {k + 1} shows the board and a leg, "
                     "needed one; use a smaller board."
                 )
             views.append(Viewpoint(f"{name}-{k + 1}", camera, T))
@@ -222,10 +227,10 @@ def _numbered(
     return own, tuple(left), tuple(names)
 
 
-def _encoding(views: Sequence[Viewpoint], gamma: float, is_told: bool) -> tuple[Viewpoint, ...]:
-    """Return views whose cameras encode light in their grey levels, as their makers say or not."""
+def _encoding(views: Sequence[Viewpoint], gamma: float, given: bool) -> tuple[Viewpoint, ...]:
+    """Return views whose cameras have a gamma, which the dataset gives or not."""
     cameras = {
-        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_given=is_told) for view in views
+        id(view.camera): replace(view.camera, gamma=gamma, gamma_is_given=given) for view in views
     }
     return tuple(replace(view, camera=cameras[id(view.camera)]) for view in views)
 
@@ -238,20 +243,19 @@ def _recorded(
     settings: SimulationSettings,
     chance: Streams,
     *,
-    told: bool,  # roughly where cameras stand, if hints are wanted
+    hints: bool,  # whether the dataset says roughly where cameras stand
 ) -> Measurements:
-    """Return the rows of the dataset: readings with their errors, and what is told of cameras."""
+    """Return the rows of the dataset: readings with their errors, and rough poses of cameras."""
     legs, images = truth.leg_names, scene.images
     photographs = settings.level is Level.PHOTOGRAPHS
     # Tables say themselves what is seen; in photographs nobody looks for a leg that often hides.
-    least = _OFTEN if photographs else 0.0
+    least = _MIN_SEEN if photographs else 0.0
     views = []
     for v, view in enumerate(scene.views):
         T = rough_pose(view.T_base_camera, chance["hints"])
         shown = tuple(legs[j] for j in images.seen_in_view(v, least))
-        hint = shown if 0 < len(shown) < len(legs) else None
-        hints = (T, hint) if settings.hints and told else (None, None)
-        views.append(View(view.name, view.camera, *hints))
+        used = shown if 0 < len(shown) < len(legs) else None
+        views.append(View(view.name, view.camera, *((T, used) if hints else (None, None))))
     q, size = poses.readings, settings.readings.size
     if settings.readings.distribution is Distribution.UNIFORM:
         q = q + chance["readings"].uniform(-size, size, q.shape)
@@ -271,7 +275,7 @@ def _recorded(
         view=images.view,
         pose=pose.astype(np.intp),
         q=q[images.pose],
-        sigma_q=max(settings.encoder_sigma, _LEAST_SIGMA_Q),
+        sigma_q=max(settings.encoder_sigma, _MIN_SIGMA_Q),
         pose_labels=tuple(labels[p] for p in seen),
     )
 
@@ -290,46 +294,32 @@ def photographs(
         with worker_pool(workers) as run:
             for v, view in enumerate(views):
                 rows = np.flatnonzero(images.view == v).tolist()
-                posed_machines = {
-                    row: session.posed_machines[images.pose[row]].solids for row in rows
-                }
-                nearby = next(iter(posed_machines.values()), ())
-                place = _Place(f"{id(session)} {v}", view, nearby, appearance, of_views[v])
-                studio = _Studio(place, posed_machines, {row: of_images[row] for row in rows})
+                machines = {row: session.posed_machines[images.pose[row]].solids for row in rows}
+                sensor_rngs = {row: of_images[row] for row in rows}
+                key = f"{id(session)} {v}"
+                studio = _Studio(key, view, appearance, of_views[v], machines, sensor_rngs)
                 yield from zip(rows, run(studio.photograph, rows), strict=True)
     finally:
         _rendered_view.cache_clear()
 
 
 @dataclass(frozen=True)
-class _Place:
-    """A camera in its place; two of one key are the same, in whatever process they are."""
+class _Studio:
+    """A camera before its surroundings, and the machine in the poses that it photographs.
+
+    Two of one key are the same, in whatever process they are.
+    """
 
     key: str
     viewpoint: Viewpoint = field(compare=False)
-    posed: tuple[PlacedSolid, ...] = field(compare=False)
     appearance: Appearance = field(compare=False)
-    rng: np.random.Generator = field(compare=False)
-
-
-@lru_cache(maxsize=1)
-def _rendered_view(place: _Place) -> RenderedView:
-    """Return the camera in front of its surroundings, painted once in each process."""
-    view = place.viewpoint
-    return prepare_view(place.posed, view.camera, view.T_base_camera, place.appearance, place.rng)
-
-
-@dataclass(frozen=True, eq=False)
-class _Studio:
-    """A camera in its place, and the machine in the poses that it takes photographs of."""
-
-    place: _Place
-    posed_machines: Mapping[int, tuple[PlacedSolid, ...]]
-    sensor_rngs: Mapping[int, np.random.Generator]
+    rng: np.random.Generator = field(compare=False)  # of the surroundings
+    machines: Mapping[int, tuple[PlacedSolid, ...]] = field(compare=False)  # of each row
+    sensor_rngs: Mapping[int, np.random.Generator] = field(compare=False)
 
     def photograph(self, row: int) -> bytes:
         """Return the PNG of a row."""
-        image = _rendered_view(self.place).render(self.posed_machines[row], self.sensor_rngs[row])
+        image = _rendered_view(self).render(self.machines[row], self.sensor_rngs[row])
         encoded, content = cv2.imencode(".png", image, _FAST if image.ndim == 3 else ())
         if not encoded:
             raise OutOfResources(
@@ -338,3 +328,10 @@ class _Studio:
                 "one; use another camera."
             )
         return content.tobytes()
+
+
+@lru_cache(maxsize=1)
+def _rendered_view(studio: _Studio) -> RenderedView:
+    """Return the surroundings, painted once in each process."""
+    view, nearby = studio.viewpoint, next(iter(studio.machines.values()), ())
+    return prepare_view(nearby, view.camera, view.T_base_camera, studio.appearance, studio.rng)

@@ -42,7 +42,7 @@ from legcal.simulation.rendering.appearance import Appearance, Light
 from legcal.simulation.request import Angles, Level, Request, Sampling
 from legcal.vision import Board
 
-LARGEST = 1.0  # [m] or [rad]
+MAX_SIZE = 1.0  # [m] or [rad]
 ANGLES = ("axes", "twists")
 
 
@@ -149,8 +149,8 @@ DEFAULT_ERRORS = ParameterErrors(
     twists=_TENTH_DEGREE,
 )
 DEFAULT_READINGS = Spread(2e-6, Distribution.NORMAL)
-MOST_IMAGES = 100_000
-MOST_SIGMA_PX = 100.0
+MAX_IMAGES = 100_000
+MAX_SIGMA_PX = 100.0
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class SimulationSettings:
         self._check_kinds()
         for name in ("poses", "views", "images", "seed"):
             if not isinstance(getattr(self, name), Path):
-                least, most = (0, None) if name == "seed" else (1, MOST_IMAGES)
+                least, most = (0, None) if name == "seed" else (1, MAX_IMAGES)
                 what = "as the seed" if name == "seed" else name
                 whole = whole_number(what, getattr(self, name), least, most)
                 object.__setattr__(self, name, whole)
@@ -266,12 +266,12 @@ class SimulationSettings:
     def _check_sizes(self) -> None:
         """Refuse numbers out of their limits."""
         sizes: dict[str, tuple[float, float, float]] = {
-            "noise of edge points": (self.sigma_px, 0.0, MOST_SIGMA_PX),
-            "noise of readings": (self.readings.size, 0.0, LARGEST),
+            "noise of edge points": (self.sigma_px, 0.0, MAX_SIGMA_PX),
+            "noise of readings": (self.readings.size, 0.0, MAX_SIZE),
         }
         for name in KINDS:
             size = getattr(self.errors, name).size
-            sizes[f"errors of {name.replace('_', ' ')}"] = (size, 0.0, LARGEST)
+            sizes[f"errors of {name.replace('_', ' ')}"] = (size, 0.0, MAX_SIZE)
         for name, sigma in vars(self.table).items():
             sizes[f"noise of {name}"] = (sigma, *SIGMA_RANGE)
         problems = [
@@ -314,10 +314,10 @@ class SimulationSettings:
     def check_images(self, n_views: int, n_poses: int) -> None:
         """Refuse more images than a dataset may have."""
         found = n_views * n_poses * self.images
-        if found > MOST_IMAGES:
+        if found > MAX_IMAGES:
             raise UsageError(
                 f"The dataset could not be simulated: found {found} images ({n_views} views of "
-                f"{n_poses} poses, {self.images} of each), needed at most {MOST_IMAGES}; give "
+                f"{n_poses} poses, {self.images} of each), needed at most {MAX_IMAGES}; give "
                 "fewer views, poses or images."
             )
 
@@ -547,8 +547,8 @@ def _errors(request: Request, nominal: Machine) -> ParameterErrors:
             )
         kinds, units = _ERROR_KINDS[kind]
         spread = _spread(size, units, Distribution.UNIFORM, f"--error {kind}")
-        if spread.size > LARGEST:
-            most = f"{LARGEST / units['deg']:.3g}deg" if "deg" in units else f"{LARGEST:g}m"
+        if spread.size > MAX_SIZE:
+            most = f"{MAX_SIZE / units['deg']:.3g}deg" if "deg" in units else f"{MAX_SIZE:g}m"
             raise UsageError(
                 f"--error {kind} could not be used: found {describe(size)}, needed 0 to {most}; "
                 "correct it and its unit."

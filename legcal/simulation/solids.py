@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import trimesh
@@ -22,7 +22,6 @@ from legcal.machine import (
     Configurations,
     Leg,
     Machine,
-    Urdf,
     number_list,
     origin_of,
     parse_robot,
@@ -45,22 +44,22 @@ _FLAT_JOINTS = 1e-3  # thickness of joint centres that lie in a plane, of their 
 class Cylinder:
     """A closed cylinder about the z axis, its middle at the origin."""
 
-    radius: float  # radius, length: its size [m]
-    length: float
+    radius: float  # [m]
+    length: float  # [m]
 
 
 @dataclass(frozen=True)
 class Sphere:
     """A sphere about the origin."""
 
-    radius: float  # its size [m]
+    radius: float  # [m]
 
 
 @dataclass(frozen=True)
 class Box:
     """A box along the axes, its middle at the origin."""
 
-    size: tuple[float, float, float]  # its whole lengths along x, y, z [m]
+    size: tuple[float, float, float]  # whole lengths along x, y, z [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,45 +71,6 @@ class Mesh:
 
 
 Shape = Cylinder | Sphere | Box | Mesh
-
-
-class Visual(NamedTuple):
-    """A visual of a link: its shape, its pose there, and its colour (r, g, b) if it has one."""
-
-    link: str
-    shape: Shape
-    T_link_shape: RigidTransform
-    colour: tuple[float, float, float] | None
-
-
-def visuals(urdf: Urdf) -> list[Visual]:
-    """Return all visuals of a tree in the order of the file."""
-    robot = parse_robot(urdf.path, urdf.content)
-    named = {m.get("name", ""): _rgb(m) for m in robot.findall("material")}
-    problems: list[str] = []
-    found = []
-    for link in robot.findall("link"):
-        for visual in link.findall("visual"):
-            geometry = visual.find("geometry")
-            if geometry is None or len(geometry) == 0:
-                continue
-            try:
-                _check(urdf.path, geometry[0])
-                shape, T = _shown(urdf.path, visual)
-            except ValueError as error:
-                problems.append(
-                    f"{urdf.path}, line {visual.sourceline}: the visual of link "
-                    f"'{link.get('name')}' could not be shown: {error}."
-                )
-                continue
-            material = visual.find("material")
-            colour = None
-            if material is not None:
-                colour = _rgb(material) or named.get(material.get("name", ""))
-            found.append(Visual(link.get("name", ""), shape, T, colour))
-    if problems:
-        raise ModelError(problems)
-    return found
 
 
 def _check(urdf_path: Path, element: etree._Element) -> None:
@@ -264,15 +224,12 @@ PART = Material(albedo=0.30, specular=0.05, shininess=15.0, limb=0.20)
 class Solid:
     """A solid that moves with a link."""
 
-    name: str  # its name
-    # the URDF link; None where it stands in the base frame and is no part of the machine
-    link: str | None
-    shape: Shape  # its shape
+    name: str
+    link: str | None  # of the URDF; None for what stands in the base frame and is no part of it
+    shape: Shape
     T_link_solid: RigidTransform  # its pose in the link, or in the base frame
-    material: Material = PART  # its surface
-    # the leg whose axis it is coaxial with, as an index into ``mechanism.legs``
-    leg: int | None = None
-    part: str | None = None  # the link that names it as a part of that leg in observations
+    material: Material = PART
+    leg: int | None = None  # whose axis it is coaxial with
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,25 +242,40 @@ class PlacedSolid:
 
 def solids_of(machine: Machine) -> tuple[Solid, ...]:
     """Return the visuals of a mechanism, those that are coaxial with legs marked as such."""
-    shown = visuals(machine.urdf)
+    urdf = machine.urdf
+    robot = parse_robot(urdf.path, urdf.content)
+    colours = {m.get("name", ""): _rgb(m) for m in robot.findall("material")}
     poses = link_poses(machine, machine.home_configuration)
-    lines = _leg_lines(machine)
-    counts: dict[str, int] = {}
+    problems: list[str] = []
     solids = []
-    for visual in shown:
-        number = counts[visual.link] = counts.get(visual.link, 0) + 1
-        leg = _leg_of(visual, poses[visual.link], machine.legs, lines)
-        solids.append(
-            Solid(
-                name=visual.link if number == 1 else f"{visual.link}/{number}",
-                link=visual.link,
-                shape=visual.shape,
-                T_link_solid=visual.T_link_shape,
-                material=_material(visual, None if leg is None else machine.legs[leg]),
-                leg=leg,
-                part=None if leg is None else visual.link,
-            )
-        )
+    for element in robot.findall("link"):
+        link, number = element.get("name", ""), 0
+        for visual in element.findall("visual"):
+            geometry = visual.find("geometry")
+            if geometry is None or len(geometry) == 0:
+                continue
+            try:
+                _check(urdf.path, geometry[0])
+                shape, T = _shown(urdf.path, visual)
+            except ValueError as error:
+                problems.append(
+                    f"{urdf.path}, line {visual.sourceline}: the visual of link "
+                    f"'{link}' could not be shown: {error}."
+                )
+                continue
+            number += 1
+            leg = None
+            if isinstance(shape, Cylinder):
+                leg = _leg_along(shape, product(poses[link], T), link, machine)
+            named = visual.find("material")
+            colour = None
+            if named is not None:
+                colour = _rgb(named) or colours.get(named.get("name", ""))
+            material = _material(shape, colour, None if leg is None else machine.legs[leg])
+            name = link if number == 1 else f"{link}/{number}"
+            solids.append(Solid(name, link, shape, T, material, leg))
+    if problems:
+        raise ModelError(problems)
     return tuple(solids)
 
 
@@ -321,44 +293,33 @@ def placed(solids: Sequence[Solid], poses: Mapping[str, RigidTransform]) -> tupl
     )
 
 
-def _leg_lines(machine: Machine) -> list[tuple[Array, Array]]:
-    """Return a point and the direction of every leg's axis at home, in the base frame."""
+def _leg_along(
+    shape: Cylinder, T_base_shape: RigidTransform, link: str, machine: Machine
+) -> int | None:
+    """Return the leg that has a visual of a link, at home, among its cylinders."""
+    half = np.array([0.0, 0.0, 0.5 * shape.length])
+    ends = T_base_shape.apply(np.stack([-half, half]))
     A, B = machine.A_base, machine.home.apply(machine.B_platform)
     u = (B - A) / np.linalg.norm(B - A, axis=-1, keepdims=True)
-    return list(zip(A, u, strict=True))
-
-
-def _leg_of(
-    visual: Visual,
-    T_base_link: RigidTransform,
-    legs: Sequence[Leg],
-    lines: list[tuple[Array, Array]],
-) -> int | None:
-    """Return the leg that counts a visual among its cylinders, at home."""
-    if not isinstance(visual.shape, Cylinder):
-        return None
-    half = np.array([0.0, 0.0, 0.5 * visual.shape.length])
-    ends = (T_base_link * visual.T_link_shape).apply(np.stack([-half, half]))
-    for j, (leg, (A, u)) in enumerate(zip(legs, lines, strict=True)):
-        counted = any(
-            c.link == visual.link and abs(c.radius - visual.shape.radius) < COAXIAL
-            for c in leg.cylinders
+    for j, leg in enumerate(machine.legs):
+        has_it = any(
+            c.link == link and abs(c.radius - shape.radius) < COAXIAL for c in leg.cylinders
         )
-        if counted and distance_to_line(ends, u, A).max() < 2.0 * COAXIAL:
+        if has_it and distance_to_line(ends, u[j], A[j]).max() < 2.0 * COAXIAL:
             return j
     return None
 
 
-def _material(visual: Visual, leg: Leg | None) -> Material:
+def _material(shape: Shape, colour: tuple[float, float, float] | None, leg: Leg | None) -> Material:
     """Return the surface of a visual: its colour if it has one, else what it most likely is."""
     material = PART
-    if leg is not None and isinstance(visual.shape, Cylinder):
+    if leg is not None and isinstance(shape, Cylinder):
         thickest = max(c.radius for c in leg.cylinders)
-        material = TUBE if visual.shape.radius > 0.999 * thickest else ROD
-    if visual.colour is None:
+        material = TUBE if shape.radius > 0.999 * thickest else ROD
+    if colour is None:
         return material
-    albedo = max(sum(visual.colour) / 3.0, 0.02)
-    r, g, b = (c / albedo for c in visual.colour)
+    albedo = max(sum(colour) / 3.0, 0.02)
+    r, g, b = (c / albedo for c in colour)
     return replace(material, albedo=albedo, tint=(r, g, b))
 
 

@@ -35,17 +35,18 @@ from legcal.simulation.settings import (
     ANGLES,
     ERRORS_OF,
     KINDS,
-    LARGEST,
+    MAX_SIZE,
     Distribution,
     ParameterErrors,
     Spread,
 )
 from legcal.simulation.solids import Cylinder, solids_of
 
-_MOST = {Distribution.UNIFORM: 0.5, Distribution.NORMAL: 0.1}  # of the thinnest cylinder
+# of the thinnest cylinder
+_MAX_RADIUS_ERROR = {Distribution.UNIFORM: 0.5, Distribution.NORMAL: 0.1}
 _ALIKE = 1e-9  # [m]; cylinders of one leg with one radius are one tube and stay so
-DRAWS = 20
-FURTHEST = 0.2  # of a leg length, by which the nominal home may miss what the true legs demand
+MAX_DRAWS = 20
+MAX_HOME_SHIFT = 0.2  # of a leg length, from the nominal home to that of the true legs
 
 
 def draw_errors(
@@ -84,11 +85,11 @@ def _check(errors: ParameterErrors) -> None:
     problems = []
     for kind in KINDS:
         size = getattr(errors, kind).size
-        if not (math.isfinite(size) and 0.0 <= size <= LARGEST):
+        if not (math.isfinite(size) and 0.0 <= size <= MAX_SIZE):
             scale, unit = (np.rad2deg(1.0), "deg") if kind in ANGLES else (1e3, "mm")
             problems.append(
                 f"The errors of {kind.replace('_', ' ')} could not be drawn: found a size of "
-                f"{scale * size:g} {unit}, needed 0 to {scale * LARGEST:.3g} {unit}; correct it."
+                f"{scale * size:g} {unit}, needed 0 to {scale * MAX_SIZE:.3g} {unit}; correct it."
             )
     if problems:
         raise UsageError(problems)
@@ -122,7 +123,7 @@ def draw_radii(
 
 def _check_radii(spread: Spread, thinnest: float) -> None:
     """Refuse errors that may leave nothing of a leg."""
-    most = _MOST[spread.distribution] * thinnest
+    most = _MAX_RADIUS_ERROR[spread.distribution] * thinnest
     if not spread.size <= most:
         raise UsageError(
             f"The errors of radii could not be drawn: found a size of {1e3 * spread.size:g} mm, "
@@ -140,10 +141,10 @@ def write_true_model(
     """
     problems: Counter[str] = Counter()
     of_radii = rng.spawn(1)[0]
-    for _ in range(DRAWS):
+    for _ in range(MAX_DRAWS):
         legs = draw_errors(nominal, errors, rng)
         radii = draw_radii(nominal, errors.radii, of_radii)
-        home = home_with(nominal, legs, FURTHEST)
+        home = home_with(nominal, legs, MAX_HOME_SHIFT)
         if home is None:
             problems["legs that do not meet near home"] += 1
             continue
@@ -162,8 +163,8 @@ def write_true_model(
         path.unlink(missing_ok=True)
     found = ", ".join(f"{count} times {what}" for what, count in problems.most_common())
     raise ModelError(
-        f"{nominal.yaml_path}: no true machine could be made: found {found} in {DRAWS} draws of "
-        "errors, needed one draw that closes as the nominal model does; give smaller errors, or "
+        f"{nominal.yaml_path}: no true machine could be made: found {found} in {MAX_DRAWS} draws "
+        "of errors, needed one draw that closes as the nominal model does; give smaller errors, or "
         "none of the axes and lengths that close the loops."
     )
 

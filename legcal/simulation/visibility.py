@@ -17,12 +17,12 @@ from legcal.progress import Report, no_progress
 from legcal.simulation.solids import PosedMachine
 from legcal.vision import Camera
 
-SEEN = 0.4  # of a leg's length that one stretch must show
-SHORTEST_PX = 20.0  # a stretch of one cylinder that gives an outline
+MIN_SHARE = 0.4  # of a leg's length that one stretch must show
+MIN_LENGTH_PX = 20.0  # a stretch of one cylinder that gives an outline
 SAMPLES = 96  # points along a leg
 _BORDER_PX = 2.0  # of the image, where nothing counts as seen
-_ALIKE = 0.01  # relative difference of radii that shows no step
-_ASIDE = 0.01  # of the radius: how far beside its outline a leg is looked past
+_RADIUS_TOLERANCE = 0.01  # relative difference of radii that shows no step
+_BESIDE = 0.01  # of the radius: how far beside its outline a leg is looked past
 _END_ON = 1.01  # radii from the axis within which a leg shows its end and no outline
 _IN_FRONT = 0.1  # radii before an outline from which on a hit hides it
 
@@ -66,8 +66,8 @@ class Stretch:
 
     leg: int
     part: str  # the URDF link of the cylinder
-    radius: float  # its radius [m]
-    start: float  # start, end: distances from A along the leg [m]
+    radius: float  # [m]
+    start: float  # from A along the leg [m]
     end: float
 
 
@@ -82,16 +82,7 @@ class LegView:
     @property
     def is_seen(self) -> bool:
         """Whether the leg counts as seen."""
-        return self.share >= SEEN and len(self.stretches) > 0
-
-
-@dataclass(frozen=True, eq=False)
-class _Skin:
-    """The outer radius of a leg along its axis, sampled; zero where there is no cylinder."""
-
-    s: Array
-    radius: Array
-    name: tuple[str, ...]
+        return self.share >= MIN_SHARE and len(self.stretches) > 0
 
 
 def legs_in_image(
@@ -106,7 +97,7 @@ def legs_in_image(
     length = np.linalg.norm(posed.B - posed.A, axis=-1)
     u = (posed.B - posed.A) / length[:, None]
     skins = [_skin(leg.cylinders, float(L), samples) for leg, L in zip(legs, length, strict=True)]
-    s, radius = (np.array([getattr(skin, x) for skin in skins]) for x in ("s", "radius"))
+    s, radius = (np.array([skin[k] for skin in skins]) for k in (0, 1))
     T_camera_base = T_base_camera.inv()
     u_camera = u @ T_camera_base.as_matrix()[:3, :3].T
     A_camera = np.asarray(T_camera_base.apply(posed.A))
@@ -116,7 +107,7 @@ def legs_in_image(
     offsets = contact_offsets(u_camera[:, None], axis, radius)
     pixels, inside = pixels_in_image(camera, axis[:, :, None] + offsets)
     tested = inside & (radius > 0.0)[..., None]
-    beside = axis[:, :, None] + (1.0 + _ASIDE) * offsets
+    beside = axis[:, :, None] + (1.0 + _BESIDE) * offsets
     margin = np.broadcast_to(_IN_FRONT * radius[..., None], tested.shape)
     free = tested.copy()
     free[tested] = ~posed.hidden(
@@ -125,22 +116,30 @@ def legs_in_image(
     both = np.all(free, axis=-1)
     middle = pixels.mean(axis=-2)
     return tuple(
-        _leg_view(j, skin, both[j], middle[j], float(length[j])) for j, skin in enumerate(skins)
+        _leg_view(j, *skin, both[j], middle[j], float(length[j])) for j, skin in enumerate(skins)
     )
 
 
-def _leg_view(leg: int, skin: _Skin, free: BoolArray, pixels: Array, length: float) -> LegView:
+def _leg_view(
+    leg: int,
+    s: Array,  # (n,) samples along the axis [m]
+    radius: Array,
+    names: Sequence[str],  # of the cylinder at each sample
+    free: BoolArray,
+    pixels: Array,
+    length: float,
+) -> LegView:
     """Return what is seen of a leg whose samples are free or not."""
     first, last = _longest(free)
     if last <= first:
         return LegView(0.0, 0.0, ())
-    share = float(skin.s[last] - skin.s[first]) / length
+    share = float(s[last] - s[first]) / length
     stretches = []
-    for name in dict.fromkeys(skin.name):
-        chosen = free & np.array([other == name for other in skin.name])
+    for name in dict.fromkeys(names):
+        chosen = free & np.array([other == name for other in names])
         start, end = _longest(chosen)
-        if name and end > start and np.linalg.norm(pixels[end] - pixels[start]) >= SHORTEST_PX:
-            piece = float(skin.radius[start]), float(skin.s[start]), float(skin.s[end])
+        if name and end > start and np.linalg.norm(pixels[end] - pixels[start]) >= MIN_LENGTH_PX:
+            piece = float(radius[start]), float(s[start]), float(s[end])
             stretches.append(Stretch(leg, name, *piece))
     length_px = float(np.linalg.norm(pixels[last] - pixels[first]))
     return LegView(share, length_px, tuple(stretches))
@@ -157,8 +156,10 @@ def _longest(chosen: BoolArray) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=4096)  # many cameras look at one machine
-def _skin(cylinders: tuple[Cylinder, ...], length: float, samples: int) -> _Skin:
-    """Return the outer radius along a leg, and the cylinder that each stretch is named by.
+def _skin(
+    cylinders: tuple[Cylinder, ...], length: float, samples: int
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return samples along a leg, the outer radius there (0 for a gap), and cylinders' names.
 
     Touching cylinders of one radius look like one; the longest of them names it, and of equally
     long ones the last in the alphabet.
@@ -171,10 +172,10 @@ def _skin(cylinders: tuple[Cylinder, ...], length: float, samples: int) -> _Skin
     for i, (cylinder, (start, end)) in enumerate(zip(cylinders, spans, strict=True)):
         covered[i, (s >= start) & (s <= end)] = cylinder.radius
     radius = covered.max(axis=0, initial=0.0)
-    change = np.abs(np.diff(radius)) > _ALIKE * np.maximum(radius[1:], radius[:-1])
+    change = np.abs(np.diff(radius)) > _RADIUS_TOLERANCE * np.maximum(radius[1:], radius[:-1])
     group = np.concatenate([[0], np.cumsum(change)])
     names = [_name_of(cylinders, covered, radius, group == g) for g in range(group[-1] + 1)]
-    return _Skin(s, radius, tuple(names[g] for g in group))
+    return s, radius, tuple(names[g] for g in group)
 
 
 def _name_of(
@@ -185,12 +186,12 @@ def _name_of(
     alike = [
         (c.end - c.start, c.link)
         for c, row in zip(cylinders, covered, strict=True)
-        if R > 0.0 and np.any(np.abs(row[chosen] - R) <= _ALIKE * R)
+        if R > 0.0 and np.any(np.abs(row[chosen] - R) <= _RADIUS_TOLERANCE * R)
     ]
     if not alike:
         return ""
     name = max(alike)[1]
-    return name if abs(main_cylinders(cylinders)[name].radius - R) <= _ALIKE * R else ""
+    return name if abs(main_cylinders(cylinders)[name].radius - R) <= _RADIUS_TOLERANCE * R else ""
 
 
 def pixels_in_image(camera: Camera, points: Array) -> tuple[Array, BoolArray]:
@@ -308,14 +309,15 @@ def _sees_nothing(name: str, legs: Sequence[Leg], views: Sequence[Sequence[LegVi
             "cylinders coaxial with the legs; add them."
         )
     most = max(leg.share for view in views for leg in view)
-    if most >= SEEN:
+    if most >= MIN_SHARE:
         longest = max(leg.length_px for view in views for leg in view)
         return (
             f"{start} that legs are at most {longest:.1f} px long in them, needed "
-            f"{SHORTEST_PX:g} px of a tube or rod; move the camera nearer (its place is in "
+            f"{MIN_LENGTH_PX:g} px of a tube or rod; move the camera nearer (its place is in "
             "metres), or give it a longer focal length."
         )
     return (
         f"{start} that no image shows a leg (at best {100.0 * most:.0f} % of one), needed an "
-        f"unhidden stretch of {100.0 * SEEN:.0f} % of at least one leg; turn or move the camera."
+        f"unhidden stretch of {100.0 * MIN_SHARE:.0f} % of at least one leg; turn or move the "
+        "camera."
     )

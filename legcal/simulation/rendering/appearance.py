@@ -14,8 +14,8 @@ from legcal.simulation.rendering.rays import Single
 SAMPLES = (13, 21, 34, 55, 89, 144)  # Fibonacci numbers: the lattices of a pixel's rays
 
 _POSITIVE = ("exposure", "gamma")
-_LEAST = {"electrons": 1.0}
-_MOST = {
+_MIN = {"electrons": 1.0}
+_MAX = {
     "blur": 20.0, "gamma": 10.0, "clutter": 500.0, "cables": 100.0, "limb": 1.0, "texture": 10.0,
     "electrons": math.inf,
 }  # fmt: skip
@@ -167,8 +167,8 @@ class Appearance:
 
 def _check_number(name: str, value: float) -> None:
     """Refuse a number that makes no sense."""
-    most = _MOST.get(name, 1e6)
-    least = _LEAST.get(name, 0.0)
+    most = _MAX.get(name, 1e6)
+    least = _MIN.get(name, 0.0)
     words = "above" if name in _POSITIVE else "of at least"
     if not least <= value <= most or (name in _POSITIVE and value == 0.0):
         raise UsageError(

@@ -48,50 +48,13 @@ _TABLE = Material(albedo=0.22, specular=0.06, shininess=12.0, limb=0.0, texture=
                   tint=(1.15, 1.0, 0.85))  # fmt: skip
 _CABLE = Material(albedo=0.04, specular=0.15, shininess=15.0, limb=0.2)
 
+_UP = np.array([0.0, 0.0, 1.0])  # of the base frame: lamps, tables
+
 _TIE = 1.0 - 3e-6  # surfaces nearer to each other than this part of the depth are one
 _THIN = 3.0  # [px] solids that rays through pixel centres may miss
 _PIXELS = 8192  # on edges, at a time
 _SHADED = 3  # of so many of a pixel's rays that meet a solid, one is shaded
 _FACES = 8  # that are told apart in the search for edges
-
-
-@dataclass(frozen=True, eq=False)
-class Surroundings:
-    """What does not move, in the base frame."""
-
-    centre: Array  # (3,) the middle of the machine [m]
-    radius: float  # the radius of a sphere around the machine [m]
-    up: Array  # (3,) the side of the base on which the machine stands
-    # floor, clutter, cables: below, behind and around, and in front of the machine
-    floor: tuple[PlacedSolid, ...]
-    clutter: tuple[PlacedSolid, ...]
-    cables: tuple[PlacedSolid, ...]
-
-
-def draw_surroundings(
-    placed: Sequence[PlacedSolid],
-    camera: Camera,
-    T_base_camera: RigidTransform,
-    appearance: Appearance,
-    rng: np.random.Generator,
-) -> Surroundings:
-    """Draw what stands around a machine in one view."""
-    centre, radius = _around(placed)
-    up = np.array([0.0, 0.0, 1.0])
-    eye = T_base_camera.translation
-    floor = _table(placed, centre, radius, up, eye) if appearance.table else ()
-    return Surroundings(
-        centre=centre,
-        radius=radius,
-        up=up,
-        floor=floor,
-        clutter=tuple(
-            _piece(i, centre, radius, camera, T_base_camera, rng) for i in range(appearance.clutter)
-        ),
-        cables=tuple(
-            _cable(i, centre, radius, T_base_camera, rng) for i in range(appearance.cables)
-        ),
-    )
 
 
 def _around(placed: Sequence[PlacedSolid]) -> tuple[Array, float]:
@@ -107,14 +70,14 @@ def _around(placed: Sequence[PlacedSolid]) -> tuple[Array, float]:
 
 
 def _table(
-    placed: Sequence[PlacedSolid], centre: Array, radius: float, up: Array, eye: Array
+    placed: Sequence[PlacedSolid], centre: Array, radius: float, eye: Array
 ) -> tuple[PlacedSolid, ...]:
     """Return a table right below the lowest solid; none where it would hide the machine."""
-    lowest = min((_lowest(p, up) for p in placed), default=-radius)
-    if float(eye @ up) <= lowest:
+    lowest = min((_lowest(p, _UP) for p in placed), default=-radius)
+    if float(eye @ _UP) <= lowest:
         return ()
     size = 4.0 * radius, 3.2 * radius, 0.06 * radius
-    foot = centre + (lowest - float(centre @ up) - 0.5 * size[2]) * up
+    foot = centre + (lowest - float(centre @ _UP) - 0.5 * size[2]) * _UP
     T = RigidTransform.from_components(foot, Rotation.from_euler("z", 0.3))
     return (_placed("table", Box(size), T, _TABLE),)
 
@@ -411,13 +374,10 @@ class RenderedView:
 
     T_camera_base: RigidTransform  # pose of the base frame in the camera
     appearance: Appearance
-    surroundings: Surroundings  # what stands around
     painter: Painter  # paints with the camera and the light
     canvas: Canvas  # the surroundings, their light apart by lamp
-    # bystanders, foreground: what stands around and casts shadows on the machine, and what hangs in
-    # front of it
-    bystanders: tuple[SolidInView, ...]
-    foreground: tuple[SolidInView, ...]
+    bystanders: tuple[SolidInView, ...]  # what stands around and casts shadows on the machine
+    foreground: tuple[SolidInView, ...]  # what hangs in front of it
 
     def render(self, placed: Sequence[PlacedSolid], rng: np.random.Generator) -> Image:
         """Return a photograph of solids in this scene."""
@@ -461,21 +421,20 @@ def prepare_view(
     """Return the scene of a view: its surroundings drawn, lit and painted."""
     rays = pixel_rays(camera)
     T_camera_base = T_base_camera.inv()
-    surroundings = draw_surroundings(placed, camera, T_base_camera, appearance, rng)
-    light = _lighting(surroundings, T_camera_base, appearance)
+    centre, radius = _around(placed)
+    floor = _table(placed, centre, radius, T_base_camera.translation) if appearance.table else ()
+    clutter = [
+        _piece(i, centre, radius, camera, T_base_camera, rng) for i in range(appearance.clutter)
+    ]
+    cables = [_cable(i, centre, radius, T_base_camera, rng) for i in range(appearance.cables)]
+    light = _lighting(centre, radius, T_camera_base, appearance)
     painter = Painter(rays, light, appearance.samples)
     canvas = _empty(rays, light, appearance, rng)
-    bystanders = in_view(surroundings.clutter, T_camera_base)
-    painter.paint(canvas, [*in_view(surroundings.floor, T_camera_base), *bystanders])
-    foreground = in_view(surroundings.cables, T_camera_base)
+    bystanders = in_view(clutter, T_camera_base)
+    painter.paint(canvas, [*in_view(floor, T_camera_base), *bystanders])
+    foreground = in_view(cables, T_camera_base)
     return RenderedView(
-        T_camera_base,
-        appearance,
-        surroundings,
-        painter,
-        canvas,
-        tuple(bystanders),
-        tuple(foreground),
+        T_camera_base, appearance, painter, canvas, tuple(bystanders), tuple(foreground)
     )
 
 
@@ -491,28 +450,28 @@ def render(
 
 
 def _lighting(
-    surroundings: Surroundings, T_camera_base: RigidTransform, appearance: Appearance
+    centre: Array, radius: float, T_camera_base: RigidTransform, appearance: Appearance
 ) -> Lighting:
     """Return the light in the camera frame, its distances in radii of the machine."""
     lamps = []
     for light in appearance.lights:
         direction = np.array(light.direction) / np.linalg.norm(light.direction)
-        distance = light.distance * surroundings.radius
+        distance = light.distance * radius
         if light.with_camera:
             direction = T_camera_base.rotation.inv().apply(direction * [1.0, -1.0, -1.0])
-        where: Array = surroundings.centre + distance * direction
+        where: Array = centre + distance * direction
         lamps.append(
             Lamp(
                 position=np.asarray(T_camera_base.apply(where)),
                 power=light.strength * distance**2,
-                radius=light.radius * surroundings.radius,
+                radius=light.radius * radius,
                 shadows=light.shadows and appearance.shadows,
             )
         )
     return Lighting(
         lamps=tuple(lamps),
         ambient=appearance.ambient,
-        up=np.asarray(T_camera_base.rotation.apply(surroundings.up)),
+        up=np.asarray(T_camera_base.rotation.apply(_UP)),
         limb=appearance.limb,
         specular=appearance.specular,
         texture=appearance.texture,
