@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from legcal import calibrate, load_mechanism
-from legcal.calibration.joint_fit.edge_biases import KINDS
+from legcal.calibration.joint_fit.outline_errors import KINDS
 from legcal.calibration.verdict import Calibration
 from legcal.geometry import components
 from legcal.geometry.types import Array

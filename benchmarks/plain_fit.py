@@ -13,7 +13,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.sparse import coo_array, csr_array
 
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.state import State
+from legcal.calibration.joint_fit.variables import State
 from legcal.geometry.types import Array, BoolArray
 from legcal.machine import free_coordinates
 

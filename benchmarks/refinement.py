@@ -27,8 +27,9 @@ from hexapod_session import disturbed_start, noisy_outlines, noisy_readings, sim
 from plain_fit import PlainFit
 
 from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.problem import build_fit
-from legcal.estimation import NoiseModel, minimise
+from legcal.estimation import minimise
 
 SIZES = (45, 450, 4500)
 REPEATS = 5

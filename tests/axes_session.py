@@ -5,9 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from legcal.calibration.joint_fit.poses import start_from
 from legcal.calibration.joint_fit.solution import joints_of
-from legcal.calibration.joint_fit.state import FittedLegs, Start
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, start_from
 from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
 from legcal.data.measurements import Measurements
 from legcal.geometry.types import Array

@@ -8,8 +8,8 @@ import numpy as np
 from machine_session import MachineSession
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.joint_fit.observations import SeenBoard
-from legcal.calibration.joint_fit.state import Start
+from legcal.calibration.joint_fit.factors import BoardCorners
+from legcal.calibration.joint_fit.variables import Start
 from legcal.data.corners import Corners, found_corners
 from legcal.geometry.types import Array
 from legcal.vision.board import Board
@@ -45,8 +45,8 @@ def corners_of(
     return found_corners(of_row, corner, px, np.full(len(px), SIGMA_PX))
 
 
-def with_board(session: MachineSession, corners: Corners) -> tuple[SeenBoard, Start]:
+def with_board(session: MachineSession, corners: Corners) -> tuple[BoardCorners, Start]:
     """Return what is seen of the board, and the wrong start with a board that is wrong as well."""
     wrong = RigidTransform.from_components([0.004, -0.003, 0.005], Rotation.from_rotvec([0.02] * 3))
     start = replace(session.start, T_Rb_board=place_of_board(session) * wrong)
-    return SeenBoard(BOARD, corners), start
+    return BoardCorners(BOARD, corners), start

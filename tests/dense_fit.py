@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.state import State
+from legcal.calibration.joint_fit.variables import State
 from legcal.estimation import Linearization, Rows, linearize
 from legcal.estimation.problem import Places
 from legcal.geometry.types import Array
@@ -105,7 +105,7 @@ def _dense(problem: FitProblem, where: Places, rows: Rows) -> Array:
     for i in range(n):
         for m, column in enumerate(kept[i]):
             wide[i, :, column] += rows.J[i, :, m]
-        assert where.own is not None
-        first = problem.n_kept + 6 * int(where.own[i])
-        wide[i, :, first : first + 6] += rows.J_own[i]
+        assert where.element is not None
+        first = problem.n_kept + 6 * int(where.element[i])
+        wide[i, :, first : first + 6] += rows.J_element[i]
     return wide[..., :-1].reshape(n * q, problem.size)

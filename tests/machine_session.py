@@ -10,8 +10,7 @@ import numpy as np
 from outline_study import closed_poses, moved_poses
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.joint_fit.poses import start_from
-from legcal.calibration.joint_fit.state import FittedLegs, Start, fitted_legs
+from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry import components, motions_of

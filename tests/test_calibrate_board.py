@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 import legcal
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
-from legcal.calibration.joint_fit.parameters import BOARD_SCALE
+from legcal.calibration.joint_fit.choices import BOARD_SCALE
 from legcal.calibration.verdict import Calibration
 from legcal.data.corners import found_corners
 from legcal.data.measurements import Measurements, View

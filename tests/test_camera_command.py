@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from legcal import calibrate_camera, cli
 from legcal.calibration.camera import CameraCalibration
-from legcal.calibration.joint_fit.parameters import Prior, known_parameters, resolve
+from legcal.calibration.joint_fit.choices import Prior, known_parameters, resolve
 from legcal.data.measurements import View
 from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError

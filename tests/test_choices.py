@@ -7,7 +7,7 @@ import pytest
 from chosen import HEXAPOD, choose, known
 
 from legcal import load_mechanism
-from legcal.calibration.joint_fit.parameters import NO_CHOICES, Prior, resolve
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Prior, resolve
 from legcal.data.overrides import overrides_of_call
 from legcal.machine import parametrization_of
 

@@ -9,7 +9,7 @@ import pytest
 from dataset_folder import Folder, folder
 
 from legcal import calibrate, cli
-from legcal.calibration.joint_fit.parameters import Choices, Prior, known_parameters, resolve
+from legcal.calibration.joint_fit.choices import Choices, Prior, known_parameters, resolve
 from legcal.data.dataset import load_dataset
 from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, UsageError

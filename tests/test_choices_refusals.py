@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from chosen import HEXAPOD, choose, known
 
-from legcal.calibration.joint_fit.parameters import resolve
+from legcal.calibration.joint_fit.choices import resolve
 from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, UsageError
 

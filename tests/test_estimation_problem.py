@@ -83,7 +83,7 @@ def test_elimination_gives_the_covariance_of_the_whole_system() -> None:
     J = np.zeros((len(rows.r), problem.size))
     J[:, :N_SHARED] = rows.J[:, 0]
     for i, k in enumerate(np.repeat(np.arange(N_OWN), N_EACH).tolist()):
-        J[i, N_SHARED + 2 * k : N_SHARED + 2 * k + 2] = rows.J_own[i, 0]
+        J[i, N_SHARED + 2 * k : N_SHARED + 2 * k + 2] = rows.J_element[i, 0]
     H = J.T @ J
     H[0, 0] += 0.5**-2
     assert np.array_equal(where.index, np.tile(np.arange(N_SHARED), (len(J), 1)))

@@ -8,8 +8,8 @@ from hexapod_session import LENS, RADIUS, Session, disturbed_start, moved_outlin
 from machine_session import LENS as LENS_OF_MACHINES
 from machine_session import machine_session
 
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.parameters import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.geometry.types import Array
 from legcal.machine import moved_legs

@@ -7,8 +7,8 @@ import pytest
 from machine_session import MachineSession, machine_session, shifted
 from thinned import thinned
 
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.parameters import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.errors import DidNotConverge
 

@@ -14,8 +14,8 @@ from hexapod_session import (
     simulate,
 )
 
+from legcal.calibration.joint_fit.choices import Choices
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.parameters import Choices
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines

@@ -19,17 +19,17 @@ from hexapod_session import (
 from simulated import settings
 
 import legcal
+from legcal.calibration.joint_fit.factors import known_gammas
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.gammas import (
-    FEIGNED,
-    LARGEST_STEP,
-    RANGE,
-    SEEN_SHARE,
-    SETTLED,
+from legcal.calibration.joint_fit.outline_errors import (
+    GAMMA_RANGE,
+    GAMMA_TOLERANCE,
+    LIMB_SIGMA,
+    MAX_GAMMA_STEP,
+    RECOVERED_SHARE,
     EstimatedGamma,
     next_gammas,
 )
-from legcal.calibration.joint_fit.observations import known_gammas
 from legcal.calibration.outline_detection import detect
 from legcal.data.dataset import load_dataset
 from legcal.data.measurements import Measurements
@@ -77,8 +77,8 @@ def test_gamma_of_a_camera_is_found_by_its_outlines(session: Session) -> None:
     assert gamma.views == ("c1", "c2", "c3")
     assert gamma.measured_with == 1.0
     assert gamma.fitted_sigma < 0.02
-    of_fit, unseen = gamma.fitted_sigma / SEEN_SHARE, np.log(gamma.gamma)  # as much again
-    assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + FEIGNED**2))
+    of_fit, unseen = gamma.fitted_sigma / RECOVERED_SHARE, np.log(gamma.gamma)  # as much again
+    assert gamma.sigma == pytest.approx(np.sqrt(of_fit**2 + unseen**2 + LIMB_SIGMA**2))
     assert np.log(gamma.gamma) == pytest.approx(LOG_GAMMA, abs=0.06)  # the fit's own three sigmas
     assert any("The gamma of the camera of views c1, c2, c3 is not told" in n for n in found.notes)
     assert not any("gamma" in name for name in found.biases)
@@ -188,11 +188,11 @@ def test_search_comes_to_rest_near_the_gamma_at_which_fits_see_nothing(
         if not gammas:
             break
         assert set(gammas) == {"c1", "c2"}
-        assert RANGE[0] <= gammas["c1"] <= RANGE[1]
-        assert abs(np.log(gammas["c1"] / read)) <= LARGEST_STEP + 1e-12
+        assert GAMMA_RANGE[0] <= gammas["c1"] <= GAMMA_RANGE[1]
+        assert abs(np.log(gammas["c1"] / read)) <= MAX_GAMMA_STEP + 1e-12
         read = gammas["c1"]
     assert gammas == {}
-    assert abs(np.log(true / read)) <= SETTLED / share + 1e-12
+    assert abs(np.log(true / read)) <= GAMMA_TOLERANCE / share + 1e-12
 
 
 def test_note_says_where_gamma_is_hardly_told_and_names_few_views() -> None:

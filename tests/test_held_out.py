@@ -11,7 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.calibration.joint_fit import held_out as pose_by_outlines
-from legcal.calibration.joint_fit.edge_biases import N_KINDS, possible_biases
 from legcal.calibration.joint_fit.held_out import (
     HeldOut,
     Posterior,
@@ -19,11 +18,11 @@ from legcal.calibration.joint_fit.held_out import (
     compare_held_out,
     poses_by_outlines,
 )
+from legcal.calibration.joint_fit.outline_errors import N_KINDS, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import build_fit
-from legcal.calibration.joint_fit.state import Start
+from legcal.calibration.joint_fit.variables import Start
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
-from legcal.estimation.noise import NoiseModel
 from legcal.geometry import motions_of
 from legcal.machine import Leg
 

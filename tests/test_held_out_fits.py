@@ -18,7 +18,7 @@ from thinned import thinned
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.held_out import HeldOut, compare_held_out
-from legcal.calibration.joint_fit.poses import start_from
+from legcal.calibration.joint_fit.variables import start_from
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, IntArray

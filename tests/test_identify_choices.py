@@ -7,7 +7,7 @@ import pytest
 from hexapod_example import HEXAPOD
 
 from legcal.calibration.identify.judge import check_identifiable, identifiability_of_dataset
-from legcal.calibration.joint_fit.parameters import Choices, Prior
+from legcal.calibration.joint_fit.choices import Choices, Prior
 from legcal.data.dataset import Dataset, load_dataset
 from legcal.data.holdout import dataset_at
 from legcal.errors import NotIdentifiable

@@ -8,8 +8,8 @@ from axes_session import AxesSession, axes_session
 from hexapod_session import disturbed_start, joint_errors, simulate
 from thinned import thinned
 
+from legcal.calibration.joint_fit.factors import average_images, observed_axes
 from legcal.calibration.joint_fit.fit import bound, refine
-from legcal.calibration.joint_fit.observations import average_images, observed_axes
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.solution import Solution, joints_of
 from legcal.data.axes import LegAxes, axes_from_outlines

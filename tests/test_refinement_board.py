@@ -7,11 +7,11 @@ import pytest
 from board_session import BOARD, SIGMA_PX, corners_of, place_of_board, with_board
 from machine_session import LENS, MachineSession, machine_session
 
+from legcal.calibration.joint_fit.choices import BOARD_SCALE, Choices, Prior
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.parameters import BOARD_SCALE, Choices, Prior
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import Start
+from legcal.calibration.joint_fit.variables import Start
 from legcal.data.measurements import Measurements, View
 from legcal.errors import DidNotConverge
 from legcal.geometry.types import Array
@@ -60,7 +60,7 @@ def test_rows_of_corners_have_the_derivatives_of_finite_differences() -> None:
         atol = 1e-5 * float(np.abs(slope).max())
         # What was measured moves with the camera at the derivative of the lens where it was.
         np.testing.assert_allclose(wide[..., x], slope, rtol=1e-3, atol=10.0 * atol)
-    assert not rows.J_own.any()
+    assert not rows.J_element.any()
 
 
 def test_corners_are_where_the_camera_projects_them() -> None:
@@ -68,7 +68,7 @@ def test_corners_are_where_the_camera_projects_them() -> None:
     seen, start = with_board(session, corners_of(session))
     problem = build_fit(session.legs, session.measurements, session.outlines, board=seen)
     state = problem.begin(start)
-    board, rows = problem.board, problem.factor("corners").linearize(state)
+    board, rows = problem.corners, problem.factor("corners").linearize(state)
     assert len(board) == BOARD.n_corners * 3  # one for all images of a view
     in_base = start.T_Rb_board.apply(board.point)
     for v, T in enumerate(start.T_camera_Rb):

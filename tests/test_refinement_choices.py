@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from machine_session import LENS, MachineSession, machine_session
 
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.parameters import NO_CHOICES, Choices, Prior
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.measurements import View
 from legcal.errors import DidNotConverge, NotIdentifiable

@@ -10,7 +10,7 @@ from thinned import thinned
 
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import FittedLegs, Start
+from legcal.calibration.joint_fit.variables import FittedLegs, Start
 from legcal.machine import Leg, moved_legs
 
 MACHINES = ("3-rps", "tricept", "hexapod-rod", "3-rpr")

@@ -9,15 +9,15 @@ from machine_session import SHIPPED, MachineSession, machine_session
 
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.session import Session
+from legcal.calibration.joint_fit.choices import Choices, Prior
 from legcal.calibration.joint_fit.determinacy import open_directions
 from legcal.calibration.joint_fit.fit import bound, refine
-from legcal.calibration.joint_fit.parameters import Choices, Prior
+from legcal.calibration.joint_fit.outline_errors import NoiseModel
 from legcal.calibration.joint_fit.problem import build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, FittedLegs, State, with_values
+from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, FittedLegs, State, with_values
 from legcal.estimation import Frames, information, linearize
-from legcal.estimation.noise import NoiseModel
 from legcal.geometry.types import Array
 from legcal.machine import parametrize, radius_name
 

@@ -22,7 +22,7 @@ from thinned import thinned
 
 from legcal.calibration.joint_fit.fit import refine, refine_from_best
 from legcal.calibration.joint_fit.solution import Solution, joints_of
-from legcal.calibration.joint_fit.state import FittedLegs, RefinementSettings
+from legcal.calibration.joint_fit.variables import FittedLegs, RefinementSettings
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array

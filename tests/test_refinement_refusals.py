@@ -18,8 +18,12 @@ from hexapod_session import (
 )
 
 from legcal.calibration.joint_fit.fit import refine, refine_from_best
-from legcal.calibration.joint_fit.poses import cameras_from_hints, platform_poses, start_from
-from legcal.calibration.joint_fit.state import fitted_legs
+from legcal.calibration.joint_fit.variables import (
+    cameras_from_hints,
+    fitted_legs,
+    platform_poses,
+    start_from,
+)
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable

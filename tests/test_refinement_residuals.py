@@ -15,7 +15,7 @@ from legcal.calibration.joint_fit.factors import (
     outline_residual,
 )
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.state import Start, State
+from legcal.calibration.joint_fit.variables import Start, State
 from legcal.estimation import Huber, PseudoHuber, linearize
 from legcal.geometry import cayley, turned
 from legcal.geometry.types import Array

@@ -16,10 +16,10 @@ from dense_fit import (
 from machine_session import LENS, PINHOLE, MachineSession, machine_session
 from thinned import thinned
 
-from legcal.calibration.joint_fit.edge_biases import N_KINDS, EdgeBiases
-from legcal.calibration.joint_fit.parameters import Choices, Prior
+from legcal.calibration.joint_fit.choices import Choices, Prior
+from legcal.calibration.joint_fit.outline_errors import N_KINDS, EdgeBiases
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.state import State
+from legcal.calibration.joint_fit.variables import State
 from legcal.data.axes import axes_from_outlines
 from legcal.estimation import Frames, PseudoHuber, Rows, linearize, normal_equations, solver
 from legcal.geometry.types import Array
@@ -226,7 +226,7 @@ def _heights(problem: FitProblem, begin: State) -> Array:
     """Return what the violations of a planar machine are where its platform has its height."""
     heights = np.zeros_like(violations(problem, begin))
     if not problem.legs.spatial:
-        heights[-3 * problem.n_own :][2::3] = begin.platform_pose.t[:, 2]
+        heights[-3 * problem.n_elements :][2::3] = begin.platform_pose.t[:, 2]
     return heights
 
 
@@ -235,7 +235,7 @@ def test_poses_go_back_to_their_constraints_the_shortest_way() -> None:
     problem = build_fit(session.legs, session.measurements, session.outlines)
     state = problem.begin(session.truth)
     x = np.zeros(problem.size)
-    x[problem.n_kept :] = 1e-6 * np.random.default_rng(0).normal(size=6 * problem.n_own)
+    x[problem.n_kept :] = 1e-6 * np.random.default_rng(0).normal(size=6 * problem.n_elements)
     back = problem.projected(problem.moved(state, x))
     done = x[problem.n_kept :].reshape(-1, 6)
     there, here = back.platform_pose, state.platform_pose

@@ -13,12 +13,12 @@ from hexapod_session import (
 )
 from thinned import thinned
 
-from legcal.calibration.joint_fit.edge_biases import possible_biases
+from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.observations import observed_outlines
+from legcal.calibration.joint_fit.outline_errors import possible_biases
 from legcal.calibration.joint_fit.rounds import NO_CHANGES, Changes, unsettled
 from legcal.calibration.joint_fit.solution import Solution
-from legcal.calibration.joint_fit.state import DEFAULT_SETTINGS, RefinementSettings
+from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.errors import DidNotConverge
 
 

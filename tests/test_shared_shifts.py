@@ -16,21 +16,21 @@ from hexapod_session import (
     simulate,
 )
 
-from legcal.calibration.joint_fit.edge_biases import (
+from legcal.calibration.joint_fit.factors import ObservedOutlines, observed_outlines
+from legcal.calibration.joint_fit.fit import refine
+from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
     N_KINDS,
     EdgeBiases,
+    NoiseModel,
     estimated_biases,
     possible_biases,
 )
-from legcal.calibration.joint_fit.fit import refine
-from legcal.calibration.joint_fit.observations import ObservedOutlines, observed_outlines
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import with_edge_biases
-from legcal.calibration.joint_fit.state import State
+from legcal.calibration.joint_fit.variables import State
 from legcal.data.outlines import Outlines
 from legcal.estimation import linearize, scores_of_block
-from legcal.estimation.noise import NoiseModel
 from legcal.estimation.variances import Effects, estimate_variances
 from legcal.geometry.types import Array
 

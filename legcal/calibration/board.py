@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit import SeenBoard, Solution
+from legcal.calibration.joint_fit import BoardCorners, Solution
 from legcal.calibration.session import Session
 from legcal.data import (
     CORNERS_NAME,
@@ -41,9 +41,9 @@ class BoardViews:
     T_board_camera: tuple[RigidTransform | None, ...]  # None where a view does not show it
     view_of_row: tuple[str, ...]
 
-    def seen(self, rows: IntArray) -> SeenBoard:
+    def seen(self, rows: IntArray) -> BoardCorners:
         """Return the board in some of the images."""
-        return SeenBoard(self.board, self.corners.at(rows))
+        return BoardCorners(self.board, self.corners.at(rows))
 
     def judged(self, solution: Solution) -> Corners:
         """Return the corners of all images, those that a fit left out rejected."""

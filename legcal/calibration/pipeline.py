@@ -28,7 +28,7 @@ from legcal.calibration.four_steps import Steps, four_steps, starts
 from legcal.calibration.identify.judge import check_identifiable
 from legcal.calibration.joint_fit import (
     DEFAULT_SETTINGS,
-    ROUNDS,
+    MAX_GAMMA_ROUNDS,
     Choices,
     EstimatedGamma,
     HeldOut,
@@ -318,7 +318,7 @@ def _measure_again(
     again = replace(again, machine=_with_fitted_radii(again.machine, estimate.solution))
     given = known_gammas(again.keep, again.measurements)
     gammas: list[tuple[EstimatedGamma, ...]] = []
-    for _ in range(1 + ROUNDS):
+    for _ in range(1 + MAX_GAMMA_ROUNDS):
         placement = _fitted_placement(session, estimate.solution, seen)
         outlines = measure_photographs(again, placement, session.progress)
         estimate = _fit(estimate.part, outlines, placement, board, options)

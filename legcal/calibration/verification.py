@@ -24,6 +24,7 @@ from legcal.calibration.documents import (
 )
 from legcal.calibration.joint_fit import (
     Choices,
+    NoiseModel,
     PlatformPair,
     Prior,
     Solution,
@@ -34,7 +35,7 @@ from legcal.calibration.result_folder import EarlierResult, read_result
 from legcal.calibration.session import Options, start_session
 from legcal.data import Dataset, load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
-from legcal.estimation import Frames, NoiseModel
+from legcal.estimation import Frames
 from legcal.geometry import Array
 from legcal.machine import (
     Machine,

@@ -1,19 +1,19 @@
 """One estimation problem for everything: variables, factors, one solver, information.
 
-Whatever legcal finds from measurements is a :class:`Problem`, and knows here neither images nor
-robots (section 4 of the paper is one client, :mod:`legcal.calibration.joint_fit`):
+Every estimate from measurements is the minimum of a :class:`Problem`; this room knows neither
+images nor robots (section 4 of the paper is one client, :mod:`legcal.calibration.joint_fit`):
 
 **State** A dataclass of the client with one field for each block of variables, of any type.
 
 **Variables** A block: elements of one manifold. ``unknown`` (n, d) says which unknown moves each of
-the d numbers of each element: -1 is fixed (a gauge, or what somebody fixed), equal numbers move
+the d numbers of each element: -1 is fixed (gauge, or by choice), equal numbers move
 together (views that share a lens). ``retract`` applies changes: :func:`add`, ``Frames.moved``, or
-the client's own. ``labels`` and ``units`` name unknowns that people read, ``coordinates`` and
-``jacobian`` say what they read where that is not x itself, ``prior`` is what is known of these.
+the client's own. ``labels`` and ``units`` name unknowns that are reported, ``coordinates`` and
+``jacobian`` map x to reported values where these differ, ``prior`` is a Gaussian on them.
 
 **Factor** Measurements of one kind: ``rows(state)`` returns residuals of all of them at once with
-their derivatives by the blocks that ``touches`` names, in that order, and by the eliminated element
-``own``; ``whitening`` makes them unit Gaussians, ``robust`` puts the loss on them.
+their derivatives by the blocks that ``touches`` names, in that order, and by the eliminated
+``element``; ``whitening`` makes them unit Gaussians, ``robust`` puts the loss on them.
 
 **Problem** Kept variables, one block of eliminated ones (platform poses, boards in images: each
 measurement touches one of them at most, and the Schur complement removes them), factors, an exact
@@ -30,11 +30,10 @@ A client writes a state, a function of rows for each kind of measurement (CasADi
 of finite differences checks them all), and the blocks. At predicted observations the same
 :func:`information` is the Cramer-Rao bound and says what is identifiable; it is additive over
 eliminated elements, so that candidate images are low-rank updates of it
-(``NormalEquations.contributions``). What a mistake would do (:func:`response`), what residuals say
-of columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and what a fit
-predicts of other measurements (:func:`explained_share`) are read off the same matrix. Noise whose
-size is not known is estimated by restricted maximum likelihood (:class:`NoiseModel`,
-:class:`Effects`).
+(``NormalEquations.contributions``). The response to errors of what is fixed (:func:`response`),
+score tests of columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and the
+covariance of predictions (:func:`explained_share`) come from the same matrix. Variances of random
+effects are estimated by restricted maximum likelihood (:class:`Effects`).
 """
 
 import lazy_loader

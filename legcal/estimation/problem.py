@@ -13,15 +13,45 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.spatial.transform import RigidTransform
 
-from legcal.estimation.manifold import add
-from legcal.geometry import Array, IntArray
+from legcal.geometry import Array, IntArray, components, motions_of, turned
 
 S = TypeVar("S")  # the state: a dataclass with one field for each block of variables
+
+
+def add(value: Array, change: Array) -> Array:
+    """Return numbers after a change, whatever shape their elements have."""
+    return np.asarray(value + change.reshape(value.shape))
+
+
+class Frames(NamedTuple):
+    """Rigid motions T_to_from as rotations and translations.
+
+    They move by six numbers each: a rotation vector from the left (Cayley's map) [rad], then a
+    displacement [m].
+    """
+
+    R: Array  # (n, 3, 3)
+    t: Array  # (n, 3)
+
+    @classmethod
+    def of(cls, motions: Sequence[RigidTransform]) -> Frames:
+        """Return the frames of rigid motions."""
+        return cls(*components(motions))
+
+    @property
+    def motions(self) -> tuple[RigidTransform, ...]:
+        """The same as rigid motions."""
+        return motions_of(self.R, self.t)
+
+    def moved(self, change: Array) -> Frames:
+        """Return frames after changes (n, 6)."""
+        return Frames(turned(self.R, change[:, :3]), self.t + change[:, 3:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +70,7 @@ class GaussianPrior:
         )
 
 
+_MAX_KEY = 2**40  # of numbers of groups: above, they are counted anew
 NO_PRIOR = GaussianPrior(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0))
 
 
@@ -60,7 +91,7 @@ class Variables:
     coordinates: Callable[[Any], Array] | None = None  # value -> (n_unknowns,)
     jacobian: Callable[[Any], Array] | None = None  # value -> (n_unknowns, n_unknowns)
     prior: GaussianPrior = NO_PRIOR
-    largest: tuple[float, ...] = ()  # (d,) change of each number in one step, at most
+    max_step: tuple[float, ...] = ()  # (d,) of each number
 
     @cached_property
     def n_unknowns(self) -> int:
@@ -89,7 +120,7 @@ def fixed_at_start(n: int, d: int) -> IntArray:
 class Rows:
     """Residuals r (n, q) of n measurements, and slopes (n, q, l) by what they depend on directly.
 
-    ``chain`` turns slopes into derivatives by kept variables and by eliminated ones; it is asked
+    ``chain`` turns slopes into derivatives by kept variables and by eliminated ones; it is called
     only where these are needed.
     """
 
@@ -98,9 +129,9 @@ class Rows:
     chain: Callable[[Array], tuple[Array, Array]]
 
     @classmethod
-    def of(cls, r: Array, J: Array, J_own: Array | None = None) -> Rows:
+    def of(cls, r: Array, J: Array, J_element: Array | None = None) -> Rows:
         """Return rows whose derivatives by kept and by eliminated variables are known."""
-        own, m = np.zeros((*r.shape, 0)) if J_own is None else J_own, J.shape[-1]
+        own, m = np.zeros((*r.shape, 0)) if J_element is None else J_element, J.shape[-1]
         return cls(
             r, np.concatenate([J, own], axis=-1), lambda slope: (slope[..., :m], slope[..., m:])
         )
@@ -115,7 +146,7 @@ class Rows:
         return self._derivatives[0]
 
     @property
-    def J_own(self) -> Array:
+    def J_element(self) -> Array:
         """Derivatives by the eliminated element of each measurement, (n, q, d)."""
         return self._derivatives[1]
 
@@ -145,7 +176,7 @@ class Factor(Generic[S]):
     touches: tuple[Touch, ...]  # kept variables, in the order of the columns of J
     n: int  # measurements
     n_rows: int  # residuals of each
-    own: IntArray | None = None  # (n,) the eliminated element of each; None where there is none
+    element: IntArray | None = None  # (n,) the eliminated element of each; None where there is none
     whitening: Array | float = 1.0  # (n, q, q) T with T C T^T = 1; zero leaves one out
     robust: bool = False  # whether the loss is on it, or plain squares
 
@@ -159,14 +190,14 @@ class Places:
     """Which unknowns the measurements of a factor depend on, and the matrices that sum them up."""
 
     index: IntArray  # (n, m) positions in x; n_kept for what is no unknown
-    own: IntArray | None  # (n,)
+    element: IntArray | None  # (n,)
     n_kept: int
-    n_own: int
+    n_elements: int
     order: IntArray  # (n,) measurements with the same unknowns one after the other: a group
     bounds: tuple[tuple[int, int], ...]  # of each group in that order
     columns: IntArray  # (n_groups, m)
-    to_kept: csr_array | None  # ((n_kept + 1) n_own, n m) sums what couples kept to own
-    to_own: csr_array | None  # (n_own, n)
+    to_kept: csr_array | None  # ((n_kept + 1) n_elements, n m) sums what couples kept to own
+    to_element: csr_array | None  # (n_elements, n)
 
     @property
     def groups(self) -> list[tuple[IntArray, IntArray]]:
@@ -175,29 +206,40 @@ class Places:
         return list(zip(members, self.columns, strict=True))
 
 
-def _places(index: IntArray, own: IntArray | None, n_kept: int, n_own: int) -> Places:
+def _places(
+    touched: Sequence[IntArray],
+    index: IntArray,
+    element: IntArray | None,
+    n_kept: int,
+    n_elements: int,
+) -> Places:
+    """Return the places of measurements, with the elements of blocks that each touches."""
     n, m = index.shape
-    if n:
-        columns, group = np.unique(index, axis=0, return_inverse=True)
-    else:
-        columns, group = index, np.zeros(0, dtype=np.intp)
-    ends = np.cumsum(np.bincount(group.ravel())).tolist()
-    order, bounds = np.argsort(group.ravel(), kind="stable"), tuple(pairwise([0, *ends]))
-    if own is None:
-        return Places(index, own, n_kept, n_own, order, bounds, columns, None, None)
-    row = (index * n_own + own[:, None]).ravel()
+    group = np.zeros(n, dtype=np.intp)
+    for column in (c for part in touched for c in part.reshape(n, part.size // max(n, 1)).T):
+        group = group * (int(column.max(initial=0)) + 1) + column
+        if group.max(initial=0) > _MAX_KEY:
+            group = np.unique(group, return_inverse=True)[1].ravel()
+    _, first, group = np.unique(group, return_index=True, return_inverse=True)
+    columns, group = index[first], group.ravel()
+    ends = np.cumsum(np.bincount(group)).tolist()
+    order, bounds = np.argsort(group, kind="stable"), tuple(pairwise([0, *ends]))
+    if element is None:
+        return Places(index, element, n_kept, n_elements, order, bounds, columns, None, None)
+    row = (index * n_elements + element[:, None]).ravel()
     ones = np.ones(n * m)
-    to_kept = csr_array((ones, (row, np.arange(n * m))), shape=((n_kept + 1) * n_own, n * m))
-    to_own = csr_array((ones[:n], (own, np.arange(n))), shape=(n_own, n))
-    return Places(index, own, n_kept, n_own, order, bounds, columns, to_kept, to_own)
+    shape = (n_kept + 1) * n_elements, n * m
+    to_kept = csr_array((ones, (row, np.arange(n * m))), shape=shape)
+    to_element = csr_array((ones[:n], (element, np.arange(n))), shape=(n_elements, n))
+    return Places(index, element, n_kept, n_elements, order, bounds, columns, to_kept, to_element)
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
     """The motions of eliminated elements that exact constraints leave."""
 
-    Z: Array  # (n_own, d, f) basis with the kept variables at rest; zero columns where it has fewer
-    Q: Array  # (n_kept, n_own, d) motion with each kept unknown
+    Z: Array  # (n_elements, d, f) basis with kept variables fixed, zero columns where fewer
+    Q: Array  # (n_kept, n_elements, d) motion with each kept unknown
 
 
 class Constraint(Protocol[S]):
@@ -240,7 +282,7 @@ class Problem(Generic[S]):
 
     def _laid_out(self, old: _Layout | None) -> _Layout:
         """Return the layout, with what is left of an old one."""
-        touches = tuple((factor.touches, factor.own) for factor in self.factors)
+        touches = tuple((factor.touches, factor.element) for factor in self.factors)
         known: dict[int, Places] = {}
         if (
             old is not None
@@ -258,7 +300,7 @@ class Problem(Generic[S]):
                 block.name: np.where(block.unknown < 0, n_kept, start + block.unknown)
                 for block, start in zip(self.variables, first, strict=False)
             }
-        n_own = 0 if self.eliminated is None else len(self.eliminated.unknown)
+        n_elements = 0 if self.eliminated is None else len(self.eliminated.unknown)
         places = []
         for factor in self.factors:
             if id(factor.touches) in known:
@@ -267,7 +309,8 @@ class Problem(Generic[S]):
             parts = [place[name][element][..., d] for name, element, d in factor.touches]
             columns = [part.reshape(factor.n, int(np.prod(part.shape[1:]))) for part in parts]
             index = np.concatenate([np.zeros((factor.n, 0), dtype=np.intp), *columns], axis=1)
-            places.append(_places(index, factor.own, n_kept, n_own))
+            touched = [element for _, element, _ in factor.touches]
+            places.append(_places(touched, index, factor.element, n_kept, n_elements))
         return _Layout(self.variables, self.eliminated, touches, place, n_kept, tuple(places))
 
     @property
@@ -290,19 +333,19 @@ class Problem(Generic[S]):
         return self._laid.n_kept
 
     @property
-    def n_own(self) -> int:
+    def n_elements(self) -> int:
         """Number of eliminated elements."""
         return 0 if self.eliminated is None else len(self.eliminated.unknown)
 
     @property
-    def d_own(self) -> int:
+    def d_element(self) -> int:
         """Number of unknowns of each."""
         return 0 if self.eliminated is None else self.eliminated.unknown.shape[1]
 
     @property
     def size(self) -> int:
         """Number of all unknowns."""
-        return self.n_kept + self.n_own * self.d_own
+        return self.n_kept + self.n_elements * self.d_element
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -368,7 +411,7 @@ class Problem(Generic[S]):
             if block.n_unknowns
         }
         if self.eliminated is not None:
-            own = x[self.n_kept :].reshape(-1, self.d_own)
+            own = x[self.n_kept :].reshape(-1, self.d_element)
             block = self.eliminated
             values[block.name] = block.retract(getattr(state, block.name), own)
         return replace(state, **values)  # type: ignore[type-var]
@@ -381,12 +424,12 @@ class Problem(Generic[S]):
         """Return by which factor a step exceeds the largest changes that blocks allow."""
         change, parts = np.append(x[: self.n_kept], 0.0), [0.0]
         for block in self.variables:
-            if block.largest and block.n_unknowns:
-                by = np.abs(change[self.place[block.name]]) / np.array(block.largest)
+            if block.max_step and block.n_unknowns:
+                by = np.abs(change[self.place[block.name]]) / np.array(block.max_step)
                 parts.append(float(by.max(initial=0.0)))
-        if self.eliminated is not None and self.eliminated.largest:
-            own = np.abs(x[self.n_kept :].reshape(-1, self.d_own))
-            parts.append(float((own / np.array(self.eliminated.largest)).max(initial=0.0)))
+        if self.eliminated is not None and self.eliminated.max_step:
+            moved = np.abs(x[self.n_kept :].reshape(-1, self.d_element))
+            parts.append(float((moved / np.array(self.eliminated.max_step)).max(initial=0.0)))
         return max(parts)
 
     def coordinates(self, state: S) -> Array:

@@ -30,21 +30,21 @@ from legcal.estimation.problem import (
 from legcal.geometry import Array, BoolArray, IntArray
 
 _FIRST_DAMPING = 1e-6
-_LEAST_DAMPING = 1e-10
-_MOST_DAMPING = 1e8
-_SMALLEST_FALL = 1e-12  # of the cost, in squared standard deviations: the minimum is reached
-_ROUNDING = 1e-13  # of the cost: below, its fall is not seen
-_MEDIANS = 5.0  # width of the loss while most measurements are beyond its final one
-_SLOW = 0.5  # of the cost: if the next step lowers it by less, this loss has done its work
-_NARROWING = 0.8  # of the width: smaller changes of the median do not change the loss
-_DONE = 0.01  # of the cost: where a step lowers it by less, the loss is narrowed in any case
-_HALF = 0.5  # of the width, then
-_OWN_STEPS = 3
-_SAFER = 3.0  # times a damping that failed is tried after one that did not
-_FORGOTTEN = 0.3  # of a damping that failed, every step
-_PATIENCE = 30  # steps before a minimum may be near enough
-_RANGE = 1e-13  # eigenvalues below this part of the largest are rounding
-_SAFE = 1e-9  # a scaled block with a pivot below may be singular
+_MIN_DAMPING = 1e-10
+_MAX_DAMPING = 1e8
+_COST_TOLERANCE = 1e-12  # predicted fall of the cost at a minimum, in squared sigmas
+_ROUNDING = 1e-13  # of the cost
+_WIDTH_IN_MEDIANS = 5.0  # width of the loss while most measurements are beyond its final one
+_SLOW_FALL = 0.5  # of the cost: below, the loss is narrowed as far as the median allows
+_MIN_NARROWING = 0.8  # of the width: smaller changes of the median do not change the loss
+_CONVERGED_FALL = 0.01  # of the cost: below, the loss is narrowed in any case
+_NARROWED = 0.5  # of the width, then
+_MAX_ELEMENT_STEPS = 3
+_DAMPING_MARGIN = 3.0  # times a damping that failed is tried after one that did not
+_DAMPING_DECAY = 0.3  # of a damping that failed, every step
+_MIN_ITERATIONS = 30  # before the relative tolerance counts
+_RANK_TOLERANCE = 1e-13  # eigenvalues below this part of the largest are rounding
+_MIN_PIVOT = 1e-9  # a scaled block with a pivot below may be singular
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ def minimise(
     loss: Loss = LEAST_SQUARES,
     *,
     max_iterations: int = 200,
-    near_enough: float = 0.0,
+    relative_tolerance: float = 0.0,
     must_converge: bool = True,
 ) -> Minimum[S]:
     """Minimise the robust cost from a state.
@@ -76,17 +76,16 @@ def minimise(
         What to minimise, and where to start.
     max_iterations : int
         Steps to try.
-    near_enough : float
-        Fall of the cost, as a part of it, for which no more than some steps are tried: where
-        measurements that are wrong altogether bend the cost, the last steps are many and lead to
-        where these pull.
+    relative_tolerance : float
+        Relative fall of the cost at which to stop after some steps: where outliers bend the cost,
+        the last steps are many and follow these.
     must_converge : bool
         Whether to refuse where the steps do not come to an end; else the best state is returned.
 
     Raises
     ------
     DidNotConverge
-        If no step lowers the cost although it is not at rest, or the steps do not come to an end.
+        If no step lowers the cost before it has converged, or after *max_iterations* steps.
     """
     state = problem.projected(state)
     linear = linearize(problem, state)
@@ -94,38 +93,38 @@ def minimise(
     damping, failed, fall_before = _FIRST_DAMPING, 0.0, np.inf
     for iteration in range(1, max_iterations + 1):
         cost = robust_cost(problem, linear, wide)
-        step, promised = normal_equations(problem, state, linear, wide).step(damping)
-        at_rest = promised < _SMALLEST_FALL + _ROUNDING * cost
+        step, predicted = normal_equations(problem, state, linear, wide).step(damping)
+        converged = predicted < _COST_TOLERANCE + _ROUNDING * cost
         trial = _tried(problem, state, step)
-        if trial is not None and not at_rest and not robust_cost(problem, trial[1], wide) < cost:
+        if trial is not None and not converged and not robust_cost(problem, trial[1], wide) < cost:
             trial = _followed(problem, *trial, wide, cost)
         fall = -np.inf if trial is None else cost - robust_cost(problem, trial[1], wide)
-        if trial is not None and np.isfinite(fall) and (fall > 0.0 or at_rest):
+        if trial is not None and np.isfinite(fall) and (fall > 0.0 or converged):
             state, linear = trial
-            damping = max(_next(damping, fall / max(promised, 1e-300)), _SAFER * failed)
-            failed *= _FORGOTTEN
-            rate = promised / fall_before if np.isfinite(fall_before) else 1.0
-            expected = promised * min(rate, 1.0)
+            damping = max(_next(damping, fall / max(predicted, 1e-300)), _DAMPING_MARGIN * failed)
+            failed *= _DAMPING_DECAY
+            rate = predicted / fall_before if np.isfinite(fall_before) else 1.0
+            expected = predicted * min(rate, 1.0)
             narrower = wide
-            if expected < _SLOW * (cost - fall):
+            if expected < _SLOW_FALL * (cost - fall):
                 narrower = _widened(problem, linear, loss, wide.width)
-            if narrower.width == wide.width and expected < _DONE * (cost - fall):
-                narrower = _of_width(loss, max(loss.width, _HALF * wide.width))
+            if narrower.width == wide.width and expected < _CONVERGED_FALL * (cost - fall):
+                narrower = _of_width(loss, max(loss.width, _NARROWED * wide.width))
             same = narrower.width == wide.width
-            smallest = near_enough * (cost - fall) if iteration > _PATIENCE else 0.0
-            if same and (at_rest or expected < max(smallest, _SMALLEST_FALL)):
+            smallest = relative_tolerance * (cost - fall) if iteration > _MIN_ITERATIONS else 0.0
+            if same and (converged or expected < max(smallest, _COST_TOLERANCE)):
                 return Minimum(state, linear, robust_cost(problem, linear, wide), iteration)
-            fall_before = promised if same else np.inf
+            fall_before = predicted if same else np.inf
             wide = narrower
             continue
         failed, damping = damping, 10.0 * damping
         fall_before = np.inf
-        if damping > _MOST_DAMPING:
+        if damping > _MAX_DAMPING:
             break
     if not must_converge:
         return Minimum(state, linear, robust_cost(problem, linear, wide), iteration)
     raise DidNotConverge(
-        f"The {problem.name} did not converge: found a cost that still falls by {promised:.2g} a "
+        f"The {problem.name} did not converge: found a cost that still falls by {predicted:.2g} a "
         f"step after {iteration} steps, needed a minimum; {problem.remedy}."
     )
 
@@ -156,15 +155,15 @@ def _widened(problem: Problem[S], linear: Linearization, loss: Loss, before: flo
             norms = norms[norms > 0.0]
             medians += [float(np.sqrt(np.median(norms)))] if len(norms) else []
     median = max(medians)  # some kinds agree with each other before anything else does
-    wanted = loss.width if median <= loss.width else _MEDIANS * median
-    narrows = wanted == loss.width or wanted < _NARROWING * before
+    wanted = loss.width if median <= loss.width else _WIDTH_IN_MEDIANS * median
+    narrows = wanted == loss.width or wanted < _MIN_NARROWING * before
     return _of_width(loss, wanted if narrows else before)
 
 
 def _next(damping: float, gain: float) -> float:
-    """Return the damping after a step that gave that part of what it promised."""
+    """Return the damping after a step that gave that part of what it predicted."""
     if gain > 0.75:
-        return max(0.1 * damping, _LEAST_DAMPING)
+        return max(0.1 * damping, _MIN_DAMPING)
     return damping if gain > 0.25 else 4.0 * damping
 
 
@@ -183,16 +182,16 @@ def _tried(problem: Problem[S], state: S, step: Array) -> tuple[S, Linearization
 def _followed(
     problem: Problem[S], state: S, linear: Linearization, loss: Loss, cost: float
 ) -> tuple[S, Linearization] | None:
-    """Return where eliminated elements come to rest after a step that has not lowered the cost.
+    """Return the state after more steps of eliminated elements alone, where a step failed.
 
     Some factors are nearly exact, and curved: a long straight step leaves them, and the elements
     bring them back where the rest of the step was right.
     """
     there: tuple[S, Linearization] | None = (state, linear)
-    for _ in range(_OWN_STEPS if problem.eliminated is not None else 0):
+    for _ in range(_MAX_ELEMENT_STEPS if problem.eliminated is not None else 0):
         if there is None or not np.isfinite(robust_cost(problem, there[1], loss)):
             return None
-        step = normal_equations(problem, *there, loss).own_step()
+        step = normal_equations(problem, *there, loss).element_step()
         there = _tried(problem, there[0], step)
         if there is not None and robust_cost(problem, there[1], loss) < cost:
             return there
@@ -204,26 +203,26 @@ class NormalEquations:
     """The normal equations of a problem at a state."""
 
     U: Array  # (n_kept, n_kept)
-    W: Array  # (n_kept, n_own, f)
-    V: Array  # (n_own, f, f)
+    W: Array  # (n_kept, n_elements, f)
+    V: Array  # (n_elements, f, f)
     g_kept: Array  # (n_kept,) gradient of the cost
-    g_own: Array  # (n_own, f)
+    g_elements: Array  # (n_elements, f)
     tangent: Tangent | None  # None where eliminated elements are free
     held: Array  # (w, n_kept) directions that stay
 
     @cached_property
     def V_inverse(self) -> Array:
-        """The inverses of the eliminated blocks on their range, (n_own, f, f)."""
+        """The inverses of the eliminated blocks on their range, (n_elements, f, f)."""
         return inverse_on_range(self.V)
 
     @property
     def follow(self) -> Array:
-        """How elements follow the kept unknowns inside the constraints, (n_own, f, n_kept)."""
+        """How elements follow the kept unknowns inside the constraints, (n_elements, f, n_kept)."""
         return np.asarray(-self.V_inverse @ np.moveaxis(self.W, 0, 2))
 
-    def inside(self, J_own: Array, own: IntArray) -> Array:
+    def inside(self, J_element: Array, element: IntArray) -> Array:
         """Return derivatives (n, q, f) inside the constraints from those by elements (n, q, d)."""
-        return J_own if self.tangent is None else J_own @ self.tangent.Z[own]
+        return J_element if self.tangent is None else J_element @ self.tangent.Z[element]
 
     def reduced(self) -> Array:
         """Return the normal matrix (n_kept, n_kept) of the kept unknowns, the others free."""
@@ -231,7 +230,7 @@ class NormalEquations:
         return np.asarray(0.5 * (R + R.T))
 
     def contributions(self) -> Array:
-        """Return what each element takes off U, (n_own, n_kept, n_kept): W V^-1 W^T of each.
+        """Return what each element takes off U, (n_elements, n_kept, n_kept): W V^-1 W^T of each.
 
         With the factors of an element alone, U less its contribution is what it adds to the
         information of the kept unknowns, of rank no more than its residuals.
@@ -248,7 +247,7 @@ class NormalEquations:
         return np.asarray(N @ inverse_on_range(N.T @ R @ N) @ N.T)
 
     def step(self, damping: float) -> tuple[Array, float]:
-        """Return a Levenberg-Marquardt step (size,) and the fall of the cost that it promises.
+        """Return a Levenberg-Marquardt step (size,) and the predicted fall of the cost.
 
         *damping* is the part of the diagonal that is added to it.
         """
@@ -257,33 +256,33 @@ class NormalEquations:
         WV = _by_element(self.W, V_inverse)
         U = _damped(self.U, damping)
         R = U - _coupled(WV, self.W)
-        right = -self.g_kept + _flat(WV) @ self.g_own.ravel()
+        right = -self.g_kept + _flat(WV) @ self.g_elements.ravel()
         if len(self.held):
             N = null_space(self.held)
             kept = N @ _solve(N.T @ R @ N, N.T @ right)
         else:
             kept = _solve(R, right)
-        pull = self.g_own + (kept @ _flat(self.W)).reshape(self.g_own.shape)
+        pull = self.g_elements + (kept @ _flat(self.W)).reshape(self.g_elements.shape)
         y = -(V_inverse @ pull[..., None])[..., 0]
-        linear = float(self.g_kept @ kept + np.sum(self.g_own * y))
+        linear = float(self.g_kept @ kept + np.sum(self.g_elements * y))
         extra = float(
             np.sum(np.diagonal(U - self.U) * kept**2)
             + np.sum(np.einsum("kpp->kp", V - self.V) * y**2)
         )
         return self._whole(kept, y), 0.5 * (extra - linear)
 
-    def own_step(self) -> Array:
+    def element_step(self) -> Array:
         """Return the step (size,) of the eliminated elements alone."""
-        y = -(self.V_inverse @ self.g_own[..., None])[..., 0]
+        y = -(self.V_inverse @ self.g_elements[..., None])[..., 0]
         return self._whole(np.zeros(len(self.U)), y)
 
     def _whole(self, kept: Array, y: Array) -> Array:
         """Return a step of all unknowns, from one inside the constraints."""
-        own = y
+        elements = y
         if self.tangent is not None:
-            own = np.einsum("kpf,kf->kp", self.tangent.Z, y)
-            own = own + np.einsum("akp,a->kp", self.tangent.Q, kept)
-        return np.concatenate([kept, own.ravel()])
+            elements = np.einsum("kpf,kf->kp", self.tangent.Z, y)
+            elements = elements + np.einsum("akp,a->kp", self.tangent.Q, kept)
+        return np.concatenate([kept, elements.ravel()])
 
 
 def normal_equations(
@@ -326,7 +325,7 @@ def _of_rows(
 ) -> NormalEquations:
     """Return normal equations, with motions inside the constraints in place of elements."""
     places = problem.places
-    U, W, V, g_kept, g_own = _sums(
+    U, W, V, g_kept, g_elements = _sums(
         [(places[name], rows) for name, rows in weighted.items()], problem
     )
     U = U + linear.prior_J.T @ linear.prior_J
@@ -338,23 +337,23 @@ def _of_rows(
         Z, Q = motion.Z, motion.Q
         coupled, QV = _coupled(W, Q), _by_element(Q, V)
         U = U + coupled + coupled.T + _coupled(Q, QV)
-        g_kept = g_kept + _flat(Q) @ g_own.ravel()
+        g_kept = g_kept + _flat(Q) @ g_elements.ravel()
         W = _by_element(W + QV, Z)
         V = np.swapaxes(Z, 1, 2) @ V @ Z
-        g_own = np.einsum("kpf,kp->kf", Z, g_own)
+        g_elements = np.einsum("kpf,kp->kf", Z, g_elements)
     held = np.zeros((len(problem.held), problem.n_kept))
     held[:, : problem.held.shape[1]] = problem.held
-    return NormalEquations(U, W, V, g_kept, g_own, motion, held)
+    return NormalEquations(U, W, V, g_kept, g_elements, motion, held)
 
 
 def _sums(
     kinds: list[tuple[Places, Rows]], problem: Problem[S]
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the blocks U, W, V of J^T J and both parts of J^T r, all measurements added up."""
-    n_kept, n_own, d = problem.n_kept, problem.n_own, problem.d_own
+    n_kept, n_elements, d = problem.n_kept, problem.n_elements, problem.d_element
     U, g_kept = np.zeros((n_kept + 1, n_kept + 1)), np.zeros(n_kept + 1)
-    W = np.zeros(((n_kept + 1) * n_own, d))
-    V, g_own = np.zeros((n_own, d * d)), np.zeros((n_own, d))
+    W = np.zeros(((n_kept + 1) * n_elements, d))
+    V, g_elements = np.zeros((n_elements, d * d)), np.zeros((n_elements, d))
     for where, rows in kinds:
         n, q, m = rows.J.shape
         if n == 0:
@@ -367,13 +366,13 @@ def _sums(
             products[group] = r[of_group] @ J[of_group]
         np.add.at(U, (where.columns[:, :, None], where.columns[:, None, :]), squares)
         np.add.at(g_kept, where.columns, products)
-        if where.to_kept is not None and where.to_own is not None:
-            J_own = rows.J_own
-            W += where.to_kept @ (np.swapaxes(rows.J, 1, 2) @ J_own).reshape(n * m, d)
-            V += where.to_own @ (np.swapaxes(J_own, 1, 2) @ J_own).reshape(n, d * d)
-            g_own += where.to_own @ np.einsum("nqi,nq->ni", J_own, rows.r)
-    blocks = W.reshape(n_kept + 1, n_own, d)[:n_kept], V.reshape(n_own, d, d)
-    return U[:n_kept, :n_kept], *blocks, g_kept[:n_kept], g_own
+        if where.to_kept is not None and where.to_element is not None:
+            J_element = rows.J_element
+            W += where.to_kept @ (np.swapaxes(rows.J, 1, 2) @ J_element).reshape(n * m, d)
+            V += where.to_element @ (np.swapaxes(J_element, 1, 2) @ J_element).reshape(n, d * d)
+            g_elements += where.to_element @ np.einsum("nqi,nq->ni", J_element, rows.r)
+    blocks = W.reshape(n_kept + 1, n_elements, d)[:n_kept], V.reshape(n_elements, d, d)
+    return U[:n_kept, :n_kept], *blocks, g_kept[:n_kept], g_elements
 
 
 def inverse_on_range(S: Array) -> Array:
@@ -387,22 +386,22 @@ def inverse_on_range(S: Array) -> Array:
     scale = _scale(flat)
     scaled = scale[:, :, None] * flat * scale[:, None, :]
     inverse = np.empty_like(scaled)
-    safe = _is_safe(scaled)
+    safe = _is_regular(scaled)
     inverse[safe] = np.linalg.inv(scaled[safe])
     value, vector = np.linalg.eigh(scaled[~safe])
-    kept = value > _RANGE * value[..., -1:]
+    kept = value > _RANK_TOLERANCE * value[..., -1:]
     reciprocal = np.where(kept, 1.0, 0.0) / np.where(kept, value, 1.0)
     inverse[~safe] = (vector * reciprocal[..., None, :]) @ np.swapaxes(vector, -1, -2)
     return np.asarray((scale[:, :, None] * inverse * scale[:, None, :]).reshape(S.shape))
 
 
-def _is_safe(scaled: Array) -> BoolArray:
+def _is_regular(scaled: Array) -> BoolArray:
     """Say which matrices of unit diagonal are far from singular."""
     try:
         L = np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:
         return np.zeros(len(scaled), dtype=np.bool_)
-    return np.asarray(np.einsum("kii->ki", L).min(axis=1, initial=1.0) ** 2 > _SAFE)
+    return np.asarray(np.einsum("kii->ki", L).min(axis=1, initial=1.0) ** 2 > _MIN_PIVOT)
 
 
 def _scale(S: Array) -> Array:
@@ -412,17 +411,17 @@ def _scale(S: Array) -> Array:
 
 
 def _flat(W: Array) -> Array:
-    """Return what couples kept to eliminated unknowns as one matrix (n_kept, n_own f)."""
+    """Return what couples kept to eliminated unknowns as one matrix (n_kept, n_elements f)."""
     return W.reshape(len(W), W.shape[1] * W.shape[2])
 
 
 def _coupled(left: Array, right: Array) -> Array:
-    """Return the sum over elements of left right^T, both (n_kept, n_own, f)."""
+    """Return the sum over elements of left right^T, both (n_kept, n_elements, f)."""
     return np.asarray(_flat(left) @ _flat(right).T)
 
 
 def _by_element(W: Array, blocks: Array) -> Array:
-    """Return W (n_kept, n_own, f) times the block (n_own, f, h) of each element."""
+    """Return W (n_kept, n_elements, f) times the block (n_elements, f, h) of each element."""
     found = np.empty((*W.shape[:2], blocks.shape[2]))
     np.matmul(W.swapaxes(0, 1), blocks, out=found.swapaxes(0, 1))
     return found

@@ -1,6 +1,6 @@
-"""What a problem's data hold: covariances, weak directions, influence and score tests.
+"""Covariances, weak directions, responses and score tests of a problem.
 
-All of it is read off the normal equations at one state, eliminated elements following.
+All of it follows from the normal equations at one state, eliminated elements following.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from legcal.estimation.problem import Linearization, Problem, S, linearize
 from legcal.estimation.solver import NormalEquations, inverse_on_range, normal_equations
 from legcal.geometry import Array, IntArray
 
-_NAMED = 0.3  # components of a direction that are named, relative to the largest
+_MIN_COMPONENT = 0.3  # components of a direction that are named, relative to the largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ def worst_directions(
     for i in range(min(n_directions, len(names))):
         v = vector[:, -1 - i] * np.sign(vector[np.argmax(np.abs(vector[:, -1 - i])), -1 - i])
         order = np.argsort(-np.abs(v), kind="stable")
-        named = [j for j in order if abs(v[j]) >= _NAMED * abs(v[order[0]])][:4]
+        named = [j for j in order if abs(v[j]) >= _MIN_COMPONENT * abs(v[order[0]])][:4]
         sigma = float(np.sqrt(max(variance[-1 - i], 0.0)))
         found.append(WeakDirection(sigma, tuple((names[j], float(v[j])) for j in named)))
     return tuple(found)
@@ -78,11 +78,13 @@ def reduced_jacobian(
     measurement, row = np.arange(n)[:, None, None], np.arange(q)[None, :, None]
     np.add.at(G, (measurement, row, where.index[:, None, :]), rows.J)
     G = G[..., :-1]
-    if where.own is None:
+    if where.element is None:
         return np.asarray(G)
     if normal.tangent is not None:
-        G = G + rows.J_own @ np.moveaxis(normal.tangent.Q, 0, 2)[where.own]
-    return np.asarray(G + normal.inside(rows.J_own, where.own) @ normal.follow[where.own])
+        G = G + rows.J_element @ np.moveaxis(normal.tangent.Q, 0, 2)[where.element]
+    return np.asarray(
+        G + normal.inside(rows.J_element, where.element) @ normal.follow[where.element]
+    )
 
 
 def explained_share(
@@ -94,18 +96,42 @@ def explained_share(
 ) -> Array:
     """Return the covariance (n, q, q) of a factor's predicted whitened residuals.
 
-    The residuals of a right fit have covariance one minus this, those of what it has not seen one
-    plus this. *covariance* is that of the kept unknowns, if not that of these equations.
+    Residuals of fitted measurements have covariance one minus this, those of others one plus this.
+    *covariance* is that of the kept unknowns, if not that of these equations.
     """
     where, rows = problem.places[name], linear[name]
     G = reduced_jacobian(problem, linear, normal, name)
     share = (G @ (normal.kept_covariance() if covariance is None else covariance)) @ np.swapaxes(
         G, -1, -2
     )
-    if where.own is None:
+    if where.element is None:
         return np.asarray(share)
-    J_own = normal.inside(rows.J_own, where.own)
-    return np.asarray(share + J_own @ normal.V_inverse[where.own] @ np.swapaxes(J_own, -1, -2))
+    J_element = normal.inside(rows.J_element, where.element)
+    return np.asarray(
+        share + J_element @ normal.V_inverse[where.element] @ np.swapaxes(J_element, -1, -2)
+    )
+
+
+def residual_changes(
+    problem: Problem[S], linear: Linearization, block: str, error: Array
+) -> dict[str, Array]:
+    """Return how whitened residuals (n, q) of each factor change with an error of a block's values.
+
+    *error* (n, d) is of all numbers of the block, whether they are unknowns or fixed.
+    """
+    changes = {}
+    width = {variables.name: variables.unknown.shape[1] for variables in problem.variables}
+    for factor in problem.factors:
+        J, first = linear[factor.name].J, 0
+        change = np.zeros(J.shape[:2])
+        for name, element, numbers in factor.touches:
+            end = first + len(range(width[name])[numbers]) * int(np.prod(element.shape[1:]))
+            if name == block:
+                by = error[element][..., numbers].reshape(factor.n, end - first)
+                change += np.einsum("nqk,nk->nq", J[..., first:end], by)
+            first = end
+        changes[factor.name] = change
+    return changes
 
 
 def response(
@@ -120,21 +146,21 @@ def response(
     """
     n_changes = next(iter(changes.values())).shape[-1]
     gradient = np.zeros((problem.n_kept + 1, n_changes))
-    own = np.zeros((problem.n_own, problem.d_own, n_changes))
+    elements = np.zeros((problem.n_elements, problem.d_element, n_changes))
     for name, change in changes.items():
         where, rows = problem.places[name], linear[name]
         for member, column in where.groups:
             part = np.einsum("nqm,nqc->mc", rows.J[member], change[member], optimize=True)
             np.add.at(gradient, column, part)
-        if where.to_own is not None:
-            of_own = np.einsum("nqi,nqc->nic", rows.J_own, change)
-            of_own = of_own.reshape(len(change), problem.d_own * n_changes)
-            own += (where.to_own @ of_own).reshape(own.shape)
+        if where.to_element is not None:
+            of_element = np.einsum("nqi,nqc->nic", rows.J_element, change)
+            of_element = of_element.reshape(len(change), problem.d_element * n_changes)
+            elements += (where.to_element @ of_element).reshape(elements.shape)
     kept = gradient[:-1]
     if normal.tangent is not None:
-        kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, own, optimize=True)
-        own = np.swapaxes(normal.tangent.Z, 1, 2) @ own
-    kept = kept - np.einsum("akf,kfc->ac", normal.W, normal.V_inverse @ own, optimize=True)
+        kept = kept + np.einsum("akp,kpc->ac", normal.tangent.Q, elements, optimize=True)
+        elements = np.swapaxes(normal.tangent.Z, 1, 2) @ elements
+    kept = kept - np.einsum("akf,kfc->ac", normal.W, normal.V_inverse @ elements, optimize=True)
     return np.asarray(-normal.kept_covariance() @ kept)
 
 
@@ -144,27 +170,29 @@ def score_test(
     normal: NormalEquations,
     columns: Mapping[str, Array],
 ) -> tuple[Array, Array]:
-    """Return what the fit leaves of v^T r (c,) and of v^T v (c, c): Rao's test of new columns v.
+    """Return v^T M r (c,) and v^T M v (c, c), M projecting onto residuals: Rao's test of columns v.
 
     *columns* has whitened columns (n, q, c) of factors by name; *normal* is of plain squares.
     """
     c = next(iter(columns.values())).shape[-1]
     kept, score, left = np.zeros((problem.n_kept, c)), np.zeros(c), np.zeros((c, c))
-    by_own = np.zeros((*normal.V.shape[:2], c))
+    by_element = np.zeros((*normal.V.shape[:2], c))
     for name, v in columns.items():
         where, rows = problem.places[name], linear[name]
         G = reduced_jacobian(problem, linear, normal, name)
         kept += np.einsum("nqk,nqc->kc", G, v, optimize=True)
         score += np.einsum("nqc,nq->c", v, rows.r)
         left += np.einsum("nqc,nqd->cd", v, v)
-        if where.own is not None:
-            J_own = normal.inside(rows.J_own, where.own)
-            np.add.at(by_own, where.own, np.swapaxes(J_own, 1, 2) @ v)
-    following, covariance = normal.V_inverse @ by_own, normal.kept_covariance()
-    own = (normal.V_inverse @ normal.g_own[..., None])[..., 0]
-    g_kept = normal.g_kept - np.einsum("akp,kp->a", normal.W, own)
-    score = score - kept.T @ covariance @ g_kept - np.einsum("kpc,kp->c", following, normal.g_own)
-    left = left - kept.T @ covariance @ kept - np.einsum("kpc,kpd->cd", following, by_own)
+        if where.element is not None:
+            J_element = normal.inside(rows.J_element, where.element)
+            np.add.at(by_element, where.element, np.swapaxes(J_element, 1, 2) @ v)
+    following, covariance = normal.V_inverse @ by_element, normal.kept_covariance()
+    elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
+    g_kept = normal.g_kept - np.einsum("akp,kp->a", normal.W, elements)
+    score = (
+        score - kept.T @ covariance @ g_kept - np.einsum("kpc,kp->c", following, normal.g_elements)
+    )
+    left = left - kept.T @ covariance @ kept - np.einsum("kpc,kpd->cd", following, by_element)
     return score, left
 
 
@@ -185,14 +213,14 @@ def scores_of_block(problem: Problem[S], state: S, name: str) -> tuple[Array, Ar
     -------
     z : (b,) array
         B^T M r with B the whitened effects, r the residuals without any effect and M the projector
-        onto what the fit leaves of residuals.
+        onto the residuals of the fit.
     K : (b, b) array
         B^T M B: the covariance of z if all effects are zero.
     """
     normal = normal_equations(problem, state, linearize(problem, state))
     R = normal.reduced()
-    own = (normal.V_inverse @ normal.g_own[..., None])[..., 0]
-    g = normal.g_kept - np.einsum("akp,kp->a", normal.W, own)
+    elements = (normal.V_inverse @ normal.g_elements[..., None])[..., 0]
+    g = normal.g_kept - np.einsum("akp,kp->a", normal.W, elements)
     effects, block = problem.where(name), problem.block(name)
     value = block.read(getattr(state, name))
     others = np.setdiff1d(np.arange(len(R)), effects)

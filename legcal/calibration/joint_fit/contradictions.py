@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from legcal.calibration.joint_fit.choices import BOARD_SCALE, Prior
 from legcal.calibration.joint_fit.determinacy import Held, held_at_nominal, open_directions
-from legcal.calibration.joint_fit.parameters import BOARD_SCALE, Prior
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, first_minimum, fit_in_rounds
-from legcal.calibration.joint_fit.state import RefinementSettings, Start, State, intrinsic_of
+from legcal.calibration.joint_fit.variables import RefinementSettings, Start, State, intrinsic_of
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation import (
     NormalEquations,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.state import State, with_values
+from legcal.calibration.joint_fit.variables import State, with_values
 from legcal.errors import NotIdentifiable
 from legcal.estimation import NormalEquations, inverse_on_range, named_information
 from legcal.geometry import Array

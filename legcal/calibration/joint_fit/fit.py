@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.contradictions import (
     blaming_what_was_stated,
     refuse_contradicted_priors,
@@ -21,12 +22,12 @@ from legcal.calibration.joint_fit.determinacy import (
     open_directions,
     refuse_lost,
 )
-from legcal.calibration.joint_fit.observations import SeenBoard
-from legcal.calibration.joint_fit.parameters import NO_CHOICES, Choices
+from legcal.calibration.joint_fit.factors import BoardCorners
+from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the_median
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
 from legcal.calibration.joint_fit.rounds import first_minimum, fit_in_rounds
 from legcal.calibration.joint_fit.solution import Solution, assemble_solution, comparable_cost
-from legcal.calibration.joint_fit.state import (
+from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
     RefinementSettings,
@@ -37,12 +38,10 @@ from legcal.data import LegAxes, Measurements, Outlines
 from legcal.errors import DidNotConverge, LegcalError, NotIdentifiable
 from legcal.estimation import (
     Minimum,
-    NoiseModel,
     PseudoHuber,
     information,
     linearize,
     named_covariance,
-    noise_of_the_median,
 )
 from legcal.geometry import Array
 
@@ -58,7 +57,7 @@ def refine(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
-    board: SeenBoard | None = None,
+    board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
 ) -> Solution:
     """Fit kinematic parameters, cameras, platform poses and radii to all data at once.
@@ -78,7 +77,7 @@ def refine(
     axes : LegAxes, optional
         Measured axes, beside outlines or instead of them (give
         :func:`legcal.data.outlines.no_outlines`). Their covariances are taken as they are.
-    board : SeenBoard, optional
+    board : BoardCorners, optional
         A calibration board that stands still on the base, and its corners in images.
     choices : Choices
         Parameters that are fixed, freed or known beforehand.
@@ -111,7 +110,7 @@ def refine_from_best(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
-    board: SeenBoard | None = None,
+    board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
 ) -> Solution:
     """Fit everything from several starts and keep the lowest cost.

@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.edge_biases import EdgeBiases, possible_biases
-from legcal.calibration.joint_fit.observations import observed_outlines, of_parts, seen_by
+from legcal.calibration.joint_fit.factors import observed_outlines
+from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel, possible_biases
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.state import State
+from legcal.calibration.joint_fit.variables import State
 from legcal.data import Measurements, Outlines
 from legcal.errors import NotIdentifiable, NotVisible
 from legcal.estimation import (
     Frames,
     Linearization,
-    NoiseModel,
     NormalEquations,
     explained_share,
     information,
@@ -58,8 +57,8 @@ class Posterior:
     ) -> Predicted:
         """Return what the fit predicts of other images of the same views, at given poses."""
         fitted, legs, state = self.problem, self.problem.legs, self.state
-        found = of_parts(observed_outlines(outlines, measurements, legs), fitted.outlines.parts)
-        found = seen_by(found, state.cameras)
+        found = observed_outlines(outlines, measurements, legs)
+        found = found.with_parts_first(fitted.outlines.parts).through(state.cameras)
         possible = possible_biases(found, legs.names, fitted.outlines)
         shifts = possible.of_sizes(self.edge_biases.sigma)
         problem = fitted.with_measurements(measurements, found, shifts)
@@ -157,7 +156,7 @@ def _by_outlines(
 
 def _step(normal: NormalEquations) -> tuple[Array, Array]:
     """Return Gauss-Newton's steps (n_poses, 6) and their squared lengths in sigmas (n_poses,)."""
-    y = -(normal.V_inverse @ normal.g_own[..., None])[..., 0]
+    y = -(normal.V_inverse @ normal.g_elements[..., None])[..., 0]
     squared = np.einsum("kf,kfh,kh->k", y, normal.V, y)
     return (_motions(normal) @ y[..., None])[..., 0], np.asarray(squared)
 

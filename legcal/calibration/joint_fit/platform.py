@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.joint_fit.poses import platform_poses
 from legcal.calibration.joint_fit.sensitivity import Sensitivity
+from legcal.calibration.joint_fit.variables import platform_poses
 from legcal.errors import DidNotConverge
 from legcal.estimation import Frames
 from legcal.geometry import Array

@@ -1,8 +1,10 @@
-"""The problem of the joint fit: which unknowns there are, and the factors that touch them.
+"""The problem of the joint fit: its variables, its factors, and the exact constraints of poses.
 
 The blocks, in the order of x: kinematic parameters (``legs``), ``radii``, intrinsics (``cameras``),
 ``board_scale``, common-mode edge ``biases``, all of which have names; ``camera_pose`` and
-``board_pose``; and the eliminated ``platform_pose``.
+``board_pose``; and the eliminated ``platform_pose``. Another kind of measurement is a class with a
+factor, registered in :class:`legcal.calibration.joint_fit.factors.Observed`; what it depends on
+besides is a field of :class:`State` and a block in :func:`_built`.
 """
 
 from __future__ import annotations
@@ -13,33 +15,24 @@ from functools import partial
 
 import numpy as np
 
-from legcal.calibration.joint_fit.edge_biases import EdgeBiases
+from legcal.calibration.joint_fit.choices import BOARD_SCALE, NO_CHOICES, Choices
 from legcal.calibration.joint_fit.factors import (
-    axis_factor,
-    corner_factor,
-    on_sensor,
-    outline_factor,
-    outline_rows,
-    reading_factor,
-)
-from legcal.calibration.joint_fit.observations import (
+    BoardCorners,
+    Observed,
     ObservedAxes,
-    ObservedBoard,
+    ObservedCorners,
     ObservedOutlines,
     Readings,
-    SeenBoard,
-    no_board,
+    observe,
     observed_axes,
-    observed_board,
-    observed_outlines,
-    readings,
-    seen_by,
+    observed_corners,
+    observed_readings,
 )
-from legcal.calibration.joint_fit.parameters import BOARD_SCALE, NO_CHOICES, Choices
-from legcal.calibration.joint_fit.poses import LegConstraints
-from legcal.calibration.joint_fit.state import (
+from legcal.calibration.joint_fit.outline_errors import EdgeBiases, NoiseModel
+from legcal.calibration.joint_fit.variables import (
     DEFAULT_SETTINGS,
     FittedLegs,
+    LegConstraints,
     LegParameters,
     RefinementSettings,
     Start,
@@ -50,10 +43,8 @@ from legcal.calibration.joint_fit.state import (
 from legcal.data import LegAxes, Measurements, Outlines
 from legcal.errors import NotIdentifiable
 from legcal.estimation import (
-    Factor,
     Frames,
     GaussianPrior,
-    NoiseModel,
     Problem,
     Variables,
     all_free,
@@ -69,7 +60,7 @@ from legcal.vision import (
     with_intrinsics,
 )
 
-_LARGEST_TURN = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # [rad], and any displacement, in a step
+_MAX_STEP = (0.3, 0.3, 0.3, np.inf, np.inf, np.inf)  # of a frame: [rad], and any displacement
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,10 +69,7 @@ class FitProblem(Problem[State]):
 
     parameters: LegParameters
     choices: Choices
-    outlines: ObservedOutlines
-    readings: Readings
-    axes: ObservedAxes
-    board: ObservedBoard
+    observed: Observed
     first_radii: Array  # (n_radii,) where radii, intrinsics and the board's size begin
     first_cameras: tuple[Camera, ...]
     first_board_scale: float
@@ -92,6 +80,26 @@ class FitProblem(Problem[State]):
     def legs(self) -> FittedLegs:
         """The legs."""
         return self.parameters.legs
+
+    @property
+    def outlines(self) -> ObservedOutlines:
+        """The outlines."""
+        return self.observed.outlines
+
+    @property
+    def readings(self) -> Readings:
+        """The readings."""
+        return self.observed.readings
+
+    @property
+    def axes(self) -> ObservedAxes:
+        """The measured axes."""
+        return self.observed.axes
+
+    @property
+    def corners(self) -> ObservedCorners:
+        """The corners of the calibration board."""
+        return self.observed.corners
 
     @property
     def free(self) -> BoolArray:
@@ -107,7 +115,7 @@ class FitProblem(Problem[State]):
     def n_unknowns(self) -> int:
         """Number of unknowns; a pose counts with the freedoms that its constraints leave."""
         bound = 6 - len(freedoms(self.legs.frame_legs)) + sum(map(n_bonds, self.legs.nominal))
-        return self.n_kept + max(6 - bound, 0) * self.n_own
+        return self.n_kept + max(6 - bound, 0) * self.n_elements
 
     @property
     def n_equations(self) -> int:
@@ -127,19 +135,9 @@ class FitProblem(Problem[State]):
             Frames.of(start.T_Rb_Re),
         )
 
-    def offsets(self, state: State, outlines: ObservedOutlines | None = None) -> Array:
-        """Return how far both ends of all outlines are from where a state puts them, (n, 2) [px].
-
-        *outlines* are others, seen at fixed places of the sensor plane.
-        """
-        if outlines is None:
-            return outline_rows(self.outlines, self.keys, state).r
-        return outline_rows(outlines, (), state).r
-
-    def feet(self, state: State) -> Array:
-        """Return the ends of outlines on the sensor plane at a state, (n, 2, 2)."""
-        o = self.outlines
-        return on_sensor(state.cameras, self.keys, o.view, o.feet, o.pixels)[0]
+    def offsets(self, state: State) -> Array:
+        """Return the distances of both ends of outlines from predicted ones, (n, 2) [px]."""
+        return self.outlines.offsets(self.keys, state)
 
     def weighted(self, noise: NoiseModel, accepted: BoolArray | None = None) -> FitProblem:
         """Return the problem with outlines of other noise, those that are not accepted left out."""
@@ -149,15 +147,32 @@ class FitProblem(Problem[State]):
     def with_biases(self, biases: EdgeBiases) -> FitProblem:
         """Return the problem with these common-mode edge biases in place of those it had."""
         outlines = replace(self.outlines, bias_index=biases.index, bias_shift=biases.shift)
-        whitening = self.factor("outlines").whitening
-        factor = outline_factor(outlines, whitening, self.keys)
-        other = replace(self, outlines=outlines)
+        factor = replace(outlines.factor(self.keys), whitening=self.factor("outlines").whitening)
+        other = replace(self, observed=self.observed._replace(outlines=outlines))
         return other.with_parts((_bias_block(biases),), (factor,))
 
-    def with_board(self, board: ObservedBoard, rejected: Sequence[tuple[int, int]]) -> FitProblem:
+    def with_keys(self, keys: tuple[str, ...]) -> FitProblem:
+        """Return the problem with more intrinsics, fixed, among its variables."""
+        block = self.block("cameras")
+        unknown = fixed_at_start(len(block.unknown), len(keys))
+        unknown[:, [keys.index(key) for key in self.keys]] = block.unknown
+        block = replace(block, unknown=unknown, retract=partial(changed_cameras, keys=keys))
+        factors = [
+            replace(factor, whitening=self.factor(factor.name).whitening)
+            for factor in self.observed.factors(keys)
+        ]
+        return replace(self, keys=keys).with_parts((block,), factors)
+
+    def with_corners(
+        self, corners: ObservedCorners, rejected: Sequence[tuple[int, int]]
+    ) -> FitProblem:
         """Return the problem with other corners of the calibration board."""
-        other = replace(self, board=board, rejected_corners=(*self.rejected_corners, *rejected))
-        return other.with_factors(corner_factor(board, self.keys))
+        other = replace(
+            self,
+            observed=self.observed._replace(corners=corners),
+            rejected_corners=(*self.rejected_corners, *rejected),
+        )
+        return other.with_factors(corners.factor(self.keys))
 
     def with_measurements(
         self, measurements: Measurements, outlines: ObservedOutlines, biases: EdgeBiases
@@ -166,36 +181,30 @@ class FitProblem(Problem[State]):
 
         The parts of the problem come first in those of *outlines*, others have known radii.
         """
-        outlines = replace(outlines, bias_index=biases.index, bias_shift=biases.shift)
-        encoders = readings(measurements, self.legs)
-        lines, corners = observed_axes(None, measurements, self.legs), no_board()
+        observed = Observed(
+            replace(outlines, bias_index=biases.index, bias_shift=biases.shift),
+            observed_readings(measurements, self.legs),
+            observed_axes(None, measurements, self.legs),
+            observed_corners(None, measurements, ()),
+        )
         radii = self.block("radii")
         more = np.full((len(outlines.parts) - len(radii.unknown), 1), -1)
         radii = replace(radii, unknown=np.concatenate([radii.unknown, more]))
         blocks = {"radii": radii, "biases": _bias_block(biases)}
-        whitening = NoiseModel().whitening(outlines.covariance)
         return replace(
             self,
-            outlines=outlines,
-            readings=encoders,
-            axes=lines,
-            board=corners,
+            observed=observed,
             variables=tuple(blocks.get(block.name, block) for block in self.variables),
             eliminated=_poses(measurements.n_poses),
-            factors=_factors(outlines, whitening, encoders, lines, corners, self.keys),
+            factors=observed.factors(self.keys),
         )
 
     def with_choices(self, choices: Choices, settings: RefinementSettings) -> FitProblem:
         """Return a problem with the same measurements and cameras, and other unknowns."""
         owners = shared_cameras(self.outlines.views, self.first_cameras)
-        outlines = replace(
-            self.outlines,
-            bias_index=self.outlines.bias_index[:, :0],
-            bias_shift=self.outlines.bias_shift[:, :0],
-        )
-        observed = outlines, self.readings, self.axes, self.board
+        observed = self.observed._replace(outlines=self.outlines.without_biases())
         return _built(
-            self.legs, choices, observed, self.first_cameras, owners, self.n_own, settings
+            self.legs, choices, observed, self.first_cameras, owners, self.n_elements, settings
         )
 
 
@@ -206,7 +215,7 @@ def build_fit(
     settings: RefinementSettings = DEFAULT_SETTINGS,
     *,
     axes: LegAxes | None = None,
-    board: SeenBoard | None = None,
+    board: BoardCorners | None = None,
     choices: Choices = NO_CHOICES,
 ) -> FitProblem:
     """Build the joint fit without solving it; arguments as those of :func:`refine`.
@@ -218,21 +227,13 @@ def build_fit(
     DatasetError
         If an outline or an axis cannot be used.
     """
-    observed = observed_outlines(outlines, measurements, legs)
     names, given = [v.name for v in measurements.views], [v.camera for v in measurements.views]
     owners = shared_cameras(names, given)
     cameras = tuple(
         _with_values(camera, owner, choices) for camera, owner in zip(given, owners, strict=True)
     )
-    if any(camera is not other for camera, other in zip(cameras, given, strict=True)):
-        observed = seen_by(observed, cameras)
-    seen = (
-        observed,
-        readings(measurements, legs),
-        observed_axes(axes, measurements, legs),
-        observed_board(board, measurements, cameras),
-    )
-    problem = _built(legs, choices, seen, cameras, owners, measurements.n_poses, settings)
+    observed = observe(measurements, legs, outlines, axes, board, cameras)
+    problem = _built(legs, choices, observed, cameras, owners, measurements.n_poses, settings)
     equations = problem.n_equations + len(problem.priors.mean)
     if equations < problem.n_unknowns:
         shown = f"{len(problem.outlines)} outlines"
@@ -259,14 +260,14 @@ def _with_values(camera: Camera, owner: str, choices: Choices) -> Camera:
 def _built(
     legs: FittedLegs,
     choices: Choices,
-    observed: tuple[ObservedOutlines, Readings, ObservedAxes, ObservedBoard],
+    observed: Observed,
     cameras: tuple[Camera, ...],
     owners: tuple[str, ...],
     n_poses: int,
     settings: RefinementSettings,
 ) -> FitProblem:
     """Return the problem of measurements, with the unknowns and the priors of choices."""
-    outlines, encoders, lines, corners = observed
+    outlines, corners = observed.outlines, observed.corners
     parametrization = legs.parametrization
     names, units = parametrization.names, parametrization.units
     free = np.array(
@@ -283,10 +284,8 @@ def _built(
         parameters.jacobian if parameters.turns else None,
     )
     intrinsics, keys = _intrinsics(outlines.views, cameras, owners, choices)
-    seen = np.zeros(len(cameras), dtype=np.bool_)
-    seen[outlines.view] = seen[lines.view] = seen[corners.view] = True
-    camera_pose = np.full((len(cameras), 6), -1, dtype=np.intp)
-    camera_pose[seen] = all_free(int(seen.sum()), 6)
+    camera_pose = fixed_at_start(len(cameras), 6)
+    camera_pose[observed.views] = all_free(len(observed.views), 6)
     no_biases = Variables("biases", np.zeros((0, 1), dtype=np.intp))
     nominal = np.array([legs.radii[part] for part in outlines.parts])
     radii = [radius_name(legs.names[leg], part) for leg, part in outlines.parts]
@@ -303,25 +302,18 @@ def _built(
             choices,
         ),
         no_biases,
-        Variables("camera_pose", camera_pose, Frames.moved, largest=_LARGEST_TURN),
+        Variables("camera_pose", camera_pose, Frames.moved, max_step=_MAX_STEP),
         Variables(
             "board_pose",
             all_free(1, 6) if len(corners) else fixed_at_start(1, 6),
             Frames.moved,
-            largest=_LARGEST_TURN,
+            max_step=_MAX_STEP,
         ),
     )
     return FitProblem(
         variables=tuple(_stated(block, choices) for block in blocks),
         eliminated=_poses(n_poses),
-        factors=_factors(
-            outlines,
-            NoiseModel().whitening(outlines.covariance),
-            encoders,
-            lines,
-            corners,
-            keys,
-        ),
+        factors=observed.factors(keys),
         constraint=LegConstraints(legs),
         name="joint fit",
         remedy="start nearer to the truth (joints to 5 mm, cameras to 2 cm and 2 deg) and check "
@@ -329,10 +321,7 @@ def _built(
         "edges",
         parameters=parameters,
         choices=choices,
-        outlines=outlines,
-        readings=encoders,
-        axes=lines,
-        board=corners,
+        observed=observed,
         first_radii=np.array(
             [choices.values.get(n, r) for n, r in zip(radii, nominal.tolist(), strict=True)]
         ),
@@ -342,25 +331,8 @@ def _built(
     )
 
 
-def _factors(
-    outlines: ObservedOutlines,
-    whitening: Array,
-    readings: Readings,
-    axes: ObservedAxes,
-    board: ObservedBoard,
-    keys: tuple[str, ...],
-) -> tuple[Factor[State], ...]:
-    """Return one factor for each kind of measurement."""
-    return (
-        outline_factor(outlines, whitening, keys),
-        reading_factor(readings),
-        axis_factor(axes),
-        corner_factor(board, keys),
-    )
-
-
 def _poses(n_poses: int) -> Variables:
-    return Variables("platform_pose", all_free(n_poses, 6), Frames.moved, largest=_LARGEST_TURN)
+    return Variables("platform_pose", all_free(n_poses, 6), Frames.moved, max_step=_MAX_STEP)
 
 
 def _scalars(

@@ -11,29 +11,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from legcal.calibration.joint_fit.edge_biases import (
+from legcal.calibration.joint_fit.outline_errors import (
     KINDS,
+    MEDIAN_OF_2,
     N_KINDS,
     EdgeBiases,
+    NoiseModel,
+    estimate_noise,
     estimated_biases,
+    noise_of_the_median,
     possible_biases,
     with_gamma,
 )
 from legcal.calibration.joint_fit.problem import FitProblem
-from legcal.calibration.joint_fit.state import RefinementSettings, State
+from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.errors import DidNotConverge
 from legcal.estimation import (
-    MEDIAN_OF_2,
     GaussianPrior,
     Minimum,
-    NoiseModel,
     PseudoHuber,
-    estimate_noise,
     explained_share,
     information,
     linearize,
     minimise,
-    noise_of_the_median,
     robust_cost,
     scores_of_block,
 )
@@ -92,7 +92,7 @@ def first_minimum(
         begin,
         loss,
         max_iterations=settings.max_iterations,
-        near_enough=_NEAR_ENOUGH,
+        relative_tolerance=_NEAR_ENOUGH,
     )
     linear = linearize(problem, found.state)
     return Minimum(found.state, linear, robust_cost(problem, linear, loss), found.iterations)
@@ -120,11 +120,11 @@ def fit_in_rounds(
     biases = possible.of_sizes(with_gamma(np.zeros(N_KINDS)))
     problem, state = with_edge_biases(problem, first, biases)
 
-    def solved(near_enough: float = 0.0) -> tuple[FitProblem, Minimum[State]]:
+    def solved(relative_tolerance: float = 0.0) -> tuple[FitProblem, Minimum[State]]:
         weighted = problem.weighted(noise, accepted)
         loss, n_steps = PseudoHuber(settings.loss_width), settings.max_iterations
         return weighted, minimise(
-            weighted, state, loss, max_iterations=n_steps, near_enough=near_enough
+            weighted, state, loss, max_iterations=n_steps, relative_tolerance=relative_tolerance
         )
 
     for _ in range(settings.rejection_rounds if len(claimed) else 0):
@@ -136,7 +136,7 @@ def fit_in_rounds(
         problem, minimum = solved(_NEAR_ENOUGH)
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(problem.offsets(state), accepted, settings)
-    for _ in range(_BOARD_ROUNDS if len(problem.board) else 0):
+    for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
         problem = _with_judged_corners(problem.weighted(noise, accepted), state, settings)
         problem, minimum = solved(_NEAR_ENOUGH)
         state, iterations = minimum.state, iterations + minimum.iterations
@@ -233,7 +233,7 @@ def _with_judged_corners(
     problem: FitProblem, state: State, settings: RefinementSettings
 ) -> FitProblem:
     """Return a problem whose corners have the errors that residuals show, without wrong ones."""
-    board, linear = problem.board, linearize(problem, state)
+    board, linear = problem.corners, linearize(problem, state)
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     left = 1.0 - 0.5 * np.einsum("nqq->n", explained_share(problem, linear, normal, "corners"))
     norms = linear["corners"].squared_norms
@@ -241,10 +241,10 @@ def _with_judged_corners(
     scale = max(float(np.sqrt(variance)), _SMALLEST_SCALE)
     agrees = norms <= (scale * settings.rejection) ** 2
     wrong = zip(board.view[~agrees].tolist(), board.corner[~agrees].tolist(), strict=True)
-    judged = problem.with_board(board.chosen(agrees, scale), tuple(wrong))
+    judged = problem.with_corners(board.chosen(agrees, scale), tuple(wrong))
     rms = float(np.sqrt(np.mean((linear["corners"].r * board.sigma[:, None]) ** 2)))
     too_far = np.median(norms * board.sigma**2) > settings.largest_rms_px**2
-    if len(judged.rejected_corners) > len(judged.board) or too_far:
+    if len(judged.rejected_corners) > len(judged.corners) or too_far:
         raise DidNotConverge(
             f"The joint fit ended where the corners of the calibration board are {rms:.1f} px off "
             f"(rms), needed {settings.largest_rms_px:g} px for most; check that the board stood "
@@ -261,7 +261,7 @@ def corner_notes(problem: FitProblem) -> tuple[str, ...]:
     views = problem.outlines.views
     named = [f"{corner} in {views[view]}" for view, corner in sorted(rejected)[:_NAMED]]
     more = f" and {len(rejected) - _NAMED} more" if len(rejected) > _NAMED else ""
-    n = len(rejected) + len(problem.board)
+    n = len(rejected) + len(problem.corners)
     return (
         f"Of {n} corners of the calibration board {len(rejected)} disagree with the fit and were "
         f"left out: {', '.join(named)}{more}.",
@@ -349,24 +349,13 @@ def rejection_reasons(
     ]
     # Every rejected outline as each of all edges.
     outline, edge = np.repeat(rejected, len(edges)), np.tile(np.arange(len(edges)), len(rejected))
-    constants = o.constants[outline].copy()
+    as_others = o.at(outline)
+    constants = as_others.constants.copy()
     constants[:, 8] = np.tile(EPSILON, len(o.parts))[edge]
-    as_others = replace(
-        o,
-        index=o.index[outline],
-        leg=np.array([leg for leg, _ in o.parts], dtype=np.intp)[part[edge]],
-        view=o.view[outline],
-        pose=o.pose[outline],
-        radius=part[edge],
-        feet=problem.feet(state)[outline],
-        pixels=o.pixels[outline],
-        constants=constants,
-        covariance=o.covariance[outline],
-        by_gamma=o.by_gamma[outline],
-        bias_index=np.zeros((len(outline), 0), dtype=np.intp),
-        bias_shift=np.zeros((len(outline), 0, 2)),
-    )
-    found = np.abs(problem.offsets(state, as_others)).max(axis=1, initial=0.0)
+    legs = np.array([leg for leg, _ in o.parts], dtype=np.intp)
+    radius = part[edge]
+    as_others = replace(as_others, leg=legs[radius], radius=radius, constants=constants)
+    found = np.abs(as_others.offsets(problem.keys, state)).max(axis=1, initial=0.0)
     for i, distances in enumerate(found.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))
         if distances[nearest] < min(_ON_AN_EDGE, _MUCH_NEARER * away[i]):

@@ -9,19 +9,26 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from legcal.calibration.joint_fit.choices import known_parameters
 from legcal.calibration.joint_fit.contradictions import rejected_notes, scale_notes
 from legcal.calibration.joint_fit.determinacy import Held, held_spread, named_units
-from legcal.calibration.joint_fit.edge_biases import GAMMA_SUFFIX
-from legcal.calibration.joint_fit.gammas import EstimatedGamma, estimated_gammas
 from legcal.calibration.joint_fit.held_out import Posterior
-from legcal.calibration.joint_fit.parameters import known_parameters
+from legcal.calibration.joint_fit.outline_errors import (
+    GAMMA_SUFFIX,
+    EstimatedGamma,
+    NoiseModel,
+)
 from legcal.calibration.joint_fit.problem import FitProblem
 from legcal.calibration.joint_fit.rounds import Fit, corner_notes, rejection_reasons
-from legcal.calibration.joint_fit.sensitivity import Sensitivity, focal_lengths, sensitivities
-from legcal.calibration.joint_fit.state import RefinementSettings, State
+from legcal.calibration.joint_fit.sensitivity import (
+    Sensitivity,
+    focal_lengths,
+    sensitivities,
+    with_known_intrinsics,
+)
+from legcal.calibration.joint_fit.variables import RefinementSettings, State
 from legcal.data import Dataset, Order, Outlines, inverse, reorder_measurements
 from legcal.estimation import (
-    NoiseModel,
     PseudoHuber,
     WeakDirection,
     information,
@@ -131,8 +138,8 @@ def assemble_solution(
     estimated = covariance[np.ix_(where, where)]
     offsets = problem.offsets(state)
     used = offsets[fit.accepted]
-    n_residuals = used.size + len(problem.readings) + len(problem.priors.mean)
-    n_residuals += linear["axes"].r.size + linear["corners"].r.size
+    n_rejected = offsets.size - used.size
+    n_residuals = problem.n_equations + len(problem.priors.mean) - n_rejected
     chi2 = float(np.sum(linear.prior_r**2)) + sum(
         float(np.sum(rows.r**2)) for rows in linear.rows.values()
     )
@@ -144,9 +151,10 @@ def assemble_solution(
     held_values = np.zeros((len(held.basis), len(problem.free)))
     held_values[:, problem.free] = (held.basis * held.unit)[:, : problem.n_kinematic]
     biases = zip(problem.block("biases").labels, state.biases.tolist(), strict=True)
-    focal = focal_lengths(problem, state, linear)
+    wide, wide_linear = with_known_intrinsics(problem, state)
+    focal = focal_lengths(wide, state, wide_linear)
     doubtful = [f for f in focal if f.is_doubtful]
-    gammas = estimated_gammas(problem, state, kept, outlines)
+    gammas = _gammas(problem, state, kept, outlines)
     return Solution(
         legs=state.legs,
         T_camera_Rb=state.camera_pose.motions,
@@ -174,13 +182,13 @@ def assemble_solution(
         rejected_corners=tuple(
             (problem.outlines.views[view], corner) for view, corner in problem.rejected_corners
         ),
-        T_Rb_board=state.board_pose.motions[0] if len(problem.board) else None,
-        rms_corners_px=_rms(linear["corners"].r * problem.board.sigma[:, None]),
+        T_Rb_board=state.board_pose.motions[0] if len(problem.corners) else None,
+        rms_corners_px=_rms(linear["corners"].r * problem.corners.sigma[:, None]),
         noise=fit.noise,
         gammas=gammas,
         biases={n: v for n, v in biases if not n.endswith(GAMMA_SUFFIX)},
         shared_px=fit.edge_biases.sizes,
-        sensitivities=sensitivities(problem, state, linear, normal, loss),
+        sensitivities=sensitivities(wide, state, wide_linear, normal, loss),
         outlines=_with_rejections(outlines, problem, state, fit.accepted, offsets),
         start=label,
         iterations=fit.iterations,
@@ -203,6 +211,26 @@ def comparable_cost(problem: FitProblem, state: State, settings: RefinementSetti
     """Return the robust cost of all observations with their claimed covariances."""
     claimed, loss = problem.weighted(NoiseModel()), PseudoHuber(settings.loss_width)
     return robust_cost(claimed, linearize(claimed, state), loss)
+
+
+def _gammas(
+    problem: FitProblem, state: State, covariance: Array, outlines: Outlines
+) -> tuple[EstimatedGamma, ...]:
+    """Return the estimated gammas; *covariance* is that of the kept unknowns."""
+    o = problem.outlines
+    found = []
+    for k, position in enumerate(problem.where("biases").tolist()):
+        camera = problem.named[position].removesuffix(GAMMA_SUFFIX)
+        if camera == problem.named[position]:
+            continue
+        of_camera = np.array([name == camera for name in o.cameras], dtype=np.bool_)
+        moved = of_camera[o.view] & (o.by_gamma != 0.0)
+        measured_with = float(outlines.gamma[o.index[moved]][0])
+        views = tuple(name for name, is_one in zip(o.views, of_camera, strict=True) if is_one)
+        gamma = measured_with * float(np.exp(state.biases[k]))
+        sigma = float(np.sqrt(covariance[position, position]))
+        found.append(EstimatedGamma(views, gamma, sigma, measured_with))
+    return tuple(found)
 
 
 def _values(problem: FitProblem, state: State) -> dict[str, float]:

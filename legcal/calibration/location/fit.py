@@ -178,8 +178,8 @@ def _most_likely(
         held = (fixed / pairs.scale[:, None]).T.reshape(-1, 2, 6)[..., _TURN_FIRST]
     problem = Problem[_State](
         variables=(
-            Variables("base", all_free(1, 6), Frames.moved, largest=_MAX_STEP),
-            Variables("tool", all_free(1, 6), Frames.moved, largest=_MAX_STEP),
+            Variables("base", all_free(1, 6), Frames.moved, max_step=_MAX_STEP),
+            Variables("tool", all_free(1, 6), Frames.moved, max_step=_MAX_STEP),
             Variables(
                 "errors", all_free(k, 1), prior=GaussianPrior(errors, np.zeros(k), np.ones(k))
             ),

@@ -1,0 +1,431 @@
+"""Errors of outlines: of single ones, common-mode edge biases, and gammas of cameras.
+
+**Single outlines** have the covariance ``scale^2 C + bias^2 [[1, 1], [1, 1]] + tilt^2 [[1, -1],
+[-1, 1]]``: C is what detection claims, the bias is an error common to both ends of an outline
+(shading, blur), the tilt one of opposite signs there (:class:`NoiseModel`).
+
+**Common-mode edge biases.** Shading moves an edge of a leg alike in all images of a camera, a
+little differently where the leg stands elsewhere in the image; blur moves many edges. Such errors
+do not average out over images. So groups of outlines have unknown biases, random with variances
+that restricted maximum likelihood finds in the residuals. Where these are white there are none.
+Biases that move both edges of a leg inwards show in the residuals, and depth and radius take
+them up. Those that move a leg sideways hardly show, since the fit follows, and they are what moves
+joints. What shows must therefore say how large both are. If edges erred independently, both
+variances would be equal; light from one side makes one edge of a leg brighter and the other
+darker, and sideways biases count twice (:data:`SIDEWAYS`).
+
+**Gammas.** Where the gamma of a camera is not given, its outlines move together, each by its own
+amount, with the logarithm of that gamma over the one with which they were measured. A fit recovers
+only a share of a wrong gamma: how far each outline moves is known roughly, and common-mode biases
+take some. Where the gamma is right it finds no change, and that is searched for by secants
+(:func:`next_gammas`). Where outlines depend little on it, it may find no change at a wrong gamma
+too: the stated uncertainty accounts for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from legcal.calibration.joint_fit.factors import ObservedOutlines
+from legcal.data import few_views
+from legcal.estimation import Effects, estimate_variances
+from legcal.geometry import Array, BoolArray, IntArray
+
+_SUM = np.array([1.0, 1.0])
+_DIFFERENCE = np.array([-1.0, 1.0])
+_MEDIAN_OF_1 = 0.454936423119573  # of the square of a unit Gaussian
+MEDIAN_OF_2 = 2.0 * np.log(2.0)  # of the squared norm of two unit Gaussians
+_MIN_SCALE = 0.1
+_MIN_NOISE_GAIN = (
+    12.0  # twice the log-likelihood: of white offsets, one set in 4,000 gains that much
+)
+_MAX_ITERATIONS = 100
+_VARIANCE_TOLERANCE = 1e-9
+_RANK = 1e-10  # of the largest singular value: kinds of noise that cannot be told apart
+
+KINDS = (
+    "bias of many edges",
+    "tilt of many edges",
+    "bias of a leg in a view",
+    "tilt of a leg in a view",
+    "change of that bias over the image",
+    "change of that tilt over the image",
+)
+GAMMA, GAMMA_SUFFIX = len(KINDS), ".gamma"  # one more kind, and the end of the names of its shifts
+N_KINDS = len(KINDS) + 1
+GAMMA_SIGMA = 0.5  # of the logarithm: photographs are linear, or near 2.2
+SIDEWAYS = np.sqrt(2.0)  # standard deviation of sideways biases, those inwards being one
+_MIN_BIAS_GAIN = 25.0  # of white residuals, one set in 20,000 gains that much
+_MODES = (("bias", (1.0, 1.0)), ("tilt", (-1.0, 1.0)))  # shifts of both ends
+
+RECOVERED_SHARE = 0.5  # of the error of a gamma (logarithm) that a fit recovers, about
+RECOVERED_SHARES = (0.25, 1.2)  # limits of that share by secants
+# Systematic errors at the limb that look like another gamma, in rendered photographs of machines
+# with a known one: standard deviation of its logarithm.
+LIMB_SIGMA = 0.17
+_VAGUE_SIGMA = 0.25  # the same from where on a gamma is called hardly known
+MAX_GAMMA_ROUNDS = 2  # of measuring outlines with another gamma
+GAMMA_TOLERANCE = 0.12  # of the logarithm: smaller than LIMB_SIGMA
+GAMMA_SIGNIFICANCE = 2.0  # standard deviations of the fit: less may be chance
+MAX_GAMMA_STEP = 0.7  # of the logarithm
+GAMMA_RANGE = (1.0, 3.0)  # of gammas that are tried: linear, or encoded for screens
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Errors of single outlines.
+
+    Attributes
+    ----------
+    scale : float
+        Factor on the claimed standard deviations.
+    bias_px : float
+        Standard deviation of the error that is common to both ends of an outline [px].
+    tilt_px : float
+        Standard deviation of the error that is opposite at both ends [px].
+    """
+
+    scale: float = 1.0
+    bias_px: float = 0.0
+    tilt_px: float = 0.0
+
+    def covariance(self, claimed: Array) -> Array:
+        """Return the covariances (n, 2, 2) [px^2] of outlines with claimed ones."""
+        added = self.bias_px**2 * np.outer(_SUM, _SUM)
+        added = added + self.tilt_px**2 * np.outer(_DIFFERENCE, _DIFFERENCE)
+        return np.asarray(self.scale**2 * claimed + added)
+
+    def whitening(self, claimed: Array, used: BoolArray | None = None) -> Array:
+        """Return lower triangular T (n, 2, 2) with T C T^T = 1 [1/px]; zero where not used."""
+        T = np.linalg.inv(np.linalg.cholesky(self.covariance(claimed)))
+        return np.asarray(T if used is None else np.where(used[:, None, None], T, 0.0))
+
+    def squared_norms(self, offsets: Array, claimed: Array) -> Array:
+        """Return the squared whitened norms (n,) of offsets (n, 2) [px]."""
+        whitened = np.einsum("nij,nj->ni", self.whitening(claimed), offsets)
+        return np.asarray(np.sum(whitened**2, axis=-1))
+
+
+def noise_of_the_median(offsets: Array, claimed: Array) -> NoiseModel:
+    """Return the noise at which the median outline is as far off as it should be.
+
+    Wrong outlines, as long as they are fewer than half, hardly matter. The difference of the
+    offsets at both ends does not feel the bias and their sum does not feel the tilt: the smaller of
+    what these two say is the scale, and the excess of the other is bias or tilt.
+
+    Parameters
+    ----------
+    offsets : (n, 2) array
+        Offsets at both ends [px].
+    claimed : (n, 2, 2) array
+        Claimed covariances [px^2].
+
+    Returns
+    -------
+    NoiseModel
+    """
+
+    def scale_of(mode: Array) -> float:
+        share = (offsets @ mode) ** 2 / np.einsum("i,nij,j->n", mode, claimed, mode)
+        return float(np.sqrt(np.median(share) / _MEDIAN_OF_1))
+
+    def excess(noise: NoiseModel) -> float:
+        return float(np.median(noise.squared_norms(offsets, claimed)) - MEDIAN_OF_2)
+
+    return _balanced(scale_of(_SUM), scale_of(_DIFFERENCE), excess, offsets)
+
+
+def estimate_noise(offsets: Array, explained: Array, claimed: Array) -> NoiseModel:
+    """Return the noise of outlines by restricted maximum likelihood.
+
+    Bias and tilt of single outlines are there only if the offsets show them.
+
+    Parameters
+    ----------
+    offsets : (n, 2) array
+        Offsets of the accepted outlines at both ends [px].
+    explained : (n, 2, 2) array
+        Covariance of the predicted offsets [px^2]: the share of the errors that the fit absorbs.
+    claimed : (n, 2, 2) array
+        Claimed covariances [px^2].
+
+    Returns
+    -------
+    NoiseModel
+    """
+    moments = offsets[:, :, None] * offsets[:, None, :] + explained
+    best = _fitted(moments, claimed, bias=False, tilt=False)
+    for _ in range(2):
+        wider = [
+            _fitted(moments, claimed, bias=bias, tilt=tilt)
+            for bias, tilt in ((True, best.tilt_px > 0.0), (best.bias_px > 0.0, True))
+        ]
+        gains = [_likelihood(noise, moments, claimed) for noise in wider]
+        gain = 2.0 * (max(gains) - _likelihood(best, moments, claimed))
+        if gain <= _MIN_NOISE_GAIN:
+            break
+        best = wider[int(np.argmax(gains))]
+    return best
+
+
+def _fitted(moments: Array, claimed: Array, *, bias: bool, tilt: bool) -> NoiseModel:
+    """Return the noise of these kinds with the largest likelihood, by Fisher's scoring."""
+    shapes = [claimed]
+    if bias:
+        shapes.append(np.broadcast_to(np.outer(_SUM, _SUM), claimed.shape))
+    if tilt:
+        shapes.append(np.broadcast_to(np.outer(_DIFFERENCE, _DIFFERENCE), claimed.shape))
+    share = np.trace(np.linalg.solve(claimed, moments), axis1=1, axis2=2)
+    variances = np.zeros(len(shapes))
+    variances[0] = max(0.5 * float(np.mean(share)), _MIN_SCALE**2)
+    least = np.array([_MIN_SCALE**2, 0.0, 0.0])[: len(shapes)]
+    for _ in range(_MAX_ITERATIONS):
+        covariance = sum(v * shape for v, shape in zip(variances, shapes, strict=True))
+        inverse = np.linalg.inv(covariance)
+        weighted = [inverse @ shape for shape in shapes]
+        weighted_moments = inverse @ moments
+        information = np.array([[_product(a, b) for b in weighted] for a in weighted])
+        right = np.array([_product(a, weighted_moments) for a in weighted])
+        found = np.linalg.lstsq(information, right, rcond=_RANK)[0]
+        before, variances = variances, np.maximum(found, least)
+        if np.allclose(
+            variances, before, rtol=_VARIANCE_TOLERANCE, atol=_VARIANCE_TOLERANCE * variances[0]
+        ):
+            break
+    sigma = np.sqrt(variances).tolist()
+    return NoiseModel(sigma[0], sigma[1] if bias else 0.0, sigma[-1] if tilt else 0.0)
+
+
+def _product(a: Array, b: Array) -> float:
+    """Return the sum of the traces of the products of matrices (n, 2, 2)."""
+    return float(np.einsum("nij,nji->", a, b))
+
+
+def _likelihood(noise: NoiseModel, moments: Array, claimed: Array) -> float:
+    """Return the logarithm of the likelihood of second moments (n, 2, 2) [px^2]."""
+    covariance = noise.covariance(claimed)
+    shares = np.trace(np.linalg.solve(covariance, moments), axis1=1, axis2=2)
+    return -0.5 * float(np.sum(np.log(np.linalg.det(covariance)) + shares))
+
+
+def _balanced(
+    of_sums: float, of_differences: float, excess: Callable[[NoiseModel], float], offsets: Array
+) -> NoiseModel:
+    """Return the scale of the better mode, and the excess of the other as bias or tilt."""
+    if of_differences <= of_sums:
+        scale = max(of_differences, _MIN_SCALE)
+        return NoiseModel(scale, _root(lambda px: excess(NoiseModel(scale, px)), offsets))
+    scale = max(of_sums, _MIN_SCALE)
+    return NoiseModel(scale, 0.0, _root(lambda px: excess(NoiseModel(scale, 0.0, px)), offsets))
+
+
+def _root(excess: Callable[[float], float], offsets: Array) -> float:
+    """Return where a falling function of an added error crosses zero, 0 if it starts below."""
+    if excess(0.0) <= 0.0:
+        return 0.0
+    largest = 2.0 * float(np.abs(offsets).max())
+    while excess(largest) > 0.0:
+        largest *= 2.0
+    return float(brentq(excess, 0.0, largest, xtol=1e-12, rtol=1e-14))
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeBiases:
+    """Biases that outlines share, random with known variances.
+
+    Their names: ``all.bias``; ``c1.tilt`` of a view; ``leg1.rod.bias`` of a part;
+    ``c1.leg1.rod.inward.bias`` of both edges of a part in a view, ``c1.leg1.rod.sideways.bias``
+    and, for how it changes along x of the image, ``c1.leg1.rod.sideways.bias_x``; ``c1.gamma``
+    of a camera whose gamma is not given.
+    """
+
+    names: tuple[str, ...]  # b of them
+    kind: IntArray  # (b,) among ``KINDS``, then ``GAMMA``
+    sigma: Array  # (N_KINDS,) standard deviation of each kind [px], and of ln gamma
+    index: IntArray  # (n, c) which of them each outline has a part in
+    shift: Array  # (n, c, 2) how one unit of each moves both ends along the line's normal [px]
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviation of each bias [px, or none], (b,)."""
+        return np.asarray(self.sigma[self.kind])
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each, ``px`` or none, b of them."""
+        return tuple("" if kind == GAMMA else "px" for kind in self.kind.tolist())
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """Standard deviation of each of ``KINDS`` [px], by its name; empty without such biases."""
+        sigma = self.sigma[: len(KINDS)].tolist()
+        return dict(zip(KINDS, sigma, strict=True)) if np.any(self.kind != GAMMA) else {}
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def of_sizes(self, sigma: Array) -> EdgeBiases:
+        """Return biases with these standard deviations, without those where it is zero."""
+        kept = sigma[self.kind] > 0.0
+        number = np.cumsum(kept) - 1
+        columns = kept[self.index].all(axis=0)  # all biases of a column are of one kind
+        return EdgeBiases(
+            tuple(name for name, is_kept in zip(self.names, kept, strict=True) if is_kept),
+            self.kind[kept],
+            sigma,
+            number[self.index[:, columns]],
+            self.shift[:, columns],
+        )
+
+
+def possible_biases(
+    outlines: ObservedOutlines,
+    leg_names: Sequence[str],
+    fitted: ObservedOutlines | None = None,
+) -> EdgeBiases:
+    """Return all biases that outlines may share, with a standard deviation of one unit.
+
+    Biases of many edges are inward; those of one part in a view are inward and sideways and
+    change along x and y of the image, by one unit over the spread of places in all groups: those of
+    the outlines *fitted* to, if not these themselves.
+    """
+    o = outlines
+    parts = [f"{leg_names[leg]}.{part}" for leg, part in o.parts]
+    known = o if fitted is None else fitted
+    view = known.series[o.view]
+    found, group = np.unique(np.column_stack([view, o.radius]), axis=0, return_inverse=True)
+    group = group.ravel()
+    inward, sideways = o.epsilon, np.full(len(o), SIDEWAYS)
+    x, y = _places_in_groups(o, known).T
+    together = [f"{o.views[v]}.{parts[p]}.inward" for v, p in found.tolist()]
+    across = [f"{o.views[v]}.{parts[p]}.sideways" for v, p in found.tolist()]
+    levels = [
+        (("all",), np.zeros(len(o), dtype=np.intp), inward, "", 0),
+        (o.views, view, inward, "", 0),
+        (parts, o.radius, inward, "", 0),
+        (together, group, inward, "", 2),
+        (across, group, sideways, "", 2),
+        (together, group, inward * x, "_x", 4),
+        (across, group, sideways * x, "_x", 4),
+        (together, group, inward * y, "_y", 4),
+        (across, group, sideways * y, "_y", 4),
+    ]
+    names: list[str] = []
+    kind, index, shift = [], [], []
+    for owners, member, weight, suffix, first_kind in levels:
+        for mode, (name, ends) in enumerate(_MODES):
+            index.append(member + len(names))
+            shift.append(weight[:, None] * np.array(ends))
+            names += [f"{owner}.{name}{suffix}" for owner in owners]
+            kind += [first_kind + mode] * len(owners)
+    cameras = sorted({o.cameras[v] for v in o.view[o.by_gamma != 0.0].tolist()})
+    if cameras:
+        of_view = np.array([cameras.index(c) if c in cameras else 0 for c in o.cameras])
+        index.append(of_view[o.view] + len(names))
+        # Outlines that were measured with too small a gamma lie off by what a greater one moves.
+        shift.append(np.repeat((-o.epsilon * o.by_gamma)[:, None], 2, axis=1))
+        names += [f"{camera}{GAMMA_SUFFIX}" for camera in cameras]
+        kind += [GAMMA] * len(cameras)
+    return EdgeBiases(
+        tuple(names),
+        np.array(kind),
+        np.ones(N_KINDS),
+        np.stack(index, axis=1),
+        np.stack(shift, axis=1),
+    )
+
+
+def estimated_biases(
+    possible: EdgeBiases, z: Array, K: Array, least: Array | float = 0.0
+) -> EdgeBiases:
+    """Return the biases that the residuals show: none at all where they are white.
+
+    *z* (b,) and *K* (b, b) are scores of all of them and their covariance (:class:`Effects`);
+    *least* (N_KINDS,) are standard deviations known from elsewhere, where the residuals show less
+    [px]. That of a gamma is known, whatever the residuals show.
+    """
+    sigma = np.zeros(N_KINDS)
+    variances, _ = estimate_variances(Effects(z, K, possible.kind), _MIN_BIAS_GAIN)
+    sigma[: len(variances)] = np.sqrt(variances)
+    return possible.of_sizes(with_gamma(np.maximum(sigma, least)))
+
+
+def with_gamma(sigma: Array) -> Array:
+    """Return standard deviations (N_KINDS,) with that of the logarithm of a gamma."""
+    return np.append(sigma[:GAMMA], GAMMA_SIGMA)
+
+
+def _places_in_groups(outlines: ObservedOutlines, others: ObservedOutlines) -> Array:
+    """Return places (n, 2) from the middle of others of the group, over the spread of all these.
+
+    Where a group has no others, places count as their middle.
+    """
+    n_parts = len(outlines.parts)
+    group, of_others = (others.series[o.view] * n_parts + o.radius for o in (outlines, others))
+    places = others.pixels.mean(axis=1)
+    counts = np.bincount(of_others, minlength=len(others.views) * n_parts)
+    sums = [np.bincount(of_others, weights=x, minlength=len(counts)) for x in places.T]
+    middle = np.stack(sums, axis=1) / np.maximum(counts, 1)[:, None]
+    squares = np.sum((places - middle[of_others]) ** 2)
+    spread = float(np.sqrt(squares / (2 * len(places)))) if len(places) else 0.0
+    away = outlines.pixels.mean(axis=1) - middle[group]
+    known = (counts[group] > 0) & (spread > 0.0)
+    return np.where(known[:, None], away, 0.0) / (spread or 1.0)
+
+
+@dataclass(frozen=True)
+class EstimatedGamma:
+    """The gamma of a camera."""
+
+    views: tuple[str, ...]  # of the camera
+    gamma: float
+    fitted_sigma: float  # standard deviation of its logarithm, by the fit
+    measured_with: float  # the gamma with which the outlines were measured
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of its logarithm: fits recover a share of it."""
+        unseen = (1.0 / RECOVERED_SHARE - 1.0) * np.log(self.gamma / self.measured_with)
+        return float(
+            np.sqrt((self.fitted_sigma / RECOVERED_SHARE) ** 2 + unseen**2 + LIMB_SIGMA**2)
+        )
+
+    def __str__(self) -> str:
+        hardly = ", and its outlines hardly tell it" * (self.sigma > _VAGUE_SIGMA)
+        return (
+            f"The gamma of the camera of {few_views(self.views)} is not told{hardly}: found "
+            f"{self.gamma:.2f} +- {self.gamma * self.sigma:.2f} by outlines measured with "
+            f"{self.measured_with:.2f}, "
+            "which the uncertainty of the result takes into account; write gamma of the views in "
+            "dataset.yaml if you know it."
+        )
+
+
+def next_gammas(found: Sequence[Sequence[EstimatedGamma]]) -> dict[str, float]:
+    """Return the gammas to measure outlines with next, by view; nothing where fits find no change.
+
+    *found* has the estimates of successive fits, to outlines that were measured anew for each.
+    """
+    gammas: dict[str, float] = {}
+    for one in found[-1]:
+        of_camera = [other for fit in found for other in fit if other.views == one.views]
+        read = np.log([other.measured_with for other in of_camera])
+        seen = np.log([other.gamma for other in of_camera]) - read
+        if abs(seen[-1]) > max(GAMMA_TOLERANCE, GAMMA_SIGNIFICANCE * one.fitted_sigma):
+            step = np.clip(seen[-1] / _share(read, seen), -MAX_GAMMA_STEP, MAX_GAMMA_STEP)
+            other = float(np.clip(np.exp(read[-1] + step), *GAMMA_RANGE))
+            if abs(np.log(other) - read[-1]) > GAMMA_TOLERANCE:
+                gammas |= dict.fromkeys(one.views, other)
+    return gammas
+
+
+def _share(read: Array, seen: Array) -> float:
+    """Return which share of the error of a gamma fits recover, by the last two of them."""
+    if len(read) < 2 or abs(read[-1] - read[-2]) < GAMMA_TOLERANCE:
+        return RECOVERED_SHARE
+    share = -(seen[-1] - seen[-2]) / (read[-1] - read[-2])
+    return float(np.clip(share, *RECOVERED_SHARES))
