@@ -68,7 +68,7 @@ def test_outline_residual_measures_pixels_of_a_shifted_outline() -> None:
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     feet = o.feet.copy()
     feet[:, 0] = LENS.undistort(o.pixels[:, 0] + 0.5 * normal)
-    moved = problem.offsets(truth, replace(o, feet=feet))
+    moved = replace(o, feet=feet).offsets((), truth)
     np.testing.assert_allclose(moved[:, 0], 0.5, atol=2e-3)
     np.testing.assert_allclose(moved[:, 1], 0.0, atol=1e-8)
 
