@@ -1,6 +1,7 @@
 """Machines of the class, one function each, for tests that write them in many layouts."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from layouts import LegSpec, MachineSpec
@@ -8,6 +9,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 
+ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
+SHIPPED_YAML, SHIPPED_URDF = ROOT / "models" / "hexapod.yaml", ROOT / "urdf" / "hexapod.urdf"
 HOME = RigidTransform.from_components([0.03, -0.02, 0.6], Rotation.from_rotvec([0.1, -0.15, 0.3]))
 
 
