@@ -8,8 +8,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.lines import normal_basis
-from legcal.geometry.types import Array
+from legcal.geometry import Array, normal_basis, roll_pitch_yaw
 
 EYE = RigidTransform.identity()
 PASSED = 0.05  # [m] by which every slider is out at home
@@ -17,18 +16,16 @@ PASSED = 0.05  # [m] by which every slider is out at home
 
 @dataclass(frozen=True, eq=False)
 class LegSpec:
-    """A leg as drawn at home: joints, centres in the base link, and the axes there.
-
-    ``base_axis`` and ``platform_axis`` are the axis of R and the outer one of U; a U beside an S
-    need not have one.
-    """
+    """A leg as drawn at home: joints, centres in the base link, and the axes there."""
 
     type: str  # base joint and platform joint, "U" alone if fixed to the platform
     A: Array
     B_home: Array
     kind: str = "actuated"
-    base_axis: Array | None = None
+    base_axis: Array | None = None  # of R, or the outer one of U; a U beside an S need not have one
     platform_axis: Array | None = None
+    base_inner: Array | None = None  # of U, where it is not the one across the leg
+    slides: Array | None = None  # direction of the slider, where it is not that of the leg
 
     @property
     def ends(self) -> tuple[str, str]:
@@ -36,7 +33,7 @@ class LegSpec:
 
     @property
     def u(self) -> Array:
-        between = self.B_home - self.A
+        between = self.B_home - self.A if self.slides is None else self.slides
         return np.asarray(between / np.linalg.norm(between))
 
 
@@ -105,7 +102,7 @@ class _Text:
     ) -> None:
         self.joints.append(
             f'  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-            f"{_origin(T)}{moving}</joint>"
+            f"{origin(T)}{moving}</joint>"
         )
 
     def any_joint(self, leg: str) -> str:
@@ -115,13 +112,13 @@ class _Text:
         return next(name for name in names if f'<joint name="{name}"' in written)
 
 
-def _numbers(values: Sequence[float] | Array) -> str:
-    return " ".join(repr(float(x)) for x in values)
+def numbers(values: object) -> str:
+    return " ".join(repr(float(x)) for x in np.asarray(values).ravel())
 
 
-def _origin(T: RigidTransform) -> str:
-    rpy = T.rotation.as_euler("xyz")
-    return f'<origin xyz="{_numbers(T.translation)}" rpy="{_numbers(rpy)}"/>'
+def origin(T: RigidTransform) -> str:
+    rpy = roll_pitch_yaw(T.rotation.as_matrix())
+    return f'<origin xyz="{numbers(T.translation)}" rpy="{numbers(rpy)}"/>'
 
 
 def write_machine(
@@ -189,7 +186,7 @@ class _Leg:
         back = RigidTransform.from_translation(-out * u)
         self.roots = {"base": EYE, "platform": back * home}
         base, platform = leg.ends
-        lower = self._group("a", base, leg.A, leg.base_axis)
+        lower = self._group("a", base, leg.A, leg.base_axis, leg.base_inner)
         upper = self._group("b", platform, self.B, leg.platform_axis)[::-1]
         side = layout.spin
         if side == "S":
@@ -205,12 +202,15 @@ class _Leg:
         self.n_lower, self.n_upper = len(lower), len(upper)
         self.far_axes = 3 if leg.ends[layout.hung == "base"] == "S" else 0
 
-    def _group(self, end: str, letter: str, centre: Array, outer: Array | None) -> list[_Joint]:
+    def _group(
+        self, end: str, letter: str, centre: Array, outer: Array | None, inner: Array | None = None
+    ) -> list[_Joint]:
         """Return the revolutes of a joint, from the one fixed in base or platform inwards."""
         if outer is None:
             outer = self.rng.normal(size=3)
         outer = outer / np.linalg.norm(outer)
-        inner = np.cross(outer, self.leg.u if "S" not in self.leg.type else self.rng.normal(size=3))
+        across = self.leg.u if "S" not in self.leg.type else self.rng.normal(size=3)
+        inner = np.cross(outer, across) if inner is None else inner
         inner = inner / np.linalg.norm(inner)
         axes = {"": [], "R": [outer], "U": [outer, inner], "S": [outer, inner, self.leg.u]}[letter]
         if letter == "S" and self.layout.flip_axes:
@@ -281,7 +281,7 @@ class _Leg:
                 lower, upper = -upper, -lower
             self.text.joint(
                 joint.name, joint.type, link, child, pose.inv() * T,
-                f'<axis xyz="{_numbers(T.rotation.inv().apply(axis))}"/>'
+                f'<axis xyz="{numbers(T.rotation.inv().apply(axis))}"/>'
                 f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>',
             )  # fmt: skip
             link, pose = child, T
@@ -298,7 +298,7 @@ class _Leg:
         shown = RigidTransform.from_components(0.5 * (start + end), _toward(self.leg.u))
         length = float(np.linalg.norm(end - start))
         return (
-            f"<visual>{_origin(T.inv() * shown)}<geometry>"
+            f"<visual>{origin(T.inv() * shown)}<geometry>"
             f'<cylinder radius="0.01" length="{length!r}"/></geometry></visual>'
         )
 
@@ -314,47 +314,3 @@ def _toward(direction: Array) -> Rotation:
     """Return a rotation whose z axis points along a direction."""
     e1, e2 = normal_basis(direction)
     return Rotation.from_matrix(np.column_stack([e1, e2, direction]))
-
-
-def expected_axes(
-    description: MachineSpec, j: int
-) -> tuple[Array | None, Array | None, float | None]:
-    """Return base axis, platform axis and twist of a leg, from how it is drawn at home."""
-    leg = description.legs[j]
-    base, platform = leg.ends
-    if description.normal is not None:
-        return None, None, None
-    without_s = "S" not in leg.type
-    a = leg.base_axis if base == "R" or (base == "U" and without_s) else None
-    b = leg.platform_axis if platform == "R" or (platform == "U" and without_s) else None
-    back = description.home.rotation.inv()
-    b_platform = back.apply(leg.u) if platform == "" else None
-    if b is not None:
-        b_platform = _line(np.asarray(back.apply(b)))
-    if not without_s:
-        return (None if a is None else _line(a)), b_platform, None
-    assert a is not None
-    assert b_platform is not None
-    p = a if base == "R" else np.cross(a, leg.u)
-    if platform == "":
-        w = description.home.rotation.apply(normal_basis(np.asarray(b_platform))[0])
-    else:
-        assert b is not None
-        w = b if platform == "R" else np.cross(b, leg.u)
-    angle = float(np.arctan2(leg.u @ np.cross(p, w), p @ w))
-    return _line(a), b_platform, angle - np.pi * np.ceil(angle / np.pi - 0.5 - 1e-10)
-
-
-def _line(axis: Array) -> Array:
-    """Return a unit vector whose last component that is not zero is positive."""
-    axis = axis / np.linalg.norm(axis)
-    return np.asarray(axis * np.sign(axis[np.abs(axis) > 1e-9][-1]))
-
-
-def expected_B(description: MachineSpec, j: int) -> Array:
-    """Return the platform joint centre of a leg in the platform link."""
-    leg = description.legs[j]
-    B = leg.B_home
-    if leg.ends[1] == "":
-        B = leg.A + ((np.asarray(description.home.translation) - leg.A) @ leg.u) * leg.u
-    return np.asarray(description.home.inv().apply(B))

@@ -7,7 +7,7 @@ import numpy as np
 from layouts import LegSpec, MachineSpec
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.geometry.types import Array
+from legcal.geometry import Array
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))

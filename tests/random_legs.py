@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from legcal.geometry.lines import normal_basis
-from legcal.geometry.types import Array
+from legcal.geometry import Array, normal_basis
 from legcal.machine import Leg, LegKind, linearize
 
 

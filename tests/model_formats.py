@@ -1,16 +1,16 @@
-"""One mechanism written in every format that is read, for tests."""
+"""One machine written in every format that is read, for tests."""
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
+from layouts import numbers, origin
 from lxml import etree
 from scipy.spatial.transform import RigidTransform
 
 from legcal.machine import Machine
-from legcal.machine.tree import origin
-from legcal.machine.urdf import UrdfJoint
 
 FORMATS = (
     "mjcf bodies",
@@ -24,7 +24,7 @@ FORMATS = (
 
 
 def write_format(machine: Machine, name: str, folder: Path) -> Path:
-    """Write a mechanism in a format and return the path that means it."""
+    """Write a machine in a format and return the path that means it."""
     folder.mkdir(parents=True, exist_ok=True)
     if name.startswith("mjcf"):
         path = folder / "machine.xml"
@@ -35,11 +35,6 @@ def write_format(machine: Machine, name: str, folder: Path) -> Path:
     path = folder / "machine.urdf"
     path.write_text(_with_loops(machine, name))
     return path
-
-
-def numbers(values: object) -> str:
-    """Return numbers with all their digits."""
-    return " ".join(repr(float(x)) for x in np.asarray(values).ravel())
 
 
 def _pose(T: RigidTransform) -> str:
@@ -64,7 +59,7 @@ def _cylinders(machine: Machine) -> dict[str, list[tuple[RigidTransform, str, st
 
 
 def mjcf(machine: Machine, style: str) -> str:
-    """Return a mechanism as MJCF, in its closed home configuration.
+    """Return a machine as MJCF, in its closed home configuration.
 
     ``bodies`` closes it between bodies, ``sites`` between sites; ``defaults`` writes angles in
     radians and takes what it can from default classes.
@@ -75,7 +70,7 @@ def mjcf(machine: Machine, style: str) -> str:
     frames = {f for c in chain.closures for f in (c.frame_1, c.frame_2)}
     unit = 1.0 if style == "defaults" else 180.0 / np.pi
 
-    def joint(entry: UrdfJoint) -> str:
+    def joint(entry: Any) -> str:
         if entry.type in ("floating", "planar"):
             return f'<freejoint name="{entry.name}"/>'
         value = float(configuration[chain.q_index(entry.name)])
@@ -136,7 +131,7 @@ def mjcf(machine: Machine, style: str) -> str:
 
 
 def _with_loops(machine: Machine, style: str) -> str:
-    """Return the URDF of a mechanism with its closures in it, on the links under the frames."""
+    """Return the URDF of a machine with its closures in it, on the links under the frames."""
     robot = etree.fromstring(machine.urdf.content)
     below = {j.child: j for j in machine.urdf.joints.values() if not j.moves}
     for i, closure in enumerate(machine.chain.closures):
@@ -166,7 +161,7 @@ def _with_loops(machine: Machine, style: str) -> str:
     return etree.tostring(robot, encoding="unicode")
 
 
-def _remove(robot: etree._Element, joint: UrdfJoint) -> None:
+def _remove(robot: etree._Element, joint: Any) -> None:
     for element in list(robot):
         if (element.tag, element.get("name")) in (("joint", joint.name), ("link", joint.child)):
             robot.remove(element)
@@ -204,7 +199,7 @@ def _gepetto(machine: Machine, folder: Path) -> Path:
     return folder
 
 
-def _group(machine: Machine, first: UrdfJoint) -> list[UrdfJoint]:
+def _group(machine: Machine, first: Any) -> list[Any]:
     """Return the revolutes about x, y or z that follow each other at one point."""
     group = [first]
     while True:
@@ -221,7 +216,7 @@ def _group(machine: Machine, first: UrdfJoint) -> list[UrdfJoint]:
         group.append(found[0])
 
 
-def _letter(joint: UrdfJoint) -> str | None:
+def _letter(joint: Any) -> str | None:
     axes = dict(zip("XYZ", np.eye(3), strict=True))
     return next((k for k, axis in axes.items() if np.allclose(axis, joint.axis)), None)
 

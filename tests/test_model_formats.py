@@ -1,0 +1,215 @@
+"""One machine is one analysis, whatever format it is written in; MJCF means what MuJoCo means."""
+
+import json
+import os
+from dataclasses import replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from layouts import numbers
+from model_formats import FORMATS, mjcf, with_loops_at_joints, write_format
+from parameter_steps import with_joints
+from scipy.spatial.transform import RigidTransform, Rotation
+from thinned import thinned
+
+from legcal import load_mechanism
+from legcal.errors import LegcalError, UsageError
+from legcal.geometry import Array
+from legcal.machine import (
+    Machine,
+    geometries,
+    reload_and_check,
+    write_calibrated_yaml,
+    write_model,
+    write_urdf,
+)
+from legcal.machine.chain import ClosedChain
+from legcal.machine.mjcf import Values, closing_joints, read_bodies
+from legcal.machine.tree import close_loop
+from legcal.machine.urdf import Problems, parse_xml
+
+machine_of = cache(load_mechanism)
+
+
+def _difference(one: Array | float | None, two: Array | float | None) -> float:
+    assert (one is None) == (two is None)
+    if one is None or two is None:
+        return 0.0
+    return float(np.nanmax(np.abs(np.nan_to_num(one) - np.nan_to_num(two))))
+
+
+def assert_same_analysis(found: Machine, expected: Machine) -> None:
+    """Check that two machines are one, legs matched by where they stand."""
+    for key in ("spatial", "mobility", "n_legs", "motors"):
+        assert getattr(found, key) == getattr(expected, key), key
+    for wanted in expected.legs:
+        leg = min(found.legs, key=lambda leg: float(np.linalg.norm(leg.A - wanted.A)))
+        assert (leg.type, leg.kind, leg.sign) == (wanted.type, wanted.kind, wanted.sign)
+        assert (leg.prismatic, leg.travel) == (wanted.prismatic, wanted.travel)
+        for key in ("A", "B", "q0", "base_axis", "platform_axis", "twist"):
+            assert _difference(getattr(leg, key), getattr(wanted, key)) < 1e-9, key
+        assert [c.radius for c in leg.cylinders] == [c.radius for c in wanted.cylinders]
+    np.testing.assert_allclose(found.home.as_matrix(), expected.home.as_matrix(), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "machine"),
+    thinned(
+        product(FORMATS, ("3-upu", "tricept", "3-rpr", "hexapod", "hexapod-strut")),
+        lambda name, machine: (
+            machine in ("3-upu", "tricept")
+            or (machine == "3-rpr" and name in ("mjcf bodies", "loop_joint", "gepetto"))
+        ),
+    ),
+)
+def test_every_format_gives_the_same_analysis(name: str, machine: str, tmp_path: Path) -> None:
+    expected = machine_of(machine)
+    found = load_mechanism(write_format(expected, name, tmp_path))
+    if not name.startswith("mjcf"):  # these have no pose where they are closed
+        found = replace(found, home=expected.home)
+    assert_same_analysis(found, expected)
+
+
+def test_slides_and_a_ball_that_nothing_drives_carry_a_platform_freely(tmp_path: Path) -> None:
+    expected = machine_of("hexapod")
+    joints = "".join(
+        f'<joint name="p{i}" type="slide" axis="{numbers(axis)}"/>'
+        for i, axis in enumerate(np.eye(3))
+    )
+    joints += '<joint type="ball"/>'
+    text = mjcf(expected, "sites").replace('<freejoint name="platform_free"/>', joints)
+    (tmp_path / "machine.xml").write_text(text)
+    assert_same_analysis(load_mechanism(tmp_path / "machine.xml"), expected)
+
+
+@pytest.mark.parametrize(
+    ("machine", "tag"),
+    [("3-rpr", "loop_joint"), ("3-rpr", "constraint"), ("3-upu", "constraint")],
+)
+def test_loops_are_closed_by_revolute_and_universal_joints(
+    machine: str, tag: str, tmp_path: Path
+) -> None:
+    expected = machine_of(machine)
+    path = tmp_path / "machine.urdf"
+    path.write_text(with_loops_at_joints(expected, tag))
+    assert_same_analysis(replace(load_mechanism(path), home=expected.home), expected)
+
+
+@pytest.mark.parametrize("name", ["mjcf sites", "loop_joint", "gepetto"])
+def test_a_calibrated_model_of_any_format_is_complete(name: str, tmp_path: Path) -> None:
+    nominal = load_mechanism(write_format(machine_of("hexapod"), name, tmp_path))
+    rng = np.random.default_rng(3)
+    known = nominal.parameters
+    base, platform = known.base_joints.copy(), known.platform_joints.copy()
+    moved = [j for j in range(6) if j not in nominal.frame_legs]
+    base[moved] += rng.uniform(-1e-3, 1e-3, (3, 3))
+    platform[moved] += rng.uniform(-1e-3, 1e-3, (3, 3))
+    offsets = known.offsets + rng.uniform(-1e-3, 1e-3, 6)
+    calibrated = replace(known, base_joints=base, platform_joints=platform, offsets=offsets)
+    write_urdf(nominal, with_joints(geometries(nominal), calibrated), tmp_path / "calibrated.urdf")
+    write_calibrated_yaml(nominal, tmp_path / "calibrated.yaml", "calibrated.urdf")
+    written = reload_and_check(tmp_path / "calibrated.yaml")
+    assert written.leg_names == nominal.leg_names
+    for key in ("base_joints", "platform_joints", "offsets"):
+        found, wanted = getattr(written.parameters, key), getattr(calibrated, key)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("machine", "name"), [("hexapod", "mjcf bodies"), ("3-upu", "loop_joint"), ("3-upu", "gepetto")]
+)
+def test_what_is_written_down_loads_with_an_equal_analysis(
+    machine: str, name: str, tmp_path: Path
+) -> None:
+    found = load_mechanism(write_format(machine_of(machine), name, tmp_path / "from"))
+    yaml_path, urdf_path = write_model(found, tmp_path / "to")
+    assert (yaml_path.name, urdf_path.name) == ("machine.yaml", "machine.urdf")
+    written = load_mechanism(yaml_path)
+    assert_same_analysis(written, found)
+    for key in ("leg_names", "frame_legs", "platform_joint"):
+        assert getattr(written, key) == getattr(found, key)
+
+
+def test_a_urdf_that_needs_no_change_is_copied_and_nothing_written_over(tmp_path: Path) -> None:
+    machine = machine_of("hexapod")
+    _, urdf_path = write_model(machine, tmp_path)
+    assert urdf_path.read_bytes() == machine.urdf_path.read_bytes()
+    with pytest.raises(UsageError, match="already there, needed new files"):
+        write_model(machine, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def gepetto_robots() -> Path:
+    """The robots of Gepetto/example-parallel-robots."""
+    checkout = os.environ.get("LEGCAL_GEPETTO")
+    for robots in (checkout and Path(checkout) / "robots", checkout and Path(checkout)):
+        if robots and (robots / "wl16_like").is_dir():
+            return robots
+    pytest.skip("set LEGCAL_GEPETTO to a checkout of Gepetto/example-parallel-robots")
+
+
+def test_the_six_sps_leg_of_gepetto_is_understood(gepetto_robots: Path) -> None:
+    machine = load_mechanism(gepetto_robots / "wl16_like")
+    assert [leg.type for leg in machine.legs] == ["SPS"] * 6
+    assert (machine.mobility, len(machine.motors)) == (6, 6)
+    assert (machine.base, machine.platform) == ("hip_part", "foot_part")
+    q0 = {leg.prismatic: leg.q0 for leg in machine.legs}
+    assert q0["motor_6"] == pytest.approx(0.3582 + 0.198, abs=1e-12)
+    assert q0["motor_1"] == pytest.approx(0.4878 + 0.099 + 0.099, abs=1e-12)
+    assert any("6 legs have an S joint at both ends" in note for note in machine.diagnostics)
+
+
+def test_the_other_robots_of_gepetto_are_refused_in_one_sentence(gepetto_robots: Path) -> None:
+    for yaml_path in sorted(gepetto_robots.glob("*/robot.yaml")):
+        if yaml_path.parent.name != "wl16_like":
+            with pytest.raises(LegcalError) as refusal:
+                load_mechanism(yaml_path.parent)
+            assert "\n" not in refusal.value.problems[0]
+
+
+# --- numbers that MuJoCo has for a model with all conventions at once ---------------------------
+
+MUJOCO = Path(__file__).parent / "data" / "mujoco"
+
+
+def _rotation(quaternion: list[float]) -> Rotation:
+    """Return the rotation of a quaternion w, x, y, z."""
+    return Rotation.from_quat(np.roll(quaternion, -1))
+
+
+def test_bodies_sites_and_closures_are_where_mujoco_has_them() -> None:
+    path, values = MUJOCO / "model.xml", json.loads((MUJOCO / "values.json").read_text())
+    root, problems = parse_xml(path, path.read_bytes(), "MJCF file"), Problems(path)
+    tree = read_bodies(root, Values(root, problems))
+    pairs = [close_loop(loop, tree.text, tree.poses)[0] for loop in closing_joints(root, tree)]
+    problems.raise_if_any()
+    chain = ClosedChain(tree.text.robot("machine").decode(), [])
+    q = chain.neutral()
+    for name, value in values["q"].items():
+        if len(value) == 1:
+            q[chain.q_index(name)] = value[0]
+        elif len(value) == 4:  # a ball is three revolutes
+            for letter, angle in zip("xyz", _rotation(value).as_euler("XYZ"), strict=True):
+                q[chain.q_index(f"{name}_{letter}")] = angle
+        else:
+            T = RigidTransform.from_components(value[:3], _rotation(value[3:]))
+            moved = tree.poses["f"].inv() * T
+            at = chain.q_index(name)
+            q[at : at + 7] = [*moved.translation, *moved.rotation.as_quat()]
+
+    for name, (position, quaternion) in values["bodies"].items():
+        T = chain.pose(q, "world", name)
+        np.testing.assert_allclose(T.translation, position, atol=1e-12)
+        R = _rotation(quaternion).as_matrix()
+        np.testing.assert_allclose(T.rotation.as_matrix(), R, atol=1e-12)
+    for name, (position, matrix) in values["sites"].items():
+        body, T_body_site = tree.sites[name]
+        T = chain.pose(q, "world", body) * T_body_site
+        np.testing.assert_allclose(T.translation, position, atol=1e-12)
+        np.testing.assert_allclose(T.rotation.as_matrix().ravel(), matrix, atol=1e-12)
+    for pair, off in zip(pairs, values["closures"], strict=True):
+        one, two = (chain.pose(q, "world", frame).translation for frame in pair)
+        np.testing.assert_allclose(one - two, off, atol=1e-12)
