@@ -13,8 +13,8 @@ from thinned import thinned
 from legcal.calibration.joint_fit import held_out as pose_by_outlines
 from legcal.calibration.joint_fit.held_out import (
     HeldOut,
+    PosesByOutlines,
     Posterior,
-    ShownPoses,
     compare_held_out,
     poses_by_outlines,
 )
@@ -115,11 +115,11 @@ def test_poses_that_still_move_are_not_known(monkeypatch: pytest.MonkeyPatch) ->
     poses = [away * T for T in truth.poses]
     assert len(_shown(truth, truth.outlines, poses).known) >= 7
     monkeypatch.setattr(pose_by_outlines, "_ROBUST_STEPS", 0)
-    monkeypatch.setattr(pose_by_outlines, "_MOST_STEPS", 1)
+    monkeypatch.setattr(pose_by_outlines, "_MAX_STEPS", 1)
     assert len(_shown(truth, truth.outlines, poses).known) == 0
 
 
-def _shown(truth: Truth, outlines: Outlines, poses: Sequence[RigidTransform]) -> ShownPoses:
+def _shown(truth: Truth, outlines: Outlines, poses: Sequence[RigidTransform]) -> PosesByOutlines:
     predicted = truth.posterior.of_images(truth.measurements, outlines, poses)
     return poses_by_outlines(predicted, 4.5)
 

@@ -16,7 +16,7 @@ from thinned import thinned
 from legcal.calibration.joint_fit.factors import observed_outlines
 from legcal.calibration.joint_fit.fit import refine
 from legcal.calibration.joint_fit.outline_errors import possible_biases
-from legcal.calibration.joint_fit.rounds import NO_CHANGES, Changes, unsettled
+from legcal.calibration.joint_fit.rounds import NO_CHANGES, Changes, check_convergence
 from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import DEFAULT_SETTINGS, RefinementSettings
 from legcal.errors import DidNotConverge
@@ -59,9 +59,9 @@ def test_a_fit_that_has_the_usual_rounds_settles(session: Session, level: float)
 
 def test_outlines_that_come_and_go_are_not_settled() -> None:
     sizes, claimed = np.array([1.0, 0.0, 0.0]), np.broadcast_to(0.01 * np.eye(2), (100, 2, 2))
-    assert unsettled(Changes(sizes, sizes, 1, 100), claimed, DEFAULT_SETTINGS) == ()
-    assert unsettled(NO_CHANGES, claimed, DEFAULT_SETTINGS) == ()
-    (note,) = unsettled(Changes(sizes, sizes, 4, 100), claimed, DEFAULT_SETTINGS)
+    assert check_convergence(Changes(sizes, sizes, 1, 100), claimed, DEFAULT_SETTINGS) == ()
+    assert check_convergence(NO_CHANGES, claimed, DEFAULT_SETTINGS) == ()
+    (note,) = check_convergence(Changes(sizes, sizes, 4, 100), claimed, DEFAULT_SETTINGS)
     assert "rejected 4 outlines anew, with 100 accepted" in note
     with pytest.raises(DidNotConverge, match="rejected 6 outlines anew"):
-        unsettled(Changes(sizes, sizes, 6, 100), claimed, DEFAULT_SETTINGS)
+        check_convergence(Changes(sizes, sizes, 6, 100), claimed, DEFAULT_SETTINGS)

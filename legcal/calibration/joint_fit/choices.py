@@ -82,8 +82,8 @@ class KnownParameter:
     nominal: float  # its value in the model or camera file [unit]
     unit: str  # its unit; "" for coefficients of distortion and for the size of a board
     kind: Kind  # what it belongs to
-    least: float  # between these a stated value is believed [unit]
-    most: float  # between these a stated value is believed [unit]
+    least: float  # limits of a stated value [unit]
+    most: float  # limits of a stated value [unit]
     # what its camera file says of its uncertainty, one standard deviation [unit]
     sigma: float | None = None
 
@@ -230,17 +230,17 @@ def resolve(overrides: Sequence[Override], known: KnownParameters) -> Choices:
         pair of overrides that contradict each other.
     """
     in_file, its_problems = _decisions([w for w in overrides if w.in_file], known)
-    asked, problems = _decisions([w for w in overrides if not w.in_file], known)
+    of_call, problems = _decisions([w for w in overrides if not w.in_file], known)
     if problems:
         raise UsageError([*problems, *its_problems])
     if its_problems:
         raise DatasetError(its_problems)
-    decisions = in_file | asked
+    decisions = in_file | of_call
     for name, decision in decisions.items():
         parameter = known.by_name[name]
         if decision.action == "free" and parameter.sigma is not None:  # the camera file knows it
             decisions[name] = _Decision("prior", parameter.nominal, parameter.sigma)
-    given_way = [name for name in in_file if asked.get(name, in_file[name]) != in_file[name]]
+    given_way = [name for name in in_file if of_call.get(name, in_file[name]) != in_file[name]]
     note = f"What the dataset says of {', '.join(given_way)} gave way to what this run asks for."
     stated = {name: (d.value, d.sigma) for name, d in decisions.items() if d.value is not None}
     choices = Choices(
@@ -356,7 +356,7 @@ def _decision(override: Override, name: str, parameter: KnownParameter) -> _Deci
 def _contradiction(
     name: str, several: Sequence[tuple[Override, _Decision]], known: KnownParameters
 ) -> str:
-    """Return what is wrong with all that is asked of one parameter, if anything."""
+    """Return the sentence about overrides of one parameter that contradict each other, if any."""
     fixed = [override for override, decision in several if decision.action == "fixed"]
     others = [override for override, decision in several if decision.action != "fixed"]
     stated = {(d.value, d.sigma): override for override, d in several if d.value is not None}

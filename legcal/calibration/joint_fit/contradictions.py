@@ -1,6 +1,6 @@
-"""What was stated beforehand, against the measurements: refused or noted where they contradict.
+"""Stated priors and fixed values against the measurements: refused or noted where they contradict.
 
-A stated prior is judged with the information that measurements and other priors have of its
+A stated prior is tested with the information that measurements and other priors have of its
 parameter; a fixed value by a wider fit in which it is free.
 """
 
@@ -30,23 +30,23 @@ from legcal.machine import radius_name
 from legcal.vision import intrinsic_names, intrinsic_unit
 
 _SIGNIFICANT = 5.0  # standard deviations between a prior and the measurements
-_KNOWN = 1e-9  # of the information of a prior: what the measurements must have to be asked
-_KNOWN_WIDE = 1e-3  # the same of a wide prior in place of what was fixed
-_KNOWN_SCALE = 0.05  # of a board's size: what must be known to be believed against the file
-_WIDE = 0.05  # of the mean leg length, angles at it: the prior of what was fixed
+_MIN_INFORMATION = 1e-9  # of a prior's information: what measurements must have for a test
+_MIN_INFORMATION_WIDE = 1e-3  # the same of a wide prior in place of what was fixed
+_MAX_SCALE_SIGMA = 0.05  # of the size of a board, for a test of the dataset's
+_WIDE_SIGMA = 0.05  # of the mean leg length, angles at it: the prior of what was fixed
 _WIDE_RADIUS = 0.2  # of the radius
-_TOLD = 0.5  # of the variance of that prior: what measurements leave where they tell the value
-_HELD = 0.01  # of the mean leg length: how well a nominal model knows what is held
-_MANY = 0.1  # of all outlines
-_MOST = 0.5  # of those of a leg or a view
-_SOME = 3  # rejected outlines of a leg or a view, at least, before it is spoken of
-_SIGMAS = 3.0  # of the prior of a radius, between all radii and the model's
-_ALIKE = 0.25  # of their common difference
-_SHOWN = 4  # names, before they are only counted
+_MAX_VARIANCE_SHARE = 0.5  # of the variance of that prior, after the measurements, for a test
+_NOMINAL_SIGMA = 0.01  # of the mean leg length: how far a nominal model is off along what is held
+_MANY_REJECTED = 0.1  # of all outlines
+_MOST_REJECTED = 0.5  # of those of a leg or a view
+_MIN_COUNT = 3  # rejected outlines of a leg or a view, at least, before it is spoken of
+_RADIUS_SIGMAS = 3.0  # of the prior of a radius, between all radii and the model's
+_RADIUS_SPREAD = 0.25  # of their common difference
+_MAX_NAMES = 4  # names, before they are only counted
 
 
 def refuse_contradicted_priors(problem: FitProblem, state: State, normal: NormalEquations) -> None:
-    """Refuse what somebody stated and what cannot be true beside the measurements.
+    """Refuse stated priors that contradict the measurements.
 
     *normal* is the information at *state*, a minimum.
 
@@ -61,7 +61,7 @@ def refuse_contradicted_priors(problem: FitProblem, state: State, normal: Normal
     ):
         if problem.named[i] not in problem.choices.priors:
             continue
-        found = without_prior(problem, state, normal, i, mean, sigma)
+        found = estimate_without_prior(problem, state, normal, i, mean, sigma)
         if found is not None and found.apart > _SIGNIFICANT:
             unit = problem.units[i]
             problems.append(
@@ -87,36 +87,36 @@ def refuse_other_board(
     place, priors = problem.named.index(BOARD_SCALE), problem.priors
     for i in np.flatnonzero(priors.unknown == place).tolist():
         mean, sigma = float(priors.mean[i]), float(priors.sigma[i])
-        found = without_prior(problem, state, normal, place, mean, sigma)
-        if found is None or found.sigma > _KNOWN_SCALE or found.apart <= _SIGNIFICANT:
+        found = estimate_without_prior(problem, state, normal, place, mean, sigma)
+        if found is None or found.sigma > _MAX_SCALE_SIGMA or found.apart <= _SIGNIFICANT:
             continue
         choices = replace(problem.choices, free=problem.choices.free | {BOARD_SCALE})
         try:
             free = first_minimum(problem.with_choices(choices, settings), state, settings)
-            told = f"{free.state.board_scale[0]:.4g} times as large as"
+            size = f"{free.state.board_scale[0]:.4g} times as large as"
         except (DidNotConverge, NotIdentifiable):
-            told = "of another size than"
+            size = "of another size than"
         raise DidNotConverge(
             "The calibration board does not fit the readings and the legs: found that it is "
-            f"{told} the dataset says ({found.apart:.0f} standard deviations away), needed its "
+            f"{size} the dataset says ({found.apart:.0f} standard deviations away), needed its "
             f"dimensions to {1e2 * sigma:.2g} %; measure the board and correct its dimensions in "
             f"dataset.yaml, or let the fit find them (--free {BOARD_SCALE})."
         )
 
 
 @dataclass(frozen=True)
-class Opinion:
-    """What everything but its own prior says of a parameter."""
+class Estimate:
+    """A parameter by everything but its prior."""
 
     value: float
     sigma: float
     apart: float  # standard deviations from the prior
 
 
-def without_prior(
+def estimate_without_prior(
     problem: FitProblem, state: State, normal: NormalEquations, i: int, mean: float, sigma: float
-) -> Opinion | None:
-    """Return what measurements say of a named unknown by themselves; None if nothing.
+) -> Estimate | None:
+    """Return a named unknown by the measurements alone; None if they say nothing of it.
 
     With the information I that they have of it, an estimate that its own prior leaves at a distance
     d from the mean would be d (1 + 1 / (I sigma^2)) away without it, with the variance sigma^2 +
@@ -124,24 +124,24 @@ def without_prior(
     """
     all_of_it = named_information(problem, state, normal)
     known = float(marginal(all_of_it, np.array([i]))[0, 0]) - 1.0 / sigma**2
-    if known < _KNOWN / sigma**2:
+    if known < _MIN_INFORMATION / sigma**2:
         return None
     away = (float(problem.coordinates(state)[i]) - mean) * (1.0 + 1.0 / (known * sigma**2))
     variance = 1.0 / known
     apart = abs(away) / float(np.sqrt(sigma**2 + variance))
-    return Opinion(mean + away, float(np.sqrt(variance)), apart)
+    return Estimate(mean + away, float(np.sqrt(variance)), apart)
 
 
 @dataclass(frozen=True)
-class _Doubt:
-    """A stated value beside what the measurements say."""
+class _Comparison:
+    """A stated value beside that of the measurements."""
 
     name: str
     unit: str
     mean: float
     sigma: float  # zero where it is fixed
     found: float
-    together: float  # standard deviations apart if all stated values are asked at once
+    together: float  # standard deviations apart if all stated values are tested at once
     alone: float  # if the other stated values are right
 
     def __str__(self) -> str:
@@ -165,11 +165,11 @@ def refuse_contradicted_values(
     *,
     with_priors: bool = False,
 ) -> None:
-    """Refuse values that somebody fixed and that cannot be true beside the measurements.
+    """Refuse fixed values that contradict the measurements.
 
     The errors of outlines are those that the wider fit estimates, so that claimed covariances
-    that are too small do not make a right value suspect. It begins at the start, as if nothing
-    had been stated, and where that fails at the state; where both fail nothing is said.
+    that are too small do not refuse a right value. It begins at the start, as if nothing
+    had been stated, and where that fails at the state; where both fail nothing is refused.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def refuse_contradicted_values(
         Where the fit began, and a minimum with the values fixed or where it is looked for.
     settings : RefinementSettings
     with_priors : bool
-        Whether stated priors are asked as well.
+        Whether stated priors are tested as well.
 
     Raises
     ------
@@ -200,22 +200,22 @@ def refuse_contradicted_values(
         choices, fixed=choices.fixed - wide.keys(), priors={**choices.priors, **wide}
     )
     wider = problem.with_choices(wider_choices, settings)
-    doubts: list[_Doubt] = []
+    comparisons: list[_Comparison] = []
     for begin in (wider.begin(start), state):
         try:
             fit, held = _fitted(wider, begin, settings)
         except (DidNotConverge, NotIdentifiable):
             continue
-        doubts = _doubts(fit, held, stated, wide, settings)
+        comparisons = _compared(fit, held, stated, wide, settings)
         break
-    found = [doubt for doubt in doubts if doubt.together > _SIGNIFICANT]
-    found = found or [doubt for doubt in doubts if doubt.alone > _SIGNIFICANT]
+    found = [comparison for comparison in comparisons if comparison.together > _SIGNIFICANT]
+    found = found or [comparison for comparison in comparisons if comparison.alone > _SIGNIFICANT]
     if found:
-        raise DidNotConverge([str(doubt) for doubt in found])
+        raise DidNotConverge([str(comparison) for comparison in found])
 
 
 def _fixed_by_choice(problem: FitProblem) -> tuple[str, ...]:
-    """Return what somebody fixed: kinematic parameters, radii, intrinsics that were given."""
+    """Return what is fixed by choice: kinematic parameters, radii, intrinsics at values."""
     legs, choices = problem.legs, problem.choices
     radii = (radius_name(legs.names[leg], part) for leg, part in problem.outlines.parts)
     own = {*legs.parametrization.names, *radii, *choices.values}
@@ -223,7 +223,7 @@ def _fixed_by_choice(problem: FitProblem) -> tuple[str, ...]:
 
 
 def _values(problem: FitProblem, state: State) -> dict[str, float]:
-    """Return the values of all that somebody may state."""
+    """Return the values of all that may be stated."""
     legs = problem.legs
     values = dict(zip(legs.parametrization.names, legs.vector(state.legs).tolist(), strict=True))
     for (leg, part), radius in zip(problem.outlines.parts, state.radii.tolist(), strict=True):
@@ -235,16 +235,16 @@ def _values(problem: FitProblem, state: State) -> dict[str, float]:
 
 
 def _wide_prior(problem: FitProblem, state: State, name: str, value: float, sigma: float) -> Prior:
-    """Return a prior around a value that hardly says anything."""
+    """Return a prior around a value that holds hardly any information."""
     names, units = problem.legs.parametrization.names, problem.legs.parametrization.units
     if name in names:
-        wide = _WIDE * (state.mean_length if units[names.index(name)] == "m" else 1.0)
+        wide = _WIDE_SIGMA * (state.mean_length if units[names.index(name)] == "m" else 1.0)
     elif ".radius." in name:
         wide = _WIDE_RADIUS * value
     else:
         view, key = name.rsplit(".", 1)
         camera = state.cameras[problem.outlines.views.index(view)]
-        wide = _WIDE * (camera.K[0, 0] if intrinsic_unit(key) == "px" else 1.0)
+        wide = _WIDE_SIGMA * (camera.K[0, 0] if intrinsic_unit(key) == "px" else 1.0)
     return Prior(value, max(float(wide), sigma))
 
 
@@ -260,14 +260,14 @@ def _fitted(problem: FitProblem, state: State, settings: RefinementSettings) -> 
     return fit_in_rounds(problem, state, first.iterations, settings), held
 
 
-def _doubts(
+def _compared(
     fit: Fit,
     held: Held,
     stated: Mapping[str, tuple[float, float]],
     wide: Mapping[str, Prior],
     settings: RefinementSettings,
-) -> list[_Doubt]:
-    """Return what the measurements say of every stated value that they say anything of.
+) -> list[_Comparison]:
+    """Return every stated value beside that of the measurements, where these have any.
 
     With M the information of these parameters, their wide priors P around w in it, and f where the
     fit puts them, the measurements alone have the information K = M - P, and the slope
@@ -285,34 +285,34 @@ def _doubts(
     around = np.array([wide[name].mean for name in stated])
     covariance = inverse_on_range(M)
     slope = M @ (found - mean) - P * (around - mean)
-    doubts = []
+    comparisons = []
     for i, name in enumerate(stated):
         alone = M[i, i] - P[i]
-        if alone < _KNOWN_WIDE * P[i]:
+        if alone < _MIN_INFORMATION_WIDE * P[i]:
             continue
         together = abs(found[i] - mean[i]) / np.sqrt(covariance[i, i] + sigma[i] ** 2)
-        doubts.append(
-            _Doubt(
+        comparisons.append(
+            _Comparison(
                 name,
                 problem.units[where[i]],
                 float(mean[i]),
                 float(sigma[i]),
                 float(found[i]),
-                float(together) if covariance[i, i] * P[i] < _TOLD else 0.0,
+                float(together) if covariance[i, i] * P[i] < _MAX_VARIANCE_SHARE else 0.0,
                 float(abs(slope[i] / alone) / np.sqrt(1.0 / alone + sigma[i] ** 2)),
             )
         )
-    return doubts
+    return comparisons
 
 
 def _held_information(problem: FitProblem, held: Held, length: float) -> Array:
-    """Return the normal matrix of named unknowns that knows what is held as nominal models do.
+    """Return the normal matrix (n_named, n_named) of a nominal model along what is held.
 
-    Where the fit holds a direction at nominal that what was stated would tell, as the size of a
-    3-UPU that only translates is told by its radii, the measurements do not speak against it.
+    Where the fit holds a direction at nominal that stated values would determine, as radii do the
+    size of a 3-UPU that only translates, the measurements do not contradict them.
     """
     n = problem.n_named
-    rows, known = np.zeros((len(held.basis), n)), _HELD * length * held.unit
+    rows, known = np.zeros((len(held.basis), n)), _NOMINAL_SIGMA * length * held.unit
     rows[:, np.setdiff1d(np.arange(n), problem.where("biases"))] = held.basis / known
     return rows.T @ rows
 
@@ -323,7 +323,7 @@ def rejected_notes(problem: FitProblem, accepted: BoolArray) -> tuple[str, ...]:
     legs = _mostly_rejected([problem.legs.names[j] for j in o.leg.tolist()], accepted)
     views = _mostly_rejected([o.views[v] for v in o.view.tolist()], accepted)
     n, n_rejected = len(accepted), int(np.sum(~accepted))
-    if not legs and not views and n_rejected <= _MANY * n:
+    if not legs and not views and n_rejected <= _MANY_REJECTED * n:
         return ()
     of = [f"{rejected} of {total} of {name}" for name, (rejected, total) in (legs | views).items()]
     words = (
@@ -342,11 +342,11 @@ def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings)
     free = problem.block("radii").unknown[:, 0] >= 0
     nominal = np.array([problem.legs.radii[part] for part in problem.outlines.parts])
     change = (state.radii / nominal - 1.0)[free]
-    if len(change) < _SOME:
+    if len(change) < _MIN_COUNT:
         return ()
     common = float(np.median(change))
-    alike = bool(np.all(np.abs(change - common) < _ALIKE * abs(common)))
-    if not alike or abs(common) < _SIGMAS * settings.radius_sigma:
+    alike = bool(np.all(np.abs(change - common) < _RADIUS_SPREAD * abs(common)))
+    if not alike or abs(common) < _RADIUS_SIGMAS * settings.radius_sigma:
         return ()
     way = "smaller" if common < 0.0 else "larger"
     return (
@@ -356,8 +356,8 @@ def scale_notes(problem: FitProblem, state: State, settings: RefinementSettings)
     )
 
 
-def blaming_what_was_stated(problem: FitProblem, failure: LegcalError) -> LegcalError:
-    """Return a failure that names first what was stated beforehand, if anything was."""
+def naming_stated_values(problem: FitProblem, failure: LegcalError) -> LegcalError:
+    """Return a failure that names first the stated values, if there are any."""
     stated = _stated(problem)
     if not stated:
         return failure
@@ -372,7 +372,7 @@ def blaming_what_was_stated(problem: FitProblem, failure: LegcalError) -> Legcal
 
 
 def _stated(problem: FitProblem) -> list[str]:
-    """Return of what somebody stated a prior or a fixed value; not twists about nominal ones."""
+    """Return the parameters with a stated prior or value; not twists about nominal ones."""
     legs = problem.legs
     nominal = zip(legs.parametrization.names, legs.vector(legs.nominal).tolist(), strict=True)
     usual = {name: value for name, value in nominal if name.endswith(".twist")}
@@ -385,16 +385,16 @@ def _stated(problem: FitProblem) -> list[str]:
 
 def _listed(names: list[str]) -> str:
     """Return names in words, the first ones if they are many."""
-    more = len(names) - _SHOWN
-    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - _MAX_NAMES
+    return ", ".join(names[:_MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _mostly_rejected(names: list[str], accepted: BoolArray) -> dict[str, tuple[int, int]]:
-    """Return how many outlines were rejected of whose most were, and of how many."""
+    """Return names most of whose outlines were rejected: how many of how many."""
     found = {}
     for name in dict.fromkeys(names):
-        own = accepted[[other == name for other in names]]
-        rejected = int(np.sum(~own))
-        if rejected >= _SOME and rejected > _MOST * len(own):
-            found[name] = (rejected, len(own))
+        of_name = accepted[[other == name for other in names]]
+        rejected = int(np.sum(~of_name))
+        if rejected >= _MIN_COUNT and rejected > _MOST_REJECTED * len(of_name):
+            found[name] = (rejected, len(of_name))
     return found

@@ -1,8 +1,8 @@
 """Open directions: refused where they matter, held at nominal where the platform stays.
 
 Directions are held where they hardly move the platform, by up to a hundredth of their own change.
-The nominal model is wrong along them as it is wrong elsewhere, which the fit has found out: the
-root mean square of its changes says how much, of lengths and of angles apart.
+The nominal model is assumed as wrong along them as elsewhere, by the root mean square of the
+changes that the fit found, of lengths and of angles apart.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from legcal.machine import (
     split_by_motion,
 )
 
-_LARGEST_SIGMA = 0.1  # of the mean leg length
+_MAX_SIGMA = 0.1  # of the mean leg length
 _HELD_SIGMA = 0.01  # of it, where the platform does not move
 _HARMLESS = 0.01  # of the change of the parameters: the platform hardly moves
-_OTHERS = 0.05  # of a direction that is not kinematic: more, and it is not a matter of the legs
+_MAX_OTHERS = 0.05  # of a direction that is not kinematic: more, and it is not a matter of the legs
 _REMEDY = "add images from other directions, of other legs or at poses that differ more"
-_LEAST = 1e-12  # [m] a spread that counts as none
+_MIN_SPREAD = 1e-12  # [m] a spread that counts as none
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Held:
 
 
 def open_directions(problem: FitProblem, state: State, normal: NormalEquations) -> Held:
-    """Return the open directions that do no harm.
+    """Return the open directions that hardly move the platform.
 
     *problem* holds nothing yet; *normal* is its information at the state.
 
@@ -60,10 +60,10 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     scaled = unit[:, None] * information * unit
     value, vector = np.linalg.eigh(0.5 * (scaled + scaled.T))
     n_open, n_poor = (
-        int(np.sum(value * (sigma * length) ** 2 < 1.0)) for sigma in (_LARGEST_SIGMA, _HELD_SIGMA)
+        int(np.sum(value * (sigma * length) ** 2 < 1.0)) for sigma in (_MAX_SIGMA, _HELD_SIGMA)
     )
     basis, poor = vector[:, :n_open].T, vector[:, :n_poor].T
-    others = np.flatnonzero((basis[:, problem.n_kinematic :] ** 2).sum(axis=1) > _OTHERS**2)
+    others = np.flatnonzero((basis[:, problem.n_kinematic :] ** 2).sum(axis=1) > _MAX_OTHERS**2)
     if len(others):
         basis = basis[others]
     else:
@@ -92,7 +92,9 @@ def open_directions(problem: FitProblem, state: State, normal: NormalEquations) 
     return Held(harmless, unit, tuple(directions), weak)
 
 
-def refuse_lost(problem: FitProblem, state: State, normal: NormalEquations, held: Held) -> None:
+def refuse_undetermined_inliers(
+    problem: FitProblem, state: State, normal: NormalEquations, held: Held
+) -> None:
     """Refuse a fit whose accepted outlines leave more open than was held before rejections.
 
     Raises
@@ -108,7 +110,7 @@ def refuse_lost(problem: FitProblem, state: State, normal: NormalEquations, held
     scaled = held.unit[:, None] * information * held.unit
     N = null_space(held.basis) if len(held.basis) else np.eye(len(kept))
     value, vector = np.linalg.eigh(N.T @ scaled @ N)
-    if value[0] * (_LARGEST_SIGMA * state.mean_length) ** 2 < 1.0:
+    if value[0] * (_MAX_SIGMA * state.mean_length) ** 2 < 1.0:
         names = [problem.named[i] for i in kept]
         raise NotIdentifiable(
             "The fit is not determined: found that the outlines which agree with it leave "
@@ -147,7 +149,7 @@ def held_spread(problem: FitProblem, state: State, held: Held) -> Array:
     for kind in (is_length, ~is_length):
         found = float(np.sum(kind) - np.sum(H[:, kind] ** 2))  # the rest is held: no change
         sigma[kind] = np.sqrt(np.sum(change[kind] ** 2) / max(found, 1.0))
-    weighted = H / np.maximum(sigma, _LEAST)
+    weighted = H / np.maximum(sigma, _MIN_SPREAD)
     spread = H.T @ np.linalg.solve(weighted @ weighted.T, H)
     back = np.linalg.inv(problem.jacobian(state))[:n, :n] * unit
     return np.asarray(back @ spread @ back.T)

@@ -122,7 +122,7 @@ class ObservedOutlines:
         return len(self.index)
 
     def at(self, which: IntArray) -> ObservedOutlines:
-        """Return some of the outlines, repeated where asked, without biases."""
+        """Return some of the outlines, by index, without biases."""
         bare = self.without_biases()
         shared = ("parts", "views", "series", "cameras")
         chosen = {
@@ -447,7 +447,7 @@ def observed_axes(
 def average_images(axes: LegAxes, measurements: Measurements) -> LegAxes:
     """Return one axis for each leg at each pose in each view, weighted by the covariances.
 
-    Nothing is lost by it, and a fit is smaller by the number of images.
+    No information is lost, and a fit is smaller by the number of images.
     """
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     return join_axes(axes, view * measurements.n_poses + pose)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from legcal.calibration.joint_fit.choices import NO_CHOICES, Choices
 from legcal.calibration.joint_fit.contradictions import (
-    blaming_what_was_stated,
+    naming_stated_values,
     refuse_contradicted_priors,
     refuse_contradicted_values,
     refuse_other_board,
@@ -20,7 +20,7 @@ from legcal.calibration.joint_fit.contradictions import (
 from legcal.calibration.joint_fit.determinacy import (
     held_at_nominal,
     open_directions,
-    refuse_lost,
+    refuse_undetermined_inliers,
 )
 from legcal.calibration.joint_fit.factors import BoardCorners
 from legcal.calibration.joint_fit.outline_errors import NoiseModel, noise_of_the_median
@@ -45,8 +45,8 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array
 
-_LARGEST_RADIUS_CHANGE = 0.5
-_EQUAL_COSTS = 1e-6  # relative: the same minimum
+_MAX_RADIUS_CHANGE = 0.5
+_COST_TOLERANCE = 1e-6  # relative: the same minimum
 
 
 def refine(
@@ -115,9 +115,8 @@ def refine_from_best(
 ) -> Solution:
     """Fit everything from several starts and keep the lowest cost.
 
-    The first minima are compared; only the lowest is worked out, the others stand in for it if
-    that fails. A start that fails is skipped with a note; between equal costs the earlier
-    start wins.
+    The first minima are compared; only the lowest is refined, the next one if that fails. A
+    start that fails is skipped with a note; between equal costs the earlier start wins.
 
     Raises
     ------
@@ -139,7 +138,7 @@ def refine_from_best(
             continue
         if len(starts) > 1:
             notes.append(f"The start {start.label} led to a cost of {cost:.6g}.")
-        place = sum(other <= (1.0 + _EQUAL_COSTS) * cost for _, _, other in candidates)
+        place = sum(other <= (1.0 + _COST_TOLERANCE) * cost for _, _, other in candidates)
         candidates.insert(place, (start, minimum, cost))
     for start, minimum, _ in candidates:
         try:
@@ -167,12 +166,12 @@ def _first(
     except DidNotConverge as failure:
         refuse_contradicted_values(problem, start, begin, settings, with_priors=True)
         _refuse_undetermined(problem, begin)
-        raise blaming_what_was_stated(problem, failure) from None
+        raise naming_stated_values(problem, failure) from None
     return found, comparable_cost(problem, found.state, settings)
 
 
 def _held_at_start(problem: FitProblem, begin: State) -> tuple[FitProblem, State]:
-    """Return problem and state with what the measurements seem to leave open held, for now."""
+    """Return problem and state with directions held that are open at the start."""
     begin = problem.projected(begin)
     linear = linearize(problem, begin)
     try:
@@ -189,7 +188,7 @@ def _refined(
     first: Minimum[State],
     settings: RefinementSettings,
 ) -> Solution:
-    """Work out a first minimum."""
+    """Refine a first minimum: held directions, rounds, checks, result."""
     refuse_contradicted_values(problem, start, first.state, settings)
     loss = PseudoHuber(settings.loss_width)
     normal = information(problem, first.state, first.linear, loss)
@@ -203,14 +202,14 @@ def _refined(
             state, iterations = there.state, iterations + there.iterations
         fit = fit_in_rounds(problem, state, iterations, settings)
         normal = information(fit.problem, fit.state, fit.minimum.linear, loss)
-        refuse_lost(fit.problem, fit.state, normal, held)
+        refuse_undetermined_inliers(fit.problem, fit.state, normal, held)
         _refuse_other_radii(problem, fit.state)
     except (DidNotConverge, NotIdentifiable) as failure:
         refuse_contradicted_values(free, start, state, settings, with_priors=True)
         _refuse_contradicted(free, state)
         _refuse_undetermined(free, state)
         if isinstance(failure, DidNotConverge):
-            raise blaming_what_was_stated(free, failure) from None
+            raise naming_stated_values(free, failure) from None
         raise
     if rejected_notes(fit.problem, fit.accepted):
         refuse_contradicted_values(free, start, state, settings, with_priors=True)
@@ -243,7 +242,7 @@ def _refuse_other_radii(problem: FitProblem, state: State) -> None:
         "agree to a half; check the radius, and the outlines for edges that are swapped or "
         "belong to another leg."
         for (leg, part), radius in zip(problem.outlines.parts, state.radii, strict=True)
-        if not abs(radius / legs.radii[leg, part] - 1.0) < _LARGEST_RADIUS_CHANGE
+        if not abs(radius / legs.radii[leg, part] - 1.0) < _MAX_RADIUS_CHANGE
     ]
     if problems:
         raise DidNotConverge(problems)

@@ -1,7 +1,7 @@
-"""How well a fit predicts images that it has not seen: in pixels, and at the platform.
+"""How well a fit predicts held-out images: in pixels, and at the platform.
 
 In pixels: where the calibrated model, its readings and its cameras put the outlines, against where
-they are. At the platform: its pose by the readings, against its pose by what the image shows alone.
+they are. At the platform: its pose by the readings, against its pose by the outlines alone.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from legcal.machine import pose_differences
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """Images that a fit has not seen, with all that it knows of them."""
+    """Held-out images, and what a fit predicts of them."""
 
     problem: FitProblem  # their outlines and readings; the unknowns of the fit, their own biases
     state: State  # where the fit ended, at the poses of these images
-    covariance: Array  # (n_kept, n_kept) by the fit; biases that it has not met have their prior
+    covariance: Array  # (n_kept, n_kept) by the fit; biases of other groups have their prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,17 +90,17 @@ class Posterior:
         return covariance
 
 
-_ROBUST_STEPS, _MOST_STEPS = 10, 30
+_ROBUST_STEPS, _MAX_STEPS = 10, 30
 _WIDTH = 3.0  # whitened distance at which an outline starts to count less
-_KNOWN = 0.03  # [rad], or of a leg's length: a pose known worse is none
-_FURTHEST = 0.1  # [rad], or of a leg's length, in one step
-_LOST = 0.3  # the same from where the search began
-_SETTLED = 1e-4  # squared length of the last step, in standard deviations
-_RANK = 1.0  # [1/rad^2, 1/m^2]: better than a metre or radian
+_MAX_SIGMA = 0.03  # [rad], or of a leg's length: a pose known worse is none
+_MAX_STEP = 0.1  # [rad], or of a leg's length, in one step
+_MAX_DISTANCE = 0.3  # the same from where the search began
+_STEP_TOLERANCE = 1e-4  # squared length of the last step, in standard deviations
+_MIN_INFORMATION = 1.0  # [1/rad^2, 1/m^2]: better than a metre or radian
 
 
 @dataclass(frozen=True, eq=False)
-class ShownPoses:
+class PosesByOutlines:
     """Poses by outlines alone."""
 
     T_Rb_Re: tuple[RigidTransform, ...]  # all of them; those that are not known mean nothing
@@ -110,7 +110,7 @@ class ShownPoses:
     covariance: Array
 
 
-def poses_by_outlines(predicted: Predicted, rejection: float) -> ShownPoses:
+def poses_by_outlines(predicted: Predicted, rejection: float) -> PosesByOutlines:
     """Return the poses that fit the outlines best, from those by the readings.
 
     Outlines count less the farther off they are, then those nearer than *rejection* (whitened)
@@ -120,9 +120,9 @@ def poses_by_outlines(predicted: Predicted, rejection: float) -> ShownPoses:
     linear = linearize(problem, begin)
     length = begin.mean_length
     state, known = begin, _is_known(_by_outlines(problem, begin, linear), length)
-    settled = np.zeros(len(known), dtype=np.bool_)
+    converged = np.zeros(len(known), dtype=np.bool_)
     weight = np.ones(len(problem.outlines))
-    for step in range(_ROBUST_STEPS + _MOST_STEPS):
+    for step in range(_ROBUST_STEPS + _MAX_STEPS):
         s = linear["outlines"].squared_norms
         if step < _ROBUST_STEPS:
             weight = 1.0 / (1.0 + s / _WIDTH**2)
@@ -130,8 +130,8 @@ def poses_by_outlines(predicted: Predicted, rejection: float) -> ShownPoses:
             weight = np.where(s < rejection**2, 1.0, 0.0)
         normal = _by_outlines(problem, state, linear, weight)
         change, squared = _step(normal)
-        settled = (squared < _SETTLED) & (step >= _ROBUST_STEPS)
-        moving = known & ~settled
+        converged = (squared < _STEP_TOLERANCE) & (step >= _ROBUST_STEPS)
+        moving = known & ~converged
         if not moving.any():
             break
         state, is_near = _moved(predicted, state, np.where(moving[:, None], change, 0.0), length)
@@ -139,9 +139,9 @@ def poses_by_outlines(predicted: Predicted, rejection: float) -> ShownPoses:
         linear = linearize(problem, state)
     outlines = _by_outlines(problem, state, linear, weight)
     readings = information(problem, state, linear, only=("readings",))
-    which = np.flatnonzero(known & settled & _is_known(outlines, length))
+    which = np.flatnonzero(known & converged & _is_known(outlines, length))
     covariance = _covariance(outlines, readings, predicted.covariance)[which]
-    return ShownPoses(state.platform_pose.motions, which, covariance)
+    return PosesByOutlines(state.platform_pose.motions, which, covariance)
 
 
 def _by_outlines(
@@ -171,11 +171,11 @@ def _moved(
     problem, begin = predicted.problem, predicted.state
     unit, first = np.repeat([1.0, length], 3), begin.platform_pose
     reach = np.linalg.norm(change / unit, axis=1, keepdims=True)
-    change = change * np.minimum(1.0, _FURTHEST / np.maximum(reach, 1e-300))
+    change = change * np.minimum(1.0, _MAX_STEP / np.maximum(reach, 1e-300))
     moved = state.platform_pose.moved(change)
     cosine = 0.5 * (np.einsum("kij,kij->k", moved.R, first.R) - 1.0)
     shift = np.linalg.norm(moved.t - first.t, axis=1)
-    is_near = (cosine > np.cos(_LOST)) & (shift < _LOST * length)
+    is_near = (cosine > np.cos(_MAX_DISTANCE)) & (shift < _MAX_DISTANCE * length)
     trial = problem.projected(_with_poses(state, first, is_near, moved))
     seen = np.isfinite(problem.offsets(trial)).all(axis=1)
     is_near[problem.outlines.pose[~seen]] = False
@@ -193,12 +193,12 @@ def _is_known(normal: NormalEquations, length: float) -> BoolArray:
     """Return which poses are determined well enough to mean anything."""
     Z = _motions(normal)
     covariance = Z @ normal.V_inverse @ np.swapaxes(Z, 1, 2)
-    has_rank = np.linalg.eigvalsh(normal.V)[:, 0] > _RANK
+    has_rank = np.linalg.eigvalsh(normal.V)[:, 0] > _MIN_INFORMATION
     turn, shift = (
         np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2))
         for part in (slice(0, 3), slice(3, 6))
     )
-    return np.asarray(has_rank & (shift < _KNOWN * length) & (turn < _KNOWN))
+    return np.asarray(has_rank & (shift < _MAX_SIGMA * length) & (turn < _MAX_SIGMA))
 
 
 def _covariance(outlines: NormalEquations, readings: NormalEquations, of_fit: Array) -> Array:
@@ -220,19 +220,19 @@ def _motions(normal: NormalEquations) -> Array:
 
 
 _MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))  # of the norm of two unit Gaussians
-_SINGULAR = 1e-18  # of the largest eigenvalue of what readings say of a pose
+_RANK_TOLERANCE = 1e-18  # of the largest eigenvalue of what readings say of a pose
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What images that were kept aside say of a fit.
+    """Held-out images compared with the predictions of a fit.
 
     Offsets are without the biases that outlines share with fitted ones. What is expected is one
     standard deviation, by the noise of outlines and readings and the covariance of all that the fit
     knows.
     """
 
-    n_images: int  # kept aside
+    n_images: int  # held out
     n_poses: int
     outlines: int  # in them
     wrong: int  # far from where they should be for their noise; left out of what follows
@@ -275,12 +275,12 @@ def compare_held_out(
     T_Rb_Re: Sequence[RigidTransform],
     rejection: float,
 ) -> HeldOut:
-    """Compare images that were kept aside with what a fit of others predicts.
+    """Compare held-out images with the predictions of a fit of others.
 
-    Shifts that the outlines share with those of the fit are taken off. What is expected has the
-    noise of the outlines, that of the readings, and the covariance of all that the fit knows.
+    Common-mode biases that the outlines share with those of the fit are subtracted. The expected
+    errors have the noise of the outlines, that of the readings, and the covariance of the fit.
 
-    Of *measurements*, kept aside, the used *outlines* are compared, at the poses *T_Rb_Re* by the
+    Of held-out *measurements* the used *outlines* are compared, at the poses *T_Rb_Re* by the
     fit and the readings; *rejection* is the whitened distance beyond which the fit rejects one.
 
     Raises
@@ -330,7 +330,7 @@ def compare_held_out(
 def _refuse_undetermined(readings: NormalEquations) -> None:
     """Raise NotIdentifiable where readings do not determine a pose."""
     value = np.linalg.eigvalsh(readings.V)
-    bad = np.flatnonzero(value[:, 0] <= _SINGULAR * value[:, -1])
+    bad = np.flatnonzero(value[:, 0] <= _RANK_TOLERANCE * value[:, -1])
     if len(bad):
         raise NotIdentifiable(
             "The images that were kept aside could not be compared with what the fit predicts: "
@@ -357,7 +357,7 @@ def _norms(r: Array, covariance: Array) -> Array:
 
 
 def _usual(norm: Array) -> float:
-    """Return how far off outlines usually are, in sigmas of their noise, at least one."""
+    """Return the median distance of outlines in sigmas of their noise, at least one."""
     return max(float(np.median(norm)) / _MEDIAN, 1.0) if len(norm) else 1.0
 
 

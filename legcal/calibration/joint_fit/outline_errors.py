@@ -45,7 +45,7 @@ _MIN_NOISE_GAIN = (
 )
 _MAX_ITERATIONS = 100
 _VARIANCE_TOLERANCE = 1e-9
-_RANK = 1e-10  # of the largest singular value: kinds of noise that cannot be told apart
+_RANK = 1e-10  # of the largest singular value: kinds of noise that the offsets do not separate
 
 KINDS = (
     "bias of many edges",

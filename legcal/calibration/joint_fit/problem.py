@@ -338,7 +338,7 @@ def _poses(n_poses: int) -> Variables:
 def _scalars(
     name: str, labels: Sequence[str], unit: str, mean: Array, sigma: Array, choices: Choices
 ) -> Variables:
-    """Return the block of numbers, those that nobody freed with a prior; some may be fixed."""
+    """Return the block of numbers, with priors where they are not freed; some may be fixed."""
     is_free = np.array([not choices.holds(label) for label in labels], dtype=np.bool_)
     unknown = np.where(is_free, np.cumsum(is_free) - 1, -1).astype(np.intp)
     if not labels:  # one that does not move
@@ -354,13 +354,13 @@ def _scalars(
 
 
 def _stated(block: Variables, choices: Choices) -> Variables:
-    """Return a block with the priors that somebody stated of it."""
-    asked = [i for i, label in enumerate(block.labels) if label in choices.priors]
-    if not asked:
+    """Return a block with its stated priors."""
+    which = [i for i, label in enumerate(block.labels) if label in choices.priors]
+    if not which:
         return block
-    priors = [choices.priors[block.labels[i]] for i in asked]
+    priors = [choices.priors[block.labels[i]] for i in which]
     stated = GaussianPrior(
-        np.array(asked, dtype=np.intp),
+        np.array(which, dtype=np.intp),
         np.array([prior.mean for prior in priors]),
         np.array([prior.sigma for prior in priors]),
     )
@@ -371,13 +371,13 @@ def _intrinsics(
     views: Sequence[str], cameras: Sequence[Camera], owners: Sequence[str], choices: Choices
 ) -> tuple[Variables, tuple[str, ...]]:
     """Return the block of intrinsics, shared by views of one camera, and what its columns are."""
-    asked = {*choices.free, *choices.priors}
+    wanted = {*choices.free, *choices.priors}
     names = [
         f"{view}.{key}"
         for view, camera in zip(views, cameras, strict=True)
         if view in owners
         for key in intrinsic_names(camera)
-        if f"{view}.{key}" in asked
+        if f"{view}.{key}" in wanted
     ]
     keys = tuple(dict.fromkeys(name.rsplit(".", 1)[1] for name in names))
     number = {name: i for i, name in enumerate(names)}

@@ -1,8 +1,8 @@
 """From a first minimum to the final one: outlines and corners rejected, their errors estimated.
 
-Rounds reject what disagrees until that settles. Then the noise of outlines and the variances of
-common-mode edge biases are estimated by restricted maximum likelihood and all is fitted again,
-until nothing that matters changes.
+Rounds reject outliers until the set of inliers stays the same. Then the noise of outlines and the
+variances of common-mode edge biases are estimated by restricted maximum likelihood and all is
+fitted again, until these converge.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from legcal.vision import EPSILON
 
 _NOMINAL_SIGMA = 0.1  # of the mean leg length, angles at it
 _BOARD_ROUNDS = 3
-_NEAR_ENOUGH = 0.005  # of the cost a step: rejecting need not wait for the rest
-_LEAST_LEFT = 0.05  # of the equations of corners, beyond what the fit takes up
-_SMALLEST_SCALE = 0.1
-_ROUNDED_PX = 1e-3  # smaller errors of outlines do not matter
-_FURTHEST = 0.5  # of the largest error of outlines, in the last round
-_MOST_CHANGED = 0.05  # of the accepted outlines
-_NAMED = 4
+_REJECTION_TOLERANCE = 0.005  # relative, of the cost, in rounds that reject outliers
+_MIN_REDUNDANCY = 0.05  # of the equations of corners, beyond what the fit absorbs
+_MIN_SCALE = 0.1
+_MIN_ERROR_PX = 1e-3  # absolute tolerance of standard deviations of errors
+_MAX_ERROR_CHANGE = 0.5  # of the largest error of outlines, in the last round
+_MAX_CHANGED = 0.05  # of the accepted outlines
+_MAX_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Fit:
     edge_biases: EdgeBiases
     accepted: BoolArray  # (n_outlines,)
     iterations: int
-    notes: tuple[str, ...]  # what the last round still changed, if that was more than it should
+    notes: tuple[str, ...]  # what the last round still changed, if it did not converge
 
     @property
     def state(self) -> State:
@@ -92,7 +92,7 @@ def first_minimum(
         begin,
         loss,
         max_iterations=settings.max_iterations,
-        relative_tolerance=_NEAR_ENOUGH,
+        relative_tolerance=_REJECTION_TOLERANCE,
     )
     linear = linearize(problem, found.state)
     return Minimum(found.state, linear, robust_cost(problem, linear, loss), found.iterations)
@@ -101,7 +101,7 @@ def first_minimum(
 def fit_in_rounds(
     problem: FitProblem, first: State, iterations: int, settings: RefinementSettings
 ) -> Fit:
-    """Reject what disagrees until that settles, then estimate the noise and solve, in rounds.
+    """Reject outliers until none changes, then estimate the noise and solve, in rounds.
 
     Of axes the claimed covariances are taken as they are, and the robust loss alone guards against
     wrong ones. *first* is what :func:`first_minimum` found in *iterations*.
@@ -109,8 +109,8 @@ def fit_in_rounds(
     Raises
     ------
     DidNotConverge
-        If a solve fails, most outlines or axes disagree with what was found, or the rounds do not
-        settle.
+        If a solve fails, most outlines or axes disagree with the fit, or the rounds do not
+        converge.
     """
     claimed, noise = problem.outlines.covariance, NoiseModel()
     accepted = np.ones(len(claimed), dtype=np.bool_)
@@ -133,14 +133,14 @@ def fit_in_rounds(
         accepted = _accepted(problem, state, noise, settings)
         if np.array_equal(before, accepted):
             break
-        problem, minimum = solved(_NEAR_ENOUGH)
+        problem, minimum = solved(_REJECTION_TOLERANCE)
         state, iterations = minimum.state, iterations + minimum.iterations
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     for _ in range(_BOARD_ROUNDS if len(problem.corners) else 0):
         problem = _with_judged_corners(problem.weighted(noise, accepted), state, settings)
-        problem, minimum = solved(_NEAR_ENOUGH)
+        problem, minimum = solved(_REJECTION_TOLERANCE)
         state, iterations = minimum.state, iterations + minimum.iterations
-    asked, changes = problem.with_biases(possible), NO_CHANGES
+    with_possible, changes = problem.with_biases(possible), NO_CHANGES
     for _ in range(settings.noise_rounds if len(claimed) else 1):
         errors_before, accepted_before = _sizes(noise, biases), accepted
         noise = _noise(problem, state, noise, accepted, settings)
@@ -150,7 +150,7 @@ def fit_in_rounds(
         if not accepted.any():
             break
         there = replace(state, biases=_values(problem, state, possible))
-        scores = scores_of_block(asked.weighted(noise, accepted), there, "biases")
+        scores = scores_of_block(with_possible.weighted(noise, accepted), there, "biases")
         biases = estimated_biases(possible, *scores, least)
         if len(biases) or len(state.biases):
             problem, state = with_edge_biases(problem, state, biases)
@@ -159,7 +159,7 @@ def fit_in_rounds(
         errors = _sizes(noise, biases)
         n_changed = int(np.sum(accepted != accepted_before))
         changes = Changes(errors_before, errors, n_changed, int(accepted.sum()))
-        if changes.are_settled(settings):
+        if changes.converged(settings):
             break
     _refuse_disagreement(problem.offsets(state), accepted, settings)
     wrong = int(np.sum(minimum.linear["axes"].squared_norms > settings.axis_disagreement**2))
@@ -170,7 +170,7 @@ def fit_in_rounds(
             "agree; check the camera poses, the readings, and the units (rad, m) of axes and their "
             "sigmas."
         )
-    notes = unsettled(changes, claimed, settings)
+    notes = check_convergence(changes, claimed, settings)
     return Fit(problem, minimum, noise, biases, accepted, iterations, notes)
 
 
@@ -232,13 +232,13 @@ def _refuse_disagreement(offsets: Array, accepted: BoolArray, settings: Refineme
 def _with_judged_corners(
     problem: FitProblem, state: State, settings: RefinementSettings
 ) -> FitProblem:
-    """Return a problem whose corners have the errors that residuals show, without wrong ones."""
+    """Return a problem whose corners have errors by their residuals, outliers left out."""
     board, linear = problem.corners, linearize(problem, state)
     normal = information(problem, state, linear, PseudoHuber(settings.loss_width))
     left = 1.0 - 0.5 * np.einsum("nqq->n", explained_share(problem, linear, normal, "corners"))
     norms = linear["corners"].squared_norms
-    variance = float(np.median(norms)) / MEDIAN_OF_2 / max(float(np.mean(left)), _LEAST_LEFT)
-    scale = max(float(np.sqrt(variance)), _SMALLEST_SCALE)
+    variance = float(np.median(norms)) / MEDIAN_OF_2 / max(float(np.mean(left)), _MIN_REDUNDANCY)
+    scale = max(float(np.sqrt(variance)), _MIN_SCALE)
     agrees = norms <= (scale * settings.rejection) ** 2
     wrong = zip(board.view[~agrees].tolist(), board.corner[~agrees].tolist(), strict=True)
     judged = problem.with_corners(board.chosen(agrees, scale), tuple(wrong))
@@ -254,13 +254,13 @@ def _with_judged_corners(
 
 
 def corner_notes(problem: FitProblem) -> tuple[str, ...]:
-    """Return what is to be said of corners that were left out, one sentence."""
+    """Return a sentence on corners that were rejected, if any."""
     rejected = problem.rejected_corners
     if not rejected:
         return ()
     views = problem.outlines.views
-    named = [f"{corner} in {views[view]}" for view, corner in sorted(rejected)[:_NAMED]]
-    more = f" and {len(rejected) - _NAMED} more" if len(rejected) > _NAMED else ""
+    named = [f"{corner} in {views[view]}" for view, corner in sorted(rejected)[:_MAX_NAMED]]
+    more = f" and {len(rejected) - _MAX_NAMED} more" if len(rejected) > _MAX_NAMED else ""
     n = len(rejected) + len(problem.corners)
     return (
         f"Of {n} corners of the calibration board {len(rejected)} disagree with the fit and were "
@@ -277,10 +277,12 @@ class Changes:
     n_changed: int  # outlines that were accepted and are not, or the other way round
     n_accepted: int  # after it
 
-    def are_settled(self, settings: RefinementSettings) -> bool:
+    def converged(self, settings: RefinementSettings) -> bool:
         """Say whether another round would change nothing that matters."""
-        near = np.allclose(self.after, self.before, rtol=settings.settled, atol=_ROUNDED_PX)
-        return near and self.n_changed <= settings.settled * self.n_accepted
+        near = np.allclose(
+            self.after, self.before, rtol=settings.error_tolerance, atol=_MIN_ERROR_PX
+        )
+        return near and self.n_changed <= settings.error_tolerance * self.n_accepted
 
 
 NO_CHANGES = Changes(np.zeros(0), np.zeros(0), 0, 0)
@@ -291,8 +293,10 @@ def _sizes(noise: NoiseModel, biases: EdgeBiases) -> Array:
     return np.array([noise.scale, noise.bias_px, noise.tilt_px, *biases.sigma[: len(KINDS)]])
 
 
-def unsettled(changes: Changes, claimed: Array, settings: RefinementSettings) -> tuple[str, ...]:
-    """Return what the last round changed though it should have left it, nothing if it did.
+def check_convergence(
+    changes: Changes, claimed: Array, settings: RefinementSettings
+) -> tuple[str, ...]:
+    """Return a note on what the last round still changed, none where it converged.
 
     *claimed* are the covariances (n, 2, 2) of the outlines [px^2].
 
@@ -301,7 +305,7 @@ def unsettled(changes: Changes, claimed: Array, settings: RefinementSettings) ->
     DidNotConverge
         If that is a lot.
     """
-    if changes.are_settled(settings):
+    if changes.converged(settings):
         return ()
     unit = np.ones(len(changes.after))
     unit[0] = np.sqrt(0.5 * np.mean(np.trace(claimed, axis1=1, axis2=2)))
@@ -313,8 +317,8 @@ def unsettled(changes: Changes, claimed: Array, settings: RefinementSettings) ->
         f"from {before[i]:.3f} px to {after[i]:.3f} px"
     )
     largest = max(float(before.max()), float(after.max()))
-    most_changed = _MOST_CHANGED * changes.n_accepted
-    if abs(after[i] - before[i]) > _FURTHEST * largest or changes.n_changed > most_changed:
+    most_changed = _MAX_CHANGED * changes.n_accepted
+    if abs(after[i] - before[i]) > _MAX_ERROR_CHANGE * largest or changes.n_changed > most_changed:
         raise DidNotConverge(
             "The joint fit could not settle which outlines are right and how large their "
             f"errors are: found that {found}, needed hardly any change; add images, or correct "
@@ -327,14 +331,14 @@ def unsettled(changes: Changes, claimed: Array, settings: RefinementSettings) ->
 
 
 DISAGREES = "disagrees with the fit"  # the beginning of a reason
-_ON_AN_EDGE = 1.5  # [px] at both ends
-_MUCH_NEARER = 0.25  # of the distance from the outline that it was taken for
+_ON_EDGE_PX = 1.5  # [px] at both ends
+_NEARER = 0.25  # of the distance from the outline that it was taken for
 
 
 def rejection_reasons(
     problem: FitProblem, state: State, rejected: IntArray, offsets: Array
 ) -> list[str]:
-    """Return why outlines (m,) disagree with a fit, in words: how far, and which edge they lie on.
+    """Return the reasons of rejection of outlines (m,): how far off, and which edge they lie on.
 
     *offsets* (n, 2) of all outlines are from where the fit puts them [px].
     """
@@ -358,6 +362,6 @@ def rejection_reasons(
     found = np.abs(as_others.offsets(problem.keys, state)).max(axis=1, initial=0.0)
     for i, distances in enumerate(found.reshape(len(rejected), len(edges))):
         nearest = int(np.argmin(distances))
-        if distances[nearest] < min(_ON_AN_EDGE, _MUCH_NEARER * away[i]):
+        if distances[nearest] < min(_ON_EDGE_PX, _NEARER * away[i]):
             reasons[i] += f", lies on {edges[nearest]}"
     return reasons

@@ -59,7 +59,7 @@ class Solution:
 
     legs: tuple[Leg, ...]  # in R_b and R_e
     T_camera_Rb: tuple[RigidTransform, ...]  # one a view; of the start where it shows nothing
-    cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were asked for
+    cameras: tuple[Camera, ...]  # of the views, with the intrinsics that were estimated
     T_Rb_Re: tuple[RigidTransform, ...]  # platform poses
     radii: dict[tuple[int, str], float]  # [m] for each (leg index, part) that was observed
     parametrization: Parametrization  # all kinematic parameters
@@ -89,7 +89,7 @@ class Solution:
     rejected_corners: tuple[tuple[str, int], ...]  # view and number, in all images of the view
     T_Rb_board: RigidTransform | None  # None if no image shows one
     noise: NoiseModel  # errors of single outlines
-    gammas: tuple[EstimatedGamma, ...]  # of cameras whose gamma nobody told
+    gammas: tuple[EstimatedGamma, ...]  # of cameras without a given gamma
     biases: Mapping[str, float]  # common-mode edge biases by name [px]
     shared_px: Mapping[str, float]  # their standard deviations by kind [px]; empty without any
     sensitivities: tuple[Sensitivity, ...]  # to mistakes in what was taken as known

@@ -54,7 +54,7 @@ class RefinementSettings:
     rejection: float = 4.5  # beyond, an outline is rejected; a right one in 25,000 is
     rejection_rounds: int = 6  # at most, until the rejected outlines stay the same
     noise_rounds: int = 10  # at most, in which the errors of outlines are estimated after that
-    settled: float = 0.02  # relative change of these errors below which the rounds end
+    error_tolerance: float = 0.02  # relative change of these errors at which the rounds end
     axis_disagreement: float = 20.0  # beyond, an axis disagrees; if most do, the fit is refused
     largest_rms_px: float = 3.0  # of the offsets of accepted outlines [px]
     max_iterations: int = 200  # steps to try in each solve
@@ -257,10 +257,10 @@ def with_values(
     """Return legs some of whose parameters, by their number, have given values [m, rad]."""
     wanted = np.append(legs.vector(tuple(geometry)), 0.0)
     wanted[list(values)] = list(values.values())
-    asked = np.isin(legs.parametrization.place, list(values))
+    given = np.isin(legs.parametrization.place, list(values))
     found = []
     for leg, nominal, place, own in zip(
-        geometry, legs.nominal, legs.parametrization.place, asked, strict=True
+        geometry, legs.nominal, legs.parametrization.place, given, strict=True
     ):
         if not own.any():
             found.append(leg)
@@ -288,10 +288,10 @@ def with_values(
 
 
 def _axis_at(
-    axis: Array | None, nominal: Array | None, angles: Array, asked: BoolArray
+    axis: Array | None, nominal: Array | None, angles: Array, given: BoolArray
 ) -> Array | None:
-    """Return an axis at angles from the nominal one, as it was if none is asked for."""
-    if axis is None or nominal is None or not asked.any():
+    """Return an axis at angles from the nominal one, as it was if none is given for."""
+    if axis is None or nominal is None or not given.any():
         return axis
     there = np.asarray(turn_of(nominal, angles).apply(nominal))
     return there if there @ axis > 0.0 else -there
