@@ -20,10 +20,10 @@ from legcal.data.overrides import overrides_of_call
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible, UsageError
 from legcal.geometry.types import Array, IntArray
 from legcal.machine import load_mechanism
-from legcal.vision.board import Board, board_of
+from legcal.perception import find_corners
+from legcal.vision import Board, board_of
 from legcal.vision.camera import DistortionModel, intrinsic_values
 from legcal.vision.camera_file import read_camera
-from legcal.vision.corners import find_corners
 
 SPEC = "chessboard:9x6:30mm"
 CHARUCO = Board("charuco", 7, 5, 0.04, marker=0.029, dictionary="DICT_4X4_50")

@@ -14,13 +14,13 @@ from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, NotVisible, UsageError
 from legcal.files import motion_from_xyz_quat
 from legcal.machine import Machine, load_mechanism
-from legcal.perception.boards import camera_poses
+from legcal.perception import camera_poses, find_corners
 from legcal.simulation.board import chosen_board
 from legcal.simulation.dataset import simulate
 from legcal.simulation.request import Level, Request
 from legcal.simulation.settings import SimulationSettings, requested
-from legcal.vision.board import Board, described_board
-from legcal.vision.corners import find_corners
+from legcal.vision import Board
+from legcal.vision import parse_board as described_board
 
 
 @cache
@@ -82,12 +82,12 @@ def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Pa
     assert dataset.corners is not None
     assert dataset.board is not None
     assert [view.name for view in m.views] == [f"c1-{k + 1}" for k in range(m.n_rows)]
-    poses = camera_poses(dataset.corners, dataset.board, m, [view.name for view in m.views])
+    poses, _ = camera_poses(dataset.corners, dataset.board, m, [view.name for view in m.views])
     truth = _truth(held)
     _, T_base_board = described_board(truth["board"], held)
     assert T_base_board is not None
     places = []
-    for view, T_board_camera in zip(m.views, poses.views, strict=True):
+    for view, T_board_camera in zip(m.views, poses, strict=True):
         assert T_board_camera is not None
         there = motion_from_xyz_quat(**truth["views"][view.name]["T_base_camera"])
         assert (T_base_board * T_board_camera).translation == pytest.approx(

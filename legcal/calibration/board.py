@@ -119,15 +119,15 @@ def observe_board(session: Session) -> BoardViews | None:
         corners = detect_corners(dataset.board, load, rows, session.pool, session.progress)
         shown = needed if len(corners) else {view.name for view in used}
         require_board(dataset.board, corners, load, measurements, shown)
-    poses = camera_poses(corners, dataset.board, measurements, needed)
-    if all(T is None for T in poses.views):
+    T_board_camera, corners = camera_poses(corners, dataset.board, measurements, needed)
+    if all(T is None for T in T_board_camera):
         raise NotVisible(
             f"{dataset.yaml_path}: the calibration board could not be used: found no image with "
             f"{MIN_CORNERS} of its corners or more, needed one; add corners to "
             f"{CORNERS_NAME}, or remove that table or the block board."
         )
     names = tuple(measurements.views[v].name for v in measurements.view.tolist())
-    return BoardViews(dataset.board, poses.corners, poses.views, names)
+    return BoardViews(dataset.board, corners, T_board_camera, names)
 
 
 def base_of_board(dataset: Dataset, board: BoardViews, hints: Poses) -> RigidTransform | None:

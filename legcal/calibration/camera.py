@@ -30,6 +30,7 @@ from legcal.estimation import (
 )
 from legcal.files import Document, OwnYaml, describe
 from legcal.geometry import Array, BoolArray, IntArray
+from legcal.perception import describe_image, find_corners, plane_poses
 from legcal.progress import Report, no_progress
 from legcal.vision import (
     CALIBRATED,
@@ -40,13 +41,10 @@ from legcal.vision import (
     ImageSize,
     board_of,
     camera_info,
-    described,
     distort_derivatives,
-    find_corners,
     image_size,
     intrinsic_names,
     intrinsic_values,
-    plane_poses,
     quiet_opencv,
     read_image,
     with_intrinsics,
@@ -437,13 +435,10 @@ def _corner_rows(state: _State, seen: SeenCorners, names: Sequence[str]) -> Rows
         shape = *seen.px.shape, len(names)
         return Rows.of(nothing, np.zeros(shape), np.zeros((*seen.px.shape, 6)))
     xy = P[:, :2] / P[:, 2:]
-    by_point = np.zeros((len(P), 2, 3))
-    by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0
-    by_point[:, :, 2] = -xy
-    by_point = camera.pixels_per_unit(xy) @ by_point / P[:, 2, None, None]
+    predicted, by_point = camera.project_with_derivative(P)
     by_turn = np.cross(arm[:, None, :], by_point)  # d(pixel) = by_point . (w x arm)
     by_pose = np.concatenate([by_turn, by_point], axis=-1)
-    return Rows.of(camera.distort(xy) - seen.px, distort_derivatives(camera, xy, names), by_pose)
+    return Rows.of(predicted - seen.px, distort_derivatives(camera, xy, names), by_pose)
 
 
 FOCAL_LENGTHS = (0.25, 4.0, 13)  # least to greatest, how many: parts of the longer side
@@ -967,7 +962,7 @@ def _seen(board: Board, found: Sequence[_Corners]) -> SeenCorners:
 
 def _nowhere(board: Board, paths: Sequence[Path], size: ImageSize) -> NotVisible:
     """Return the refusal of images without the board, and say what they show instead."""
-    what = next((w for p in paths[:_ASKED] if (w := described(board, _read(p, size)))), None)
+    what = next((w for p in paths[:_ASKED] if (w := describe_image(board, _read(p, size)))), None)
     thing = "tags" if board.kind == "aprilgrid" else "squares"
     hint = ""
     if what is None and board.kind == "chessboard":

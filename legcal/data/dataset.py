@@ -35,7 +35,7 @@ from legcal.files import (
 )
 from legcal.geometry import Image
 from legcal.machine import DATASET_YAML, Machine, load_mechanism, shipped_folders, shipped_names
-from legcal.vision import Board, Camera, image_problem, read_board, read_camera, read_image
+from legcal.vision import Board, Camera, image_problem, parse_board, read_camera, read_image
 
 AXES_NAME = "axes.csv"
 CORNERS_NAME = "corners.csv"
@@ -213,7 +213,9 @@ def load_dataset(folder: str | Path, *, check_images: bool = True) -> Dataset:
     yaml_path = _dataset_file(Path(folder))
     folder = yaml_path.parent
     entry = _read_entry(yaml_path)
-    board, T_base_board = read_board(entry.board, yaml_path)
+    board, T_base_board = None, None
+    if entry.board is not None:
+        board, T_base_board = parse_board(entry.board, yaml_path)
     problems = hand_held_problems(yaml_path, entry.views, has_board=board is not None)
     if found := path_problem(folder, entry.measurements):
         problems.append(

@@ -1,6 +1,10 @@
-from .boards import camera_poses as camera_poses
-from .boards import detect_corners as detect_corners
-from .boards import require_board as require_board
+from .board_corners import describe_image as describe_image
+from .board_corners import detect_corners as detect_corners
+from .board_corners import find_corners as find_corners
+from .board_corners import require_board as require_board
+from .board_poses import PlanePose as PlanePose
+from .board_poses import camera_poses as camera_poses
+from .board_poses import plane_poses as plane_poses
 from .diagnostics import BEFORE_FIT as BEFORE_FIT
 from .diagnostics import FAR_OFF as FAR_OFF
 from .diagnostics import hint_notes as hint_notes

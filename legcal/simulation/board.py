@@ -14,8 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import DatasetError
-from legcal.files import motion_to_xyz_quat, parse_yaml, read_text
+from legcal.files import motion_to_xyz_quat
 from legcal.geometry import Array, BoolArray
 from legcal.simulation.solids import Box, Material, PlacedSolid, PosedMachine, Solid
 from legcal.simulation.visibility import pixels_in_image
@@ -26,8 +25,8 @@ from legcal.vision import (
     Camera,
     board_document,
     charuco_board,
-    described_board,
     dictionary,
+    read_board_file,
 )
 
 INK = 0.06  # how much of the light that white returns black does
@@ -231,7 +230,7 @@ def chosen_board(
     if choice is None or isinstance(choice, Board):
         return choice
     if choice not in KINDS:
-        return _from_file(Path(choice))
+        return read_board_file(Path(choice))
     joints = np.concatenate([part for m in posed_machines for part in (m.A, m.B)])
     width = _WIDTH * float(np.linalg.norm(np.ptp(joints, axis=0)))
     if choice == "aprilgrid":
@@ -242,15 +241,3 @@ def chosen_board(
         marker = round(0.72 * side, _DIGITS)
         return Board("charuco", 7, 5, side, marker=marker, dictionary="DICT_4X4_50")
     return Board("chessboard", 9, 6, max(round(width / 9.0, _DIGITS), 0.001))
-
-
-def _from_file(path: Path) -> Board:
-    """Return the board of a YAML file."""
-    found = parse_yaml(read_text(path, "board file"), path, "board file")
-    block = found.get("board")
-    if not isinstance(block, dict):
-        raise DatasetError(
-            f"{path}: the board file could not be used: found no block board, needed one as in "
-            "dataset.yaml; add it."
-        )
-    return described_board(block, path)[0]

@@ -1,12 +1,13 @@
 from .board import APRIL_TAGS as APRIL_TAGS
+from .board import DICTIONARIES as DICTIONARIES
 from .board import Board as Board
 from .board import BoardKind as BoardKind
-from .board import board_document as board_document
-from .board import board_of as board_of
 from .board import charuco_board as charuco_board
-from .board import described_board as described_board
 from .board import dictionary as dictionary
-from .board import read_board as read_board
+from .board_file import board_document as board_document
+from .board_file import board_of as board_of
+from .board_file import parse_board as parse_board
+from .board_file import read_board_file as read_board_file
 from .camera import DISTORTION_MODELS as DISTORTION_MODELS
 from .camera import Camera as Camera
 from .camera import DistortionModel as DistortionModel
@@ -21,8 +22,6 @@ from .camera import with_intrinsics as with_intrinsics
 from .camera_file import CALIBRATED as CALIBRATED
 from .camera_file import camera_info as camera_info
 from .camera_file import read_camera as read_camera
-from .corners import described as described
-from .corners import find_corners as find_corners
 from .cylinder import EPSILON as EPSILON
 from .cylinder import angles_of_direction as angles_of_direction
 from .cylinder import axis_of_outlines as axis_of_outlines
@@ -31,10 +30,12 @@ from .cylinder import direction_of_angles as direction_of_angles
 from .cylinder import outlines_of_axis as outlines_of_axis
 from .cylinder import point_with_zero_y as point_with_zero_y
 from .image_file import ImageSize as ImageSize
+from .image_file import enlarged as enlarged
 from .image_file import image_problem as image_problem
 from .image_file import image_size as image_size
 from .image_file import quiet_opencv as quiet_opencv
 from .image_file import read_image as read_image
+from .image_file import reduced as reduced
 from .in_view import EQUAL_RADII as EQUAL_RADII
 from .in_view import Band as Band
 from .in_view import Piece as Piece
@@ -43,6 +44,3 @@ from .in_view import band_of_leg as band_of_leg
 from .in_view import hidden_by as hidden_by
 from .in_view import predict_legs as predict_legs
 from .in_view import visible_pieces as visible_pieces
-from .plane_pose import PlanePose as PlanePose
-from .plane_pose import plane_poses as plane_poses
-from .plane_pose import refined_pose as refined_pose

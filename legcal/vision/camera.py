@@ -119,6 +119,15 @@ class Camera:
         xy = P_camera[..., :2] / P_camera[..., 2:]
         return self.distort(xy)
 
+    def project_with_derivative(self, P_camera: Array) -> tuple[Array, Array]:
+        """Return pixels (n, 2) of points (n, 3), and their derivatives (n, 2, 3) [px/m]."""
+        xy = P_camera[:, :2] / P_camera[:, 2:]
+        by_point = np.zeros((len(xy), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0
+        by_point[:, :, 2] = -xy
+        by_point = self.pixels_per_unit(xy) @ by_point / P_camera[:, 2, None, None]
+        return self.distort(xy), by_point
+
     def distort(self, xy: Array) -> Array:
         """Return the pixels of points (x, y) of the sensor plane, both (..., 2)."""
         if not self.has_distortion:

@@ -1,35 +1,136 @@
-"""Corners of a board in an image: searched, fitted as saddles of grey levels, judged."""
+"""Corners of the calibration board in images: searched, fitted as saddles of grey levels, judged.
 
+:func:`find_corners` is for one image, :func:`detect_corners` for those of a dataset; where no image
+shows the board, :func:`require_board` says what they show instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from legcal.data import LEAST_CORNERS, Corners, Measurements, found_corners, join_corners
+from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.vision.board import APRIL_TAGS, DICTIONARIES, Board, charuco_board, dictionary
-from legcal.vision.image_file import enlarged, reduced
+from legcal.perception.light import to_grey
+from legcal.perception.placement import Load
+from legcal.progress import Report
+from legcal.vision import (
+    APRIL_TAGS,
+    DICTIONARIES,
+    Board,
+    charuco_board,
+    dictionary,
+    enlarged,
+    reduced,
+)
+from legcal.workers import Run
 
-REACH_PX = 9  # pixels of the window to each side, at most
-_FEWEST_PX = 24  # pixels that a fit needs
-_ITERATIONS = 15
-_STOP_PX = 1e-3
-_LARGEST_STEP = np.array([1.0, 1.0, 0.2, 0.2, 1.0])  # [px, px, rad, rad, px]
-_USUAL_BLUR = 0.7  # [px] at the start
-_BLUR_REACH = 1.5  # standard deviations of the blur that reach beside an edge
-_LEAST_BAND = 0.3  # of what is free beside an edge that is used at least
-_FARTHEST_PX = 2.0  # of the result from the start
-_MOST_TURNED = 0.2  # [rad] of an edge from where it should point
-_BLUR = (0.35, 4.0)  # [px]
-_LEAST_CONTRAST = 4.0  # grey levels of 255
-_WORST_FIT = 0.15  # residual, as a part of the contrast
-FLOOR_PX = 0.01  # no corner is known better: print, flatness, pixels that differ
+STAGE = "Searching the board"
+MAX_ASKED = 2  # images of a view that are searched for what they show instead
+
+_NEIGHBOURHOOD = 1.5  # squares within which corners tell how the board lies in the image around one
+_STRAIGHT_AROUND = 0.9  # of what is straight around a corner that is used
+_FRAME = 0.2  # of the side of a tag that its black frame is wide, as Kalibr prints it
+_MAX_BLUR_RATIO, _MAX_MISFIT_RATIO = 1.5, 2.5  # times what is usual in the image
+_GOOD_FIT = 0.03  # of the contrast left over: never a reason for doubt
+
+
+def find_corners(
+    board: Board,
+    image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
+) -> tuple[IntArray, Array, Array]:
+    """Return the corners of a board that an image shows.
+
+    Corners whose surroundings are not those of a board, or partly hidden, are left out. A
+    chessboard is found as a whole, or not at all.
+
+    Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
+    """
+    grey = np.ascontiguousarray(image, dtype=np.float32)
+    eight_bits = np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8)
+    search = {
+        "chessboard": _search_chessboard,
+        "charuco": _search_charuco,
+        "aprilgrid": _search_aprilgrid,
+    }[board.kind]
+    numbers, rough = search(board, eight_bits)
+    numbers, first = np.unique(numbers, return_index=True)
+    rough = rough[first]
+    axes = _axes(board, numbers, rough) if len(numbers) >= LEAST_CORNERS else np.zeros((0, 2, 2))
+    clearance = _clearance(board)
+    fitted = [_fit_saddle(grey, *at, *clearance) for at in zip(rough, axes, strict=False)]
+    found = _consistent([(n, s) for n, s in zip(numbers.tolist(), fitted, strict=False) if s])
+    return (
+        np.array([number for number, _ in found], dtype=np.intp),
+        np.array([saddle.px for _, saddle in found]).reshape(-1, 2),
+        np.array([saddle.sigma_px for _, saddle in found], dtype=np.float64),
+    )
+
+
+def _consistent(found: list[tuple[int, _Saddle]]) -> list[tuple[int, _Saddle]]:
+    """Return the corners that look like most of them; none if these are too few.
+
+    What stands before a corner, or a shadow through it, makes its edges look wider or other.
+    """
+    if not found:
+        return []
+    blur = np.array([saddle.blur_px for _, saddle in found])
+    misfit = np.array([saddle.misfit for _, saddle in found])
+    usual = np.median(blur), np.median(misfit)
+    kept = np.abs(np.log(blur / usual[0])) < np.log(_MAX_BLUR_RATIO)
+    kept &= misfit < max(_MAX_MISFIT_RATIO * usual[1], _GOOD_FIT)
+    left = [both for both, is_kept in zip(found, kept, strict=True) if is_kept]
+    return left if len(left) >= LEAST_CORNERS else []
+
+
+def _clearance(board: Board) -> tuple[float, float]:
+    """Return how far edges through a corner are straight, and free of other print beside [m]."""
+    if board.kind == "aprilgrid":
+        gap = board.spacing * board.side
+        return _STRAIGHT_AROUND * gap, min(_FRAME * board.side, gap)
+    gap = 0.5 * (board.side - board.marker)
+    band = gap if board.kind == "charuco" else board.side
+    return 0.5 * _STRAIGHT_AROUND * board.side, band
+
+
+def _axes(board: Board, numbers: IntArray, px: Array) -> Array:
+    """Return the steps in the image for a metre along x and y of the board, (k, 2, 2) [px / m]."""
+    xy = board.points[numbers, :2]
+    pitch = board.side * (1.0 + board.spacing)
+    found = []
+    for here in xy:
+        away = (xy - here) / pitch
+        weight = np.exp(-0.5 * np.sum(away**2, axis=1) / _NEIGHBOURHOOD**2) + 1e-3
+        A = weight[:, None] * np.column_stack([away, np.ones(len(away))])
+        found.append(np.linalg.lstsq(A, weight[:, None] * px, rcond=None)[0][:2].T / pitch)
+    return np.array(found)
+
+
+_WINDOW_PX = 9  # pixels of the window to each side, at most
+_MIN_PIXELS = 24  # pixels that a fit needs
+_MAX_ITERATIONS = 15
+_CONVERGED_PX = 1e-3
+_MAX_STEP = np.array([1.0, 1.0, 0.2, 0.2, 1.0])  # [px, px, rad, rad, px]
+_START_BLUR = 0.7  # [px] at the start
+_BLUR_SIGMAS = 1.5  # standard deviations of the blur that reach beside an edge
+_MIN_BAND = 0.3  # of what is free beside an edge that is used at least
+_MAX_SHIFT_PX = 2.0  # of the result from the start
+_MAX_TURN = 0.2  # [rad] of an edge from where it should point
+_BLURS = (0.35, 4.0)  # [px]
+_MIN_CONTRAST = 4.0  # grey levels of 255
+_MAX_MISFIT = 0.15  # residual, as a part of the contrast
+_MIN_SIGMA_PX = 0.01  # no corner is known better: print, flatness, pixels that differ
 
 
 @dataclass(frozen=True)
-class Saddle:
+class _Saddle:
     """A crossing of two edges in an image."""
 
     px: Array  # (2,) where it is [px]
@@ -38,33 +139,33 @@ class Saddle:
     misfit: float  # what the model leaves over (root mean square), as a part of the contrast
 
 
-def fit_saddle(
+def _fit_saddle(
     grey: NDArray[np.float32],  # (height, width) grey levels, 0 to 255
     start: Array,  # (2,) where the corner should be [px]
     axes: Array,  # (2, 2) the steps in the image along the edges of the board through the corner
     length: float,  # how far both edges are straight on either side of the corner [m]
     band: float,  # how far from the edges nothing else is printed [m]
-) -> Saddle | None:
+) -> _Saddle | None:
     """Return where two edges cross near a pixel; None where the picture is another."""
     u, v, levels = _window(grey, start)
     away = np.stack([u - start[0], v - start[1]])
     on_board = np.abs(np.linalg.solve(axes, away))
     steps = np.linalg.norm(axes, axis=0)
     turns = np.arctan2(axes[1], axes[0])
-    x = np.array([*start, *turns, _USUAL_BLUR])
+    x = np.array([*start, *turns, _START_BLUR])
     found = None
     for _ in range(2):  # how far blur reaches from what else is printed, the first fit tells
-        clear = max(band - (0.5 + _BLUR_REACH * x[4]) / float(steps.min()), _LEAST_BAND * band)
+        clear = max(band - (0.5 + _BLUR_SIGMAS * x[4]) / float(steps.min()), _MIN_BAND * band)
         used = (on_board.max(axis=0) <= length) & (on_board.min(axis=0) <= clear)
-        if np.count_nonzero(used) < _FEWEST_PX:
+        if np.count_nonzero(used) < _MIN_PIXELS:
             return None
         found = _fitted(np.stack([u[used], v[used]]), levels[used], x)
-        if found is None or not np.hypot(*(found.x[:2] - start)) < _FARTHEST_PX:
+        if found is None or not np.hypot(*(found.x[:2] - start)) < _MAX_SHIFT_PX:
             return None
         x = found.x
-        if np.abs(x[2:4] - turns).max() > _MOST_TURNED:
+        if np.abs(x[2:4] - turns).max() > _MAX_TURN:
             return None
-    return None if found is None else _judged(found)
+    return None if found is None else _saddle(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +183,8 @@ def _window(grey: NDArray[np.float32], start: Array) -> tuple[Array, Array, Arra
     """Return columns, rows and levels of the pixels around a place."""
     height, width = grey.shape
     column, row = np.rint(start).astype(int)
-    columns = np.arange(max(column - REACH_PX, 0), min(column + REACH_PX + 1, width))
-    rows = np.arange(max(row - REACH_PX, 0), min(row + REACH_PX + 1, height))
+    columns = np.arange(max(column - _WINDOW_PX, 0), min(column + _WINDOW_PX + 1, width))
+    rows = np.arange(max(row - _WINDOW_PX, 0), min(row + _WINDOW_PX + 1, height))
     u, v = (grid.ravel().astype(np.float64) for grid in np.meshgrid(columns, rows))
     levels = grey[np.ix_(rows, columns)].ravel().astype(np.float64)
     return u, v, levels
@@ -92,14 +193,14 @@ def _window(grey: NDArray[np.float32], start: Array) -> tuple[Array, Array, Arra
 def _fitted(p: Array, levels: Array, x: Array) -> _Fit | None:
     """Fit the model to pixels (2, n) by Gauss-Newton, its linear parameters eliminated."""
     linear, residual, J = _linearised(x, p, levels)
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         A = np.concatenate([J, linear], axis=0).T
         step = np.linalg.lstsq(A, residual, rcond=None)[0][:5]
-        step *= min(1.0, *(_LARGEST_STEP / np.maximum(np.abs(step), 1e-12)))
+        step *= min(1.0, *(_MAX_STEP / np.maximum(np.abs(step), 1e-12)))
         x = x + step
-        x[4] = np.clip(x[4], *_BLUR)
+        x[4] = np.clip(x[4], *_BLURS)
         linear, residual, J = _linearised(x, p, levels)
-        if np.abs(step[:2]).max() < _STOP_PX:
+        if np.abs(step[:2]).max() < _CONVERGED_PX:
             return _Fit(x, linear, residual, J, levels)
     return None
 
@@ -127,31 +228,31 @@ def _linearised(x: Array, p: Array, levels: Array) -> tuple[Array, Array, Array]
     return linear, residual, np.concatenate([centre, turn, blur[None]])
 
 
-def _judged(fit: _Fit) -> Saddle | None:
+def _saddle(fit: _Fit) -> _Saddle | None:
     """Return the corner with what its residual is worth; None where the model does not fit."""
     A = np.concatenate([fit.J, fit.linear], axis=0).T
     n, free = A.shape
     rms = float(np.sqrt(fit.residual @ fit.residual / max(n - free, 1)))
     contrast = 0.5 * float(np.ptp(fit.levels))
-    if contrast < _LEAST_CONTRAST or rms > _WORST_FIT * contrast or fit.x[4] >= _BLUR[1]:
+    if contrast < _MIN_CONTRAST or rms > _MAX_MISFIT * contrast or fit.x[4] >= _BLURS[1]:
         return None
     variance = 0.5 * float(np.trace(np.linalg.pinv(A.T @ A)[:2, :2])) * rms**2
-    if not 0.0 < variance < _FARTHEST_PX**2:
+    if not 0.0 < variance < _MAX_SHIFT_PX**2:
         return None
-    sigma = float(np.hypot(np.sqrt(variance), FLOOR_PX))
-    return Saddle(fit.x[:2].copy(), sigma, float(fit.x[4]), rms / contrast)
+    sigma = float(np.hypot(np.sqrt(variance), _MIN_SIGMA_PX))
+    return _Saddle(fit.x[:2].copy(), sigma, float(fit.x[4]), rms / contrast)
 
 
 _PLAIN = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 # Slow searches where quick ones fail; corners near each other are told apart in a larger image.
-_TRIED = ((1, _PLAIN), (2, _PLAIN), (1, _PLAIN | cv2.CALIB_CB_EXHAUSTIVE))
+_SEARCHES = ((1, _PLAIN), (2, _PLAIN), (1, _PLAIN | cv2.CALIB_CB_EXHAUSTIVE))
 _STRAIGHT = 0.45  # of a square from a corner
-_UNEVEN = 1.6  # times as long as the one before it is no step to the next line
-_MOSTLY = 0.9  # of the neighbours that must be black and white
-_CROSSING = 0.08  # misfit of a corner; where squares meet a rim it is twice as large
+_MAX_STEP_RATIO = 1.6  # times as long as the one before it is no step to the next line
+_MIN_ALTERNATING = 0.9  # of the neighbours that must be black and white
+_MAX_CROSSING_MISFIT = 0.08  # misfit of a corner; where squares meet a rim it is twice as large
 
 
-def search_chessboard(
+def _search_chessboard(
     board: Board,
     grey: NDArray[np.uint8],  # (height, width) the image
 ) -> tuple[IntArray, Array]:
@@ -159,17 +260,17 @@ def search_chessboard(
 
     A part of a larger chessboard is none: nobody can tell which part.
     """
-    grid = inner_corners(grey, board.grid)
-    if grid is None or goes_on(grid, grey):
+    grid = _inner_corners(grey, board.grid)
+    if grid is None or _continues(grid, grey):
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     return np.arange(board.n_corners), _oriented(grid, grey).reshape(-1, 2)
 
 
-def inner_corners(
+def _inner_corners(
     grey: NDArray[np.uint8], grid: tuple[int, int], *, quick: bool = False
 ) -> Array | None:
     """Return a grid of so many corners along x and y, (ny, nx, 2) [px]; None if there is none."""
-    for scale, flags in _TRIED[:1] if quick else _TRIED:
+    for scale, flags in _SEARCHES[:1] if quick else _SEARCHES:
         found, corners = cv2.findChessboardCornersSB(enlarged(grey, scale), grid, flags=flags)
         if found and corners is not None:
             px = reduced(np.asarray(corners, dtype=np.float64), scale)
@@ -183,17 +284,17 @@ def _is_regular(grid: Array, grey: NDArray[np.uint8]) -> bool:
     """Say whether no line of a grid is left out and its squares are black and white in turn."""
     for lines in (grid, np.swapaxes(grid, 0, 1)):
         steps = np.linalg.norm(np.diff(lines, axis=0), axis=-1)
-        if np.any(np.abs(np.log(steps[1:] / steps[:-1])) > np.log(_UNEVEN)):
+        if np.any(np.abs(np.log(steps[1:] / steps[:-1])) > np.log(_MAX_STEP_RATIO)):
             return False
     black, levels = _squares(grid, grey)
     signed = np.where(black, -1.0, 1.0) * levels
     beside = np.concatenate(
         [(signed[:, 1:] + signed[:, :-1]).ravel(), (signed[1:] + signed[:-1]).ravel()]
     )
-    return bool(max(np.mean(beside > 0.0), np.mean(beside < 0.0)) > _MOSTLY)
+    return bool(max(np.mean(beside > 0.0), np.mean(beside < 0.0)) > _MIN_ALTERNATING)
 
 
-def goes_on(grid: Array, grey: NDArray[np.uint8]) -> bool:
+def _continues(grid: Array, grey: NDArray[np.uint8]) -> bool:
     """Say whether the squares go on beyond a grid of corners, (ny, nx, 2), on one of its sides."""
     levels = grey.astype(np.float32)
     size = np.array([grey.shape[1], grey.shape[0]])
@@ -203,10 +304,10 @@ def goes_on(grid: Array, grey: NDArray[np.uint8]) -> bool:
         along = np.gradient(side[0], axis=0)
         inside = np.all((beyond > 0.0) & (beyond < size - 1), axis=1)
         fits = [
-            fit_saddle(levels, p, np.column_stack([x, y]), _STRAIGHT, 1.0)
+            _fit_saddle(levels, p, np.column_stack([x, y]), _STRAIGHT, 1.0)
             for p, x, y in zip(beyond[inside], along[inside], away[inside], strict=True)
         ]
-        crossings = [fit for fit in fits if fit is not None and fit.misfit < _CROSSING]
+        crossings = [fit for fit in fits if fit is not None and fit.misfit < _MAX_CROSSING_MISFIT]
         if len(crossings) > 0.5 * len(side[0]):
             return True
     return False
@@ -238,13 +339,13 @@ def _squares(grid: Array, grey: NDArray[np.uint8]) -> tuple[BoolArray, Array]:
     return (i + j) % 2 == 0, grey[row, column].astype(np.float64)
 
 
-_SMALLEST = 0.01  # perimeter of a marker, as a part of the longer side of the image
+_MIN_PERIMETER = 0.01  # perimeter of a marker, as a part of the longer side of the image
 _BORDERS = (2, 1)  # modules of the black frame of a tag: Kalibr's, and the usual one
 _SCALES = (1, 2)  # by which images are enlarged: modules may be only a few pixels wide
 _FIRST_TAG = 0xD5D628584  # of the family 36h11, its modules row by row from the top left
 
 
-def search_charuco(
+def _search_charuco(
     board: Board,
     grey: NDArray[np.uint8],  # (height, width) the image
 ) -> tuple[IntArray, Array]:
@@ -263,12 +364,12 @@ def search_charuco(
     return best
 
 
-def search_aprilgrid(
+def _search_aprilgrid(
     board: Board,
     grey: NDArray[np.uint8],  # (height, width) the image
 ) -> tuple[IntArray, Array]:
     """Return numbers (k,) and rough places (k, 2) [px] of the corners of the tags that are seen."""
-    tags, places = search_tags(board, grey)
+    tags, places = _search_tags(board, grey)
     own = tags < board.columns * board.rows
     tags, places = tags[own], places[own]
     column, row = tags % board.columns, tags // board.columns
@@ -282,7 +383,7 @@ def search_aprilgrid(
     return numbers.ravel().astype(np.intp), places.reshape(-1, 2)
 
 
-def search_tags(
+def _search_tags(
     board: Board,
     grey: NDArray[np.uint8],  # (height, width) the image
 ) -> tuple[IntArray, Array]:
@@ -300,13 +401,13 @@ def search_tags(
             found = reduced(np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2), scale)
         if len(ids) and scale == _SCALES[-1]:
             break
-    turn = quarter_turns() if board.dictionary == APRIL_TAGS else 0
+    turn = _quarter_turns() if board.dictionary == APRIL_TAGS else 0
     order = [(k + turn) % 4 for k in (3, 2, 1, 0)]
     return ids, found[:, order]
 
 
 @lru_cache(maxsize=1)
-def quarter_turns() -> int:
+def _quarter_turns() -> int:
     """Return how far OpenCV's tags are turned against Kalibr's, in quarter turns clockwise.
 
     OpenCV lists the corners of a tag clockwise from the top left of its own picture of it.
@@ -321,7 +422,7 @@ def _parameters(border: int) -> cv2.aruco.DetectorParameters:
     """Return the settings of the detector."""
     found = cv2.aruco.DetectorParameters()
     found.markerBorderBits = border
-    found.minMarkerPerimeterRate = _SMALLEST
+    found.minMarkerPerimeterRate = _MIN_PERIMETER
     found.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return found
 
@@ -334,90 +435,79 @@ def _flat(numbers: object, corners: object) -> tuple[IntArray, Array]:
     return np.asarray(numbers).ravel().astype(np.intp), places
 
 
-FEWEST = 4  # corners that place a camera
-_NEAR = 1.5  # squares within which corners tell how the board lies in the image around one
-_STRAIGHT_AROUND = 0.9  # of what is straight around a corner that is used
-_FRAME = 0.2  # of the side of a tag that its black frame is wide, as Kalibr prints it
-_MOST_BLURRED, _MOST_MISFIT = 1.5, 2.5  # times what is usual in the image
-_GOOD_FIT = 0.03  # of the contrast left over: never a reason for doubt
-_SEARCH = {
-    "chessboard": search_chessboard,
-    "charuco": search_charuco,
-    "aprilgrid": search_aprilgrid,
-}
-
-
-def find_corners(
+def detect_corners(
     board: Board,
-    image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
-) -> tuple[IntArray, Array, Array]:
-    """Return the corners of a board that an image shows.
+    load: Load,
+    rows: Sequence[int],
+    run: Run,
+    report: Report,
+) -> Corners:
+    """Return the corners of the board in the images of rows; one without the board has none.
 
-    Corners whose surroundings are not those of a board, or partly hidden, are left out. A
-    chessboard is found as a whole, or not at all.
-
-    Returns numbers (k,); px (k, 2); sigma_px (k,) [px].
+    ``load`` returns the image of a row and can travel to another process.
     """
-    grey = np.ascontiguousarray(image, dtype=np.float32)
-    eight_bits = np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8)
-    numbers, rough = _SEARCH[board.kind](board, eight_bits)
-    numbers, first = np.unique(numbers, return_index=True)
-    rough = rough[first]
-    axes = _axes(board, numbers, rough) if len(numbers) >= FEWEST else np.zeros((0, 2, 2))
-    clearance = _clearance(board)
-    fitted = [fit_saddle(grey, *at, *clearance) for at in zip(rough, axes, strict=False)]
-    found = _alike([(n, s) for n, s in zip(numbers.tolist(), fitted, strict=False) if s])
-    return (
-        np.array([number for number, _ in found], dtype=np.intp),
-        np.array([saddle.px for _, saddle in found]).reshape(-1, 2),
-        np.array([saddle.sigma_px for _, saddle in found], dtype=np.float64),
-    )
-
-
-def _alike(found: list[tuple[int, Saddle]]) -> list[tuple[int, Saddle]]:
-    """Return the corners that look like most of them; none if these are too few.
-
-    What stands before a corner, or a shadow through it, makes its edges look wider or other.
-    """
-    if not found:
-        return []
-    blur = np.array([saddle.blur_px for _, saddle in found])
-    misfit = np.array([saddle.misfit for _, saddle in found])
-    usual = np.median(blur), np.median(misfit)
-    kept = np.abs(np.log(blur / usual[0])) < np.log(_MOST_BLURRED)
-    kept &= misfit < max(_MOST_MISFIT * usual[1], _GOOD_FIT)
-    left = [both for both, is_kept in zip(found, kept, strict=True) if is_kept]
-    return left if len(left) >= FEWEST else []
-
-
-def _clearance(board: Board) -> tuple[float, float]:
-    """Return how far edges through a corner are straight, and free of other print beside [m]."""
-    if board.kind == "aprilgrid":
-        gap = board.spacing * board.side
-        return _STRAIGHT_AROUND * gap, min(_FRAME * board.side, gap)
-    gap = 0.5 * (board.side - board.marker)
-    band = gap if board.kind == "charuco" else board.side
-    return 0.5 * _STRAIGHT_AROUND * board.side, band
-
-
-def _axes(board: Board, numbers: IntArray, px: Array) -> Array:
-    """Return the steps in the image for a metre along x and y of the board, (k, 2, 2) [px / m]."""
-    xy = board.points[numbers, :2]
-    pitch = board.side * (1.0 + board.spacing)
+    report(STAGE, 0, len(rows))
     found = []
-    for here in xy:
-        away = (xy - here) / pitch
-        weight = np.exp(-0.5 * np.sum(away**2, axis=1) / _NEAR**2) + 1e-3
-        A = weight[:, None] * np.column_stack([away, np.ones(len(away))])
-        found.append(np.linalg.lstsq(A, weight[:, None] * px, rcond=None)[0][:2].T / pitch)
-    return np.array(found)
+    search = partial(_search, board, load)
+    for k, (row, (corner, px, sigma)) in enumerate(zip(rows, run(search, rows), strict=True)):
+        found.append(found_corners(np.full(len(corner), row, dtype=np.intp), corner, px, sigma))
+        report(STAGE, k + 1, len(rows))
+    return join_corners(found)
 
 
-_FEWEST_CORNERS = 3  # along a side of a chessboard, for OpenCV
-_FEWEST_MARKERS = 3  # of another dictionary that are no chance
+def require_board(
+    board: Board,
+    corners: Corners,
+    load: Load,
+    measurements: Measurements,
+    views: Collection[str],
+) -> None:
+    """Refuse needed views whose images do not show the board, and say what they show instead.
+
+    Raises NotVisible with one sentence for each of them.
+    """
+    shown = set(measurements.view[corners.row].tolist())
+    problems = []
+    for v, view in enumerate(measurements.views):
+        rows = [row for row in np.flatnonzero(measurements.view == v).tolist()
+                if measurements.image[row]]  # fmt: skip
+        if view.name not in views or v in shown or not rows:
+            continue
+        found = next(
+            (
+                what
+                for row in rows[:MAX_ASKED]
+                if (what := describe_image(board, to_grey(load(row))))
+            ),
+            None,
+        )
+        problems.append(
+            f"view {view.name}: the board could not be found in any of its {len(rows)} "
+            f"image{'s' * (len(rows) != 1)}: found {found or 'nothing like it'}, needed "
+            f"{_in_words(board)}; correct the block board of the dataset file, or turn the camera."
+        )
+    if problems:
+        raise NotVisible(problems)
 
 
-def described(
+def _in_words(board: Board) -> str:
+    """Return a board in words."""
+    what = "tags" if board.kind == "aprilgrid" else "squares"
+    whole = ", the whole of it" if board.kind == "chessboard" else ""
+    name = {"chessboard": "a chessboard", "charuco": "a ChArUco board", "aprilgrid": "an AprilGrid"}
+    return f"{name[board.kind]} of {board.columns} x {board.rows} {what}{whole}"
+
+
+def _search(board: Board, load: Load, row: int) -> tuple[IntArray, Array, Array]:
+    """Return the corners, their pixels and sigmas in the image of a row."""
+    return find_corners(board, to_grey(load(row)))
+
+
+_MIN_SIDE = 3  # along a side of a chessboard, for OpenCV
+_MIN_MARKERS = 3  # of another dictionary that are no chance
+
+
+def describe_image(
     board: Board,
     image: NDArray[np.generic],  # (height, width) grey levels, 0 to 255
 ) -> str | None:
@@ -435,12 +525,12 @@ def _other_squares(board: Board, grey: NDArray[np.uint8]) -> str | None:
     tried = [(nx + a, ny + b) for a in steps for b in steps] + [(nx // 2 + 1, ny // 2 + 1)]
     part = None
     for x, y in dict.fromkeys(tried):
-        if min(x, y) < _FEWEST_CORNERS:
+        if min(x, y) < _MIN_SIDE:
             continue
-        grid = inner_corners(grey, (x, y), quick=True)
+        grid = _inner_corners(grey, (x, y), quick=True)
         if grid is None:
             continue
-        if not goes_on(grid, grey):
+        if not _continues(grid, grey):
             seen = f"a chessboard of {x + 1} x {y + 1} squares"
             return seen + (" or that part of one" if x <= nx and y <= ny else "")
         part = part or "a part of a chessboard of more squares"
@@ -452,7 +542,7 @@ def _other_markers(board: Board, grey: NDArray[np.uint8]) -> str | None:
     thing = "tags" if board.kind == "aprilgrid" else "markers"
     count = board.columns * board.rows
     own = count if board.kind == "aprilgrid" else count // 2
-    numbers, _ = search_tags(board, grey)
+    numbers, _ = _search_tags(board, grey)
     beyond = np.unique(numbers[numbers >= own])
     if len(beyond):
         return (
@@ -463,12 +553,12 @@ def _other_markers(board: Board, grey: NDArray[np.uint8]) -> str | None:
             (replace(board, columns=board.rows, rows=board.columns), "squares_x and squares_y"),
             (replace(board, legacy=not board.legacy), "legacy_pattern"),
         ):
-            if len(search_charuco(turned, grey)[0]) > 3:
+            if len(_search_charuco(turned, grey)[0]) > 3:
                 return f"its {thing}, as of a board with another {what}"
     if len(numbers):
         return f"only {len(numbers)} of its {own} {thing}"
     for other in DICTIONARIES:
-        seen = search_tags(replace(board, dictionary=other), grey)[0]
-        if other != board.dictionary and len(seen) >= _FEWEST_MARKERS:
+        seen = _search_tags(replace(board, dictionary=other), grey)[0]
+        if other != board.dictionary and len(seen) >= _MIN_MARKERS:
             return f"markers of {other}"
     return None

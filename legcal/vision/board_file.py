@@ -1,0 +1,293 @@
+"""Boards as files and options name them: the block ``board`` of YAML, and ``--board``."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, Strict, field_validator, model_validator
+from scipy.spatial.transform import RigidTransform
+
+from legcal.errors import DatasetError, UsageError
+from legcal.files import (
+    LENGTH,
+    FileSchema,
+    MotionEntry,
+    Number,
+    closest,
+    describe,
+    parse_quantity,
+    parse_yaml,
+    read_text,
+    validate,
+)
+from legcal.vision.board import APRIL_TAGS, DICTIONARIES, Board, dictionary_size
+
+SIDES = (0.0005, 1.0)  # [m] of a square, a marker or a tag
+MAX_COUNT = 100  # squares or tags along a side
+
+
+def _in_metres(side: float) -> float:
+    """Refuse the side of a square that no board has."""
+    least, most = SIDES
+    if not least <= side <= most:
+        raise ValueError(
+            f"found {side:g} m, needed {least:g} to {most:g} m; write metres, 0.03 for 30 mm."
+        )
+    return side
+
+
+def _count(number: int) -> int:
+    """Refuse a number of squares or tags that no board has."""
+    if not 1 <= number <= MAX_COUNT:
+        raise ValueError(f"found {number}, needed 1 to {MAX_COUNT}; correct the number.")
+    return number
+
+
+Side = Annotated[Number, AfterValidator(_in_metres)]
+Count = Annotated[int, Strict(), AfterValidator(_count)]
+
+
+class _BoardEntry(FileSchema):
+    """What every board has."""
+
+    kind: str
+    T_base_board: MotionEntry | None = None
+
+
+class ChessboardEntry(_BoardEntry):
+    """A chessboard: squares are counted, not inner corners."""
+
+    squares_x: Count
+    squares_y: Count
+    square: Side
+
+    @model_validator(mode="after")
+    def _looks_different_from_each_side(self) -> Self:
+        x, y = self.squares_x, self.squares_y
+        if min(x, y) < 4:
+            raise ValueError(
+                f"found {x} x {y} squares, needed 4 or more each way, of which black and white "
+                "ones are counted; correct them or use another board."
+            )
+        if x % 2 == y % 2:
+            raise ValueError(
+                f"found a chessboard of {x} x {y} squares, which looks the same after half a turn, "
+                "needed an odd number of squares one way and an even one the other; cover a row "
+                "of squares, or use another board, such as ChArUco."
+            )
+        return self
+
+    def board(self) -> Board:
+        """Return the board."""
+        return Board("chessboard", self.squares_x, self.squares_y, self.square)
+
+
+class CharucoEntry(_BoardEntry):
+    """A ChArUco board: markers in the white squares of a chessboard."""
+
+    squares_x: Count
+    squares_y: Count
+    square: Side
+    marker: Side
+    dictionary: str
+    legacy_pattern: Annotated[bool, Strict()] = False
+
+    @field_validator("dictionary")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        if name not in DICTIONARIES:
+            raise ValueError(
+                f"found {describe(name)}, needed a dictionary of OpenCV; "
+                f"{closest(name, DICTIONARIES)}"
+            )
+        return name
+
+    @model_validator(mode="after")
+    def _can_be_printed(self) -> Self:
+        x, y = self.squares_x, self.squares_y
+        if min(x, y) < 2 or (x - 1) * (y - 1) < 4:
+            raise ValueError(
+                f"found {x} x {y} squares, needed four or more corners between them; correct the "
+                "numbers, which count black and white squares."
+            )
+        if not self.marker < self.square:
+            raise ValueError(
+                f"found markers of {self.marker:g} m in squares of {self.square:g} m, needed "
+                "smaller markers; exchange marker and square, or correct them."
+            )
+        size = dictionary_size(self.dictionary)
+        if x * y // 2 > size:
+            raise ValueError(
+                f"found {x * y // 2} markers on {x} x {y} squares, needed at most the {size} of "
+                f"{self.dictionary}; correct the dictionary or the numbers of squares."
+            )
+        return self
+
+    def board(self) -> Board:
+        """Return the board."""
+        return Board(
+            "charuco",
+            self.squares_x,
+            self.squares_y,
+            self.square,
+            marker=self.marker,
+            dictionary=self.dictionary,
+            legacy=self.legacy_pattern,
+        )
+
+
+class AprilgridEntry(_BoardEntry):
+    """An AprilGrid as Kalibr prints it."""
+
+    tags_x: Count
+    tags_y: Count
+    tag_size: Side
+    tag_spacing: Annotated[Number, Field(gt=0.0)]
+    family: Literal["36h11"] = "36h11"
+
+    @field_validator("tag_spacing")
+    @classmethod
+    def _is_a_part_of_the_side(cls, spacing: float) -> float:
+        if not 0.05 <= spacing <= 2.0:
+            raise ValueError(
+                f"found {spacing:g}, needed 0.05 to 2: the gap between two tags as a part of the "
+                "side of one; divide the gap by tag_size."
+            )
+        return spacing
+
+    @model_validator(mode="after")
+    def _has_tags(self) -> Self:
+        x, y, most = self.tags_x, self.tags_y, dictionary_size(APRIL_TAGS)
+        if not 2 <= x * y <= most:
+            raise ValueError(
+                f"found {x} x {y} tags, needed 2 to {most} tags of {self.family} in all; correct "
+                "the numbers."
+            )
+        return self
+
+    def board(self) -> Board:
+        """Return the board."""
+        return Board(
+            "aprilgrid",
+            self.tags_x,
+            self.tags_y,
+            self.tag_size,
+            spacing=self.tag_spacing,
+            dictionary=APRIL_TAGS,
+        )
+
+
+_KINDS: Mapping[str, type[ChessboardEntry | CharucoEntry | AprilgridEntry]] = {
+    "chessboard": ChessboardEntry,
+    "charuco": CharucoEntry,
+    "aprilgrid": AprilgridEntry,
+}
+
+
+def parse_board(found: Mapping[str, Any], path: Path) -> tuple[Board, RigidTransform | None]:
+    """Return the board that a block describes, and its pose in the base link where it is given."""
+    kind = found.get("kind")
+    if not isinstance(kind, str) or kind not in _KINDS:
+        what = "no such key" if "kind" not in found else describe(kind)
+        raise DatasetError(
+            f"{path}: board.kind could not be read: found {what}, needed {', '.join(_KINDS)}; "
+            "name the kind of the board."
+        )
+    entry = validate(_KINDS[kind], found, path, "board")
+    T = None if entry.T_base_board is None else entry.T_base_board.motion()
+    return entry.board(), T
+
+
+def board_document(board: Board) -> dict[str, Any]:
+    """Return a board as the block of ``dataset.yaml`` has it, without its pose."""
+    n = (board.columns, board.rows)
+    if board.kind == "aprilgrid":
+        sizes = {"tag_size": board.side, "tag_spacing": board.spacing}
+        return {"kind": board.kind, "tags_x": n[0], "tags_y": n[1], **sizes}
+    squares = {"kind": board.kind, "squares_x": n[0], "squares_y": n[1], "square": board.side}
+    if board.kind == "chessboard":
+        return squares
+    legacy = {"legacy_pattern": True} if board.legacy else {}
+    return {**squares, "marker": board.marker, "dictionary": board.dictionary, **legacy}
+
+
+FORMS = {
+    "chessboard": "chessboard:9x6:25mm (squares, side)",
+    "charuco": "charuco:7x5:40mm:29mm:DICT_4X4_50 (squares, side, marker, dictionary)",
+    "aprilgrid": "aprilgrid:6x6:88mm:0.3 (tags, side, gap as a part of it)",
+}
+_MIN_SQUARES = 4  # along a side of a chessboard
+_COUNTS = re.compile(r"(\d{1,4})[xX](\d{1,4})", re.ASCII)
+_OPTION = "--board"
+
+
+def board_of(spec: str | Path | Board) -> Board:
+    """Return the board that a word or a file describes."""
+    if isinstance(spec, Board):
+        return spec
+    kind, *words = str(spec).split(":")
+    if kind not in FORMS:
+        return read_board_file(Path(spec))
+    counts = _COUNTS.fullmatch(words[0]) if words else None
+    expected = {"chessboard": (1, 2), "charuco": (4, 5), "aprilgrid": (3,)}[kind]
+    if counts is None or len(words) not in expected:
+        raise _refused(str(spec), describe(str(spec)), FORMS[kind])
+    x, y = int(counts[1]), int(counts[2])
+    if kind == "chessboard":
+        return _chessboard(str(spec), x, y, words[1:])
+    side = parse_quantity(words[1], LENGTH, _OPTION)
+    if kind == "aprilgrid":
+        try:
+            spacing = float(words[2])
+        except ValueError as error:
+            raise _refused(str(spec), describe(words[2]), "the gap as a number, 0.3") from error
+        found = {"tags_x": x, "tags_y": y, "tag_size": side, "tag_spacing": spacing}
+    else:
+        marker = parse_quantity(words[2], LENGTH, _OPTION)
+        found = {"squares_x": x, "squares_y": y, "square": side, "marker": marker}
+        found["dictionary"] = words[3]  # type: ignore[assignment]
+        if words[4:]:
+            if words[4] != "legacy":
+                raise _refused(str(spec), describe(words[4]), "legacy, or nothing, at the end")
+            found["legacy_pattern"] = True
+    try:
+        return parse_board({"kind": kind, **found}, Path(_OPTION))[0]
+    except DatasetError as error:
+        raise UsageError(error.problems) from error
+
+
+def _chessboard(spec: str, x: int, y: int, words: list[str]) -> Board:
+    """Return a chessboard; which of its sides is up does not matter to a camera."""
+    side = parse_quantity(words[0], LENGTH, _OPTION) if words else 0.025
+    if not _MIN_SQUARES <= min(x, y) <= max(x, y) <= MAX_COUNT:
+        needed = f"{_MIN_SQUARES} to {MAX_COUNT} squares each way, black and white ones counted"
+        raise _refused(spec, f"{x} x {y} squares", needed)
+    if not SIDES[0] <= side <= SIDES[1]:
+        needed = f"a side of {1e3 * SIDES[0]:g} to {1e3 * SIDES[1]:g} mm"
+        raise _refused(spec, f"squares of {1e3 * side:g} mm", needed)
+    return Board("chessboard", x, y, side)
+
+
+def read_board_file(path: Path) -> Board:
+    """Return the board of a YAML file."""
+    if not os.path.isfile(path):
+        kinds = "; ".join(FORMS.values())
+        raise _refused(str(path), describe(str(path)), f"a YAML file or one of: {kinds}")
+    found = parse_yaml(read_text(path, "board file"), path, "board file").get("board")
+    if not isinstance(found, dict):
+        raise DatasetError(
+            f"{path}: the board could not be read: found no block board, needed one as in "
+            "dataset.yaml; add it."
+        )
+    return parse_board(found, path)[0]
+
+
+def _refused(spec: str, found: str, needed: str) -> UsageError:
+    return UsageError(
+        f"The board {describe(spec)} could not be used: found {found}, needed {needed}; correct "
+        f"{_OPTION}."
+    )

@@ -1,0 +1,406 @@
+"""Calibration boards: as files describe them, as they are printed, found, and place cameras."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from boards import (
+    APRILGRID,
+    BOARDS,
+    CHARUCO,
+    CHESSBOARD,
+    LENS,
+    before,
+    picture,
+    plain_picture,
+    seen_at,
+)
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from legcal.data import Corners, Measurements, View, found_corners, join_corners
+from legcal.errors import DatasetError, NotVisible
+from legcal.perception import (
+    camera_poses,
+    describe_image,
+    detect_corners,
+    find_corners,
+    plane_poses,
+    require_board,
+)
+from legcal.progress import no_progress
+from legcal.simulation.board import INK, BoardPrint
+from legcal.vision import Board, Camera, board_document, charuco_board, parse_board
+from legcal.workers import in_turn
+
+PATH = Path("dataset.yaml")
+SIGMA = 0.05
+FISHEYE = replace(LENS, distortion=np.array([0.02, -0.01, 0.0, 0.0]), model="equidistant")
+RATIONAL = replace(
+    LENS,
+    distortion=np.array([0.3, 0.1, 1e-4, -1e-4, 0.01, 0.4, 0.08, 0.01]),
+    model="rational_polynomial",
+)
+
+
+# What a board is, and how files describe it.
+
+
+def test_corners_are_numbered_as_opencv_and_kalibr_number_them() -> None:
+    assert CHESSBOARD.points[[0, 1, 6]] == pytest.approx(
+        np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.03, 0.0]])
+    )
+    theirs = np.asarray(charuco_board(CHARUCO).getChessboardCorners())
+    assert CHARUCO.points == pytest.approx(theirs, abs=1e-7)
+    # Row by row of corners: two of each tag, 0.3 of a tag between tags.
+    x = 0.06 * np.array([0.0, 1.0, 1.3, 2.3, 2.6, 3.6])
+    assert APRILGRID.points[:6, 0] == pytest.approx(x)
+    assert APRILGRID.points[::6, 1] == pytest.approx(x[:4])
+    for board in BOARDS:
+        low, high = board.extent.min(axis=0), board.extent.max(axis=0)
+        assert np.all((board.points >= low - 1e-12) & (board.points <= high + 1e-12))
+
+
+@settings(max_examples=40)
+@given(
+    st.sampled_from(["chessboard", "charuco", "aprilgrid"]),
+    st.integers(2, 12),
+    st.integers(2, 12),
+    st.floats(0.001, 0.5),
+    st.floats(0.2, 0.9),
+    st.booleans(),
+)
+def test_a_board_is_read_as_it_was_written(
+    kind: str, x: int, y: int, side: float, part: float, legacy: bool
+) -> None:
+    if kind == "chessboard":
+        assume(min(x, y) >= 4 and x % 2 != y % 2)
+        board = Board("chessboard", x, y, side)
+    elif kind == "charuco":
+        assume((x - 1) * (y - 1) >= 4 and part * side >= 0.0005)
+        markers = {"marker": part * side, "dictionary": "DICT_5X5_100"}
+        board = Board("charuco", x, y, side, legacy=legacy, **markers)  # type: ignore[arg-type]
+    else:
+        board = Board("aprilgrid", x, y, side, spacing=part, dictionary="DICT_APRILTAG_36h11")
+    read, T = parse_board(board_document(board), PATH)
+    assert T is None
+    assert vars(read) == vars(board)
+    assert read.points == pytest.approx(board.points, abs=0.0)
+    pose = {"xyz": [0.1, 0.2, 0.3], "quat_xyzw": [0.0, 0.0, 0.6, 0.8]}
+    T = parse_board({**board_document(board), "T_base_board": pose}, PATH)[1]
+    assert T is not None
+    assert T.translation == pytest.approx([0.1, 0.2, 0.3])
+    assert T.rotation.as_quat() == pytest.approx([0.0, 0.0, 0.6, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("board", "changes", "words"),
+    [
+        (CHESSBOARD, {"square": 30}, ("square", "30 m", "0.03 for 30 mm")),
+        (CHESSBOARD, {"square": 0.0}, ("square", "0 m")),
+        (CHESSBOARD, {"square": float("nan")}, ("square",)),
+        (CHESSBOARD, {"kind": "chess"}, ("kind", "'chess'", "chessboard")),
+        (CHESSBOARD, {"kind": None}, ("kind",)),
+        (CHESSBOARD, {"squares_x": 8}, ("8 x 6 squares", "half a turn")),
+        (CHESSBOARD, {"squares_x": 3}, ("3 x 6 squares", "4 or more")),
+        (CHESSBOARD, {"squares_x": 9.5}, ("squares_x",)),
+        (CHESSBOARD, {"squares_x": -1}, ("squares_x", "-1")),
+        (CHESSBOARD, {"squares_x": True}, ("squares_x",)),
+        (CHESSBOARD, {"columns": 9}, ("columns", "unknown key")),
+        (CHESSBOARD, {"T_base_board": {"xyz": [0, 0, 0]}}, ("T_base_board.quat_xyzw",)),
+        (CHARUCO, {"marker": 0.05}, ("0.05 m", "0.04 m", "smaller")),
+        (CHARUCO, {"marker": 30}, ("marker", "30 m")),
+        (CHARUCO, {"marker": None}, ("marker",)),
+        (CHARUCO, {"dictionary": "4X4"}, ("dictionary", "'4X4'", "DICT_4X4")),
+        (CHARUCO, {"squares_x": 20, "squares_y": 20}, ("200 markers", "the 50 of")),
+        (CHARUCO, {"squares_x": 2, "squares_y": 3}, ("2 x 3 squares", "four or more")),
+        (APRILGRID, {"tag_size": 88}, ("tag_size", "88 m")),
+        (APRILGRID, {"tag_spacing": 0.026}, ("tag_spacing", "0.026", "0.05 to 2")),
+        (APRILGRID, {"tags_x": 60, "tags_y": 60}, ("60 x 60 tags", "587")),
+        (APRILGRID, {"family": "25h9"}, ("family", "'25h9'", "36h11")),
+    ],
+)
+def test_a_board_that_cannot_be_is_refused(
+    board: Board, changes: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    with pytest.raises(DatasetError) as caught:
+        parse_board({**board_document(board), **changes}, PATH)
+    (problem,) = caught.value.problems
+    assert [word for word in (str(PATH), *words) if word not in problem] == []
+
+
+# What is printed.
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize(("columns", "rows"), [(5, 4), (4, 5)])
+def test_the_print_of_a_charuco_board_is_that_of_opencv(
+    columns: int, rows: int, legacy: bool
+) -> None:
+    board = replace(CHARUCO, columns=columns, rows=rows, marker=0.03, legacy=legacy)
+    side = 40
+    theirs = np.asarray(charuco_board(board).generateImage((side * columns, side * rows))) > 127
+    v, u = np.indices(theirs.shape) + 0.5
+    sheet = BoardPrint.of(board, 2, np.zeros(2))
+    x, y = u.ravel() * 0.04 / side, v.ravel() * 0.04 / side
+    ours = sheet.reflectance(x, y).reshape(theirs.shape) > 0.5
+    assert np.mean(ours != theirs) < 1e-3
+
+
+def test_tags_are_those_of_kalibr_and_the_first_square_of_a_chessboard_is_black() -> None:
+    # Tag 0 of the family 36h11, its code row by row from the top left, y upwards.
+    sheet = BoardPrint.of(APRILGRID, 5, np.zeros(2))
+    module = 0.06 / 10
+    k = np.arange(6)
+    x, y = np.meshgrid((2.5 + k) * module, (7.5 - k) * module)
+    code = sheet.reflectance(x.ravel(), y.ravel()) > 0.5
+    assert int("".join("1" if white else "0" for white in code), 2) == 0xD5D628584
+    gap = 0.3 * 0.06
+    black = sheet.reflectance(np.array([-0.5 * gap, 0.03]), np.array([-0.5 * gap, -0.5 * gap]))
+    assert black == pytest.approx([INK, 1.0])
+    sheet = BoardPrint.of(CHESSBOARD, 2, np.zeros(2))
+    x, y = np.array([-0.015, 0.015, 0.015]), np.array([-0.015, -0.015, 0.015])
+    assert sheet.reflectance(x, y) == pytest.approx([INK, 1.0, INK])
+
+
+# Where its corners are in an image.
+
+
+@pytest.mark.parametrize("kind", [board.kind for board in BOARDS])
+def test_corners_are_where_the_camera_sees_them_and_as_good_as_they_claim(kind: str) -> None:
+    board, T, image = plain_picture(kind)
+    number, px, sigma = find_corners(board, image)
+    error = px - seen_at(board, T)[number]
+    assert len(number) >= 0.8 * board.n_corners
+    assert np.all(np.diff(number) > 0)
+    assert np.abs(error.mean(axis=0)).max() < 0.01
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    assert 0.3 < np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 1.6
+    assert np.all(sigma < 0.06)
+
+
+def test_corners_of_a_blurred_picture_have_larger_sigmas() -> None:
+    board, T, sharp = plain_picture("chessboard")
+    number, px, sigma = find_corners(board, picture(board, T, blur=1.5))
+    error = px - seen_at(board, T)[number]
+    assert np.median(sigma) > 1.15 * np.median(find_corners(board, sharp)[2])
+    assert np.sqrt(np.mean((error / sigma[:, None]) ** 2)) < 1.6
+
+
+def test_gamma_does_not_move_corners() -> None:
+    board, T, _ = plain_picture("charuco")
+    looks: dict[str, Any] = {"bits": 16, "electrons": np.inf}
+    (a, one, _), (b, other, _) = (
+        find_corners(board, picture(board, T, gamma=gamma, **looks)) for gamma in (1.0, 2.4)
+    )
+    both = np.intersect1d(a, b)
+    shift = one[np.isin(a, both)] - other[np.isin(b, both)]
+    assert len(both) > 10
+    assert np.abs(shift.mean(axis=0)).max() < 0.004
+
+
+def test_a_chessboard_turned_in_the_picture_keeps_its_numbers() -> None:
+    T = before(CHESSBOARD, 0.55) * RigidTransform.from_rotation(Rotation.from_euler("z", np.pi))
+    number, px, _ = find_corners(CHESSBOARD, picture(CHESSBOARD, T))
+    assert len(number) >= 0.8 * CHESSBOARD.n_corners
+    assert np.abs(px - seen_at(CHESSBOARD, T)[number]).max() < 0.2
+
+
+def test_a_hidden_corner_is_left_out_and_a_part_of_a_chessboard_is_none() -> None:
+    hidden, T = 7, before(CHARUCO)
+    image = picture(CHARUCO, T, hidden=CHARUCO.points[hidden] - [0.0, 0.0, 0.011])
+    number, px, _ = find_corners(CHARUCO, image)
+    assert hidden not in number
+    assert len(number) >= 6
+    assert np.abs(px - seen_at(CHARUCO, T)[number]).max() < 0.3
+    image = picture(CHESSBOARD, before(CHESSBOARD), hidden=CHESSBOARD.points[14])
+    assert len(find_corners(CHESSBOARD, image)[0]) == 0
+    larger = plain_picture("chessboard")[2]
+    assert len(find_corners(replace(CHESSBOARD, columns=5), larger)[0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("stated", "kind", "words"),
+    [
+        (replace(CHARUCO, columns=5, rows=3), "charuco", "markers with numbers up to 11"),
+        (replace(APRILGRID, columns=2), "aprilgrid", "tags with numbers up to 5"),
+        (replace(CHARUCO, dictionary="DICT_5X5_50"), "charuco", "markers of DICT_4X4"),
+        (replace(CHESSBOARD, columns=6, rows=5), "chessboard", "a chessboard of 6 x 7 squares"),
+    ],
+)
+def test_a_board_of_other_dimensions_is_named(stated: Board, kind: str, words: str) -> None:
+    assert words in str(describe_image(stated, plain_picture(kind)[2]))
+
+
+def _measurements(per_view: tuple[int, ...], camera: Camera = LENS) -> Measurements:
+    view = np.repeat(np.arange(len(per_view)), per_view)
+    n = len(view)
+    return Measurements(
+        views=tuple(View(f"c{v + 1}", camera) for v in range(len(per_view))),
+        image=tuple(f"{k}.png" for k in range(n)),
+        view=view,
+        pose=np.arange(n),
+        q=np.zeros((n, 1)),
+        sigma_q=1e-6,
+    )
+
+
+def test_images_are_searched_by_row_and_a_view_without_the_board_is_refused() -> None:
+    board, _, image = plain_picture("aprilgrid")
+    blank = np.random.default_rng(0).normal(100.0, 3.0, (120, 160)).astype(np.float32)
+    steps: list[tuple[int, int]] = []
+    images = [blank, image]
+    corners = detect_corners(
+        board, images.__getitem__, [0, 1], in_turn, lambda _, k, n: steps.append((k, n))
+    )
+    assert set(corners.row.tolist()) == {1}
+    assert steps == [(0, 2), (1, 2), (2, 2)]
+    require_board(board, corners, images.__getitem__, _measurements((2,)), ["c1"])
+    other = replace(board, columns=2)
+    nothing = detect_corners(other, lambda _: blank, [0], in_turn, no_progress)
+    assert len(nothing) == 0
+    assert describe_image(board, blank) is None
+    require_board(other, nothing, lambda _: image, _measurements((1,)), [])
+    with pytest.raises(NotVisible, match=r"c1: .* any of its 1 image: found tags with numbers up"):
+        require_board(other, nothing, lambda _: image, _measurements((1,)), ["c1"])
+
+
+# Where cameras stand before it.
+
+
+def _corners(
+    board: Board,
+    places: list[RigidTransform],
+    seed: int = 0,
+    camera: Camera = LENS,
+    sigma: float = SIGMA,
+) -> Corners:
+    rng, tables = np.random.default_rng(seed), []
+    for row, T in enumerate(places):
+        px = seen_at(board, T, camera)
+        px = px + sigma * rng.normal(size=px.shape)
+        n = len(px)
+        row_of = np.full(n, row)
+        tables.append(found_corners(row_of, np.arange(n), px, np.full(n, max(sigma, 1e-3))))
+    return join_corners(tables)
+
+
+def _turn(one: RigidTransform | None, other: RigidTransform) -> float:
+    assert one is not None
+    return float((one.rotation * other.rotation.inv()).magnitude())
+
+
+@pytest.mark.parametrize("camera", [LENS, FISHEYE, RATIONAL], ids=lambda c: c.model)
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
+def test_without_noise_the_pose_is_exact(board: Board, camera: Camera) -> None:
+    turned = RigidTransform.from_rotation(Rotation.from_euler("z", 0.5))
+    places = [before(board, 0.6), before(board, 0.6) * turned]
+    corners = _corners(board, places, camera=camera, sigma=0.0)
+    for pose, T in zip(
+        camera_poses(corners, board, _measurements((1, 1), camera))[0], places, strict=True
+    ):
+        assert pose is not None
+        assert pose.as_matrix() == pytest.approx(T.as_matrix(), abs=1e-8)
+
+
+def test_errors_are_as_large_as_the_information_says_and_images_add_up() -> None:
+    T = before(CHARUCO, 0.6)
+    truth, squares = T.inv(), []
+    joint: list[tuple[float, float]] = []
+    for seed in range(12):
+        corners = _corners(CHARUCO, [T] * 4, seed)
+        one = corners.choose(corners.row == 0)
+        best = plane_poses(LENS, CHARUCO.points[one.corner], one.px, one.sigma_px)[0]
+        turn = (best.T_camera_plane.rotation * truth.rotation.inv()).as_rotvec()
+        d = np.concatenate([turn, best.T_camera_plane.translation - truth.translation])
+        squares.append(d @ best.information @ d / 6.0)
+        pose = camera_poses(corners, CHARUCO, _measurements((4,)))[0][0]
+        joint.append((float(np.linalg.norm(turn)), _turn(pose, T)))
+    assert 0.6 < np.mean(squares) < 1.5
+    alone, together = np.sqrt(np.mean(np.square(joint), axis=0))
+    assert together == pytest.approx(alone / 2.0, rel=0.5)
+
+
+def test_a_view_without_the_board_has_no_pose_and_is_refused_only_where_it_is_needed() -> None:
+    corners, m = _corners(CHARUCO, [before(CHARUCO)]), _measurements((1, 2))
+    assert camera_poses(corners, CHARUCO, m)[0][1] is None
+    with pytest.raises(NotVisible, match=r"view c2: .* none of its 2 images, needed them in one"):
+        camera_poses(corners, CHARUCO, m, ["c2"])
+    line = corners.choose(corners.corner < CHARUCO.grid[0])
+    assert camera_poses(line, CHARUCO, _measurements((1,)))[0] == (None,)
+
+
+def test_two_poses_that_explain_a_board_alike_are_refused_or_told_apart_by_more_images() -> None:
+    board = replace(CHESSBOARD, side=0.004)  # almost without perspective
+    T = before(board, 0.4, np.array([0.3, 0.0, 0.0]))
+    one = _corners(board, [T], 2, sigma=0.2)
+    both = plane_poses(LENS, board.points, one.px, one.sigma_px)
+    assert len(both) == 2
+    assert 0.0 <= both[1].cost - both[0].cost < 12.0
+    with pytest.raises(NotVisible, match=r"two poses that explain the 30 corners .* degrees apart"):
+        camera_poses(one, board, _measurements((1,)), ["c1"])
+    assert camera_poses(one, board, _measurements((1,)))[0] == (None,)
+    many = _corners(board, [T] * 12, 2, sigma=0.2)
+    pose = camera_poses(many, board, _measurements((12,)), ["c1"])[0][0]
+    assert _turn(pose, T) < np.deg2rad(2.0)
+
+
+@pytest.mark.parametrize("shift", [0.001, 0.01])
+def test_a_board_that_moved_in_an_image_is_named_with_how_far(shift: float) -> None:
+    T = before(CHARUCO, 0.6)
+    moved = RigidTransform.from_translation([shift, 0.0, 0.0]) * T
+    with pytest.raises(DatasetError, match=r"view c1: .* in 2.png than in \d.png, by up") as caught:
+        camera_poses(_corners(CHARUCO, [T, T, moved, T]), CHARUCO, _measurements((4,)))
+    apart = float(str(caught.value).split("by up to ")[1].split(" mm")[0])
+    assert apart == pytest.approx(1e3 * shift, rel=0.3)
+    assert camera_poses(_corners(CHARUCO, [T] * 4), CHARUCO, _measurements((4,)))[0][0] is not None
+
+
+OTHER_LENS = replace(LENS, K=LENS.K * np.array([[0.6], [1.0], [1.0]]))
+
+
+@pytest.mark.parametrize(
+    ("true", "stated", "camera", "words"),
+    [
+        (APRILGRID, replace(APRILGRID, spacing=0.5), LENS, "the numbers of tags and tag_spacing"),
+        (APRILGRID, replace(APRILGRID, columns=2, rows=3), LENS, "the numbers of tags"),
+        (CHARUCO, replace(CHARUCO, columns=4, rows=6), LENS, "squares, marker and square"),
+        (CHARUCO, CHARUCO, OTHER_LENS, "camera file is of this camera and lens"),
+    ],
+)
+def test_corners_of_another_board_or_lens_are_refused(
+    true: Board, stated: Board, camera: Camera, words: str
+) -> None:
+    corners = _corners(true, [before(true)])
+    with pytest.raises(DatasetError, match=f"view c1: .* pose of the {true.kind} .*{words}"):
+        camera_poses(corners, stated, _measurements((1,), camera))
+
+
+def test_corners_that_no_one_pose_has_before_the_camera_are_refused() -> None:
+    """Each image shows one half of the board, and by it the other half is behind the camera."""
+    x, y = CHARUCO.points[:, 0], CHARUCO.points[:, 1]
+    tables = []
+    for row, sign in enumerate((1.0, -1.0)):
+        depth = sign * (x - x.mean())
+        here = np.flatnonzero(depth > 0.1 * np.ptp(x))
+        P = np.column_stack([y - y.mean(), np.full(len(x), 0.5 * sign * np.ptp(x)), depth])
+        px, sigma = LENS.project(P[here]), np.full(len(here), SIGMA)
+        tables.append(found_corners(np.full(len(here), row), here, px, sigma))
+    with pytest.raises(DatasetError, match=r"found no one pose of the charuco .* all its images"):
+        camera_poses(join_corners(tables), CHARUCO, _measurements((2,)))
+
+
+def test_an_outlier_is_rejected_and_does_not_bend_the_pose() -> None:
+    T = before(CHARUCO, 0.6)
+    corners = _corners(CHARUCO, [T], 3)
+    px = corners.px.copy()
+    px[4] += [6.0, -4.0]
+    poses, kept = camera_poses(replace(corners, px=px), CHARUCO, _measurements((1,)))
+    assert np.flatnonzero(~kept.used).tolist() == [4]
+    assert "px from where the other corners put it" in kept.reason[4]
+    clean = camera_poses(corners, CHARUCO, _measurements((1,)))[0][0]
+    assert clean is not None
+    assert _turn(poses[0], clean) < 4e-3
