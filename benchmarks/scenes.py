@@ -39,9 +39,9 @@ from legcal.perception.camera_search import JOINT_ERROR, place_camera, refined, 
 from legcal.perception.detection import measure_outlines
 from legcal.perception.light import to_grey
 from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
-from legcal.perception.look_again import look_again
 from legcal.perception.placement import Placement, Search, group_views
 from legcal.perception.recognise import recognise
+from legcal.perception.view_fit import refine_views
 from legcal.simulation.visibility import field_of_view, silhouette
 
 WRONG_PX = 3.0  # an outline this far from the true one is another edge
@@ -75,7 +75,7 @@ def find(given: Given) -> Found:
     middle = time.process_time()
     outlines, _ = measure_outlines(search, found, rows.tolist())
     groups = group_views(m, rows, [None], None)
-    placement, outlines, _ = look_again(search, groups, found, outlines)
+    placement, outlines, _ = refine_views(search, groups, found, outlines)
     seconds = middle - begin, time.process_time() - middle
     return Found(placement, outlines, seconds)
 

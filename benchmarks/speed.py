@@ -31,8 +31,8 @@ from legcal.perception import Photographs, Placement, measure_photographs, place
 from legcal.perception.detection import measure_outlines
 from legcal.perception.image_quality import expose
 from legcal.perception.light import to_grey
-from legcal.perception.look_again import look_again
 from legcal.perception.placement import group_views
+from legcal.perception.view_fit import refine_views
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -102,7 +102,7 @@ def measure_speed() -> None:
     groups = group_views(photographs.measurements, photographs.detect, scene.T_base_camera, None)
     watch(
         "views fitted, and missing legs",
-        lambda: look_again(search, groups, near, once, together=False),
+        lambda: refine_views(search, groups, near, once, together=False),
     )
     watch("outlines with all care", lambda: measure_photographs(photographs, near, no_progress))
     view = photographs.measurements.view

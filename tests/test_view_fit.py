@@ -14,7 +14,7 @@ from legcal.perception.placement import Group, Search, group_views
 from legcal.perception.view_fit import (
     ViewFit,
     fit_view,
-    least_evidence,
+    min_evidence,
     reversed_pose,
     sideways_sigmas,
 )
@@ -93,9 +93,9 @@ def test_exact_outlines_give_back_the_camera(seed: int) -> None:
     away, angle = lp.apart(T, fit.T_base_group)
     assert away < 1e-3
     assert angle < 1e-3
-    assert not fit.misfits.any()
+    assert not fit.outliers.any()
     assert fit.evidence == pytest.approx(2.0 * 2 * N_IMAGES * N_LEGS, rel=0.01)
-    assert fit.evidence > least_evidence(group)
+    assert fit.evidence > min_evidence(group)
 
 
 def test_the_camera_is_as_far_off_as_its_covariance_says() -> None:
@@ -108,7 +108,7 @@ def test_the_camera_is_as_far_off_as_its_covariance_says() -> None:
 
 def test_a_leg_that_is_elsewhere_in_one_image_is_told() -> None:
     fit, _, _, T = _fitted(1, joints=1e-3, moved=25.0)
-    wrong = set(zip(fit.row[fit.misfits].tolist(), fit.leg[fit.misfits].tolist(), strict=True))
+    wrong = set(zip(fit.row[fit.outliers].tolist(), fit.leg[fit.outliers].tolist(), strict=True))
     assert wrong == {(1, 2)}
     assert lp.apart(T, fit.T_base_group)[1] < np.deg2rad(1.0)
 

@@ -227,10 +227,9 @@ def _places(
     if element is None:
         return Places(index, element, n_kept, n_elements, order, bounds, columns, None, None)
     row = (index * n_elements + element[:, None]).ravel()
-    ones = np.ones(n * m)
     shape = (n_kept + 1) * n_elements, n * m
-    to_kept = csr_array((ones, (row, np.arange(n * m))), shape=shape)
-    to_element = csr_array((ones[:n], (element, np.arange(n))), shape=(n_elements, n))
+    to_kept = csr_array((np.ones(n * m), (row, np.arange(n * m))), shape=shape)
+    to_element = csr_array((np.ones(n), (element, np.arange(n))), shape=(n_elements, n))
     return Places(index, element, n_kept, n_elements, order, bounds, columns, to_kept, to_element)
 
 

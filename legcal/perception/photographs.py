@@ -35,7 +35,6 @@ from legcal.perception.diagnostics import (
 from legcal.perception.image_quality import Exposure, expose, image_defects
 from legcal.perception.light import to_grey
 from legcal.perception.lines import EdgePairs
-from legcal.perception.look_again import look_again
 from legcal.perception.outline import WRONG_WIDTH, Method
 from legcal.perception.placement import (
     NEAR_FIT_PX,
@@ -47,6 +46,7 @@ from legcal.perception.placement import (
 )
 from legcal.perception.radii import Part, radius_notes
 from legcal.perception.recognise import recognise
+from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision import camera_numbers
 from legcal.workers import Run
@@ -184,7 +184,7 @@ def observe(
     groups = group_views(photographs.measurements, usable, hints, joined)
     is_own = np.isin(outlines.row, usable)
     own, others = outlines.choose(is_own), outlines.choose(~is_own)
-    placement, found, _ = look_again(
+    placement, found, _ = refine_views(
         search,
         groups,
         placement,

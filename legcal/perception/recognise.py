@@ -27,10 +27,9 @@ from legcal.perception.camera_search import (
     with_first,
 )
 from legcal.perception.detection import measure_outlines
-from legcal.perception.look_again import group_name, look_again
 from legcal.perception.placement import Group, Joined, Placement, Search, group_views
 from legcal.perception.radii import LEFT, MOST_TURNS, NO_OTHER_RADII, OtherRadii, Part, other_radii
-from legcal.perception.view_fit import ViewFit, fit_view, least_evidence
+from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
 Pictures = Mapping[int, Picture]  # by row
@@ -251,7 +250,7 @@ def _decided_by_outlines(
             for i in np.argsort(-by_both, kind="stable")[:N_AGAIN].tolist():
                 one = looks[i]
                 if one.fit is not None:
-                    again = look_again(search, [few], one.placement, one.outlines)
+                    again = refine_views(search, [few], one.placement, one.outlines)
                     looks[i] = _Look(again[0], again[1], again[2][0])
     best = _best(looks)
     fit = looks[best].fit
@@ -297,7 +296,7 @@ def _is_decided(looks: Sequence[_Look], candidates: Candidates, group: Group) ->
         more, times = MORE_AGREED, TIMES_AGREED
     elif len(group.rows) > 1 and fit.evidence >= WITHOUT_RIVAL * other:
         more = MORE_AGREED
-    return fit.evidence >= max(least_evidence(group) + more, times * other)
+    return fit.evidence >= max(min_evidence(group) + more, times * other)
 
 
 def _same(one: Outlines, other: Outlines) -> bool:

@@ -1,42 +1,71 @@
-"""The camera of a view and its legs, fitted to outlines that were measured once.
+"""Views fitted to their outlines, and guided matching of the legs that are missing.
 
-Edge pairs place a camera to some millimetres and leave out legs that have none. Outlines are far
-better known: a fit of the camera, of where the view sees the joints, and of what each image adds to
-the platform joints says where all legs are, how well that is known, and which legs do not fit.
+Edge pairs place a camera to some millimetres and leave out legs that have none; outlines are far
+better known. A group of views is one :class:`legcal.estimation.Problem`:
+
+    pose        of the machine in the frame of the group, about the middle of its joints
+    shift       of A and B of each leg against the model
+    offset      of B of each leg in each image besides, eliminated
+
+Outlines, priors of shifts and of offsets are its factors; the standard deviations of the priors are
+estimated on the way, and a Cauchy weight of each leg in each image makes it robust.
+:func:`refine_views` rejects legs that do not fit, looks for missing ones within what the fit knows,
+and fits again. Outlines of wrong edges agree on no fit, which also tells camera poses from each
+other that edge pairs do not.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.data import Outlines
+from legcal.data import Outlines, is_edited, join_outlines
 from legcal.errors import NotVisible
+from legcal.estimation import (
+    Factor,
+    Frames,
+    GaussianPrior,
+    Linearization,
+    NormalEquations,
+    Problem,
+    Rows,
+    Variables,
+    all_free,
+    information,
+    linearize,
+)
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import main_cylinders
 from legcal.perception.agreement import NEAREST, Poses, exchanged
-from legcal.perception.placement import Group, Search
+from legcal.perception.detection import NOT_PLACED, measure_outlines
+from legcal.perception.outline import OUTSIDE
+from legcal.perception.placement import Group, Placement, Search
 from legcal.vision import Camera, outlines_of_axis
+from legcal.workers import Run, in_turn
+
+DISAGREES = "disagrees with the other legs of its view"  # a reason
+WINDOW_PX, WINDOW_SIGMAS, MAX_WINDOW_PX = 2.0, 3.0, 40.0  # around a fit
+CLEAR = 0.7  # of the evidence that an ambiguous pose must have, where edge pairs are clear
 
 JOINT_SIGMA = 6e-3  # of the joint centres of the nominal model in all images, at first [m]
-JOINT_SIGMAS = 1.5e-3, 12e-3  # the least and the largest that legs may show
+JOINT_SIGMA_BOUNDS = 1.5e-3, 12e-3  # between which legs may show it
 IMAGE_SIGMA = 2e-3  # of the platform joints in an image besides, at first [m]
-IMAGE_SIGMAS = 0.7e-3, 12e-3  # the least and the largest that images may show
-TURN_SIGMA, PLACE_SIGMA = 0.3, 0.15  # of the pose that was recognised: angle, part of the distance
-MOST_TURN, MOST_PLACE = 0.2, 0.1  # of a step: angle, part of the distance
-STEPS, FIXED_STEPS = 8, 2  # of Gauss-Newton, and those before standard deviations are estimated
-ROBUST = 2.0  # standard deviations from which on a leg of an image counts less
-WORTH, MOST_OUTLINES = 2.0, 4  # of an outline as evidence: half a square, of a leg in an image
-MISFIT = 3.5  # standard deviations from the fit, of a leg in an image
-LARGEST_SHIFT = 4.0  # of a leg, in standard deviations
-LONE_SHIFT = 2.5  # the same of a leg of which only single outlines were found
-MOST_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
-SUITS = 0.85  # of the most evidence that outlines can give
+IMAGE_SIGMA_BOUNDS = 0.7e-3, 12e-3  # between which images may show it
+TURN_SIGMA, DISTANCE_SIGMA = 0.3, 0.15  # prior of the pose: angle, displacement by its distance
+MAX_TURN, MAX_DISPLACEMENT = 0.2, 0.1  # of a step: angle, part of the distance
+ITERATIONS, FIXED_ITERATIONS = 8, 2  # of Gauss-Newton, and those before sigmas are estimated
+CAUCHY_WIDTH = 2.0  # standard deviations from which on a leg of an image counts less
+OUTLINE_EVIDENCE, MAX_OUTLINES = 2.0, 4  # of an outline, half a square; of a leg in an image
+MAX_DISTANCE = 3.5  # standard deviations from the fit, of a leg in an image
+MAX_SHIFT = 4.0  # of a leg, in standard deviations
+MAX_LONE_SHIFT = 2.5  # the same of a leg of which only single outlines were found
+MAX_TURN_SIGMA = np.deg2rad(10.0)  # of a pose; before any outline it is TURN_SIGMA
+GOOD_FIT = 0.85  # of the most evidence that outlines can give
 SHIFT_COST = 0.25  # of shifts, less than half a square: some are the pose's
-LEAST_EVIDENCE = 8.0, 1.2  # and for each image
-EDGE_SIGMA = 0.3  # of an outline: what its covariance does not know, as a wrong gamma [px]
-NUDGE = 1e-6  # of finite differences [m]
+MIN_EVIDENCE, MIN_EVIDENCE_OF_IMAGE = 8.0, 1.2  # and besides for each image
+EDGE_SIGMA = 0.3  # of an outline: what its covariance leaves out, as a wrong gamma [px]
+STEP = 1e-6  # of finite differences [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,42 +81,51 @@ class ViewFit:
     row: IntArray  # (n,) legs in images that have outlines
     leg: IntArray  # (n,)
     n_outlines: IntArray  # (n,) how many of each
-    own: Array  # (n, 3) what their images add to B [m]
+    offset: Array  # (n, 3) what their images add to B [m]
     distance: Array  # (n,) how far their outlines are from the fit, in standard deviations
     middle: Array  # (3,) of the machine in the base link [m]
     evidence: float  # what it is worth that each outline was found near where the fit has it, less
     # half of the squares of how far they are off and of the shifts
 
     @property
-    def suits(self) -> bool:
-        """Whether nearly all outlines suit the fit as well as they can."""
-        most = WORTH * np.minimum(self.n_outlines, MOST_OUTLINES).sum()
-        return self.evidence >= SUITS * float(most)
+    def is_good(self) -> bool:
+        """Whether nearly all outlines agree with the fit as well as they can."""
+        most = OUTLINE_EVIDENCE * np.minimum(self.n_outlines, MAX_OUTLINES).sum()
+        return self.evidence >= GOOD_FIT * float(most)
 
     @property
-    def misfits(self) -> BoolArray:
+    def outliers(self) -> BoolArray:
         """Legs in images that are too far from where the other legs have them, (n,)."""
         shift = np.abs(self.shift).max(axis=(1, 2)) / self.joint_sigma
         alone = np.ones(len(self.shift), dtype=np.bool_)
         alone[self.leg[self.n_outlines > 1]] = False
-        far = shift > np.where(alone, LONE_SHIFT, LARGEST_SHIFT)
-        return np.asarray((self.distance > MISFIT) | far[self.leg])
+        far = shift > np.where(alone, MAX_LONE_SHIFT, MAX_SHIFT)
+        return np.asarray((self.distance > MAX_DISTANCE) | far[self.leg])
 
     def joints(self, A_base: Array, B_base: Array) -> tuple[Array, Array]:
         """Return joint centres (n_rows, n_legs, 3) where the images of the group see them [m]."""
         B = B_base + self.shift[:, 1]
-        B[self.row, self.leg] += self.own
+        B[self.row, self.leg] += self.offset
         return A_base + self.shift[:, 0], B
 
     @property
     def is_determined(self) -> bool:
         """Whether the outlines tell the pose from those around it: else legs may be others."""
-        return bool(self.turn_sigma <= MOST_TURN_SIGMA)
+        return bool(self.turn_sigma <= MAX_TURN_SIGMA)
 
     @property
     def turn_sigma(self) -> float:
         """Standard deviation of the rotation about the axis that is known worst [rad]."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What the fit of a group moves."""
+
+    pose: Frames  # (1,) of the machine in the frame of the group, its origin at the middle
+    shift: Array  # (n_legs, 2, 3) of A and B of the legs against the model, in the base link [m]
+    offset: Array  # (n_items, 3) what its image adds to B of each leg [m]
 
 
 def fit_view(
@@ -102,53 +140,175 @@ def fit_view(
     From where they were recognised, with shifts (n_legs, 2, 3) of A and B against the model [m].
     None without any outline.
     """
-    lines = lines_of(search, group, outlines)
+    lines = _lines_of(search, group, outlines)
     if lines is None:
         return None
     middle = np.concatenate([lines.A, lines.B]).mean(axis=0)
     T = T_base_group.inv()
-    begin = _State(T.rotation.as_matrix(), T.translation, shift, np.zeros((lines.n_items, 3)))
-    state, weight = begin, np.ones(lines.n_items)
+    pose = Frames(T.rotation.as_matrix()[None], T.apply(middle)[None])
+    state = _State(pose, shift, np.zeros((lines.n_items, 3)))
+    problem = _problem(group, lines, state, middle)
+    weight = np.ones(lines.n_items)
     joint_sigma, image_sigma = JOINT_SIGMA, IMAGE_SIGMA
     try:
-        equations = equations_of(group, lines, state, middle)
-        for step in range(STEPS):
-            sigmas = joint_sigma, image_sigma
-            normal = _normal_equations(lines, equations, state, begin, weight, sigmas, middle)
-            state = _moved(state, normal, lines, middle)
-            equations = equations_of(group, lines, state, middle)
-            square, own_square = _squared_distances(lines, equations, state, image_sigma)
-            weight = 1.0 / (1.0 + square / (lines.size * ROBUST**2))
-            if step >= FIXED_STEPS:  # most legs and images are alike
-                variance = np.diag(np.linalg.inv(normal.H))[6:].reshape(state.shift.shape)
+        linear = linearize(problem, state)
+        for iteration in range(ITERATIONS):
+            normal = _normal_equations(problem, state, linear, weight, joint_sigma, image_sigma)
+            step, _ = normal.step(0.0)
+            distance = float(np.linalg.norm(state.pose.t))
+            overshoot = max(
+                float(np.linalg.norm(step[:3])) / MAX_TURN,
+                float(np.linalg.norm(step[3:6])) / (MAX_DISPLACEMENT * distance),
+                1.0,
+            )
+            state = problem.moved(state, step / overshoot)
+            linear = linearize(problem, state)
+            rows = linear["outlines"]
+            square, offset_square = _squared_distances(lines, rows, state.offset, image_sigma)
+            weight = 1.0 / (1.0 + square / (lines.size * CAUCHY_WIDTH**2))
+            if iteration >= FIXED_ITERATIONS:  # most legs and images are alike
+                variance = np.diag(normal.kept_covariance())[6:].reshape(state.shift.shape)
                 of_leg = np.mean(state.shift**2 + variance, axis=(1, 2))[np.unique(lines.item_leg)]
-                of_image = np.sum(weight * own_square) / (3.0 * weight.sum())
-                joint_sigma = float(np.clip(np.sqrt(np.median(of_leg)), *JOINT_SIGMAS))
-                image_sigma = float(np.clip(np.sqrt(of_image), *IMAGE_SIGMAS))
+                of_image = np.sum(weight * offset_square) / (3.0 * weight.sum())
+                joint_sigma = float(np.clip(np.sqrt(np.median(of_leg)), *JOINT_SIGMA_BOUNDS))
+                image_sigma = float(np.clip(np.sqrt(of_image), *IMAGE_SIGMA_BOUNDS))
     except NotVisible:
         return None
-    sigmas = joint_sigma, image_sigma
-    normal = _normal_equations(lines, equations, state, begin, weight, sigmas, middle)
-    pose = Poses(state.R[None], state.t[None], state.shift[None])
+    normal = _normal_equations(problem, state, linear, weight, joint_sigma, image_sigma)
+    R = state.pose.R[0]
+    T_group_base = RigidTransform.from_components(
+        state.pose.t[0] - R @ middle, Rotation.from_matrix(R)
+    )
     return ViewFit(
-        pose.T_base_camera(),
+        T_group_base.inv(),
         state.shift,
-        np.asarray(np.linalg.inv(normal.H), dtype=np.float64),
+        normal.kept_covariance(),
         joint_sigma,
         image_sigma,
         lines.item_row,
         lines.item_leg,
         lines.size // 2,
-        state.own,
+        state.offset,
         np.sqrt(square / lines.size),
         middle,
-        _evidence(lines, equations, state, joint_sigma),
+        _evidence(lines, linear["outlines"], state, joint_sigma),
     )
 
 
-def least_evidence(group: Group) -> float:
-    """Return how much evidence outlines must give: more images show more that suits by chance."""
-    return LEAST_EVIDENCE[0] + LEAST_EVIDENCE[1] * len(group.rows)
+def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Problem[_State]:
+    """Return the problem of a group; weights and sigmas of its priors are put on its rows later."""
+    n_legs, every_item = len(start.shift), np.arange(lines.n_items)
+    R, centre = start.pose.R[0], start.pose.t[0]
+    distance = float(np.linalg.norm(centre))
+
+    def pose_from_start(pose: Frames) -> Array:
+        turn = Rotation.from_matrix(pose.R[0] @ R.T).as_rotvec()
+        return np.concatenate([turn, pose.t[0] - centre])
+
+    prior_sigma = np.concatenate([np.full(3, TURN_SIGMA), np.full(3, DISTANCE_SIGMA * distance)])
+    prior = GaussianPrior(np.arange(6, dtype=np.intp), np.zeros(6), prior_sigma)
+    pose = Variables("pose", all_free(1, 6), Frames.moved, coordinates=pose_from_start, prior=prior)
+
+    def offset_rows(state: _State) -> Rows:
+        J_own = np.broadcast_to(np.eye(3), (lines.n_items, 3, 3))
+        return Rows.of(state.offset, np.zeros((lines.n_items, 3, 0)), J_own)
+
+    def shift_rows(state: _State) -> Rows:
+        J = np.broadcast_to(np.eye(6), (n_legs, 6, 6))
+        return Rows.of(state.shift.reshape(n_legs, 6), J)
+
+    every = slice(None)
+    n = len(lines.leg)
+    touches = ("pose", np.zeros(n, dtype=np.intp), every), ("shift", lines.leg, every)
+    return Problem(
+        (pose, Variables("shift", all_free(n_legs, 6))),
+        Variables("offset", all_free(lines.n_items, 3)),
+        (
+            Factor(
+                "outlines",
+                lambda state: _outline_rows(group, lines, state, middle),
+                touches,
+                n,
+                2,
+                lines.item,
+                lines.whitening,
+            ),
+            Factor("offsets", offset_rows, (), lines.n_items, 3, every_item),
+            Factor("shifts", shift_rows, (("shift", np.arange(n_legs), every),), n_legs, 6),
+        ),
+    )
+
+
+def _outline_rows(group: Group, lines: "_Lines", state: _State, middle: Array) -> Rows:
+    """Return offsets (n, 2) of outlines [px], with derivatives by pose and shift, and by offset."""
+    R, centre = state.pose.R[0], state.pose.t[0]
+    A = (lines.A + state.shift[lines.leg, 0] - middle) @ R.T + centre
+    B = (lines.B + state.shift[lines.leg, 1] + state.offset[lines.item] - middle) @ R.T + centre
+    px, D = np.empty((len(A), 2)), np.empty((len(A), 2, 2, 3))
+    for v in np.unique(lines.view).tolist():
+        here, T = lines.view == v, group.T_group_camera[v].inv()
+        R_view = T.rotation.as_matrix()
+        X = np.stack([A[here], B[here]], axis=1) @ R_view.T + T.translation
+        args = lines.radius[here], lines.edge[here], lines.ends[here], lines.metric[here]
+        px[here], at_camera = _offsets_of(X, *args)
+        D[here] = at_camera @ R_view
+    J = _derivatives_by(D, np.stack([A, B], axis=1) - centre, R)
+    return Rows.of(px, J[..., :12], J[..., 12:])
+
+
+def _normal_equations(
+    problem: Problem[_State],
+    state: _State,
+    linear: Linearization,
+    weight: Array,
+    joint_sigma: float,
+    image_sigma: float,
+) -> NormalEquations:
+    """Return the normal equations with weights (n_items,) of legs in images, by sigmas of priors.
+
+    A weight is that of all that an image says of a leg, the prior of its offset included.
+    """
+    root = np.sqrt(weight)
+    item = problem.factor("outlines").own
+    rows = {
+        "outlines": linear["outlines"].whitened(root[item][:, None, None]),
+        "offsets": linear["offsets"].whitened((root / image_sigma)[:, None, None]),
+        "shifts": linear["shifts"].whitened(np.asarray(1.0 / joint_sigma)),
+    }
+    return information(problem, state, replace(linear, rows=rows))
+
+
+def _squared_distances(
+    lines: "_Lines", rows: Rows, offset: Array, sigma: float
+) -> tuple[Array, Array]:
+    """Return squared distances of items from the fit, and squares of their offsets [m^2].
+
+    Both with the offsets that suit best by a prior of a standard deviation [m].
+    """
+    J = rows.J_own
+    r = rows.r - (J @ offset[lines.item][..., None])[..., 0]
+    Jt = J.swapaxes(1, 2)
+    H, g = lines.summed(Jt @ J), lines.summed((Jt @ r[..., None])[..., 0])
+    square = lines.summed(np.sum(r**2, axis=1))
+    V = np.linalg.inv(H + np.eye(3) / sigma**2)
+    best = -(V @ g[..., None])[..., 0]
+    return square + np.sum(g * best, axis=1), np.sum(best**2, axis=1) + np.trace(
+        V, axis1=1, axis2=2
+    )
+
+
+def _evidence(lines: "_Lines", rows: Rows, state: _State, joint_sigma: float) -> float:
+    """Return how much outlines speak for a state, each leg of an image by itself."""
+    square, _ = _squared_distances(lines, rows, state.offset, IMAGE_SIGMA)
+    n_outlines = np.minimum(0.5 * lines.size, MAX_OUTLINES)
+    of_legs = np.maximum(OUTLINE_EVIDENCE * n_outlines - 0.5 * square, 0.0).sum()
+    joint = max(JOINT_SIGMA, joint_sigma)
+    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)
+
+
+def min_evidence(group: Group) -> float:
+    """Return how much evidence outlines must give: more images show more that is_good by chance."""
+    return MIN_EVIDENCE + MIN_EVIDENCE_OF_IMAGE * len(group.rows)
 
 
 def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
@@ -171,8 +331,10 @@ def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
         X = np.where(front[:, None, None], X, [[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
         ends = X[..., :2] / X[..., 2:]
         thin, edge = np.zeros(len(X)), np.zeros(len(X), dtype=np.intp)
-        D = offsets_of(X, thin, edge, ends, metric_of(camera, ends))[1] @ T.rotation.as_matrix()
-        J = derivatives_by(D, X_group.reshape(-1, 2, 3) - centre, T_group_base.rotation.as_matrix())
+        D = _offsets_of(X, thin, edge, ends, _metric_of(camera, ends))[1] @ T.rotation.as_matrix()
+        J = _derivatives_by(
+            D, X_group.reshape(-1, 2, 3) - centre, T_group_base.rotation.as_matrix()
+        )
         leg = np.tile(np.arange(n_legs), len(rows))
         place = np.concatenate(
             [np.broadcast_to(np.arange(6), (len(leg), 6)), 6 + 6 * leg[:, None] + np.arange(6)], 1
@@ -193,7 +355,7 @@ def reversed_pose(search: Search, group: Group, T_base_group: RigidTransform) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class _Lines:
     """Outlines to fit, by item: a leg in an image."""
 
     view: IntArray  # (n,)
@@ -204,7 +366,7 @@ class Lines:
     radius: Array  # (n,)
     edge: IntArray  # (n,) 0 where epsilon is +1, 1 where it is -1
     ends: Array  # (n, 2, 2) on the sensor plane
-    metric: Array  # (n, 2, 2, 2), see metric_of
+    metric: Array  # (n, 2, 2, 2), see _metric_of
     whitening: Array  # (n, 2, 2)
     item_row: IntArray  # (n_items,)
     item_leg: IntArray
@@ -221,7 +383,7 @@ class Lines:
         return np.asarray(np.add.reduceat(values, self.first, axis=0))
 
 
-def lines_of(search: Search, group: Group, outlines: Outlines) -> Lines | None:
+def _lines_of(search: Search, group: Group, outlines: Outlines) -> _Lines | None:
     """Return the used outlines of a group."""
     used = np.flatnonzero(outlines.used & np.isin(outlines.row, group.rows))
     if len(used) == 0:
@@ -236,11 +398,11 @@ def lines_of(search: Search, group: Group, outlines: Outlines) -> Lines | None:
     for v in np.unique(view).tolist():
         own, camera = view == v, search.measurements.views[v].camera
         ends[own] = camera.undistort(outlines.ends[used[own]])
-        metric[own] = metric_of(camera, ends[own])
+        metric[own] = _metric_of(camera, ends[own])
     covariance = outlines.covariance[used] + EDGE_SIGMA**2 * np.eye(2)
     begins = (np.diff(row, prepend=-1) != 0) | (np.diff(leg, prepend=-1) != 0)
     first = np.flatnonzero(begins)
-    return Lines(
+    return _Lines(
         view,
         np.cumsum(begins) - 1,
         leg,
@@ -258,16 +420,16 @@ def lines_of(search: Search, group: Group, outlines: Outlines) -> Lines | None:
     )
 
 
-def offsets_of(
+def _offsets_of(
     X: Array, radius: Array, edge: IntArray, ends: Array, metric: Array
 ) -> tuple[Array, Array]:
     """Return how far points are from outlines (n, 2) [px], and derivatives (n, 2, 2, 3) by A and B.
 
     Of the outlines (0 where epsilon is +1, 1 where it is -1) of cylinders with A and B (n, 2, 3) in
     the frame of the camera [m] and radii (n,), at two points (n, 2, 2) of the sensor plane with
-    their :func:`metric_of`.
+    their :func:`_metric_of`.
     """
-    nudges = NUDGE * np.concatenate([np.zeros((1, 6)), np.eye(6)]).reshape(7, 1, 2, 3)
+    nudges = STEP * np.concatenate([np.zeros((1, 6)), np.eye(6)]).reshape(7, 1, 2, 3)
     moved = X + nudges
     u = moved[:, :, 1] - moved[:, :, 0]
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
@@ -276,16 +438,16 @@ def offsets_of(
     value = np.einsum("knx,nex->kne", h[..., :2], ends) + h[..., 2:]
     normal = np.einsum("nexy,kny->knex", metric, h[..., :2])
     offset = value / np.linalg.norm(normal, axis=-1)
-    derivative = np.moveaxis((offset[1:] - offset[0]) / NUDGE, 0, -1)
+    derivative = np.moveaxis((offset[1:] - offset[0]) / STEP, 0, -1)
     return offset[0], derivative.reshape(-1, 2, 2, 3)
 
 
-def metric_of(camera: Camera, ends: Array) -> Array:
+def _metric_of(camera: Camera, ends: Array) -> Array:
     """Return what makes normals of lines (..., 2) those in the picture at points (..., 2)."""
     return np.asarray(np.swapaxes(np.linalg.inv(camera.pixels_per_unit(ends)), -1, -2))
 
 
-def derivatives_by(D: Array, from_centre: Array, R: Array) -> Array:
+def _derivatives_by(D: Array, from_centre: Array, R: Array) -> Array:
     """Return derivatives (n, 2, 15) from those by A and B in the frame of the group."""
     turning = np.cross(from_centre[:, None], D).sum(axis=2)
     in_base = D @ R
@@ -293,125 +455,161 @@ def derivatives_by(D: Array, from_centre: Array, R: Array) -> Array:
     return np.concatenate([turning, D.sum(axis=2), of_A, of_B, of_B], axis=-1)
 
 
-class _State(NamedTuple):
-    """Where everything is."""
-
-    R: Array  # (3, 3) of T_group_base
-    t: Array  # (3,)
-    shift: Array  # (n_legs, 2, 3) of A and B of the legs against the model, in the base link [m]
-    own: Array  # (n_items, 3) what its image adds to B of each leg [m]
+Fits = list[ViewFit | None]  # of groups; None where one was not placed or has no outlines
 
 
-class _Normal(NamedTuple):
-    """Normal equations of the pose and the shifts, and what gives the images' own parts."""
+def refine_views(
+    search: Search,
+    groups: Sequence[Group],
+    placement: Placement,
+    outlines: Outlines,
+    *,
+    together: bool = True,
+    run: Run = in_turn,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[Placement, Outlines, Fits]:
+    """Fit all views to their outlines, and look for the legs that are missing near that.
 
-    H: Array
-    b: Array
-    back: Array  # (n_items, 3, 12) own part by the other unknowns
-    start: Array  # (n_items, 3) own part without them
-
-
-def equations_of(group: Group, lines: Lines, state: _State, middle: Array) -> tuple[Array, Array]:
-    """Return whitened offsets (n, 2) and their derivatives (n, 2, 15).
-
-    By the motion of the machine about its middle, the shifts of A and B of the leg, and the own
-    part of B.
+    Return cameras and joint centres by the outlines, the outlines that agree with them (what was
+    looked for and not found keeps its reason), and the fits. ``together`` is as for
+    :func:`legcal.perception.outline.measure`.
     """
-    A = (lines.A + state.shift[lines.leg, 0]) @ state.R.T + state.t
-    B = (lines.B + state.shift[lines.leg, 1] + state.own[lines.item]) @ state.R.T + state.t
-    offset, D = np.empty((len(A), 2)), np.empty((len(A), 2, 2, 3))
-    for v in np.unique(lines.view).tolist():
-        own, T = lines.view == v, group.T_group_camera[v].inv()
-        R = T.rotation.as_matrix()
-        X = np.stack([A[own], B[own]], axis=1) @ R.T + T.translation
-        args = lines.radius[own], lines.edge[own], lines.ends[own], lines.metric[own]
-        offset[own], at_camera = offsets_of(X, *args)
-        D[own] = at_camera @ R
-    centre = state.R @ middle + state.t
-    J = derivatives_by(D, np.stack([A, B], axis=1) - centre, state.R)
-    return (lines.whitening @ offset[..., None])[..., 0], lines.whitening @ J
-
-
-def _normal_equations(
-    lines: Lines,
-    equations: tuple[Array, Array],
-    state: _State,
-    begin: _State,
-    weight: Array,
-    sigmas: tuple[float, float],
-    middle: Array,
-) -> _Normal:
-    """Return the normal equations without the images' own parts, by sigmas of joints and images."""
-    joint_sigma, image_sigma = sigmas
-    residual, J = equations
-    Jt = J.swapaxes(1, 2)
-    M, b = lines.summed(Jt @ J), -lines.summed((Jt @ residual[..., None])[..., 0])
-    M[:, 12:, 12:] += np.eye(3) / image_sigma**2
-    b[:, 12:] -= state.own / image_sigma**2
-    solved = np.linalg.solve(M[:, 12:, 12:], np.concatenate([M[:, 12:, :12], b[:, 12:, None]], -1))
-    back, start = solved[..., :12], solved[..., 12]
-    S = (M[:, :12, :12] - M[:, :12, 12:] @ back) * weight[:, None, None]
-    c = (b[:, :12] - (M[:, :12, 12:] @ start[..., None])[..., 0]) * weight[:, None]
-    n = 6 + state.shift.size
-    H, g = np.zeros((n, n)), np.zeros(n)
-    for leg in np.unique(lines.item_leg).tolist():
-        own = lines.item_leg == leg
-        place = np.r_[0:6, 6 + 6 * leg : 12 + 6 * leg]
-        H[np.ix_(place, place)] += S[own].sum(axis=0)
-        g[place] += c[own].sum(axis=0)
-    turned = Rotation.from_matrix(state.R @ begin.R.T).as_rotvec()
-    centre, before = (one.R @ middle + one.t for one in (state, begin))
-    distance = float(np.linalg.norm(before))
-    known = np.concatenate([np.full(3, TURN_SIGMA), np.full(3, PLACE_SIGMA * distance)]) ** -2
-    H[np.arange(6), np.arange(6)] += known
-    g[:6] -= known * np.concatenate([turned, centre - before])
-    joints = np.arange(6, n)
-    H[joints, joints] += joint_sigma**-2
-    g[6:] -= state.shift.ravel() / joint_sigma**2
-    return _Normal(H, g, back, start)
-
-
-def _moved(state: _State, normal: _Normal, lines: Lines, middle: Array) -> _State:
-    """Return the state after a step, not too far."""
-    step = np.linalg.solve(normal.H, normal.b)
-    centre = state.R @ middle + state.t
-    distance = float(np.linalg.norm(centre))
-    reach = max(
-        float(np.linalg.norm(step[:3])) / MOST_TURN,
-        float(np.linalg.norm(step[3:6])) / (MOST_PLACE * distance),
-        1.0,
+    fits = _fits_or_reversed(search, groups, placement, outlines)
+    placement = _placed_by_fits(search, groups, placement, fits)
+    outlines, fits = _without_outliers(search, groups, placement, outlines, fits)
+    placement = _placed_by_fits(search, groups, placement, fits)
+    near = replace(placement, window=_windows(search, groups, fits, outlines))
+    rows = sorted(row for group in groups for row in group.rows)
+    again, _ = measure_outlines(search, near, rows, together=together, run=run, progress=progress)
+    found = set(zip(again.row[again.used].tolist(), again.leg[again.used].tolist(), strict=True))
+    kept = outlines.choose(~_among(outlines, found))
+    outlines = join_outlines([kept, again.choose(_among(again, found))])
+    fits = _fits(search, groups, placement, outlines)
+    outlines, fits = _without_outliers(search, groups, placement, outlines, fits)
+    placement = _without_weak_views(
+        search, groups, _placed_by_fits(search, groups, placement, fits), fits
     )
-    step = step / reach
-    shifts = step[6:].reshape(-1, 6)
-    of_item = np.concatenate([np.broadcast_to(step[:6], (lines.n_items, 6)),
-                              shifts[lines.item_leg]], axis=1)  # fmt: skip
-    own = state.own + normal.start - (normal.back @ of_item[..., None])[..., 0]
-    turn = Rotation.from_rotvec(step[:3]).as_matrix()
-    t = turn @ (state.t - centre) + centre + step[3:6]
-    return _State(turn @ state.R, t, state.shift + shifts.reshape(state.shift.shape), own)
+    placed = np.array([T is not None for T in placement.T_base_camera])
+    lost = ~placed[search.measurements.view[outlines.row]]
+    return placement, outlines.reject(lost & ~is_edited(outlines), NOT_PLACED), fits
 
 
-def _squared_distances(
-    lines: Lines, equations: tuple[Array, Array], state: _State, sigma: float
-) -> tuple[Array, Array]:
-    """Return squared distances of items from the fit, and squares of their own parts [m^2]."""
-    residual, J = equations
-    Jo = J[..., 12:]
-    r = residual - (Jo @ state.own[lines.item][..., None])[..., 0]
-    Jt = Jo.swapaxes(1, 2)
-    H, g = lines.summed(Jt @ Jo), lines.summed((Jt @ r[..., None])[..., 0])
-    square = lines.summed(np.sum(r**2, axis=1))
-    V = np.linalg.inv(H + np.eye(3) / sigma**2)
-    own = -(V @ g[..., None])[..., 0]
-    return square + np.sum(g * own, axis=1), np.sum(own**2, axis=1) + np.trace(V, axis1=1, axis2=2)
+def _fits(
+    search: Search, groups: Sequence[Group], placement: Placement, outlines: Outlines
+) -> Fits:
+    """Return the fit of each group."""
+    fits: Fits = []
+    for group in groups:
+        v = group.views[0]
+        T = placement.T_base_camera[v]
+        if T is None:
+            fits.append(None)
+            continue
+        T_base_group = T * group.T_group_camera[v].inv()
+        fits.append(fit_view(search, group, T_base_group, placement.shift[v], outlines))
+    return fits
 
 
-def _evidence(
-    lines: Lines, equations: tuple[Array, Array], state: _State, joint_sigma: float
-) -> float:
-    """Return how much outlines speak for a state, each leg of an image by itself."""
-    square, _ = _squared_distances(lines, equations, state, IMAGE_SIGMA)
-    found = np.minimum(0.5 * lines.size, MOST_OUTLINES)
-    of_legs = np.maximum(WORTH * found - 0.5 * square, 0.0).sum()
-    joint = max(JOINT_SIGMA, joint_sigma)
-    return float(of_legs - SHIFT_COST * np.sum(state.shift**2) / joint**2)
+def _fits_or_reversed(
+    search: Search, groups: Sequence[Group], placement: Placement, outlines: Outlines
+) -> Fits:
+    """Return fits, with near and far exchanged where outlines suit that better."""
+    fits = _fits(search, groups, placement, outlines)
+    for g, (group, fit) in enumerate(zip(groups, fits, strict=True)):
+        if fit is None or len(group.views) > 1 or fit.is_good:
+            continue
+        other = reversed_pose(search, group, fit.T_base_group)
+        over = fit_view(search, group, other, np.zeros_like(fit.shift), outlines)
+        if over is not None and over.evidence > fit.evidence:
+            fits[g] = over
+    return fits
+
+
+def _without_outliers(
+    search: Search,
+    groups: Sequence[Group],
+    placement: Placement,
+    outlines: Outlines,
+    fits: Fits,
+) -> tuple[Outlines, Fits]:
+    """Return outlines without those of legs that do not fit, and the fits to the others."""
+    wrong = {
+        one
+        for fit in fits
+        if fit is not None
+        for one in zip(fit.row[fit.outliers].tolist(), fit.leg[fit.outliers].tolist(), strict=True)
+    }
+    if not wrong:
+        return outlines, fits
+    out = _among(outlines, wrong) & ~is_edited(outlines)  # what people edited stays
+    outlines = outlines.reject(out, DISAGREES)
+    return outlines, _fits(search, groups, placement, outlines)
+
+
+def _placed_by_fits(
+    search: Search, groups: Sequence[Group], placement: Placement, fits: Fits
+) -> Placement:
+    """Return cameras and joint centres by the fits, those of other groups as recognised."""
+    T, shift = list(placement.T_base_camera), placement.shift.copy()
+    for group, fit in zip(groups, fits, strict=True):
+        if fit is not None:
+            for v in group.views:
+                T[v], shift[v] = fit.T_base_group * group.T_group_camera[v], fit.shift
+    recognised = placement.shifted(search, shift)
+    A, B = placement.A_base.copy(), placement.B_base.copy()
+    for group, fit in zip(groups, fits, strict=True):
+        joints = recognised.A_base, recognised.B_base
+        if fit is not None:
+            joints = fit.joints(search.A_base, search.B_base)
+        A[group.rows], B[group.rows] = (X[group.rows] for X in joints)
+    return replace(recognised, T_base_camera=tuple(T), A_base=A, B_base=B)
+
+
+def _without_weak_views(
+    search: Search, groups: Sequence[Group], placement: Placement, fits: Fits
+) -> Placement:
+    """Return cameras without those for which hardly an outline speaks, near no rough pose."""
+    T, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
+    for group, fit in zip(groups, fits, strict=True):
+        least = CLEAR * min_evidence(group)
+        is_sure = fit is not None and fit.is_determined and fit.evidence >= least
+        if group.hint is not None or T[group.views[0]] is None or is_sure:
+            continue
+        names = [search.measurements.views[v].name for v in group.views]
+        n, n_images = 0 if fit is None else int(fit.n_outlines.sum()), len(group.rows)
+        why = (
+            f"view {group_name(names)}: its camera could not be placed: found only {n} outlines "
+            f"that agree in its {n_images} image{'s' * (n_images != 1)}, needed more than other "
+            "edges give by chance; add images at other readings, in better light, or a rough "
+            "T_base_camera."
+        )
+        unplaced |= dict.fromkeys(names, why)
+        for v in group.views:
+            T[v] = None
+    return replace(placement, T_base_camera=tuple(T), unplaced=unplaced)
+
+
+def group_name(names: Sequence[str]) -> str:
+    """Return the name of a view, or of a group."""
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def _windows(search: Search, groups: Sequence[Group], fits: Fits, outlines: Outlines) -> Array:
+    """Return how far missing legs may be from a fit (n_rows, n_legs) [px]; NaN for others."""
+    missing = np.zeros((search.measurements.n_rows, search.n_legs), dtype=np.bool_)
+    visible = [not why.startswith((OUTSIDE, NOT_PLACED)) for why in outlines.reason]
+    missing[outlines.row[visible], outlines.leg[visible]] = True
+    missing[outlines.row[outlines.used], outlines.leg[outlines.used]] = False
+    window = np.full(missing.shape, np.nan)
+    for group, fit in zip(groups, fits, strict=True):
+        if fit is not None and missing[group.rows].any():
+            sigma = sideways_sigmas(search, group, fit)[group.rows]
+            near = np.minimum(WINDOW_PX + WINDOW_SIGMAS * sigma, MAX_WINDOW_PX)
+            window[group.rows] = np.where(missing[group.rows], near, np.nan)
+    return window
+
+
+def _among(outlines: Outlines, legs: set[tuple[int, int]]) -> BoolArray:
+    """Return which outlines are of some legs in images, (row, leg)."""
+    own = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)
+    return np.array([one in legs for one in own], dtype=np.bool_)
