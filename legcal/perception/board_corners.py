@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from legcal.data import LEAST_CORNERS, Corners, Measurements, found_corners, join_corners
+from legcal.data import MIN_CORNERS, Corners, Measurements, found_corners, join_corners
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import to_grey
@@ -63,7 +63,7 @@ def find_corners(
     numbers, rough = search(board, eight_bits)
     numbers, first = np.unique(numbers, return_index=True)
     rough = rough[first]
-    axes = _axes(board, numbers, rough) if len(numbers) >= LEAST_CORNERS else np.zeros((0, 2, 2))
+    axes = _axes(board, numbers, rough) if len(numbers) >= MIN_CORNERS else np.zeros((0, 2, 2))
     clearance = _clearance(board)
     fitted = [_fit_saddle(grey, *at, *clearance) for at in zip(rough, axes, strict=False)]
     found = _consistent([(n, s) for n, s in zip(numbers.tolist(), fitted, strict=False) if s])
@@ -87,7 +87,7 @@ def _consistent(found: list[tuple[int, _Saddle]]) -> list[tuple[int, _Saddle]]:
     kept = np.abs(np.log(blur / usual[0])) < np.log(_MAX_BLUR_RATIO)
     kept &= misfit < max(_MAX_MISFIT_RATIO * usual[1], _GOOD_FIT)
     left = [both for both, is_kept in zip(found, kept, strict=True) if is_kept]
-    return left if len(left) >= LEAST_CORNERS else []
+    return left if len(left) >= MIN_CORNERS else []
 
 
 def _clearance(board: Board) -> tuple[float, float]:

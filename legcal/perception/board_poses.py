@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from legcal.data import LEAST_CORNERS, Corners, Measurements, few, row_names
+from legcal.data import MIN_CORNERS, Corners, Measurements, few, row_names
 from legcal.errors import DatasetError, NotVisible
 from legcal.estimation import (
     Factor,
@@ -152,7 +152,7 @@ def camera_poses(
             if pose is None and view.name in needed:
                 n = int(np.sum(measurements.view == v))
                 problems.setdefault(NotVisible, []).append(
-                    f"view {view.name}: its camera could not be placed: found {LEAST_CORNERS} "
+                    f"view {view.name}: its camera could not be placed: found {MIN_CORNERS} "
                     f"corners of the board or more in none of its {n} image{'s' * (n != 1)}, "
                     "needed them in one; turn the camera so that it sees the board"
                     f"{', the whole of it' * (board.kind == 'chessboard')}, or check what the "
@@ -242,7 +242,7 @@ def _scale(pose: PlanePose, corners: Corners) -> float:
 
 def _span_plane(points: Array) -> bool:
     """Say whether points are enough, and not all on a line."""
-    if len(points) < LEAST_CORNERS:
+    if len(points) < MIN_CORNERS:
         return False
     size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(size[1] > 1e-3 * size[0])

@@ -210,8 +210,8 @@ def _problem(group: Group, lines: "_Lines", start: _State, middle: Array) -> Pro
     pose = Variables("pose", all_free(1, 6), Frames.moved, coordinates=pose_from_start, prior=prior)
 
     def offset_rows(state: _State) -> Rows:
-        J_own = np.broadcast_to(np.eye(3), (lines.n_items, 3, 3))
-        return Rows.of(state.offset, np.zeros((lines.n_items, 3, 0)), J_own)
+        J_element = np.broadcast_to(np.eye(3), (lines.n_items, 3, 3))
+        return Rows.of(state.offset, np.zeros((lines.n_items, 3, 0)), J_element)
 
     def shift_rows(state: _State) -> Rows:
         J = np.broadcast_to(np.eye(6), (n_legs, 6, 6))
@@ -269,7 +269,7 @@ def _normal_equations(
     A weight is that of all that an image says of a leg, the prior of its offset included.
     """
     root = np.sqrt(weight)
-    item = problem.factor("outlines").own
+    item = problem.factor("outlines").element
     rows = {
         "outlines": linear["outlines"].whitened(root[item][:, None, None]),
         "offsets": linear["offsets"].whitened((root / image_sigma)[:, None, None]),
@@ -285,7 +285,7 @@ def _squared_distances(
 
     Both with the offsets that suit best by a prior of a standard deviation [m].
     """
-    J = rows.J_own
+    J = rows.J_element
     r = rows.r - (J @ offset[lines.item][..., None])[..., 0]
     Jt = J.swapaxes(1, 2)
     H, g = lines.summed(Jt @ J), lines.summed((Jt @ r[..., None])[..., 0])
