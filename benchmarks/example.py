@@ -17,7 +17,7 @@ from legcal.calibration.verdict import Calibration
 from legcal.data.axes import axes_from_outlines
 from legcal.machine import KinematicParameters, point_like_legs, pose_differences, to_vector
 from legcal.paper.four_steps import run_steps
-from legcal.paper.nominal import nominal_mechanism
+from legcal.paper.nominal import nominal_machine
 
 ROOT = Path(__file__).parents[1]
 TRUTH = ROOT / "tests/data/hexapod-truth/models/hexapod.yaml"
@@ -48,7 +48,7 @@ def main() -> None:
     solution = calibration.solution
     radii = {cylinder.link: cylinder.radius for leg in machine.legs for cylinder in leg.cylinders}
     axes = axes_from_outlines(solution.outlines, dataset.measurements, radii)
-    nominal = nominal_mechanism(machine)
+    nominal = nominal_machine(machine)
     steps = {
         criteria: run_steps(nominal, axes, dataset.measurements, criteria=criteria).parameters
         for criteria in ("literal", "default")

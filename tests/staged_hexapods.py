@@ -5,8 +5,11 @@ from functools import cache
 
 import numpy as np
 
-from legcal.geometry.types import Array
+from legcal.geometry import Array
 from legcal.machine import KinematicParameters, from_vector, to_vector
+from legcal.paper import Criteria, run_steps
+from legcal.paper.four_steps import StagedResult
+from legcal.simulation import OutlineNoise, TableNoise
 from legcal.simulation.hexapod import (
     PAPER_VIEWS,
     HexapodSession,
@@ -16,7 +19,7 @@ from legcal.simulation.hexapod import (
     hexapod_session,
     perturb,
 )
-from legcal.simulation.observe import OutlineNoise, TableNoise
+from legcal.simulation.paper import nominal_of
 
 
 @cache
@@ -76,3 +79,10 @@ def errors(parameters: KinematicParameters, machine: PaperHexapod) -> Array:
         machine.parameters, machine.frame_legs
     )
     return np.asarray(np.abs(difference))
+
+
+def staged(
+    session: HexapodSession, nominal: PaperHexapod, criteria: Criteria = "default"
+) -> StagedResult:
+    """Run the four steps on a session."""
+    return run_steps(nominal_of(nominal), session.axes, session.measurements, criteria=criteria)

@@ -1,32 +1,26 @@
-"""Steps 1 to 3 on sessions of any shipped machine, and on bases that are made up."""
+"""What the four steps take of any shipped machine, and bases that are made up."""
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from machine_session import PINHOLE, MachineSession, machine_session
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.identify.session import Session, at_base_joints, at_platform_joints
-from legcal.data.axes import LegAxes, axes_from_outlines
-from legcal.data.measurements import Measurements, View
-from legcal.geometry.lines import normal_basis
-from legcal.geometry.types import Array, BoolArray
-from legcal.machine import Leg, LegKind, moved_legs
-from legcal.paper.joints_in_base import JointsInBase, locate_joints_in_base
-from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.paper.leg_directions import (
-    LegDirections,
-    directions_through_joints,
-    observed_directions,
-)
-from legcal.paper.nominal import Criteria, NominalMachine
-from legcal.paper.offsets import Offsets, identify_offsets
+from legcal.data import LegAxes, Measurements, View, axes_from_outlines
+from legcal.geometry import Array, BoolArray, normal_basis
+from legcal.machine import Leg, LegKind, Parametrization, moved_legs, parametrize, vector_of
+from legcal.paper import Criteria, NominalMachine, run_base_steps, run_steps
+from legcal.paper.four_steps import StagedResult
+from legcal.paper.joints_in_base import JointsInBase
+from legcal.paper.joints_in_camera import JointsInCamera
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What steps 1 to 3 take, and the truth behind it."""
+    """What the steps take, and the truth behind it."""
 
     nominal: NominalMachine
     axes: LegAxes
@@ -51,29 +45,27 @@ class Observed:
             ]
         )
 
+    @property
+    def is_angle(self) -> BoolArray:
+        """Which parameters are angles."""
+        return np.array([unit == "rad" for unit in self._parametrization().units])
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """The results of steps 1 to 3."""
+    def run(self, criteria: Criteria = "default", **options: Any) -> StagedResult:
+        """Run the four steps."""
+        return run_steps(self.nominal, self.axes, self.measurements, criteria=criteria, **options)
 
-    joints: JointsInCamera
-    base: JointsInBase
-    directions: LegDirections
-    offsets: Offsets
+    def run_base(self, criteria: Criteria = "default") -> JointsInBase:
+        """Run steps 1 and 2."""
+        return run_base_steps(self.nominal, self.axes, self.measurements, criteria=criteria)
 
+    def errors(self, legs: tuple[Leg, ...], *, twists: bool = False) -> Array:
+        """Return the error of every parameter of legs [m, rad]."""
+        parametrization, true = self._parametrization(twists=twists), self.true_legs
+        return vector_of(parametrization, legs, true) - vector_of(parametrization, true, true)
 
-def three_steps(observed: Observed, criteria: Criteria = "default") -> Steps:
-    """Run steps 1 to 3."""
-    nominal, axes, m = observed.nominal, observed.axes, observed.measurements
-    joints = locate_joints_in_cameras(nominal, axes, m, criteria=criteria)
-    base = locate_joints_in_base(nominal, joints, criteria=criteria)
-    directions = (
-        observed_directions(nominal, axes, m, joints)
-        if criteria == "literal"
-        else directions_through_joints(nominal, axes, m, joints, base)
-    )
-    offsets = identify_offsets(nominal, directions, m.sigma_q, criteria=criteria)
-    return Steps(joints, base, directions, offsets)
+    def _parametrization(self, *, twists: bool = False) -> Parametrization:
+        nominal = self.nominal
+        return parametrize(nominal.leg_names, self.true_legs, nominal.frame_legs, twists=twists)
 
 
 @cache
@@ -140,7 +132,7 @@ def planned(session: Session, sign: Array) -> Observed:
 
 
 def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMachine:
-    """Return a mechanism of RPS legs, or SPS where the axis is NaN, with R_b on joints 1, 2, 3."""
+    """Return a machine of RPS legs, or SPS where the axis is NaN, with R_b on joints 1, 2, 3."""
     up = np.array([0.0, 0.0, 1.0])
     legs = tuple(
         Leg("R", "S", LegKind.ACTUATED, A, A + up, 0.5, v)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import cast
 
 import numpy as np
 import pytest
@@ -17,11 +16,11 @@ from legcal.machine import Machine, load_mechanism
 from legcal.paper import joints_in_base, offsets
 from legcal.paper.joints_in_base import JointsInBase, register_views
 from legcal.paper.joints_in_camera import JointsInCamera, locate_joints_in_cameras
-from legcal.paper.least_squares import LeastSquares, Solution
+from legcal.paper.least_squares import LeastSquares
 from legcal.paper.leg_directions import directions_through_joints
 from legcal.paper.platform import RigidProblem, build_rigid
 from legcal.paper.platform_printed import build_mean_distances
-from legcal.paper.platform_unknowns import PlatformUnknowns
+from legcal.paper.unknowns import Unknowns
 from legcal.simulation.hexapod import PaperHexapod
 from legcal.simulation.paper import nominal_of
 
@@ -61,9 +60,9 @@ def shared_poses(session: Session) -> Session:
 
 def base_as_drawn(machine: PaperHexapod, joints: JointsInCamera) -> JointsInBase:
     """Return the base of a machine of point-like joints as step 2 would, without solving."""
-    A_Rb, no_axes = machine.parameters.base_joints, np.full((machine.n_legs, 3), np.nan)
-    cameras = register_views(A_Rb, no_axes, joints)
-    return JointsInBase(A_Rb, cameras, cast(Solution, None), no_axes)
+    nominal = nominal_of(machine)
+    cameras = register_views(nominal, joints)
+    return JointsInBase(nominal, cameras, joints, np.zeros((machine.n_legs, 3, 3)))
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -75,12 +74,12 @@ def test_default_ranks_are_those_of_the_problems_that_the_steps_solve(
     machine, axes, m = session.machine, session.axes, session.measurements
     joints = locate_joints_in_cameras(nominal_of(machine), axes, m)
     base = base_as_drawn(machine, joints)
-    directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
+    directions = directions_through_joints(axes, m, base)
     q0 = machine.parameters.offsets
     step2 = joints_in_base.build_rigid(nominal_of(machine), joints, base.T_Rb_camera)
     step3 = offsets.build_constant_distances(nominal_of(machine), directions, q0, m.sigma_q)
-    unknowns = PlatformUnknowns.of(nominal_of(machine))
-    rigid = RigidProblem.of(nominal_of(machine), unknowns, joints, base, directions, m.sigma_q)
+    unknowns = Unknowns.of_platform(nominal_of(machine))
+    rigid = RigidProblem.of(nominal_of(machine), unknowns, base, directions, m.sigma_q)
     step4 = build_rigid(rigid)
     built = [
         3 * int(joints.located.sum()),
@@ -107,13 +106,13 @@ def test_printed_ranks_are_those_of_the_problems_that_the_steps_solve(coplanar: 
     machine, axes, m = session.machine, session.axes, session.measurements
     joints = locate_joints_in_cameras(nominal_of(machine), axes, m, criteria="literal")
     base = base_as_drawn(machine, joints)
-    directions = directions_through_joints(nominal_of(machine), axes, m, joints, base)
+    directions = directions_through_joints(axes, m, base)
     built = [
         rank_of_first(joints_in_base.build_scalar_products(nominal_of(machine), joints), 12),
         rank_of_first(offsets.build_consecutive(nominal_of(machine), directions), 6),
         rank_of_first(
             build_mean_distances(
-                nominal_of(machine), PlatformUnknowns.of(nominal_of(machine)), directions
+                nominal_of(machine), Unknowns.of_platform(nominal_of(machine)), directions
             ),
             12,
         ),

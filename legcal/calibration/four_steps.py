@@ -12,7 +12,7 @@ from legcal.calibration.session import Options, Session
 from legcal.data import Order, Outlines, axes_from_outlines, few_views, inverse
 from legcal.errors import DidNotConverge, NotIdentifiable, NotVisible
 from legcal.machine import Leg, geometries
-from legcal.paper import nominal_mechanism, run_base_steps, run_platform_steps
+from legcal.paper import nominal_machine, run_base_steps, run_platform_steps
 from legcal.perception import Placement
 
 
@@ -47,7 +47,7 @@ def four_steps(
     part.progress("Four steps", 0, 1)
     axes, measurements = part.axes, part.measurements
     try:
-        nominal = nominal_mechanism(part.machine)
+        nominal = nominal_machine(part.machine)
         if axes is None:
             radii = {p: r for leg in part.machine.legs for p, r in leg.radius_of_part.items()}
             axes = axes_from_outlines(outlines, measurements, radii)
@@ -62,10 +62,9 @@ def four_steps(
             cameras = tuple(T if T is None or own is None else T * own for T, own in moved)
         try:
             found = run_platform_steps(
-                nominal,
+                base,
                 axes,
                 measurements,
-                base,
                 criteria=options.criteria,
                 transformation=options.transformation,
                 free_twists=any(name.endswith(".twist") for name in options.choices.free),

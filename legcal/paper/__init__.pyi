@@ -8,5 +8,5 @@ from .four_steps import run_steps as run_steps
 from .nominal import Criteria as Criteria
 from .nominal import NominalMachine as NominalMachine
 from .nominal import Transformation as Transformation
-from .nominal import nominal_mechanism as nominal_mechanism
-from .nominal import point_like_mechanism as point_like_mechanism
+from .nominal import nominal_machine as nominal_machine
+from .nominal import point_like_machine as point_like_machine

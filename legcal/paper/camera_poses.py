@@ -18,9 +18,9 @@ from legcal.paper.nominal import NominalMachine
 
 _ON_A_LINE = 0.05  # spread of joints across their line, in that along it
 _ALONG = 0.1  # sine of the angle between an axis and the line: less does not fix a camera
-_ALIKE = 0.07  # mean squared sine of angles between axes: turns that differ by less are alike
+_MAX_DIFFERENCE = 0.07  # of the mean squared sine of angles between axes, of alike candidates
 _TURNS = 720
-_DECIDED = 0.25  # squared errors of lengths, in those from the other side
+_MAX_RATIO = 0.25  # squared errors of lengths, in those from the other side
 
 
 def camera_poses(
@@ -47,7 +47,7 @@ def camera_poses(
     along, middle = T_camera_Rb.rotation.apply(line), A_camera.mean(axis=0)
     v = T_camera_Rb.rotation.apply(v_Rb[across])
     poses = []
-    for turn in _alike_turns(along, v, v_camera[across], signed):
+    for turn in _candidate_turns(along, v, v_camera[across], signed):
         rotation = Rotation.from_rotvec(turn * along)
         about = RigidTransform.from_components(middle - rotation.apply(middle), rotation)
         poses.append((about * T_camera_Rb).inv())
@@ -70,7 +70,7 @@ def _laid_along(A_Rb: Array, line: Array, A_camera: Array) -> RigidTransform:
     return RigidTransform.from_components(shift, rotation)
 
 
-def _alike_turns(along: Array, v: Array, seen: Array, signed: bool) -> Array:
+def _candidate_turns(along: Array, v: Array, seen: Array, signed: bool) -> Array:
     """Return the turns about a unit vector that lay axes v (r, 3) on those seen, best first."""
     turn = 2.0 * np.pi / _TURNS * np.arange(_TURNS)
     axial = (v @ along)[:, None] * along
@@ -80,10 +80,10 @@ def _alike_turns(along: Array, v: Array, seen: Array, signed: bool) -> Array:
         + np.cos(turn)[:, None] * np.sum(seen * across, axis=1)
         + np.sin(turn)[:, None] * np.sum(seen * np.cross(along, across), axis=1)
     )
-    miss = 1.0 - np.mean(np.maximum(product, 0.0) ** 2 if signed else product**2, axis=1)
-    least = np.flatnonzero((miss <= np.roll(miss, 1)) & (miss < np.roll(miss, -1)))
-    least = least[np.argsort(miss[least], kind="stable")]
-    return np.asarray(turn[least[miss[least] < miss.min() + _ALIKE]])
+    error = 1.0 - np.mean(np.maximum(product, 0.0) ** 2 if signed else product**2, axis=1)
+    least = np.flatnonzero((error <= np.roll(error, 1)) & (error < np.roll(error, -1)))
+    least = least[np.argsort(error[least], kind="stable")]
+    return np.asarray(turn[least[error[least] < error.min() + _MAX_DIFFERENCE]])
 
 
 def side_of_plane(
@@ -107,7 +107,7 @@ def side_of_plane(
         if not poses:
             return 0.0
         errors.append(_length_errors(machine, axes, measurements, poses[0], A_camera, legs))
-    if max(errors) == 0.0 or min(errors) > _DECIDED * max(errors):
+    if max(errors) == 0.0 or min(errors) > _MAX_RATIO * max(errors):
         return 0.0
     return 1.0 if errors[0] < errors[1] else -1.0
 
@@ -140,6 +140,6 @@ def _length_errors(
         turn = np.sum(np.conj(B[leg] - middle) * (seen - seen.mean()))
         size = np.abs(turn)
         laid = seen.mean() + (turn / size if size > 0.0 else 1.0) * (B - middle)
-        miss = np.abs(laid - A) - length
-        total += float(np.sum(miss[np.isfinite(miss)] ** 2))
+        error = np.abs(laid - A) - length
+        total += float(np.sum(error[np.isfinite(error)] ** 2))
     return total

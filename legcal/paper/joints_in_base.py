@@ -15,7 +15,7 @@ pose a view. A view of two joints whose axes do not fix the camera gives their d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from itertools import combinations, combinations_with_replacement, product
 from typing import Any
@@ -26,7 +26,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, components
-from legcal.machine import free_coordinates
 from legcal.paper.camera_poses import camera_poses, signs_seen
 from legcal.paper.joints_in_camera import JointsInCamera, with_signs
 from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
@@ -34,17 +33,17 @@ from legcal.paper.motions import (
     axis_frames,
     moved,
     moved_points,
-    turned_axis,
     turned_axis_slope,
     turned_frame,
     turned_points,
     whitener,
 )
 from legcal.paper.nominal import Criteria, NominalMachine
+from legcal.paper.unknowns import BASE_TURNS, OF_A, Unknowns
 
-_LARGEST_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
+_MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
 _APART = 1e-3  # of the size of the base: nearer joints count as one, whose distance says nothing
-_MOST_TRIALS = 32  # of places of cameras that look alike
+_MAX_TRIALS = 32  # of places of cameras that look alike
 _DECIDED = 4.5  # half of a squared error: a difference in cost that decides between two places
 
 
@@ -52,11 +51,20 @@ _DECIDED = 4.5  # half of a squared error: a difference in cost that decides bet
 class JointsInBase:
     """Base joint centres and revolute axes in R_b, and the cameras."""
 
-    A_Rb: Array  # (n_legs, 3) [m]
+    machine: NominalMachine  # with A and the revolute axes at the base as they were located
     T_Rb_camera: tuple[RigidTransform | None, ...]  # None for a view whose joints do not fix it
-    solution: Solution  # the converged problem: the unknowns of :class:`BaseUnknowns` first
-    # (n_legs, 3), on the side of the nominal ones; NaN without one and in planar mechanisms
-    base_axes: Array
+    in_cameras: JointsInCamera  # what they were located from
+    axis_covariance: Array  # (n_legs, 3, 3) of the axes [rad^2]; zero without one, and literal
+
+    @property
+    def A_Rb(self) -> Array:
+        """Base joint centres, (n_legs, 3) [m]."""
+        return self.machine.parameters.base_joints
+
+    @property
+    def base_axes(self) -> Array:
+        """Revolute axes, (n_legs, 3), on the side of the nominal ones; NaN without one."""
+        return self.machine.base_axes
 
 
 def locate_joints_in_base(
@@ -67,7 +75,8 @@ def locate_joints_in_base(
     Raises NotIdentifiable if the views do not tie all joints and axes together (of the literal
     criterion: if one is in no product, or products are too few), and DidNotConverge.
     """
-    unknowns = BaseUnknowns.of(machine)
+    unknowns = Unknowns.of_base(machine)
+    axis_covariance = np.zeros((machine.n_legs, 3, 3))
     if criteria == "literal":
         _check_products(machine, joints)
         problem = build_scalar_products(machine, joints)
@@ -79,77 +88,17 @@ def locate_joints_in_base(
                 "shows more legs at once."
             )
         solution = solve_least_squares(problem)
-        A_Rb, axes = unknowns.joints_at(solution.x), unknowns.axes_at(solution.x)
-        cameras = register_views(A_Rb, axes, joints)
     else:
         solution, cameras = _registered(machine, joints)
         _check_identifiable(machine, joints, solution)
-        A_Rb, axes = unknowns.joints_at(solution.x), unknowns.axes_at(solution.x)
-    axes = np.where(machine.revolute[:, None], axes, np.nan)
-    return JointsInBase(A_Rb, cameras, solution, axes)
-
-
-@dataclass(frozen=True, eq=False)
-class BaseUnknowns:
-    """Which coordinates of A and turns of v are unknowns, and their nominal values."""
-
-    joints: IntArray  # (n_legs, 3): places of the coordinates of A, leg by leg; -1 if known
-    axes: IntArray  # (n_legs, 2): places of the turns of v, after those of all joints; -1 if none
-    A_nominal: Array  # (n_legs, 3) in R_b [m], with the values of known coordinates
-    v_nominal: Array  # (n_legs, 3) in R_b; z in a plane, NaN without an axis
-
-    @classmethod
-    def of(cls, machine: NominalMachine) -> BaseUnknowns:
-        """Return the unknowns of a mechanism."""
-        free = free_coordinates(machine.n_legs, machine.frame_legs)
-        turning = np.repeat(machine.revolute[:, None], 2, axis=1)
-        n_joints = int(free.sum())
-        joints, axes = np.full(free.shape, -1), np.full(turning.shape, -1)
-        joints[free] = np.arange(n_joints)
-        axes[turning] = n_joints + np.arange(turning.sum())
-        return cls(joints, axes, machine.parameters.base_joints, machine.base_normals)
-
-    def __len__(self) -> int:
-        return int(np.sum(self.joints >= 0) + np.sum(self.axes >= 0))
-
-    @property
-    def known(self) -> Array:
-        """Known coordinates of A, zero for unknown ones, (n_legs, 3) [m]."""
-        return np.where(self.joints < 0, self.A_nominal, 0.0)
-
-    @property
-    def frames(self) -> Array:
-        """Nominal axes and normal bases as columns, (n_legs, 3, 3); zero without an axis."""
-        frames = np.zeros((len(self.axes), 3, 3))
-        with_axis = np.isfinite(self.v_nominal[:, 0])
-        frames[with_axis] = axis_frames(self.v_nominal[with_axis])
-        return frames
-
-    @property
-    def start(self) -> Array:
-        """The nominal values of the unknowns, (n,) [m, rad]."""
-        return np.concatenate(
-            [self.A_nominal[self.joints >= 0], np.zeros(int(np.sum(self.axes >= 0)))]
-        )
-
-    def joints_at(self, x: Array) -> Array:
-        """Return A in R_b, (n_legs, 3) [m], from unknowns of which these are the first."""
-        return np.where(self.joints >= 0, x[self.joints], self.A_nominal)
-
-    def axes_at(self, x: Array) -> Array:
-        """Return v in R_b, (n_legs, 3), from unknowns of which these are the first."""
-        v = self.v_nominal.copy()
-        for j in np.flatnonzero(self.axes[:, 0] >= 0):
-            v[j] = turned_axis(v[j], x[self.axes[j]])
-        return v
-
-    def axis_covariance(self, solution: Solution) -> Array:
-        """Return the covariance of v in R_b, (n_legs, 3, 3) [rad^2]; zero for legs without one."""
-        of_turns, found = solution.covariance(), np.zeros((len(self.axes), 3, 3))
-        for j in np.flatnonzero(self.axes[:, 0] >= 0):
-            slope = turned_axis_slope(self.v_nominal[j], solution.x[self.axes[j]])
-            found[j] = slope @ of_turns[np.ix_(self.axes[j], self.axes[j])] @ slope.T
-        return found
+        of_turns, place = solution.covariance(), unknowns.place[:, BASE_TURNS]
+        for j in np.flatnonzero(machine.revolute):
+            slope = turned_axis_slope(machine.base_axes[j], solution.x[place[j]])
+            axis_covariance[j] = slope @ of_turns[np.ix_(place[j], place[j])] @ slope.T
+    located = replace(machine, legs=unknowns.legs(solution.x, machine.legs))
+    if criteria == "literal":
+        cameras = register_views(located, joints)
+    return JointsInBase(located, cameras, joints, axis_covariance)
 
 
 # As printed
@@ -157,7 +106,7 @@ class BaseUnknowns:
 
 def build_scalar_products(machine: NominalMachine, joints: JointsInCamera) -> LeastSquares:
     """Build C_1 of (9), products of all pairs of vectors; the squares v . v = 1 are left out."""
-    unknowns = BaseUnknowns.of(machine)
+    unknowns = Unknowns.of_base(machine)
     legs = tuple(tuple(np.flatnonzero(located).tolist()) for located in joints.located)
     revolute = joints.axis_located & machine.revolute
     axes = tuple(tuple(np.flatnonzero(located).tolist()) for located in revolute)
@@ -166,18 +115,20 @@ def build_scalar_products(machine: NominalMachine, joints: JointsInCamera) -> Le
         for view in zip(joints.A_camera, joints.v_camera, legs, axes, strict=True)
         for product in _products(*view)
     ]
-    places = tuple(unknowns.joints.ravel().tolist()), tuple(unknowns.axes.ravel().tolist())
+    places = tuple(
+        tuple(unknowns.place[:, columns].ravel().tolist()) for columns in (OF_A, BASE_TURNS)
+    )
     n_legs = machine.n_legs
     observed = (
         np.array(seen)[None, :],
-        unknowns.known.T.reshape(1, 3, n_legs),
-        np.hstack(list(unknowns.frames)).reshape(1, 3, 3 * n_legs),
+        unknowns.known_A.T.reshape(1, 3, n_legs),
+        np.hstack(list(unknowns.base_frames)).reshape(1, 3, 3 * n_legs),
     )
     index = np.arange(len(unknowns))[None, :]
     return LeastSquares(
         "The base joints in the base frame (eq 9)",
         (Term(_product_differences(places, legs, axes), index, observed),),
-        unknowns.start,
+        unknowns.vector(machine.legs),
         exact_hessian=True,
     )
 
@@ -198,7 +149,7 @@ _Places = tuple[tuple[int, ...], ...]
 
 @lru_cache(maxsize=4)
 def _product_differences(places: _Places, legs: _Places, axes: _Places) -> ca.Function:
-    """Return (A, turns of v; products seen, known, frames) -> products of all views, less seen."""
+    """Return (A, turns of v; products, known, frames) -> products of all views, less observed."""
     n_legs = len(places[0]) // 3
     x = ca.SX.sym("x", max(*places[0], *places[1]) + 1)
     known, frames = ca.SX.sym("known", 3, n_legs), ca.SX.sym("frames", 3, 3 * n_legs)
@@ -217,17 +168,18 @@ def _product_differences(places: _Places, legs: _Places, axes: _Places) -> ca.Fu
 
 
 def register_views(
-    A_Rb: Array, v_Rb: Array, joints: JointsInCamera
+    machine: NominalMachine, joints: JointsInCamera
 ) -> tuple[RigidTransform | None, ...]:
     """Return T_Rb_camera of each view whose joints and axes fix it, in closed form, unweighted."""
-    places = [_places(A_Rb, v_Rb, joints, v) for v in range(len(joints.located))]
-    return tuple(poses[0] if fixed and len(poses) == 1 else None for poses, fixed in places)
+    candidates = [_candidates(machine, joints, v) for v in range(len(joints.located))]
+    return tuple(poses[0] if fixed and len(poses) == 1 else None for poses, fixed in candidates)
 
 
-def _places(
-    A_Rb: Array, v_Rb: Array, joints: JointsInCamera, view: int
+def _candidates(
+    machine: NominalMachine, joints: JointsInCamera, view: int
 ) -> tuple[list[RigidTransform], bool]:
-    """Return where the camera of a view may have stood, and whether that is all."""
+    """Return the candidate poses of the camera of a view, and whether there are no others."""
+    A_Rb, v_Rb = machine.parameters.base_joints, machine.base_normals
     located, with_axis = joints.located[view], joints.axis_located[view]
     return camera_poses(
         A_Rb[located],
@@ -249,14 +201,14 @@ def _registered(
     Where axes leave several places of a camera, all are tried; where they fit alike, the view says
     no more than distances.
     """
-    A_Rb, v_Rb = machine.parameters.base_joints, machine.base_normals
+    v_Rb = machine.base_normals
     starts: list[Sequence[RigidTransform | None]] = []
     fixed, n_trials = [], 1
     for view, located in enumerate(joints.located):
-        poses, is_fixed = _places(A_Rb, v_Rb, joints, view)
+        poses, is_fixed = _candidates(machine, joints, view)
         fixed.append(is_fixed)
         usable = poses and (is_fixed or located.sum() > 2)
-        if usable and n_trials * len(poses) <= _MOST_TRIALS:
+        if usable and n_trials * len(poses) <= _MAX_TRIALS:
             n_trials *= len(poses)
             starts.append(poses)
         else:
@@ -304,7 +256,7 @@ def build_rigid(
     ``start`` are T_Rb_camera; a view without one gives distances between its joints. Axes have the
     signs of the nominal ones.
     """
-    unknowns = BaseUnknowns.of(machine)
+    unknowns = Unknowns.of_base(machine)
     n_shared = len(unknowns)
     placed = np.array([T is not None for T in start], dtype=np.bool_)
     cameras = [T.inv() for T in start if T is not None]
@@ -312,7 +264,7 @@ def build_rigid(
     R, t = components(cameras)
     seen = joints.located & placed[:, None]
     with_axis = seen & joints.axis_located
-    terms = [_distances(unknowns, joints, np.flatnonzero(~placed))]
+    terms = [_distances(machine, unknowns, joints, np.flatnonzero(~placed))]
 
     def steps(view: IntArray) -> IntArray:
         return n_shared + 6 * number[view][:, None] + np.arange(6)
@@ -320,14 +272,14 @@ def build_rigid(
     for chosen, kind in ((seen & ~with_axis, "point"), (with_axis, "axis")):
         view, leg = np.nonzero(chosen)
         C, v = joints.covariance[view, leg], joints.v_camera[view, leg]
-        index = np.hstack([unknowns.joints[leg], steps(view)])
+        index = np.hstack([unknowns.place[leg, OF_A], steps(view)])
         A_camera = joints.A_camera[view, leg]
-        observed = (unknowns.known[leg], R[number[view]], t[number[view]], A_camera)
+        observed = (unknowns.known_A[leg], R[number[view]], t[number[view]], A_camera)
         if kind == "point":
             terms.append(Term(_centre(), index, (*observed, whitener(C[:, :3, :3]))))
         elif machine.spatial:
-            index = np.hstack([index, unknowns.axes[leg]])
-            more = (unknowns.frames[leg], axis_frames(v), whitener(C))
+            index = np.hstack([index, unknowns.place[leg, BASE_TURNS]])
+            more = (unknowns.base_frames[leg], axis_frames(v), whitener(C))
             terms.append(Term(_centre_and_axis(), index, (*observed, *more)))
         else:  # the centre follows turns of the normal by G
             G = C[:, :3, 3:] @ np.linalg.inv(C[:, 3:, 3:])
@@ -338,15 +290,17 @@ def build_rigid(
             W = whitener(joints.covariance[view, leg, 3:, 3:])
             normals = (R[number[view]], axis_frames(joints.v_camera[view, leg]), W)
             terms.append(Term(_normal_of_plane(), steps(view), normals))
-    start_x = np.concatenate([unknowns.start, np.zeros(6 * len(cameras))])
+    start_x = np.concatenate([unknowns.vector(machine.legs), np.zeros(6 * len(cameras))])
     return LeastSquares(
         "The base joints in the base frame (step 2)", tuple(terms), start_x, n_shared=n_shared
     )
 
 
-def _distances(unknowns: BaseUnknowns, joints: JointsInCamera, views: IntArray) -> Term:
+def _distances(
+    machine: NominalMachine, unknowns: Unknowns, joints: JointsInCamera, views: IntArray
+) -> Term:
     """Return the residuals of distances between the joints of views without a camera pose."""
-    A = unknowns.A_nominal
+    A = machine.parameters.base_joints
     size = float(np.linalg.norm(A - A.mean(axis=0), axis=1).max(initial=0.0))
     pairs = np.array(
         [
@@ -362,44 +316,44 @@ def _distances(unknowns: BaseUnknowns, joints: JointsInCamera, views: IntArray) 
     distance = np.linalg.norm(apart, axis=1)
     C = (joints.covariance[view, j] + joints.covariance[view, g])[:, :3, :3]
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", apart, C, apart)) / distance
-    known = np.stack([unknowns.known[j], unknowns.known[g]], axis=2)
-    index = np.hstack([unknowns.joints[j], unknowns.joints[g]])
+    known = np.stack([unknowns.known_A[j], unknowns.known_A[g]], axis=2)
+    index = np.hstack([unknowns.place[j, OF_A], unknowns.place[g, OF_A]])
     return Term(distance_of_joints(), index, (known, distance, sigma))
 
 
 @cache
 def _centre() -> ca.Function:
-    """Return (A, step; known, R, t, A_camera, W) -> W times the miss of A in a camera, (3,)."""
-    local, given, miss = _miss_of_centre(9)
+    """Return (A, step; known, R, t, A_camera, W) -> W times the error of A in a camera, (3,)."""
+    local, given, error = _centre_residual(9)
     W = ca.SX.sym("W", 3, 3)
-    return ca.Function("centre", [local, *given, W], [W @ miss])
+    return ca.Function("centre", [local, *given, W], [W @ error])
 
 
 @cache
 def _centre_and_axis() -> ca.Function:
-    """Return (A, step, turns; known, R, t, A_camera, frame, v_camera, W) -> W times the miss, (5,).
+    """Return (A, step, turns; known, R, t, A_camera, frame, v_camera, W) -> W times errors, (5,).
 
-    The miss of A, and the turns of v about its normal basis in the camera; the frames are those
+    The error of A, and the turns of v about its normal basis in the camera; the frames are those
     of :func:`axis_frames`, for v in R_b and in the camera.
     """
-    local, given, miss = _miss_of_centre(11)
+    local, given, error = _centre_residual(11)
     frame, v_camera, W = ca.SX.sym("frame", 3, 3), ca.SX.sym("v_camera", 3, 3), ca.SX.sym("W", 5, 5)
     turns = _turns_in_camera(local[3:9], given[1], turned_frame(local[9:], frame)[:, 0], v_camera)
     observed = [*given, frame, v_camera, W]
-    return ca.Function("joint", [local, *observed], [W @ ca.vertcat(miss, turns)])
+    return ca.Function("joint", [local, *observed], [W @ ca.vertcat(error, turns)])
 
 
 @cache
 def _centre_in_plane() -> ca.Function:
-    """Return (A, step; known, R, t, A_camera, v_camera, G, W) -> W times the miss of A, (3,).
+    """Return (A, step; known, R, t, A_camera, v_camera, G, W) -> W times the error of A, (3,).
 
     A leg of a planar mechanism: its centre is the one seen if the normal of the plane is; it
     follows turns of the normal by G (3, 2).
     """
-    local, given, miss = _miss_of_centre(9)
+    local, given, error = _centre_residual(9)
     v_camera, G, W = ca.SX.sym("v_camera", 3, 3), ca.SX.sym("G", 3, 2), ca.SX.sym("W", 3, 3)
     turns = _turns_in_camera(local[3:9], given[1], ca.SX([0.0, 0.0, 1.0]), v_camera)
-    return ca.Function("centre", [local, *given, v_camera, G, W], [W @ (miss - G @ turns)])
+    return ca.Function("centre", [local, *given, v_camera, G, W], [W @ (error - G @ turns)])
 
 
 @cache
@@ -420,16 +374,16 @@ def distance_of_joints() -> ca.Function:
     local, known = ca.SX.sym("local", 6), ca.SX.sym("known", 3, 2)
     distance, sigma = ca.SX.sym("distance"), ca.SX.sym("sigma")
     apart = local[3:] + known[:, 1] - local[:3] - known[:, 0]
-    miss = (ca.norm_2(apart) - distance) / sigma
-    return ca.Function("joints", [local, known, distance, sigma], [miss])
+    residual = (ca.norm_2(apart) - distance) / sigma
+    return ca.Function("joints", [local, known, distance, sigma], [residual])
 
 
-def _miss_of_centre(n_local: int) -> tuple[ca.SX, list[ca.SX], ca.SX]:
-    """Return local unknowns, symbols (known, R, t, A_camera) and the miss of A in the camera."""
+def _centre_residual(n_local: int) -> tuple[ca.SX, list[ca.SX], ca.SX]:
+    """Return local unknowns, symbols (known, R, t, A_camera) and the error of A in the camera."""
     local, known, t = ca.SX.sym("local", n_local), ca.SX.sym("known", 3), ca.SX.sym("t", 3)
     R, A_camera = ca.SX.sym("R", 3, 3), ca.SX.sym("A_camera", 3)
-    miss = moved_points(local[3:9], R, t, local[:3] + known) - A_camera
-    return local, [known, R, t, A_camera], miss
+    error = moved_points(local[3:9], R, t, local[:3] + known) - A_camera
+    return local, [known, R, t, A_camera], error
 
 
 def _turns_in_camera(step: ca.SX, R: ca.SX, v: ca.SX, v_camera: ca.SX) -> ca.SX:
@@ -467,16 +421,15 @@ def _check_identifiable(
 
     That is known worse than the size of the base, or a radian.
     """
-    unknowns = BaseUnknowns.of(machine)
+    unknowns = Unknowns.of_base(machine)
     n = len(unknowns)
-    limit = np.full(n, _LARGEST_TURN)
-    n_coordinates = int(np.sum(unknowns.joints >= 0))
-    limit[:n_coordinates] = np.ptp(unknowns.A_nominal, axis=0).max(initial=0.0)
+    size = np.ptp(machine.parameters.base_joints, axis=0).max(initial=0.0)
+    limit = np.where(unknowns.is_angle, _MAX_SIGMA_TURN, size)
     sigma = np.sqrt(np.diag(solution.covariance())[:n])
-    loose = np.append(solution.unseen(n) | (sigma > limit), False)
+    loose = np.append(solution.undetermined(n) | (sigma > limit), False)
     names = np.array(machine.leg_names)
-    moving = names[loose[unknowns.joints].any(axis=1)]
-    turning = names[loose[unknowns.axes].any(axis=1)]
+    moving = names[loose[unknowns.place[:, OF_A]].any(axis=1)]
+    turning = names[loose[unknowns.place[:, BASE_TURNS]].any(axis=1)]
     if not len(moving) and not len(turning):
         return
     what = "base joints" if len(moving) else "revolute axes at the base"

@@ -24,14 +24,14 @@ from legcal.paper.camera_poses import camera_poses, side_of_plane, signs_seen
 from legcal.paper.nominal import Criteria, NominalMachine
 
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
-_LARGEST_SIGMA = 0.1  # of the distance to the camera
-_LARGEST_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
-MOST_REWEIGHTINGS = 100
-_FEWEST_REWEIGHTINGS = 10
+_MAX_SIGMA_CENTRE = 0.1  # of the distance to the camera
+_MAX_SIGMA_TURN = 1.0  # [rad] of an axis; beyond, nothing is known of it
+MAX_REWEIGHTINGS = 100
+_MIN_REWEIGHTINGS = 10
 _CONVERGED = 1e-6  # standard deviations: smaller steps no longer matter
 _OUTLIER = 3.0  # an axis that misses A by this many times the median has half its weight
-_NO_NOISE = 1e-3  # standard deviations: smaller misses are rounding
-_LONGEST = 0.2  # step: [rad] of an axis, and in its distance of a centre
+_MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
+_MAX_STEP = 0.2  # [rad] of an axis, and in its distance of a centre
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,28 +67,30 @@ def locate_joints_in_cameras(
     views, legs = np.divmod(np.unique(key), n_legs)
     bundles = Bundles.of(key)
     information, _ = _plain_equations(axes, bundles)
-    doubts = [_too_few(*each) for each in zip(information, bundles.counts.tolist(), strict=True)]
-    clear = np.array([not doubt for doubt in doubts], dtype=np.bool_)
+    reasons = [
+        _no_single_point(*each) for each in zip(information, bundles.counts.tolist(), strict=True)
+    ]
+    clear = np.array([not reason for reason in reasons], dtype=np.bool_)
     at = views[clear], legs[clear]
     A, v, C = _estimate(machine, axes, bundles.some(clear), *at, criteria)
     has_axis = np.any(v != 0.0, axis=1)
-    axis_doubts = [""] * len(A)
+    axis_reasons = [""] * len(A)
     if criteria == "default":
         for k, i in enumerate(np.flatnonzero(clear)):
-            doubts[i] = _too_uncertain(A[k], C[k, :3, :3])
-            if has_axis[k] and not doubts[i]:
-                axis_doubts[k] = _too_tilted(C[k, 3:, 3:])
-    good = np.array([not doubt for doubt in doubts], dtype=np.bool_)[clear]
-    good_axis = good & has_axis & np.array([not doubt for doubt in axis_doubts], dtype=np.bool_)
+            reasons[i] = _uncertain_centre(A[k], C[k, :3, :3])
+            if has_axis[k] and not reasons[i]:
+                axis_reasons[k] = _uncertain_axis(C[k, 3:, 3:])
+    good = np.array([not reason for reason in reasons], dtype=np.bool_)[clear]
+    good_axis = good & has_axis & np.array([not reason for reason in axis_reasons], dtype=np.bool_)
     diagnostics = tuple(
         f"The {what} of leg {names[leg]} in view {measurements.views[view].name} was left out: "
-        f"{doubt}."
+        f"{reason}."
         for what, places, said in (
-            ("base joint", (views, legs), doubts),
-            ("revolute axis", at, axis_doubts),
+            ("base joint", (views, legs), reasons),
+            ("revolute axis", at, axis_reasons),
         )
-        for view, leg, doubt in zip(*(place.tolist() for place in places), said, strict=True)
-        if doubt
+        for view, leg, reason in zip(*(place.tolist() for place in places), said, strict=True)
+        if reason
     )
     shape = (len(measurements.views), n_legs)
     located, axis_located = np.zeros((2, *shape), dtype=np.bool_)
@@ -115,7 +117,7 @@ def locate_joints_in_cameras(
     return found if machine.spatial else _sided(machine, axes, measurements, found)
 
 
-def _too_few(information: Array, n_images: int) -> str:
+def _no_single_point(information: Array, n_images: int) -> str:
     """Return why (6) has no single solution, or an empty string."""
     if float(np.linalg.eigvalsh(information)[0]) > _SAME_DIRECTION * n_images:
         return ""
@@ -124,11 +126,11 @@ def _too_few(information: Array, n_images: int) -> str:
     return f"its direction is the same in all {n_images} images, and two are needed"
 
 
-def _too_uncertain(A: Array, covariance: Array) -> str:
+def _uncertain_centre(A: Array, covariance: Array) -> str:
     """Return why a centre says nothing, or an empty string."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     distance = float(np.linalg.norm(A))
-    if sigma <= _LARGEST_SIGMA * distance:
+    if sigma <= _MAX_SIGMA_CENTRE * distance:
         return ""
     return (
         f"its directions differ too little to say where they meet (sigma {1e3 * sigma:.0f} mm "
@@ -136,10 +138,10 @@ def _too_uncertain(A: Array, covariance: Array) -> str:
     )
 
 
-def _too_tilted(covariance: Array) -> str:
+def _uncertain_axis(covariance: Array) -> str:
     """Return why an axis says nothing, or an empty string."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-    if sigma <= _LARGEST_TURN:
+    if sigma <= _MAX_SIGMA_TURN:
         return ""
     return (
         "its leg's directions differ too little to say what they are normal to "
@@ -298,16 +300,16 @@ def _weighted_points(axes: LegAxes, bundles: Bundles, A: Array) -> tuple[Array, 
     """
     A, C = A.copy(), np.zeros((len(A), 3, 3))
 
-    def update(going: IntArray) -> Array:
-        some, before = bundles.some(np.isin(np.arange(len(A)), going)), A[going]
+    def update(active: IntArray) -> Array:
+        some, before = bundles.some(np.isin(np.arange(len(A)), active)), A[active]
         E, M = axes.basis[some.rows], axes.M[some.rows]
         nowhere = np.zeros((len(some.rows), 3))
-        residual, spread, _ = miss_of_joint(axes, some.rows, before[some.bundle], nowhere)
+        residual, spread, _ = joint_residuals(axes, some.rows, before[some.bundle], nowhere)
         weight = _robust_weights(some, residual[:, :2], spread[:, :2, :2])
         normal = np.swapaxes(E, -1, -2) @ weight @ E
         right = (normal @ M[..., None])[..., 0]
-        A[going], C[going] = _nearest_points(some.total(normal), some.total(right))
-        return A[going] - before
+        A[active], C[active] = _nearest_points(some.total(normal), some.total(right))
+        return A[active] - before
 
     _until_converged(update, A, C, np.arange(len(A)))
     return A, C
@@ -325,23 +327,23 @@ def _weighted_joints(
     """
     A, v, C = A.copy(), v.copy(), np.zeros((len(A), 5, 5))
 
-    def update(going: IntArray) -> Array:
-        some = bundles.some(np.isin(np.arange(len(A)), going))
-        rows, bundle, before = some.rows, some.bundle, v[going]
-        residual, spread, tilt = miss_of_joint(axes, rows, A[going][bundle], before[bundle])
+    def update(active: IntArray) -> Array:
+        some = bundles.some(np.isin(np.arange(len(A)), active))
+        rows, bundle, before = some.rows, some.bundle, v[active]
+        residual, spread, tilt = joint_residuals(axes, rows, A[active][bundle], before[bundle])
         weight = _robust_weights(some, residual, spread)
         alpha = (tilt @ np.linalg.solve(spread, residual[..., None]))[..., 0]
-        J = derivative_of_miss(axes, rows, before[bundle], alpha)
+        J = residual_jacobian(axes, rows, before[bundle], alpha)
         back = np.swapaxes(J, 1, 2) @ weight
         right = (back @ residual[..., None])[..., 0]
-        of_pool = np.unique(pool[going], return_inverse=True)[1].ravel()
-        step, C[going] = _pooled(some.total(back @ J), some.total(right), of_pool)
-        # Within _LONGEST the equations are nearly linear.
+        of_pool = np.unique(pool[active], return_inverse=True)[1].ravel()
+        step, C[active] = _pooled(some.total(back @ J), some.total(right), of_pool)
+        # Within _MAX_STEP the equations are nearly linear.
         of_A, of_v = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
-        size = np.maximum(of_A / np.linalg.norm(A[going], axis=1), of_v)
-        step /= np.maximum(size / _LONGEST, 1.0)[:, None]
-        A[going] -= step[:, :3]
-        v[going] = turned(before, -step[:, 3:])
+        size = np.maximum(of_A / np.linalg.norm(A[active], axis=1), of_v)
+        step /= np.maximum(size / _MAX_STEP, 1.0)[:, None]
+        A[active] -= step[:, :3]
+        v[active] = turned(before, -step[:, 3:])
         return step
 
     _until_converged(update, A, C, pool)
@@ -355,15 +357,17 @@ def _until_converged(
 
     One that says nothing of its joint would wander off, and is not followed.
     """
-    going = np.arange(len(A))
-    for k in range(MOST_REWEIGHTINGS):
-        step = update(going)
-        if k + 1 < _FEWEST_REWEIGHTINGS:
+    active = np.arange(len(A))
+    for k in range(MAX_REWEIGHTINGS):
+        step = update(active)
+        if k + 1 < _MIN_REWEIGHTINGS:
             continue
-        moves = np.any(step**2 > _CONVERGED**2 * np.einsum("nii->ni", C[going]), axis=1)
-        sound = np.array([not _too_uncertain(A[i], C[i, :3, :3]) for i in going], dtype=np.bool_)
-        going = going[sound & np.isin(pool[going], pool[going[moves & sound]])]
-        if not len(going):
+        moves = np.any(step**2 > _CONVERGED**2 * np.einsum("nii->ni", C[active]), axis=1)
+        sound = np.array(
+            [not _uncertain_centre(A[i], C[i, :3, :3]) for i in active], dtype=np.bool_
+        )
+        active = active[sound & np.isin(pool[active], pool[active[moves & sound]])]
+        if not len(active):
             break
 
 
@@ -371,11 +375,13 @@ def _robust_weights(bundles: Bundles, residual: Array, spread: Array) -> Array:
     """Return the inverses of covariances (k, r, r), less for residuals (k, r) far from the rest."""
     weight = np.linalg.inv(spread)
     chi = np.sqrt(np.einsum("ki,kij,kj->k", residual, weight, residual))
-    limit = np.maximum(_OUTLIER * bundles.median(chi), _NO_NOISE)[bundles.bundle]
+    limit = np.maximum(_OUTLIER * bundles.median(chi), _MIN_THRESHOLD)[bundles.bundle]
     return np.asarray(weight / (1.0 + (chi / limit) ** 2)[:, None, None])
 
 
-def miss_of_joint(axes: LegAxes, here: IntArray, A: Array, v: Array) -> tuple[Array, Array, Array]:
+def joint_residuals(
+    axes: LegAxes, here: IntArray, A: Array, v: Array
+) -> tuple[Array, Array, Array]:
     """Return by how much axes miss points A and are not normal to v (k, 3), (6) and (7).
 
     The observed axis at the height s of the point is M + s u + e (beta + s alpha), e = (e1, e2).
@@ -393,7 +399,7 @@ def miss_of_joint(axes: LegAxes, here: IntArray, A: Array, v: Array) -> tuple[Ar
     return residual, np.asarray(T @ axes.covariance[here] @ np.swapaxes(T, 1, 2)), tilt
 
 
-def derivative_of_miss(axes: LegAxes, here: IntArray, v: Array, alpha: Array) -> Array:
+def residual_jacobian(axes: LegAxes, here: IntArray, v: Array, alpha: Array) -> Array:
     """Return the derivative (k, 3, 5) of the miss by A and turns of v, at u + e alpha."""
     N, E, u = normal_basis(v), axes.basis[here], axes.u[here]
     better = u + np.einsum("kia,ki->ka", E, alpha)

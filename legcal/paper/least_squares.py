@@ -7,9 +7,10 @@ of one structure (other numbers, other weights) are compiled once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,12 +20,12 @@ from scipy.sparse.csgraph import connected_components
 from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, IntArray
 
-_RANK = 1e-7  # singular values of the scaled Jacobian below this are directions that nothing shows
+_RANK = 1e-7  # singular values of the scaled Jacobian below this are undetermined directions
 _REWEIGHTINGS = 4
 _OUTLIER = 4.0  # an observation this many times the median has half its weight
 _CONVERGED = 0.01  # change of a weight that no longer matters
-_NO_NOISE = 1e-3  # standard deviations: smaller residuals are rounding
-_KEPT = 8  # compiled structures: those of one run of the steps, with either criteria
+_MIN_THRESHOLD = 1e-3  # standard deviations: smaller residuals are rounding
+_CACHE_SIZE = 8  # compiled structures: those of one run of the steps, with either criteria
 _OPTIONS: dict[str, bool | int | float | str] = {
     "print_time": False,
     "calc_lam_p": False,
@@ -86,9 +87,10 @@ class LeastSquares:
         return _sparse(_compiled(self._structure()).jacobian(x, self._observed()))
 
     def _structure(self) -> _Structure:
+        """Return what problems share that differ only in what was observed and in the start."""
         terms = [term for term in self.terms if len(term.index)]
         keys = tuple(
-            _TermKey(
+            (
                 term.function,
                 term.index.shape,
                 np.ascontiguousarray(term.index, dtype=np.int64).tobytes(),
@@ -97,7 +99,7 @@ class LeastSquares:
             for term in terms
         )
         robust = any(term.robust for term in terms)
-        return _Structure(len(self.start), keys, self.exact_hessian, robust)
+        return len(self.start), keys, self.exact_hessian, robust
 
     def _observed(self) -> ca.DM:
         """Return what all observations saw as one vector, observations side by side."""
@@ -145,7 +147,7 @@ class Solution:
     def covariance(self) -> Array:
         """Return the covariance of the shared unknowns for residuals of unit variance.
 
-        Directions that no residual shows have none: see :meth:`unseen`.
+        Directions that no residual shows have none: see :meth:`undetermined`.
         """
         triangle, scale = _shared_triangle(self.jacobian, self.n_shared)
         scaled = np.linalg.pinv(triangle, rcond=_RANK) * scale[:, None]
@@ -156,7 +158,7 @@ class Solution:
         triangle, scale = _shared_triangle(self.jacobian, self.n_shared)
         return np.asarray(triangle / scale)
 
-    def unseen(self, n_first: int) -> BoolArray:
+    def undetermined(self, n_first: int) -> BoolArray:
         """Return which of the first (shared) unknowns can move without changing any residual."""
         triangle, _ = _shared_triangle(self.jacobian, self.n_shared)
         rows = _eliminated(triangle[None, :, n_first:], triangle[None, :, :n_first])
@@ -214,7 +216,7 @@ def _cauchy_root_weights(residuals: Array, block: IntArray) -> Array:
     size = np.zeros(int(block.max(initial=0)) + 1)
     np.add.at(size, block[inside], residuals[inside] ** 2)
     chi = np.sqrt(size)
-    limit = max(_OUTLIER * float(np.median(chi[np.unique(block[inside])])), _NO_NOISE)
+    limit = max(_OUTLIER * float(np.median(chi[np.unique(block[inside])])), _MIN_THRESHOLD)
     root_weight = np.ones(len(block))
     root_weight[inside] = 1.0 / np.sqrt(1.0 + (chi[block[inside]] / limit) ** 2)
     return root_weight
@@ -223,28 +225,12 @@ def _cauchy_root_weights(residuals: Array, block: IntArray) -> Array:
 # Compiled problems
 
 
-@dataclass(frozen=True)
-class _TermKey:
-    """A term without what it saw."""
-
-    function: ca.Function
-    shape: tuple[int, ...]  # of the index
-    index: bytes
-    observed: tuple[tuple[int, int], ...]  # shapes of what one observation saw
+# Function, shape and bytes of the index, and shapes of what one observation saw
+_TermKey = tuple[ca.Function, tuple[int, ...], bytes, tuple[tuple[int, ...], ...]]
+_Structure = tuple[int, tuple[_TermKey, ...], bool, bool]  # unknowns, terms, exact Hessian, robust
 
 
-@dataclass(frozen=True)
-class _Structure:
-    """What problems share that differ only in what was observed, in weights and in the start."""
-
-    n_unknowns: int
-    terms: tuple[_TermKey, ...]
-    exact_hessian: bool
-    robust: bool  # solved several times, with other weights
-
-
-@dataclass(frozen=True, eq=False)
-class _Compiled:
+class _Compiled(NamedTuple):
     """The functions of a structure."""
 
     solver: ca.Function  # parameters: square roots of weights, start, scale, observed
@@ -252,11 +238,12 @@ class _Compiled:
     jacobian: ca.Function  # (x, observed) -> sparse (m, n)
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _compiled(structure: _Structure) -> _Compiled:
     """Return the functions of a structure, the solver in scaled unknowns."""
-    residuals, jacobian = _residuals_and_jacobian(structure)
-    n, m = structure.n_unknowns, residuals.size1_out(0)
+    n, terms, exact_hessian, robust = structure
+    residuals, jacobian = _residuals_and_jacobian(n, terms)
+    m = residuals.size1_out(0)
     z, p = ca.MX.sym("z", n), ca.MX.sym("p", m + 2 * n + residuals.size1_in(1))
     root_weight, start, scale = p[:m], p[m : m + n], p[m + n : m + 2 * n]
     observed = p[m + 2 * n :]
@@ -269,7 +256,7 @@ def _compiled(structure: _Structure) -> _Compiled:
     options["grad_f"] = ca.Function(
         "nlp_grad_f", [z, p], [cost, gradient], ["x", "p"], ["f", "grad_f_x"]
     )
-    if not structure.exact_hessian:
+    if not exact_hessian:
         lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0)
         options["hess_lag"] = ca.Function(
             "nlp_hess_l",
@@ -278,33 +265,34 @@ def _compiled(structure: _Structure) -> _Compiled:
             ["x", "p", "lam_f", "lam_g"],
             ["triu_hess_gamma_x_x"],
         )
-    if structure.robust:  # more iterations only look for a descent below rounding
+    if robust:  # more iterations only look for a descent below rounding
         options["ipopt.acceptable_iter"] = 2
     nlp: dict[str, Any] = {"x": z, "p": p, "f": cost}
     return _Compiled(ca.nlpsol("solver", "ipopt", nlp, options), residuals, jacobian)
 
 
-def _residuals_and_jacobian(structure: _Structure) -> tuple[ca.Function, ca.Function]:
+def _residuals_and_jacobian(
+    n_unknowns: int, terms: Sequence[_TermKey]
+) -> tuple[ca.Function, ca.Function]:
     """Return (x, observed) -> residuals of all terms, and their sparse derivative by x."""
-    n_observed = sum(key.shape[0] * a * b for key in structure.terms for a, b in key.observed)
-    x, seen = ca.MX.sym("x", structure.n_unknowns), ca.MX.sym("observed", n_observed)
+    n_observed = sum(shape[0] * a * b for _, shape, _, sizes in terms for a, b in sizes)
+    x, seen = ca.MX.sym("x", n_unknowns), ca.MX.sym("observed", n_observed)
     residuals, values = [ca.MX(0, 1)], [ca.MX(0, 1)]
     rows, columns = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
     n_before = place = 0
-    for key in structure.terms:
-        n, n_local = key.shape
+    for function, (n, n_local), content, sizes in terms:
         observed = []
-        for a, b in key.observed:
+        for a, b in sizes:
             size = n * a * b
             observed.append(ca.reshape(seen[place : place + size], a, n * b))
             place += size
-        index = np.frombuffer(key.index, dtype=np.int64).reshape(n, n_local)
-        padded = np.where(index >= 0, index, structure.n_unknowns).ravel().tolist()
+        index = np.frombuffer(content, dtype=np.int64).reshape(n, n_local)
+        padded = np.where(index >= 0, index, n_unknowns).ravel().tolist()
         local = ca.reshape(ca.vertcat(x, 0.0)[padded], n_local, n)
-        residuals.append(ca.vec(key.function.map(n)(local, *observed)))
-        values.append(ca.vec(_derivative(key.function).map(n)(local, *observed)))
+        residuals.append(ca.vec(function.map(n)(local, *observed)))
+        values.append(ca.vec(_derivative(function).map(n)(local, *observed)))
         # CasADi stores columns: of one observation all residuals by its first unknown come first.
-        n_rows = int(key.function.size1_out(0))
+        n_rows = int(function.size1_out(0))
         of_observation = n_before + np.arange(n * n_rows).reshape(n, 1, n_rows)
         rows.append(np.repeat(of_observation, n_local, axis=1).ravel())
         columns.append(np.repeat(index.ravel(), n_rows))
@@ -312,8 +300,8 @@ def _residuals_and_jacobian(structure: _Structure) -> tuple[ca.Function, ca.Func
     row, column = np.concatenate(rows), np.concatenate(columns)
     order = np.lexsort((row, column))
     order = order[column[order] >= 0]
-    first = np.searchsorted(column[order], np.arange(structure.n_unknowns + 1))
-    pattern = ca.Sparsity(n_before, structure.n_unknowns, first.tolist(), row[order].tolist())
+    first = np.searchsorted(column[order], np.arange(n_unknowns + 1))
+    pattern = ca.Sparsity(n_before, n_unknowns, first.tolist(), row[order].tolist())
     jacobian = ca.MX(pattern, ca.vertcat(*values)[order.tolist()])
     return (
         ca.Function("residuals", [x, seen], [ca.vertcat(*residuals)]),

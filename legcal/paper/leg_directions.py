@@ -13,13 +13,13 @@ import numpy as np
 
 from legcal.data import LegAxes, Measurements, join_axes
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
-from legcal.paper.joints_in_base import BaseUnknowns, JointsInBase
-from legcal.paper.joints_in_camera import JointsInCamera, derivative_of_miss, miss_of_joint
+from legcal.paper.joints_in_base import JointsInBase
+from legcal.paper.joints_in_camera import JointsInCamera, joint_residuals, residual_jacobian
 from legcal.paper.nominal import NominalMachine
 
-_FAR = 8.0  # an axis that misses its joint by so many deviations or medians is a wrong one
-_NO_AXIS = 1e6  # [rad^2] of the angle to an axis that a leg does not have
-_EXACT = 1e-12  # [rad^2]: no axis is known better
+_OUTLIER = 8.0  # standard deviations or medians
+_VARIANCE_NO_AXIS = 1e6  # [rad^2] of the angle to an axis that a leg does not have
+_MIN_VARIANCE = 1e-12  # [rad^2] of an axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class LegDirections:
 
 
 def observed_directions(
-    machine: NominalMachine, axes: LegAxes, measurements: Measurements, joints: JointsInCamera
+    axes: LegAxes, measurements: Measurements, machine: NominalMachine, joints: JointsInCamera
 ) -> LegDirections:
     """Return u as the images give it, from A of step 1 in each camera frame: the u of (13).
 
@@ -73,11 +73,7 @@ def observed_directions(
 
 
 def directions_through_joints(
-    machine: NominalMachine,
-    axes: LegAxes,
-    measurements: Measurements,
-    joints: JointsInCamera,
-    base: JointsInBase,
+    axes: LegAxes, measurements: Measurements, base: JointsInBase
 ) -> LegDirections:
     """Return u of the legs given that each axis belongs to its base joint.
 
@@ -87,6 +83,7 @@ def directions_through_joints(
     covariance of the axis on "it passes through A" does, and on "it is normal to v" for a leg
     with a revolute joint.
     """
+    machine, joints = base.machine, base.in_cameras
     view = measurements.view[axes.row]
     in_base = np.array([T is not None for T in base.T_Rb_camera])
     usable = in_base[view] | joints.located[view, axes.leg]
@@ -103,7 +100,7 @@ def directions_through_joints(
     view, pose = measurements.view[axes.row], measurements.pose[axes.row]
     frame = np.where(in_base[view], 0, 1 + view)
     A = np.where(in_base[view][:, None], base.A_Rb[axes.leg], joints.A_camera[view, axes.leg])
-    normals = _known_normals(machine, joints, base, view, axes.leg)
+    normals = _known_normals(base, view, axes.leg)
     u, basis, covariance = _conditioned(axes, A, *normals)
     return LegDirections(
         group=frame * measurements.n_poses + pose,
@@ -117,14 +114,13 @@ def directions_through_joints(
     )
 
 
-def find_misses(
-    axes: LegAxes, measurements: Measurements, joints: JointsInCamera, base: JointsInBase
-) -> BoolArray:
+def find_outliers(axes: LegAxes, measurements: Measurements, base: JointsInBase) -> BoolArray:
     """Return which axes (n,) miss A, or the plane normal to v, by far: wrong outlines, as a rule.
 
-    The limit is a multiple of what the covariances promise, or of the median where they promise
-    too much.
+    The threshold is a multiple of the predicted standard deviations, or of the median where these
+    are too small.
     """
+    joints = base.in_cameras
     view = measurements.view[axes.row]
     A = joints.A_camera[view, axes.leg]
     known = joints.located[view, axes.leg]
@@ -133,16 +129,16 @@ def find_misses(
             A[view == i] = T.inv().apply(base.A_Rb[axes.leg[view == i]])
             known |= view == i
     here, v = np.arange(len(axes)), joints.v_camera[view, axes.leg]
-    residual, spread, _ = miss_of_joint(axes, here, A, v)
+    residual, spread, _ = joint_residuals(axes, here, A, v)
     with_axis = joints.axis_located[view, axes.leg]
     slope = np.zeros((len(axes), 3, 5))
     slope[:, :2, :3] = axes.basis
     at_observed = np.zeros((int(with_axis.sum()), 2))
-    slope[with_axis] = derivative_of_miss(axes, here[with_axis], v[with_axis], at_observed)
+    slope[with_axis] = residual_jacobian(axes, here[with_axis], v[with_axis], at_observed)
     spread = spread + slope @ joints.covariance[view, axes.leg] @ np.swapaxes(slope, 1, 2)
     spread[~with_axis, 2, 2] = 1.0  # of nothing: the residual is zero
     chi = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(spread), residual))
-    return np.asarray(known & (chi > _FAR * max(1.0, float(np.median(chi[known])))))
+    return np.asarray(known & (chi > _OUTLIER * max(1.0, float(np.median(chi[known])))))
 
 
 def _conditioned(
@@ -152,9 +148,9 @@ def _conditioned(
 
     v (n, 3) is zero where there is none; its covariance is (n, 3, 3) [rad^2].
     """
-    residual, spread, cross = miss_of_joint(axes, np.arange(len(axes)), A, v)
-    of_v = np.einsum("ni,nij,nj->n", axes.u, covariance, axes.u) + _EXACT
-    spread[:, 2, 2] += np.where(np.any(v != 0.0, axis=1), of_v, _NO_AXIS)
+    residual, spread, cross = joint_residuals(axes, np.arange(len(axes)), A, v)
+    of_v = np.einsum("ni,nij,nj->n", axes.u, covariance, axes.u) + _MIN_VARIANCE
+    spread[:, 2, 2] += np.where(np.any(v != 0.0, axis=1), of_v, _VARIANCE_NO_AXIS)
     gain = cross @ np.linalg.inv(spread)
     alpha = (gain @ residual[..., None])[..., 0]
     left = axes.covariance[:, :2, :2] - gain @ np.swapaxes(cross, 1, 2)
@@ -166,26 +162,18 @@ def _conditioned(
     return u, np.stack([e1, np.cross(u, e1)], axis=1), symmetric
 
 
-def _known_normals(
-    machine: NominalMachine,
-    joints: JointsInCamera,
-    base: JointsInBase,
-    view: IntArray,
-    leg: IntArray,
-) -> tuple[Array, Array]:
+def _known_normals(base: JointsInBase, view: IntArray, leg: IntArray) -> tuple[Array, Array]:
     """Return what legs are normal to (n, 3), zero if nothing, and its covariance (n, 3, 3) [rad^2].
 
     In R_b, where the view is placed there, this is the axis of step 2; in a planar mechanism z,
     which is as uncertain as the camera of the view is about it. Otherwise it is that of step 1.
     """
+    machine, joints = base.machine, base.in_cameras
     v, C = joints.v_camera[view, leg].copy(), np.zeros((len(leg), 3, 3))
     seen = joints.axis_located[view, leg]
     N = normal_basis(v[seen])
     C[seen] = np.swapaxes(N, 1, 2) @ joints.covariance[view, leg, 3:, 3:][seen] @ N
-    in_base, of_base = machine.base_normals, np.zeros((machine.n_legs, 3, 3))
-    if machine.revolute.any():
-        in_base = base.base_axes
-        of_base = BaseUnknowns.of(machine).axis_covariance(base.solution)
+    in_base, of_base = machine.base_normals, base.axis_covariance
     for i, T in enumerate(base.T_Rb_camera):
         here = np.flatnonzero(view == i)
         if T is None or not len(here):

@@ -1,4 +1,7 @@
-"""What the four steps know of a mechanism: its nominal legs, in R_b and R_e."""
+"""The machine as a step knows it: nominal legs at first, in R_b and R_e, identified ones at last.
+
+Every step takes such a machine and returns it with what it has estimated.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ Transformation = Literal["points", "cross_product"]  # how (18) is solved
 
 @dataclass(frozen=True, eq=False)
 class NominalMachine:
-    """The nominal legs of a mechanism: where the steps start, and which unknowns they have."""
+    """The legs of a machine from which a step starts, and which unknowns they have."""
 
     leg_names: tuple[str, ...]
     legs: tuple[Leg, ...]  # what belongs to the base in R_b, to the platform in R_e
@@ -45,7 +48,7 @@ class NominalMachine:
 
     @cached_property
     def parameters(self) -> KinematicParameters:
-        """Nominal joint centres and offsets [m]; constant legs have their length, passive NaN."""
+        """Joint centres and offsets [m]; constant legs have their length, passive NaN."""
         passive = np.array([leg.kind is LegKind.PASSIVE for leg in self.legs])
         return KinematicParameters(
             np.array([leg.A for leg in self.legs]),
@@ -73,7 +76,7 @@ class NominalMachine:
 
     @cached_property
     def base_axes(self) -> Array:
-        """Nominal revolute axes in R_b, (n_legs, 3); NaN where :attr:`revolute` is not."""
+        """Revolute axes in R_b, (n_legs, 3); NaN where :attr:`revolute` is not."""
         axes = np.full((self.n_legs, 3), np.nan)
         for j in np.flatnonzero(self.revolute):
             axes[j] = self.legs[j].base_axis
@@ -81,20 +84,20 @@ class NominalMachine:
 
     @cached_property
     def base_normals(self) -> Array:
-        """:attr:`base_axes`; in a planar mechanism z for all, where it is no parameter."""
+        """:attr:`base_axes`; in a planar machine z for all, where it is no parameter."""
         return self.base_axes if self.spatial else np.tile([0.0, 0.0, 1.0], (self.n_legs, 1))
 
 
-def nominal_mechanism(machine: Machine) -> NominalMachine:
-    """Return a mechanism as the steps take it."""
+def nominal_machine(machine: Machine) -> NominalMachine:
+    """Return a machine as the steps take it."""
     return NominalMachine(machine.leg_names, geometries(machine), machine.sign, machine.frame_legs)
 
 
-def point_like_mechanism(
+def point_like_machine(
     leg_names: Sequence[str],
     parameters: KinematicParameters,
     sign: NDArray[Any],
     frame_legs: tuple[int, ...],
 ) -> NominalMachine:
-    """Return a mechanism with point-like joints; legs without an offset are passive."""
+    """Return a machine with point-like joints; legs without an offset are passive."""
     return NominalMachine(tuple(leg_names), point_like_legs(parameters), sign, frame_legs)

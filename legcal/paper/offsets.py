@@ -12,7 +12,7 @@ one unknown d_jg a pair of legs, the same in all poses and views, weighted by it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cache
 from itertools import combinations
 
@@ -24,17 +24,10 @@ from legcal.geometry import Array, IntArray
 from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
 from legcal.paper.nominal import Criteria, NominalMachine
+from legcal.paper.unknowns import LENGTH, Unknowns
 
 _REWEIGHTINGS = 2
 _APART = 1e-3  # mean leg lengths: nearer platform joints count as one
-
-
-@dataclass(frozen=True, eq=False)
-class Offsets:
-    """Offsets of the legs."""
-
-    q0: Array  # (n_legs,) [m]: offset of actuated legs, length of constant ones, NaN if passive
-    solution: Solution  # the offsets of the legs that have one come first
 
 
 def identify_offsets(
@@ -43,27 +36,28 @@ def identify_offsets(
     sigma_q: float,
     *,
     criteria: Criteria = "default",
-) -> Offsets:
-    """Identify the offsets from the distances between leg ends, eq (14).
+) -> NominalMachine:
+    """Return the machine with offsets and constant lengths from distances of leg ends, eq (14).
 
     Raises NotIdentifiable if the distances do not fix every offset, and DidNotConverge.
     """
-    pairs = pairs_apart(machine, directions)
+    pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
+    nominal = machine
     if criteria == "literal":
         solution = solve_least_squares(build_consecutive(machine, directions))
         _check_identifiable(machine, directions, pairs, solution)
-        return Offsets(_all_offsets(machine, solution.x), solution)
-    q0 = machine.parameters.offsets
+        return replace(machine, legs=unknowns.legs(solution.x, machine.legs))
     for _ in range(_REWEIGHTINGS):
-        solution = solve_least_squares(build_constant_distances(machine, directions, q0, sigma_q))
-        _check_identifiable(machine, directions, pairs, solution, mean_length(directions, q0))
-        q0 = _all_offsets(machine, solution.x)
-    return Offsets(q0, solution)
+        q0 = machine.parameters.offsets
+        solution = solve_least_squares(build_constant_distances(nominal, directions, q0, sigma_q))
+        _check_identifiable(nominal, directions, pairs, solution, mean_length(directions, q0))
+        machine = replace(machine, legs=unknowns.legs(solution.x, machine.legs))
+    return machine
 
 
 def build_consecutive(machine: NominalMachine, directions: LegDirections) -> LeastSquares:
     """Build the criterion C_2 of (14): distances equal those of the next position of the view."""
-    pairs = pairs_apart(machine, directions)
+    pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
     last: dict[tuple[int, ...], int] = {}
     found = []
     for k, (a, b) in enumerate(pairs):
@@ -75,10 +69,10 @@ def build_consecutive(machine: NominalMachine, directions: LegDirections) -> Lea
     before, after = np.array(found, dtype=np.intp).T
     term = Term(
         _change_of_distance(),
-        _places(machine)[directions.leg[pairs[after]]],
+        unknowns.place[directions.leg[pairs[after]], LENGTH],
         (observed_legs(directions, pairs[before]), observed_legs(directions, pairs[after])),
     )
-    return LeastSquares("The offsets (eq 14)", (term,), _start(machine))
+    return LeastSquares("The offsets (eq 14)", (term,), unknowns.vector(machine.legs))
 
 
 def build_constant_distances(
@@ -88,40 +82,22 @@ def build_constant_distances(
 
     Offsets ``q0`` (n_legs,) are those of the weights and of the start of the distances.
     """
-    pairs = pairs_apart(machine, directions)
+    pairs, unknowns = pairs_apart(machine, directions), Unknowns.of_lengths(machine)
     ends = leg_ends(directions, q0)
     covariance = leg_end_covariance(directions, q0, sigma_q)
     legs = directions.leg[pairs]
     _, which = np.unique(legs, axis=0, return_inverse=True)
     which = which.ravel()
-    start = _start(machine)
+    start = unknowns.vector(machine.legs)
     term = Term(
         _constant_distance(),
-        np.column_stack([_places(machine)[legs], len(start) + which]),
+        np.column_stack([unknowns.place[legs, LENGTH], len(start) + which]),
         (observed_legs(directions, pairs), distance_sigma(ends, covariance, pairs)),
         robust=True,
     )
     distance = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
     mean = np.bincount(which, weights=distance) / np.bincount(which)
     return LeastSquares("The offsets (step 3)", (term,), np.concatenate([start, mean]))
-
-
-def _start(machine: NominalMachine) -> Array:
-    """Return the nominal offsets of the legs that have one."""
-    offsets = machine.parameters.offsets
-    return offsets[np.isfinite(offsets)]
-
-
-def _places(machine: NominalMachine) -> IntArray:
-    """Return the place of each leg among the legs with an offset, (n_legs,); -1 for passive."""
-    with_offset = np.isfinite(machine.parameters.offsets)
-    return np.where(with_offset, np.cumsum(with_offset) - 1, -1)
-
-
-def _all_offsets(machine: NominalMachine, x: Array) -> Array:
-    """Return the offsets of all legs from the head of x."""
-    place = _places(machine)
-    return np.where(place >= 0, x[place], np.nan)
 
 
 # Ends of legs and their distances
@@ -209,10 +185,10 @@ def _change_of_distance() -> ca.Function:
 
 @cache
 def _constant_distance() -> ca.Function:
-    """Return (q0 of two legs and d_jg; legs, sigma) -> distance seen less d_jg, in sigmas."""
+    """Return (q0 of two legs and d_jg; legs, sigma) -> distance observed less d_jg, in sigmas."""
     local, legs, sigma = ca.SX.sym("local", 3), ca.SX.sym("legs", 7, 2), ca.SX.sym("sigma")
-    miss = (distance_of_ends(local[:2], legs) - local[2]) / sigma
-    return ca.Function("constant", [local, legs, sigma], [miss])
+    residual = (distance_of_ends(local[:2], legs) - local[2]) / sigma
+    return ca.Function("constant", [local, legs, sigma], [residual])
 
 
 # Refusals
@@ -236,7 +212,7 @@ def _check_identifiable(
 ) -> None:
     """Refuse when an offset can change without any distance noticing."""
     with_offset = np.flatnonzero(np.isfinite(machine.parameters.offsets))
-    loose = solution.unseen(len(with_offset))
+    loose = solution.undetermined(len(with_offset))
     if np.isfinite(largest_sigma):
         sigma = np.sqrt(np.diag(solution.covariance())[: len(with_offset)])
         loose |= sigma > largest_sigma

@@ -10,10 +10,10 @@ observed one, and its length with reading plus offset:
 
 The offsets stay free: (13) multiplies a noisy direction by the unknown length, which biases (14),
 while here directions are predicted and not multiplied. A passive leg has no reading, and takes part
-with its direction alone, which is (19). What joints demand of a leg (normal to its revolute axis,
-no twist) are further residuals, with the axes among the unknowns: one image gives a poor pose
-of the platform, and an axis computed from such poses inherits that; all demands together make the
-poses much better, and the joints with them.
+with its direction alone, which is (19). The constraints of a leg (normal to its revolute
+axis, no twist) are further residuals, with the axes among the unknowns: one image gives a poor pose
+of the platform, and an axis computed from such poses inherits that; all constraints together make
+the poses much better, and the joints with them.
 """
 
 from __future__ import annotations
@@ -27,23 +27,14 @@ import numpy as np
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Demand, Leg, LegKind, linearize
+from legcal.machine import Demand, linearize
 from legcal.paper.joints_in_base import JointsInBase
-from legcal.paper.joints_in_camera import JointsInCamera
-from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
-from legcal.paper.leg_demands import (
-    direction_of_leg,
-    fixed_on_platform,
-    length_of_leg,
-    revolute_on_platform,
-    twist_of_leg,
-    twisting_legs,
-)
+from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
-from legcal.paper.motions import axis_frames, whitener
+from legcal.paper.leg_equations import constraint_of_leg, direction_of_leg, length_of_leg
+from legcal.paper.motions import whitener
 from legcal.paper.nominal import Criteria, NominalMachine, Transformation
 from legcal.paper.offsets import (
-    Offsets,
     distance_of_ends,
     distance_sigma,
     leg_end_covariance,
@@ -52,120 +43,73 @@ from legcal.paper.offsets import (
 )
 from legcal.paper.platform_pose import PlatformPoses, locate_platform
 from legcal.paper.platform_printed import platform_as_printed
-from legcal.paper.platform_unknowns import (
-    BASE_TURNS,
-    LENGTH,
-    OF_B,
-    PLATFORM_TURNS,
-    TWIST,
-    PlatformUnknowns,
-    held_at_nominal,
-    near_nominal,
-)
+from legcal.paper.unknowns import LENGTH, OF_B, Unknowns
+from legcal.paper.weak_directions import fix_weak_directions, nominal_prior
 
 _APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
-_RELATIVE = 1e-5  # of the mean length: floor of the sigma of a length, keeps it well conditioned
-_EXACT = 1e-5  # [rad] floor of the sigma of a demand: keeps exact base joints well conditioned
+_MIN_SIGMA_LENGTH = 1e-5  # of the mean length: keeps exact sessions well conditioned
+_MIN_SIGMA_CONSTRAINT = 1e-5  # [rad]: the same
 _IN_PLANE = np.array([0, 1, -1, -1, -1, 2])  # of displacement and turn of a planar platform
-KEPT_NEAR = (
+NEAR_NOMINAL = (
     "Step 4 kept the axes of legs without an S joint near the nominal ones: the poses show them "
     "too poorly to find them alone."
 )
 
 
-@dataclass(frozen=True, eq=False)
-class PlatformJoints:
-    """The legs with all that step 4 finds."""
-
-    # A and revolute axes at the base as step 2 found them; offsets of step 3, improved by the
-    # default criterion; B, axes on the platform, universal axes at the base, twists
-    legs: tuple[Leg, ...]
-    solution: Solution  # free coordinates of B in R_e first
-    diagnostics: tuple[str, ...] = ()  # what was left at nominal, and why
-
-    @property
-    def B_Re(self) -> Array:
-        """Platform joint centres in R_e, (n_legs, 3) [m]."""
-        return np.array([leg.B for leg in self.legs])
-
-    @property
-    def q0(self) -> Array:
-        """Offsets and lengths, (n_legs,) [m]; NaN for passive legs."""
-        return np.array([np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in self.legs])
-
-
 def locate_platform_joints(
     machine: NominalMachine,
-    joints: JointsInCamera,
     base: JointsInBase,
     directions: LegDirections,
-    offsets: Offsets,
     sigma_q: float,
     *,
     criteria: Criteria = "default",
     transformation: Transformation | None = None,
     free_twists: bool = False,
-) -> PlatformJoints:
-    """Locate the joints on the platform from the leg ends, and identify the axes.
+) -> tuple[NominalMachine, tuple[str, ...]]:
+    """Return the machine of steps 2 and 3 with all that step 4 estimates, and diagnostics.
 
-    (18) is solved by point equality, or as printed in the literal steps, unless ``transformation``
-    says otherwise; the default criterion only starts there. Raises NotIdentifiable if the images do
-    not tie all joints together, or leave something open that moves the platform; DidNotConverge.
+    These are B, axes on the platform, universal axes at the base, twists if they are freed, and
+    offsets again by the default criterion; diagnostics say what was left at nominal, and why. (18)
+    is solved by point equality, or as printed in the literal steps, unless ``transformation`` says
+    otherwise; the default criterion only starts there. Raises NotIdentifiable if the images do not
+    tie all joints together, or do not determine something that moves the platform; DidNotConverge.
     """
-    known = replace(
-        machine,
-        legs=tuple(
-            replace(
-                leg,
-                A=base.A_Rb[j],
-                base_axis=base.base_axes[j] if machine.revolute[j] else leg.base_axis,
-                q0=float(offsets.q0[j]) if np.isfinite(offsets.q0[j]) else leg.q0,
-            )
-            for j, leg in enumerate(machine.legs)
-        ),
-    )
-    unknowns = PlatformUnknowns.of(known, free_twists=free_twists)
-    how = chosen_transformation(transformation, criteria)
+    if transformation is None:
+        transformation = "cross_product" if criteria == "literal" else "points"
+    unknowns = Unknowns.of_platform(machine, free_twists=free_twists)
     if criteria == "literal":
-        return PlatformJoints(*platform_as_printed(known, unknowns, base, directions, how))
-    rigid = RigidProblem.of(known, unknowns, joints, base, directions, sigma_q, how)
-    # What is open is judged near the nominal model: there the platform moves as it should. Axes
-    # that the poses show too poorly to converge without it stay near the nominal ones.
+        legs, diagnostics = platform_as_printed(machine, unknowns, base, directions, transformation)
+        return replace(machine, legs=legs), diagnostics
+    rigid = RigidProblem.of(machine, unknowns, base, directions, sigma_q, transformation)
+    # What is not determined is judged near the nominal model: there the platform moves as it
+    # should. Axes that the poses show too poorly to converge without it stay near the nominal ones.
     problem = build_rigid(rigid)
     n, terms = len(unknowns), problem.terms
-    near = near_nominal(unknowns.of_closure)
-    solution = solve_least_squares(replace(problem, terms=(*terms, *near)))
-    found = unknowns.legs(solution.x[:n], known.legs)
-    information = solution.without_last(sum(len(term.index) for term in near)).information()
-    poses, nominal = rigid.poses_in_base(solution.x[n:]), unknowns.vector(known.legs)
-    held, said = held_at_nominal(known, unknowns, information, found, poses, nominal)
-    if near or held:
-        terms = (*terms, *held)
+    turns = unknowns.place[[leg.twist is not None for leg in machine.legs], LENGTH + 1 :]
+    prior = nominal_prior(np.unique(turns[turns >= 0]))
+    solution = solve_least_squares(replace(problem, terms=(*terms, *prior)))
+    legs = unknowns.legs(solution.x, machine.legs)
+    information = solution.without_last(sum(len(term.index) for term in prior)).information()
+    poses, nominal = rigid.poses_in_base(solution.x[n:]), unknowns.vector(machine.legs)
+    fixed, diagnostics = fix_weak_directions(machine, unknowns, information, legs, poses, nominal)
+    if prior or fixed:
+        terms = (*terms, *fixed)
         problem = replace(problem, terms=terms, start=solution.x)
         try:
             solution = solve_least_squares(problem)
         except DidNotConverge:
-            solution = solve_least_squares(replace(problem, terms=(*terms, *near)))
-            said = (*said, KEPT_NEAR)
-        found = unknowns.legs(solution.x[:n], known.legs)
-    return PlatformJoints(found, solution, said)
-
-
-def chosen_transformation(
-    transformation: Transformation | None, criteria: Criteria
-) -> Transformation:
-    """Return how (18) is solved: point equality by default, as printed in the literal steps."""
-    if transformation is not None:
-        return transformation
-    return "cross_product" if criteria == "literal" else "points"
+            solution = solve_least_squares(replace(problem, terms=(*terms, *prior)))
+            diagnostics = (*diagnostics, NEAR_NOMINAL)
+        legs = unknowns.legs(solution.x, machine.legs)
+    return replace(machine, legs=legs), diagnostics
 
 
 @dataclass(frozen=True, eq=False)
 class RigidProblem:
     """What the rigid criterion is built of."""
 
-    machine: NominalMachine  # with what steps 2 and 3 found
-    unknowns: PlatformUnknowns
+    machine: NominalMachine  # as steps 2 and 3 have it: the start
+    unknowns: Unknowns
     directions: LegDirections
     poses: PlatformPoses  # to start from
     in_base: BoolArray  # (n,), which of the directions are in R_b: twists count for these
@@ -175,9 +119,8 @@ class RigidProblem:
     @classmethod
     def of(
         cls,
-        known: NominalMachine,
-        unknowns: PlatformUnknowns,
-        joints: JointsInCamera,
+        machine: NominalMachine,
+        unknowns: Unknowns,
         base: JointsInBase,
         directions: LegDirections,
         sigma_q: float,
@@ -189,37 +132,38 @@ class RigidProblem:
         for v, T in enumerate(base.T_Rb_camera):
             if T is not None:
                 centre[directions.view == v] = T.translation
-        q0, of_A = known.parameters.offsets, _covariance_of_A(directions, joints, base)
+        q0, of_A = machine.parameters.offsets, _covariance_of_A(directions, base)
         covariance = leg_end_covariance(directions, q0, sigma_q) + of_A
         poses = locate_platform(
             directions,
             leg_ends(directions, q0),
-            known.parameters.platform_joints,
+            machine.parameters.platform_joints,
             centre=centre,
             transformation=transformation,
-            spatial=known.spatial,
+            spatial=machine.spatial,
             on_a_line=True,
             weight=1.0 / np.einsum("nii->n", covariance),
         )
         in_base = placed[directions.view]
-        return cls(known, unknowns, directions, poses, in_base, of_A, sigma_q)
+        return cls(machine, unknowns, directions, poses, in_base, of_A, sigma_q)
 
     def index(self, rows: IntArray) -> IntArray:
-        """Return the places of B and of the step of the pose of some of the legs, (k, 9)."""
+        """Return the places of the local unknowns of :mod:`leg_equations`, (k, 15)."""
         own = np.arange(6) if self.machine.spatial else _IN_PLANE
         first = len(self.unknowns) + (own.max() + 1) * self.poses.pose[rows, None]
         steps = np.where(own >= 0, first + own, -1)
-        return np.hstack([self.unknowns.place[self.directions.leg[rows], OF_B], steps])
+        of_leg = self.unknowns.place[self.directions.leg[rows], OF_B.start :]
+        return np.hstack([of_leg, steps])
 
     def known(self, rows: IntArray) -> tuple[Array, Array, Array, Array]:
         """Return what is known of some of the legs: B in part, the pose at step zero, and A."""
-        pose, held = self.poses.pose[rows], self.unknowns.held[self.directions.leg[rows]]
-        return held, self.poses.R[pose], self.poses.t[pose], self.directions.A[rows]
+        pose, B = self.poses.pose[rows], self.unknowns.known_B[self.directions.leg[rows]]
+        return B, self.poses.R[pose], self.poses.t[pose], self.directions.A[rows]
 
-    def sigma(self, rows: IntArray, demand: Demand, least: float) -> Array:
-        """Return standard deviations of a demand (k,): at least one, and what A is wrong by.
+    def sigma(self, rows: IntArray, about: Demand, least: float) -> Array:
+        """Return standard deviations of an equation (k,), *least* with an exact A.
 
-        Lengths and demands hold exactly, but between joints A that have errors: an error of A
+        Lengths and constraints hold exactly, but between joints A that have errors: an error of A
         changes the length and the direction of the leg by far more than a reading is wrong.
         """
         directions, variance = self.directions, np.zeros(len(rows))
@@ -227,12 +171,10 @@ class RigidProblem:
         _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
         for k, i in enumerate(first):
             here = np.flatnonzero(which.ravel() == k)
-            of_leg = self.machine.legs[directions.leg[rows[i]]]
+            leg = replace(self.machine.legs[directions.leg[rows[i]]], A=directions.A[rows[i]])
             pose = self.poses.pose[rows[here]]
-            linear = linearize(
-                replace(of_leg, A=directions.A[rows[i]]), self.poses.R[pose], self.poses.t[pose]
-            )
-            by_A = linear.by_local[:, linear.demands.index(demand), :3]
+            linear = linearize(leg, self.poses.R[pose], self.poses.t[pose])
+            by_A = linear.by_local[:, linear.demands.index(about), :3]
             of_A = self.A_covariance[rows[here]]
             variance[here] = np.einsum("ni,nij,nj->n", by_A, of_A, by_A)
         return np.asarray(np.sqrt(least**2 + variance))
@@ -246,19 +188,18 @@ class RigidProblem:
         return self.poses.stepped(steps, numbers[numbers >= 0])
 
 
-def _covariance_of_A(
-    directions: LegDirections, joints: JointsInCamera, base: JointsInBase
-) -> Array:
+def _covariance_of_A(directions: LegDirections, base: JointsInBase) -> Array:
     """Return the covariance of A of each leg in the frame of its group, (n, 3, 3) [m^2].
 
     Cameras that step 2 placed know A together; errors of their places are not counted.
     """
+    joints = base.in_cameras
     together = np.zeros((joints.located.shape[1], 3, 3))
     alone = joints.covariance[directions.view, directions.leg, :3, :3]
     for v, T in enumerate(base.T_Rb_camera):
         if T is not None:
-            R, seen = T.rotation.as_matrix(), joints.located[v]
-            together[seen] += R @ np.linalg.inv(joints.covariance[v, seen, :3, :3]) @ R.T
+            R, located = T.rotation.as_matrix(), joints.located[v]
+            together[located] += R @ np.linalg.inv(joints.covariance[v, located, :3, :3]) @ R.T
     placed = np.array([T is not None for T in base.T_Rb_camera])
     known = np.einsum("nii->n", together) > 0.0
     together[known] = np.linalg.inv(together[known])
@@ -292,69 +233,55 @@ def build_rigid(rigid: RigidProblem) -> LeastSquares:
             "images of three or more; add images that show several legs at once."
         )
     covariance = leg_end_covariance(directions, q0, rigid.sigma_q)
-    place = rigid.unknowns.place[directions.leg]
-    of_pairs = place[pairs]
+    of_pairs = rigid.unknowns.place[directions.leg][pairs]
     index = np.hstack([of_pairs[:, :, LENGTH], of_pairs[:, :, OF_B].reshape(-1, 6)])
     sigma = distance_sigma(leg_ends(directions, q0), covariance, pairs)
-    ended = posed[np.isfinite(q0[directions.leg[posed]])]
-    sigma_length = float(np.hypot(rigid.sigma_q, _RELATIVE * mean_offset))
-    seen = directions.u[posed], directions.basis[posed], whitener(directions.covariance[posed])
-    read = directions.reading[ended], rigid.sigma(ended, Demand.LENGTH, sigma_length)
-    lengths = np.hstack([rigid.index(ended), place[ended, LENGTH, None]])
-    terms = [
+    with_length = posed[np.isfinite(q0[directions.leg[posed]])]
+    sigma_length = float(np.hypot(rigid.sigma_q, _MIN_SIGMA_LENGTH * mean_offset))
+    observed = directions.u[posed], directions.basis[posed], whitener(directions.covariance[posed])
+    readings = (
+        directions.reading[with_length],
+        rigid.sigma(with_length, Demand.LENGTH, sigma_length),
+    )
+    terms = (
         Term(_ends_and_joints(), index, (observed_legs(directions, pairs), sigma), robust=True),
-        Term(direction_of_leg(), rigid.index(posed), (*rigid.known(posed), *seen), robust=True),
-        Term(length_of_leg(), lengths, (*rigid.known(ended), *read)),
-        *_demands(rigid, posed),
-    ]
+        Term(direction_of_leg(), rigid.index(posed), (*rigid.known(posed), *observed), robust=True),
+        Term(length_of_leg(), rigid.index(with_length), (*rigid.known(with_length), *readings)),
+        *_constraints(rigid, posed),
+    )
     x = rigid.unknowns.vector(machine.legs)
     steps = np.zeros((6 if machine.spatial else 3) * len(poses.R))
     start = np.concatenate([x, steps])
-    return LeastSquares("The platform joints (step 4)", tuple(terms), start, n_shared=len(x))
+    return LeastSquares("The platform joints (step 4)", terms, start, n_shared=len(x))
 
 
 @cache
 def _ends_and_joints() -> ca.Function:
-    """Return (q0 and B of two legs; legs, sigma) -> distance seen less that of B, in sigmas."""
+    """Return (q0 and B of two legs; legs, sigma) -> distance observed less that of B, in sigmas."""
     local, legs, sigma = ca.SX.sym("local", 8), ca.SX.sym("legs", 7, 2), ca.SX.sym("sigma")
-    miss = (distance_of_ends(local[:2], legs) - ca.norm_2(local[2:5] - local[5:])) / sigma
-    return ca.Function("ends", [local, legs, sigma], [miss])
+    residual = (distance_of_ends(local[:2], legs) - ca.norm_2(local[2:5] - local[5:])) / sigma
+    return ca.Function("ends", [local, legs, sigma], [residual])
 
 
-def _demands(rigid: RigidProblem, rows: IntArray) -> list[Term]:
-    """Return what joints demand of legs whose poses are unknown, in standard deviations."""
-    legs, nominal = rigid.machine.legs, rigid.unknowns.nominal
-    leg, terms = rigid.directions.leg[rows], []
-    for joint, function, demand in (
-        ("R", revolute_on_platform(), Demand.PLATFORM_AXIS),
-        ("", fixed_on_platform(), Demand.ALONG_1),
-    ):
-        of_joint = np.array(
-            [g.platform_joint == joint and g.platform_axis is not None for g in legs]
+def _constraints(rigid: RigidProblem, rows: IntArray) -> list[Term]:
+    """Return the residuals of constraints of legs at unknown poses, in standard deviations."""
+    legs, unknowns, terms = rigid.machine.legs, rigid.unknowns, []
+    constrained: dict[tuple[Demand, str, str], list[int]] = {}
+    for j, leg in enumerate(legs):
+        for about in {Demand.PLATFORM_AXIS, Demand.ALONG_1, Demand.TWIST}.intersection(leg.demands):
+            constrained.setdefault((about, leg.base_joint, leg.platform_joint), []).append(j)
+    for kind, those in sorted(constrained.items()):
+        usable = rows[rigid.in_base[rows]] if kind[0] is Demand.TWIST else rows
+        here = usable[np.isin(rigid.directions.leg[usable], those)]
+        if not len(here):
+            continue
+        of_row = rigid.directions.leg[here]
+        observed = (
+            unknowns.base_frames[of_row],
+            unknowns.platform_frames[of_row],
+            np.array([leg.twist or 0.0 for leg in legs])[of_row],
+            rigid.sigma(here, kind[0], _MIN_SIGMA_CONSTRAINT),
         )
-        here, of_leg = rows[of_joint[leg]], leg[of_joint[leg]]
-        if len(here):
-            index = np.hstack([rigid.index(here), rigid.unknowns.place[of_leg, PLATFORM_TURNS]])
-            frames = _frames([nominal[j].platform_axis for j in of_leg])
-            sigma = rigid.sigma(here, demand, _EXACT)
-            terms.append(Term(function, index, (*rigid.known(here), frames, sigma)))
-    for joints, of_kind in twisting_legs(legs).items():
-        here = rows[of_kind[leg] & rigid.in_base[rows]]
-        if len(here):
-            of_leg = rigid.directions.leg[here]
-            place = rigid.unknowns.place[of_leg]
-            turns = place[:, PLATFORM_TURNS], place[:, BASE_TURNS], place[:, TWIST, None]
-            observed = (
-                _frames([nominal[j].base_axis for j in of_leg]),
-                _frames([nominal[j].platform_axis for j in of_leg]),
-                np.array([float(nominal[j].twist or 0.0) for j in of_leg]),
-                rigid.sigma(here, Demand.TWIST, _EXACT),
-            )
-            index = np.hstack([rigid.index(here), *turns])
-            terms.append(Term(twist_of_leg(*joints), index, (*rigid.known(here), *observed)))
+        index, known = rigid.index(here), rigid.known(here)
+        terms.append(Term(constraint_of_leg(*kind), index, (*known, *observed)))
     return terms
-
-
-def _frames(axes: list[Array | None]) -> Array:
-    """Return the frames of axes that legs have, (n, 3, 3)."""
-    return axis_frames(np.array(axes, dtype=np.float64))

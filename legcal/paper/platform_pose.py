@@ -19,7 +19,6 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from legcal.errors import NotIdentifiable
 from legcal.geometry import (
     Array,
     IntArray,
@@ -107,7 +106,7 @@ def build_rays(
     """
     R, t = start
     index = 6 * group[:, None] + np.arange(6)
-    term = Term(_miss_of_ray(), index, (R[group], t[group], points, ends, centre))
+    term = Term(_ray_residual(), index, (R[group], t[group], points, ends, centre))
     return LeastSquares("The pose of the platform (eq 18)", (term,), np.zeros(6 * len(R)))
 
 
@@ -120,22 +119,9 @@ def register_by_rays(P_from: Array, P_camera: Array, start: RigidTransform) -> R
 
 
 @cache
-def _miss_of_ray() -> ca.Function:
+def _ray_residual() -> ca.Function:
     """Return (step; R, t, point, end, centre) -> (R point + t) x end of (18) [m^2], (3,)."""
     step, R, t = ca.SX.sym("step", 6), ca.SX.sym("R", 3, 3), ca.SX.sym("t", 3)
     point, end, centre = (ca.SX.sym(name, 3) for name in ("point", "end", "centre"))
-    miss = ca.cross(moved_points(step, R, t, point) - centre, end - centre)
-    return ca.Function("ray", [step, R, t, point, end, centre], [miss])
-
-
-def check_located(poses: PlatformPoses, what: str, names: str, *, spatial: bool) -> None:
-    """Refuse where no pose could be located, which is needed to identify something of legs."""
-    if len(poses.R):
-        return
-    number = "three" if spatial else "two"
-    shape = " that do not lie on one line" if spatial else ""
-    raise NotIdentifiable(
-        f"{what} of {names} could not be identified: no pose shows {number} legs of known length "
-        f"at once with ends{shape}, needed to know where the platform is (eq 18); add images that "
-        "show several legs at once."
-    )
+    residual = ca.cross(moved_points(step, R, t, point) - centre, end - centre)
+    return ca.Function("ray", [step, R, t, point, end, centre], [residual])

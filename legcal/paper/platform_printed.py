@@ -19,85 +19,88 @@ from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
 from legcal.machine import Leg, LegKind, tied_twist, twist_after
 from legcal.paper.joints_in_base import JointsInBase, distance_of_joints
-from legcal.paper.least_squares import LeastSquares, Solution, Term, solve_least_squares
-from legcal.paper.leg_demands import closure_of_leg, twisting_legs
+from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
+from legcal.paper.leg_equations import closure_of_leg
 from legcal.paper.motions import axis_frames
 from legcal.paper.nominal import NominalMachine, Transformation
 from legcal.paper.offsets import leg_ends, pairs_of_legs
-from legcal.paper.platform_pose import (
-    PlatformPoses,
-    check_located,
-    locate_platform,
-    register_by_rays,
-)
-from legcal.paper.platform_unknowns import (
+from legcal.paper.platform_pose import PlatformPoses, locate_platform, register_by_rays
+from legcal.paper.unknowns import (
     BASE_TURNS,
+    LENGTH,
     OF_B,
     PLATFORM_TURNS,
     TWIST,
-    PlatformUnknowns,
-    held_at_nominal,
-    near_nominal,
+    Unknowns,
     turned,
 )
+from legcal.paper.weak_directions import fix_weak_directions, nominal_prior
 
 _APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
 _SAME_DIRECTION = 1e-9  # of the normalised information: directions that differ by less are one
-_CLOSED = 1e-4  # unit of the closures together, rms: what changes them by less is not shown
+_SIGMA_CLOSURE = 1e-4  # of all closures together, rms: what changes them by less is not observed
 
 
 def platform_as_printed(
-    known: NominalMachine,
-    unknowns: PlatformUnknowns,
+    machine: NominalMachine,
+    unknowns: Unknowns,
     base: JointsInBase,
     directions: LegDirections,
     transformation: Transformation,
-) -> tuple[tuple[Leg, ...], Solution, tuple[str, ...]]:
+) -> tuple[tuple[Leg, ...], tuple[str, ...]]:
     """Identify joints and axes on the platform by (16) to (19).
 
-    ``known`` has what steps 2 and 3 found; directions are in the frames of the cameras. Returns
-    the legs, the solution of (16), and what was left at nominal, in words.
+    ``machine`` has what steps 2 and 3 estimated; directions are in the frames of the cameras.
+    Returns the legs, and what was left at nominal, in words.
     """
-    solution = solve_least_squares(build_mean_distances(known, unknowns, directions))
-    x = unknowns.vector(known.legs)
-    x[: len(solution.x)] = solution.x
-    legs = unknowns.legs(x, known.legs)
-    asked = [
+    distances = solve_least_squares(build_mean_distances(machine, unknowns, directions)).x
+    x = unknowns.vector(machine.legs)
+    x[: len(distances)] = distances
+    legs = unknowns.legs(x, machine.legs)
+    unposed = [
         name
-        for name, leg in zip(known.leg_names, legs, strict=True)
+        for name, leg in zip(machine.leg_names, legs, strict=True)
         if leg.kind is LegKind.PASSIVE or leg.platform_axis is not None or leg.twist is not None
     ]
-    if not asked:
-        return legs, solution, ()
-    directions, centre, in_base = _in_base_frame(known, base, directions, transformation)
+    if not unposed:
+        return legs, ()
+    directions, centre, in_base = _in_base_frame(machine, base, directions, transformation)
     poses = locate_platform(
         directions,
-        leg_ends(directions, known.parameters.offsets),
+        leg_ends(directions, machine.parameters.offsets),
         np.array([leg.B for leg in legs]),
         centre=centre,
         transformation=transformation,
-        spatial=known.spatial,
+        spatial=machine.spatial,
     )
-    check_located(poses, "Axes and passive ends", f"leg {', '.join(asked)}", spatial=known.spatial)
+    if not len(poses.R):
+        number = "three" if machine.spatial else "two"
+        shape = " that do not lie on one line" if machine.spatial else ""
+        raise NotIdentifiable(
+            f"Axes and passive ends of leg {', '.join(unposed)} could not be identified: no pose "
+            f"shows {number} legs of known length at once with ends{shape}, needed to know where "
+            "the platform is (eq 18); add images that show several legs at once."
+        )
     legs = tuple(
-        _with_axis_and_end(known, unknowns, j, leg, directions, poses) for j, leg in enumerate(legs)
+        _with_axis_and_end(machine, unknowns, j, leg, directions, poses)
+        for j, leg in enumerate(legs)
     )
-    legs, said = _close_legs(known, unknowns, legs, directions, poses, in_base)
-    return _in_own_frame(known, legs), solution, said
+    legs, diagnostics = _close_legs(machine, unknowns, legs, directions, poses, in_base)
+    return _in_own_frame(machine, legs), diagnostics
 
 
 def build_mean_distances(
-    known: NominalMachine, unknowns: PlatformUnknowns, directions: LegDirections
+    machine: NominalMachine, unknowns: Unknowns, directions: LegDirections
 ) -> LeastSquares:
     """Build the criterion C_3 of (16): mean distances of a view equal those in R_e.
 
     Two legs that end in one place have none. In a plane the heights of R_e are nominal.
     """
-    q0 = known.parameters.offsets
+    q0 = machine.parameters.offsets
     ends = leg_ends(directions, q0)
     pairs = pairs_of_legs(directions, q0)
-    B = known.parameters.platform_joints[directions.leg[pairs]]
+    B = machine.parameters.platform_joints[directions.leg[pairs]]
     apart = _APART * float(np.mean(q0[np.isfinite(q0)]))
     pairs = pairs[np.linalg.norm(B[:, 1] - B[:, 0], axis=1) > apart]
     distance = np.linalg.norm(ends[pairs[:, 0]] - ends[pairs[:, 1]], axis=1)
@@ -107,17 +110,17 @@ def build_mean_distances(
     mean = np.bincount(which, weights=distance) / np.bincount(which)
     legs = distinct[:, 1:]
     place = unknowns.place[:, OF_B]
-    observed = (np.swapaxes(unknowns.held[legs], 1, 2), mean, np.ones(len(mean)))
+    observed = (np.swapaxes(unknowns.known_B[legs], 1, 2), mean, np.ones(len(mean)))
     return LeastSquares(
         "The platform joints (eq 16)",
         (Term(distance_of_joints(), place[legs].reshape(-1, 6), observed),),
-        unknowns.vector(known.legs)[: int(place.max()) + 1],
+        unknowns.vector(machine.legs)[: int(place.max()) + 1],
         exact_hessian=True,
     )
 
 
 def _in_base_frame(
-    known: NominalMachine,
+    machine: NominalMachine,
     base: JointsInBase,
     directions: LegDirections,
     transformation: Transformation,
@@ -132,7 +135,7 @@ def _in_base_frame(
         here = np.flatnonzero(directions.view == v)
         if T is None or not len(here):
             continue
-        if transformation == "cross_product" and known.spatial:
+        if transformation == "cross_product" and machine.spatial:
             legs, first = np.unique(directions.leg[here], return_index=True)
             T = register_by_rays(base.A_Rb[legs], directions.A[here[first]], T.inv()).inv()
         A[here], u[here] = T.apply(A[here]), T.rotation.apply(u[here])
@@ -145,15 +148,15 @@ def _in_base_frame(
 
 
 def _with_axis_and_end(
-    known: NominalMachine,
-    unknowns: PlatformUnknowns,
+    machine: NominalMachine,
+    unknowns: Unknowns,
     j: int,
     leg: Leg,
     directions: LegDirections,
     poses: PlatformPoses,
 ) -> Leg:
     """Return leg *j* with its axis on the platform, (7), and its end if it is passive, (19)."""
-    name, nominal = known.leg_names[j], leg.platform_axis
+    name, nominal = machine.leg_names[j], leg.platform_axis
     here = np.flatnonzero((directions.leg == j) & (poses.pose >= 0))
     u, R, t = directions.u[here], poses.R[poses.pose[here]], poses.t[poses.pose[here]]
     u_Re = np.einsum("nij,ni->nj", R, u)
@@ -165,8 +168,8 @@ def _with_axis_and_end(
         leg = replace(fixed, twist=twist)
     if leg.kind is LegKind.PASSIVE:
         free = np.flatnonzero(unknowns.place[j, OF_B] >= 0)
-        if j in known.frame_legs and leg.platform_joint != "":
-            free = np.arange(3 if known.spatial else 2)
+        if j in machine.frame_legs and leg.platform_joint != "":
+            free = np.arange(3 if machine.spatial else 2)
         B = locate_passive_end(name, u, directions.A[here], (R, t), leg.B, free)
         leg = replace(leg, B=B)
     return leg
@@ -242,8 +245,8 @@ def locate_passive_end(
 
 
 def _close_legs(
-    known: NominalMachine,
-    unknowns: PlatformUnknowns,
+    machine: NominalMachine,
+    unknowns: Unknowns,
     legs: tuple[Leg, ...],
     directions: LegDirections,
     poses: PlatformPoses,
@@ -253,35 +256,32 @@ def _close_legs(
 
     ``legs`` have all else as it was found. Returns them, and what was left at nominal, in words.
     """
-    wanted = unknowns.of_closure
-    of_others = [
-        unknowns.place[j, PLATFORM_TURNS]
-        for j, leg in enumerate(unknowns.nominal)
-        if leg.platform_joint != "U"
-    ]
-    wanted = np.setdiff1d(wanted, np.array(of_others).ravel())
+    twisting = np.array([leg.twist is not None for leg in unknowns.start])
+    known_axis = np.array([leg.platform_joint != "U" for leg in unknowns.start])
+    turns = unknowns.place[twisting, LENGTH + 1 :]
+    wanted = np.setdiff1d(turns[turns >= 0], unknowns.place[known_axis, PLATFORM_TURNS])
     if not len(wanted):
         return legs, ()
     numbers = np.unique(poses.pose[in_base & (poses.pose >= 0)])
-    seen = poses.R[numbers], poses.t[numbers]
+    observed = poses.R[numbers], poses.t[numbers]
     problem = _build_closure(unknowns, wanted, legs, directions, poses, in_base)
     x, information = problem.start, np.zeros((0, len(wanted)))
-    near = near_nominal(np.arange(len(wanted)))
+    prior = nominal_prior(np.arange(len(wanted)))
     if problem.terms:
-        solution = solve_least_squares(replace(problem, terms=(*problem.terms, *near)))
+        solution = solve_least_squares(replace(problem, terms=(*problem.terms, *prior)))
         x, information = solution.x, solution.without_last(len(wanted)).information()
-    found = _closed(unknowns, legs, wanted, x)
-    held, said = held_at_nominal(
-        known, unknowns, information, found, seen, np.zeros(len(wanted)), wanted
+    closed = _closed(unknowns, legs, wanted, x)
+    fixed, diagnostics = fix_weak_directions(
+        machine, unknowns, information, closed, observed, np.zeros(len(wanted)), wanted
     )
     if problem.terms:
-        problem = replace(problem, terms=(*problem.terms, *held), start=x)
-        found = _closed(unknowns, legs, wanted, solve_least_squares(problem).x)
-    return found, said
+        problem = replace(problem, terms=(*problem.terms, *fixed), start=x)
+        closed = _closed(unknowns, legs, wanted, solve_least_squares(problem).x)
+    return closed, diagnostics
 
 
 def _build_closure(
-    unknowns: PlatformUnknowns,
+    unknowns: Unknowns,
     wanted: IntArray,
     legs: tuple[Leg, ...],
     directions: LegDirections,
@@ -293,11 +293,12 @@ def _build_closure(
     renumbered[wanted] = np.arange(len(wanted))
     place = renumbered[unknowns.place]
     shown = in_base & (poses.pose >= 0)
-    kinds = twisting_legs(legs)
-    n_rows = sum(int(np.sum(shown & of_kind[directions.leg])) for of_kind in kinds.values())
+    twisting = [(j, leg) for j, leg in enumerate(legs) if leg.twist is not None]
+    n_rows = int(np.sum(shown & np.isin(directions.leg, [j for j, _ in twisting])))
     terms = []
-    for joints, of_kind in kinds.items():
-        rows = np.flatnonzero(shown & of_kind[directions.leg])
+    for joints in dict.fromkeys((leg.base_joint, leg.platform_joint) for _, leg in twisting):
+        of_kind = [j for j, leg in twisting if (leg.base_joint, leg.platform_joint) == joints]
+        rows = np.flatnonzero(shown & np.isin(directions.leg, of_kind))
         if not len(rows):
             continue
         leg = directions.leg[rows]
@@ -307,15 +308,14 @@ def _build_closure(
             axis_frames(np.array([legs[j].base_axis for j in leg], dtype=np.float64)),
             axis_frames(np.array([legs[j].platform_axis for j in leg], dtype=np.float64)),
             np.array([float(legs[j].twist or 0.0) for j in leg]),
-            np.full(len(rows), _CLOSED / np.sqrt(n_rows)),
+            np.full(len(rows), _SIGMA_CLOSURE / np.sqrt(n_rows)),
         )
-        columns = (place[leg, PLATFORM_TURNS], place[leg, BASE_TURNS], place[leg, TWIST, None])
-        terms.append(Term(closure_of_leg(*joints), np.hstack(columns), observed))
+        terms.append(Term(closure_of_leg(*joints), place[leg, LENGTH + 1 :], observed))
     return LeastSquares("The universal axes (step 4)", tuple(terms), np.zeros(len(wanted)))
 
 
 def _closed(
-    unknowns: PlatformUnknowns, legs: tuple[Leg, ...], wanted: IntArray, x: Array
+    unknowns: Unknowns, legs: tuple[Leg, ...], wanted: IntArray, x: Array
 ) -> tuple[Leg, ...]:
     """Return legs with universal axes turned from the nominal ones, and twists changed."""
     values = np.zeros(len(unknowns) + 1)
@@ -333,9 +333,9 @@ def _closed(
     )
 
 
-def _in_own_frame(known: NominalMachine, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+def _in_own_frame(machine: NominalMachine, legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     """Return legs with the platform in R_e, where passive legs among the frame legs were moved."""
-    frame = list(known.frame_legs)
+    frame = list(machine.frame_legs)
     if all(legs[j].kind is not LegKind.PASSIVE for j in frame):
         return legs
     T = frame_on_points(np.array([legs[j].B for j in frame])).inv()

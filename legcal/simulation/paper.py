@@ -24,7 +24,7 @@ from legcal.data import LegAxes, no_outlines
 from legcal.errors import LegcalError
 from legcal.geometry import Array
 from legcal.machine import KinematicParameters, free_coordinates, point_like_legs, to_vector
-from legcal.paper import NominalMachine, point_like_mechanism, run_steps
+from legcal.paper import NominalMachine, point_like_machine, run_steps
 from legcal.simulation.hexapod import (
     PAPER_VIEWS,
     RAISED,
@@ -280,7 +280,7 @@ def bound_covariance(session: HexapodSession, exact: LegAxes) -> Array:
 
 def nominal_of(machine: PaperHexapod) -> NominalMachine:
     """Return a simulated machine as the steps take a mechanism."""
-    return point_like_mechanism(
+    return point_like_machine(
         machine.leg_names, machine.parameters, machine.sign, machine.frame_legs
     )
 
