@@ -11,14 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from axes_dataset import write_axes_dataset
 from outline_tables import assert_same
 from repeated_images import SIZE, RepeatedImages, repeated_images
 
 from legcal import cli, detect, load_dataset
 from legcal.data.outlines import QUALITY, read_observations
 from legcal.data.rows import canonical_order
-from legcal.errors import DatasetError, UsageError
+from legcal.errors import UsageError
 from legcal.perception.overview import Detection, _caption, picture_names
 from legcal.perception.photographs import Observed, Photographs, observe
 
@@ -243,13 +242,6 @@ def test_a_folder_with_other_files_is_refused_before_any_work(
     assert run(monkeypatch, rendered.path, "-o", rendered.path, "--json") == 2
     error: dict[str, Any] = json.loads(capsys.readouterr().out)["error"]
     assert "found a folder with other files and no detection.json of legcal" in error["message"]
-
-
-def test_a_dataset_without_images_is_refused(tmp_path: Path) -> None:
-    write_axes_dataset(tmp_path / "axes", n_poses=2)
-    with pytest.raises(DatasetError, match="found a table of axes, needed images of the legs"):
-        detect(tmp_path / "axes", output=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 def test_images_that_cannot_be_read_are_refused_and_nothing_is_written(
