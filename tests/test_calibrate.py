@@ -9,9 +9,10 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -167,18 +168,15 @@ def test_an_edited_row_wins_and_is_kept(example_run: Run, tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_the_order_of_photographs_does_not_matter(tmp_path: Path) -> None:
-    found = []
-    for order in (1, -1):
-        folder = copy_of_the_example(tmp_path / str(order))
-        _change(
-            folder / "measurements.csv",
-            lambda rows, order=order: [*rows[0:3], *rows[15:18], *rows[30:33]][::order],
-        )
-        found.append(calibrate(folder).solution)
-    assert found[0].names == found[1].names
-    np.testing.assert_allclose(found[0].sigma, found[1].sigma, rtol=1e-6)
-    joints = [solution.parameters.base_joints for solution in found]
-    np.testing.assert_allclose(*joints, atol=1e-12)
+    given, turned = (copy_of_the_example(tmp_path / name) for name in ("given", "turned"))
+    for folder in (given, turned):
+        _change(folder / "measurements.csv", lambda rows: [*rows[:3], *rows[15:18], *rows[30:33]])
+    _change(turned / "measurements.csv", lambda rows: rows[::-1])
+    one, other = (calibrate(folder).solution for folder in (given, turned))
+    assert one.names == other.names
+    np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-6)
+    A, turned_A = one.parameters.base_joints, other.parameters.base_joints
+    np.testing.assert_allclose(A, turned_A, atol=1e-12)
 
 
 # Recovery from outlines and axes.
@@ -498,8 +496,8 @@ def test_a_wrong_pose_of_the_board_is_noted_and_changes_nothing(
     folder = _edited(made.folder, tmp_path / "w", lambda e: e["board"].update(T_base_board=wrong))
     found = calibrate(folder)
     assert any("stands 200 mm" in note for note in found.notes)
-    joints = [c.solution.parameters.base_joints for c in (found, right)]
-    np.testing.assert_allclose(*joints, atol=1e-8)
+    A, right_A = (c.solution.parameters.base_joints for c in (found, right))
+    np.testing.assert_allclose(A, right_A, atol=1e-8)
 
 
 def test_a_board_of_other_squares_is_refused_and_can_be_estimated(
@@ -563,7 +561,7 @@ def test_views_without_corners_are_named() -> None:
     )
     corner, solution = np.zeros(2, dtype=np.intp), SimpleNamespace(T_Rb_board=None)
     corners = found_corners(np.array([0, 1]), corner, np.zeros((2, 2)), np.ones(2))
-    of = lambda table: board_notes(dataset, solution, table)  # type: ignore[arg-type]  # noqa: E731
-    assert of(corners) == of(None) == []
-    (note,) = of(replace(corners, used=np.array([True, False])))
+    notes = partial(board_notes, dataset, cast(Any, solution))
+    assert notes(corners) == notes(None) == []
+    (note,) = notes(replace(corners, used=np.array([True, False])))
     assert note.startswith("No image of c2 shows the calibration board")

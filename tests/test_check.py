@@ -329,10 +329,10 @@ def test_priors_that_data_dominate_are_no_degrees_of_freedom() -> None:
     """A linear fit of n data with unit noise and wide priors of p parameters: n - p are left."""
     rng, n, p = np.random.default_rng(7), 40, 5
     J, sigma = rng.normal(size=(n, p)), np.full(p, 1e3)
-    covariance = np.linalg.inv(J.T @ J + np.diag(sigma**-2))
+    covariance = np.asarray(np.linalg.inv(J.T @ J + np.diag(sigma**-2)))
     assert noise_dof(n + p - p, covariance, sigma) == n - p
     narrow = np.full(p, 1e-3)  # the data add nothing: all priors stay residuals
-    assert noise_dof(n, np.diag(narrow**2), narrow) == n
+    assert noise_dof(n, np.asarray(np.diag(narrow**2), dtype=np.float64), narrow) == n
 
 
 @pytest.mark.parametrize(("model", "size"), [("hexapod", 7), ("3-rpr", 5), ("3-upu-tilted", 11)])
