@@ -19,9 +19,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 import legcal
-from legcal.calibration.identify.judge import identifiability
-from legcal.calibration.identify.planning import planned_session
+from legcal.calibration.identify.identifiability import identifiability
 from legcal.calibration.identify.ranks import Analysis
+from legcal.calibration.identify.session import planned_session
 
 ROOT = Path(__file__).parents[1]
 WEAK = ["leg1,leg2,leg3,leg4,leg5", "leg1,leg2,leg3,leg4,leg5", "leg5,leg6"]

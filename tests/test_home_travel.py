@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from mechanisms import SHIPPED_URDF, SHIPPED_YAML
 
-from legcal.calibration.identify.judge import identifiability
+from legcal.calibration.identify.identifiability import identifiability
 from legcal.errors import ModelError
 from legcal.machine import legs_outside, load_mechanism
 

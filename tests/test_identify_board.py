@@ -13,9 +13,9 @@ from rich.console import Console
 from test_identify_command import run
 
 import legcal
-from legcal.calibration.identify.judge import identifiability_of_dataset
-from legcal.calibration.identify.planning import planned_session, recorded_session
+from legcal.calibration.identify.identifiability import identifiability_of_dataset
 from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.identify.session import planned_session, recorded_session
 from legcal.calibration.identify.steps import locate_joints
 from legcal.data.corners import found_corners
 from legcal.errors import UsageError

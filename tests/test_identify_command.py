@@ -19,9 +19,9 @@ from thinned import thinned
 
 import legcal
 from legcal import cli
-from legcal.calibration.identify.judge import identifiability_of_dataset
-from legcal.calibration.identify.planning import recorded_session
-from legcal.calibration.identify.ranks import WeakDirection
+from legcal.calibration.identify.identifiability import identifiability_of_dataset
+from legcal.calibration.identify.report import WeakDirection
+from legcal.calibration.identify.session import recorded_session
 from legcal.data.dataset import load_dataset
 from legcal.errors import UsageError
 from legcal.machine import Machine

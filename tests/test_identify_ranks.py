@@ -10,10 +10,10 @@ from authoring import made
 from thinned import thinned
 
 import legcal
-from legcal.calibration.identify.judge import identifiability
-from legcal.calibration.identify.planning import planned_session
+from legcal.calibration.identify.identifiability import identifiability
 from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.report import Identifiability
+from legcal.calibration.identify.session import planned_session
 from legcal.machine import Machine
 
 MODELS = sorted(path.stem for path in (Path(__file__).parents[1] / "models").glob("*.yaml"))

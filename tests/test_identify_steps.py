@@ -8,9 +8,8 @@ import pytest
 from mechanisms import SHIPPED_YAML
 from staged_hexapods import exact_session
 
-from legcal.calibration.identify.planning import planned_session
 from legcal.calibration.identify.ranks import Analysis
-from legcal.calibration.identify.session import Session
+from legcal.calibration.identify.session import Session, planned_session
 from legcal.geometry.types import Array
 from legcal.machine import Machine, load_mechanism
 from legcal.paper import joints_in_base, offsets

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from staged_hexapods import exact_session, five_millimetres_away, noisy_session, staged
 from staged_machines import planned, shipped
 
-from legcal.calibration.identify.planning import planned_session
+from legcal.calibration.identify.session import planned_session
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, IntArray, normal_basis
 from legcal.machine import Demand, LegKind, linearize, load_mechanism

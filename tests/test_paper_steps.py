@@ -12,7 +12,7 @@ from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_
 from staged_machines import Observed, planned, shipped
 from thinned import thinned
 
-from legcal.calibration.identify.planning import planned_session
+from legcal.calibration.identify.session import planned_session
 from legcal.calibration.identify.ranks import Analysis, determined
 from legcal.data import LegAxes, axes_from_outlines
 from legcal.errors import NotIdentifiable

@@ -25,7 +25,7 @@ import numpy as np
 
 from legcal.calibration.board import BoardViews, base_of_board, board_notes, observe_board
 from legcal.calibration.four_steps import Steps, four_steps, starts
-from legcal.calibration.identify.judge import check_identifiable
+from legcal.calibration.identify.identifiability import check_identifiable
 from legcal.calibration.joint_fit import (
     DEFAULT_SETTINGS,
     MAX_GAMMA_ROUNDS,

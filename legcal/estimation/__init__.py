@@ -30,7 +30,8 @@ A client writes a state, a function of rows for each kind of measurement (CasADi
 of finite differences checks them all), and the blocks. At predicted observations the same
 :func:`information` is the Cramer-Rao bound and says what is identifiable; it is additive over
 eliminated elements, so that candidate images are low-rank updates of it
-(``NormalEquations.contributions``). The response to errors of what is fixed (:func:`response`),
+(``NormalEquations.contributions``). Where ranks are decided, :func:`information_rows` keeps its
+square root. The response to errors of what is fixed (:func:`response`),
 score tests of columns that were not fitted (:func:`score_test`, :func:`scores_of_block`), and the
 covariance of predictions (:func:`explained_share`) come from the same matrix. Variances of random
 effects are estimated by restricted maximum likelihood (:class:`Effects`).

@@ -20,6 +20,11 @@ from .solver import inverse_on_range as inverse_on_range
 from .solver import minimise as minimise
 from .solver import normal_equations as normal_equations
 from .solver import robust_cost as robust_cost
+from .square_root import compress as compress
+from .square_root import eliminate as eliminate
+from .square_root import grouped as grouped
+from .square_root import information_rows as information_rows
+from .square_root import marginal_rows as marginal_rows
 from .uncertainty import WeakDirection as WeakDirection
 from .uncertainty import explained_share as explained_share
 from .uncertainty import marginal as marginal

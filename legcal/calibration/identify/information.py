@@ -1,63 +1,90 @@
-"""Information of predicted observations on the parameters: whitened, linearised rows.
+"""The problem of the joint fit at predicted observations, and what these determine.
 
-Everything is linearised at the nominal machine, in metres (angles count at the mean leg length) and
-in standard deviations, so that a singular value is one over a standard deviation [1/m]. Platform
-poses and cameras are nuisance parameters: they are eliminated.
+Platform poses, cameras and parameters are variables; images, the equations of readings and legs
+are factors, linearised at the nominal machine. Unknowns are in metres (angles count at the mean leg
+length) and rows in standard deviations, so that a singular value is one over a standard deviation
+[1/m]. Radii of legs and intrinsics of cameras come as further variables where these are judged.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from legcal.calibration.identify.session import Session, at_base_joints, at_platform_joints
+from legcal.calibration.identify.report import CameraIntrinsics
+from legcal.calibration.identify.session import (
+    Across,
+    Session,
+    at_base_joints,
+    at_platform_joints,
+)
 from legcal.calibration.joint_fit import Choices
+from legcal.estimation import (
+    Factor,
+    GaussianPrior,
+    Problem,
+    Rows,
+    Variables,
+    all_free,
+    information_rows,
+    marginal_rows,
+)
 from legcal.geometry import Array, IntArray
 from legcal.machine import Demand, freedoms, pose_equations
 
-_UNSEEN = 1e-3  # 1/m: an unknown known to no better than a kilometre is not known
-SIGMA_EXACT = 1e-7  # [m]: what the mechanism itself demands
+SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
+INTRINSICS = ("fx", "fy", "cx", "cy")
+_MAX_INTRINSICS_SIGMA = 0.1  # of a focal length: what is known to no better is not determined
+_RADIUS_SIGMA = 0.02  # relative, as a fit has it
+_OPEN = 0.05  # component of an open direction from which on an intrinsic is part of it
 
 
-def by_cameras(
-    session: Session,
-    # (n_images, n_legs, 4, f + 6 + p): what :func:`image_rows` says of them; other unknowns may
-    # follow the parameters
-    images: Array,
-    demands: WhitenedDemands,  # what :func:`demands_of` says of them, and of these others
-) -> Array:
-    """Return what everything says of cameras and parameters, (m, 6 n_frames + p) [1/m].
+@dataclass(frozen=True, eq=False)
+class _Nominal:
+    """Deviations from the nominal machine, all of them zero."""
 
-    The motions of the platform are free. Views that show a board share one camera: that of the
-    board.
-    """
-    n_f, n_p = len(freedoms(session.frame_legs)), demands.by_parameters.shape[2]
-    seen = images.reshape(len(session.view), -1, n_f + 6 + n_p)
-    n_cameras = 6 * session.n_frames
-    wide = np.zeros((*seen.shape[:2], n_f + n_cameras + n_p))
-    wide[..., :n_f], wide[..., n_f + n_cameras :] = seen[..., :n_f], seen[..., n_f + 6 :]
-    for v, frame in enumerate(session.frame.tolist()):
-        here = session.view == v
-        place = n_f + 6 * frame
-        wide[here, :, place : place + 6] = seen[here, :, n_f : n_f + 6]
-    equations = np.zeros((len(session.t), demands.by_pose.shape[1], wide.shape[2]))
-    equations[..., :n_f] = demands.by_pose
-    equations[..., n_f + n_cameras :] = demands.by_parameters
-    rows = np.concatenate([equations, by_group(wide, session.pose, len(session.t))], axis=1)
-    return compress_groups(eliminate(rows, n_f))
+    parameters: Array
+    camera: Array
+    pose: Array
+    radius: Array = field(default_factory=lambda: np.zeros(0))
+    intrinsics: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def of_parameters(session: Session, rows: Array) -> Array:
-    """Return what rows of cameras and parameters say of the parameters, (p, p)."""
-    return compress(eliminate(rows[None], rows.shape[1] - len(session.parametrization)))
+@dataclass(frozen=True, eq=False)
+class WhitenedEquations:
+    """The whitened equations of all legs at the poses of a session."""
+
+    # (k, m, f): by the possible motions of the platform: turns [m at the leg's length],
+    # displacements
+    by_pose: Array
+    by_parameters: Array  # (k, m, p): by the parameters in metres
+    leg: IntArray  # (m,): the leg of each row
+    demand: tuple[Demand, ...]  # (m,): what it is about
+
+    def at(self, poses: IntArray) -> WhitenedEquations:
+        """Return the equations at some of the poses, in that order."""
+        return replace(self, by_pose=self.by_pose[poses], by_parameters=self.by_parameters[poses])
+
+
+def leg_equations(session: Session) -> WhitenedEquations:
+    """Return what readings and legs demand of the poses of a session."""
+    equations = pose_equations(session.legs, session.R, session.t)
+    sigma = np.where(equations.measured, session.sigma_q, SIGMA_EXACT)[:, None]
+    columns = list(freedoms(session.frame_legs))
+    return WhitenedEquations(
+        (equations.by_pose / sigma * pose_unit(session))[:, :, columns],
+        equations.by_parameters(session.parametrization) / sigma * session.unit,
+        equations.leg,
+        equations.demands,
+    )
 
 
 def image_rows(session: Session) -> Array:
-    """Return what each image says, (n_images, n_legs, 4, f + 6 + p), whitened.
+    """Return the whitened derivatives (n_images, n_legs, 4, f + 6 + p) of what images show.
 
-    The unknowns are the platform's motion, the motion of the camera of that image, and the
-    parameters, all in metres.
+    By the platform's motion, the motion of the camera of that image, and the parameters.
     """
     base, platform = at_base_joints(session), at_platform_joints(session)
     turns = pose_unit(session)
@@ -74,103 +101,179 @@ def image_rows(session: Session) -> Array:
     return np.concatenate([by_pose[..., columns], by_camera, by_parameters], axis=3)
 
 
-@dataclass(frozen=True, eq=False)
-class WhitenedDemands:
-    """The whitened equations of all legs at the poses of a session."""
-
-    # (k, m, f): by the possible motions of the platform: turns [m at the leg's length],
-    # displacements
-    by_pose: Array
-    by_parameters: Array  # (k, m, p): by the parameters in metres
-    leg: IntArray  # (m,): the leg of each row
-    demand: tuple[Demand, ...]  # (m,): what it is about
-
-    def at(self, poses: IntArray) -> WhitenedDemands:
-        """Return the equations at some of the poses, in that order."""
-        return replace(self, by_pose=self.by_pose[poses], by_parameters=self.by_parameters[poses])
-
-
-def demands_of(session: Session) -> WhitenedDemands:
-    """Return what readings and legs demand of the poses of a session."""
-    equations = pose_equations(session.legs, session.R, session.t)
-    sigma = np.where(equations.measured, session.sigma_q, SIGMA_EXACT)[:, None]
-    columns = list(freedoms(session.frame_legs))
-    return WhitenedDemands(
-        (equations.by_pose / sigma * pose_unit(session))[:, :, columns],
-        equations.by_parameters(session.parametrization) / sigma * session.unit,
-        equations.leg,
-        equations.demands,
-    )
-
-
 def pose_unit(session: Session) -> Array:
     """Return what a metre of the six components of a motion is: turns count at the leg's length."""
     return np.repeat([1.0 / session.mean_length, 1.0], 3)
 
 
-def known_rows(
-    session: Session,  # the observations; its parameters are counted in metres
-    choices: Choices,  # parameters that are fixed, and those of which something is known
-) -> Array:
-    """Return what is known of the parameters as whitened rows, (p, p) [1/m]."""
-    known = np.zeros(len(session.unit))
+def prior_of(session: Session, choices: Choices) -> GaussianPrior:
+    """Return what is known of the parameters of a session: fixed ones, and those with priors."""
+    sigma: dict[int, float] = {}
     for i, name in enumerate(session.parametrization.names):
         if name in choices.priors:
-            known[i] = session.unit[i] / choices.priors[name].sigma
+            sigma[i] = choices.priors[name].sigma
         elif choices.holds(name, by_default=name.endswith(".twist")):
-            known[i] = 1.0 / SIGMA_EXACT
-    return np.diag(known)
+            sigma[i] = SIGMA_EXACT * session.unit[i]
+    known, values = np.array(list(sigma), dtype=np.intp), np.array(list(sigma.values()))
+    return GaussianPrior(known, np.zeros(len(sigma)), values)
 
 
-def eliminate(
-    # (k, r, n_own + n_shared): whitened rows of each group: derivatives in standard deviations per
-    # metre
-    rows: Array,
-    n_own: int,  # number of unknowns, the first ones, that each group has for itself
-) -> Array:
-    """Return what groups of rows say about shared unknowns when their own ones are free.
+def problem_of(
+    session: Session,
+    images: Array,  # of image_rows
+    equations: WhitenedEquations,
+    prior: GaussianPrior,
+    more: Sequence[tuple[Variables, IntArray, Array]] = (),  # see below
+) -> tuple[Problem[_Nominal], _Nominal]:
+    """Return the problem of a session and the state that it is linearised at.
 
-    Rows are turned until as few as possible contain the own unknowns, which are then dropped:
-    nothing is lost where the rows do not determine the own unknowns.
-
-    Returns (m, n_shared).
+    Views that show a board share one camera: that of the board. *more* has variables that images
+    depend on too: the element that each leg in each image depends on (n_images, n_legs), and the
+    derivatives (n_images, n_legs, 4, d) of what it shows.
     """
-    n_shared = rows.shape[2] - n_own
-    if rows.shape[0] == 0 or rows.shape[1] == 0:
-        return np.zeros((0, n_shared))
-    if n_own == 0:
-        return rows.reshape(-1, n_shared)
-    if rows.shape[1] < n_own:
-        short = n_own - rows.shape[1]
-        rows = np.concatenate([rows, np.zeros((len(rows), short, rows.shape[2]))], axis=1)
-    upper = np.asarray(np.linalg.qr(rows, mode="r"))
-    left, singular, _ = np.linalg.svd(upper[:, :n_own, :n_own])
-    top = np.swapaxes(left, 1, 2) @ upper[:, :n_own, n_own:]
-    top[singular > _UNSEEN] = 0.0
-    rest = upper[:, n_own:, n_own:]
-    kept = top[singular <= _UNSEEN]
-    return np.concatenate([kept, rest.reshape(-1, n_shared)])
+    n_f, n_p, n_poses = len(freedoms(session.frame_legs)), len(session.unit), len(session.t)
+    n_images, n_legs = images.shape[:2]
+    n, m, whole = n_images * n_legs, len(equations.leg), slice(None)
+    J = np.concatenate([images[..., n_f:], *(by for _, _, by in more)], axis=3).reshape(n, 4, -1)
+    shown = Rows.of(np.zeros((n, 4)), J, images[..., :n_f].reshape(n, 4, n_f))
+    demanded = Rows.of(np.zeros((n_poses, m)), equations.by_parameters, equations.by_pose)
+    parameters = Variables(
+        "parameters",
+        all_free(1, n_p),
+        labels=session.parametrization.names,
+        units=session.parametrization.units,
+        coordinates=lambda x: x * session.unit,
+        jacobian=lambda x: np.diag(session.unit),
+        prior=prior,
+    )
+    problem = Problem[_Nominal](
+        variables=(
+            parameters,
+            Variables("camera", all_free(session.n_frames, 6)),
+            *(variables for variables, _, _ in more),
+        ),
+        eliminated=Variables("pose", all_free(n_poses, n_f)),
+        factors=(
+            Factor(
+                "images",
+                lambda _: shown,
+                (
+                    ("camera", np.repeat(session.frame[session.view], n_legs), whole),
+                    ("parameters", np.zeros(n, dtype=np.intp), whole),
+                    *((variables.name, element.ravel(), whole) for variables, element, _ in more),
+                ),
+                n,
+                4,
+                np.repeat(session.pose, n_legs),
+            ),
+            Factor(
+                "legs",
+                lambda _: demanded,
+                (("parameters", np.zeros(n_poses, dtype=np.intp), whole),),
+                n_poses,
+                m,
+                np.arange(n_poses),
+            ),
+        ),
+    )
+    zeros = {b.name: np.zeros(b.n_unknowns) for b in problem.variables}
+    return problem, _Nominal(pose=np.zeros((n_poses, n_f)), **zeros)
 
 
-def compress(rows: Array) -> Array:
-    """Return rows (p, p) that say the same as rows (m, p)."""
-    n = rows.shape[1]
-    upper = np.asarray(np.linalg.qr(rows, mode="r")) if len(rows) else np.zeros((0, n))
-    return np.concatenate([upper, np.zeros((n - len(upper), n))])
+def expected_intrinsics(
+    session: Session,
+    images: Array,  # of image_rows
+    equations: WhitenedEquations,
+    prior: GaussianPrior,
+    orientation: Array,  # (n_views, 3, 3): R of every camera in R_b, its optical axis last
+    # (n_views): the camera of every view: views with the same one share their intrinsics
+    owners: Sequence[str],
+) -> tuple[CameraIntrinsics, ...]:
+    """Return what the legs determine of the intrinsics of cameras, estimated with all else."""
+    cameras = tuple(dict.fromkeys(owners))
+    of_view = np.array([cameras.index(owner) for owner in owners], dtype=np.intp)
+    n_legs, n_cameras = session.n_legs, len(cameras)
+    by_radius, by_intrinsics = _radii_and_intrinsics(session, orientation)
+    known = GaussianPrior(np.arange(n_legs), np.zeros(n_legs), _RADIUS_SIGMA * session.radius)
+    leg = np.broadcast_to(np.arange(n_legs), images.shape[:2])
+    camera = np.broadcast_to(of_view[session.view][:, None], images.shape[:2])
+    numbers = Variables("intrinsics", all_free(n_cameras, len(INTRINSICS)))
+    problem, state = problem_of(
+        session,
+        images,
+        equations,
+        prior,
+        (
+            (Variables("radius", all_free(n_legs, 1), prior=known), leg, by_radius),
+            (numbers, camera, by_intrinsics),
+        ),
+    )
+    left = marginal_rows(information_rows(problem, state), problem.where("intrinsics"))
+    _, singular, basis = np.linalg.svd(left)
+    # An unknown of one metre is one of as many pixels as a leg's length is long from afar.
+    is_seen = singular > 1.0 / (_MAX_INTRINSICS_SIGMA * session.mean_length)
+    spread = np.sqrt(np.sum((basis[is_seen].T / singular[is_seen]) ** 2, axis=1))
+    is_open = np.sqrt(np.sum(basis[~is_seen] ** 2, axis=0)) > _OPEN
+    first = np.unique(of_view, return_index=True)[1]
+    metre = session.focal[first] / session.mean_length  # of each camera [px]
+    sigma = spread.reshape(n_cameras, -1) * metre[:, None]
+    return tuple(
+        CameraIntrinsics(
+            camera,
+            not any(opens),
+            {n: None if o else s for n, s, o in zip(INTRINSICS, sigmas, opens, strict=True)},
+        )
+        for camera, sigmas, opens in zip(
+            cameras, sigma.tolist(), is_open.reshape(sigma.shape).tolist(), strict=True
+        )
+    )
 
 
-def compress_groups(rows: Array) -> Array:
-    """Return fewer rows that say the same."""
-    return rows if len(rows) < rows.shape[1] else np.asarray(np.linalg.qr(rows, mode="r"))
+def _radii_and_intrinsics(session: Session, orientation: Array) -> tuple[Array, Array]:
+    """Return derivatives of what images show by radii and intrinsics, (n_images, n_legs, 4, d)."""
+    shape = len(session.view), session.n_legs, 4
+    by_radius, by_intrinsics = np.zeros((*shape, 1)), np.zeros((*shape, len(INTRINSICS)))
+    unit = (session.focal / session.mean_length)[session.view][:, None, None, None]
+    for k, across in enumerate((at_base_joints(session), at_platform_joints(session))):
+        lateral, widening = intrinsics_changes(session, across, orientation)
+        sigma_lateral, towards = _scales(session, across)
+        rows = [lateral / sigma_lateral[..., None], widening * towards[..., None]]
+        by_intrinsics[:, :, 2 * k : 2 * k + 2] = np.stack(rows, 2) * unit
+        by_radius[:, :, 2 * k + 1, 0] = towards / session.radius
+    hidden = ~session.seen[session.view]
+    by_radius[hidden] = by_intrinsics[hidden] = 0.0
+    return by_radius, by_intrinsics
 
 
-def by_group(rows: Array, group: IntArray, n_groups: int) -> Array:
-    """Return rows (n, r, c) of members laid out by group, (n_groups, most * r, c), with zeros."""
-    number = np.bincount(group, minlength=n_groups)
-    place = np.zeros(len(group), dtype=np.intp)
-    order = np.argsort(group, kind="stable")
-    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(number) - number, number)
-    most = int(number.max(initial=0))
-    laid = np.zeros((n_groups, most, *rows.shape[1:]))
-    laid[group, place] = rows
-    return laid.reshape(n_groups, most * rows.shape[1], rows.shape[2])
+def intrinsics_changes(session: Session, across: Across, orientation: Array) -> tuple[Array, Array]:
+    """Return what a pixel more of each intrinsic does, both (n_images, n_legs, 4).
+
+    How far it moves the axis across the leg [m/px], and how much wider it makes the leg [1/px].
+    """
+    R = orientation[session.view]
+    at = (across.point - session.camera[session.view][:, None]) @ R  # in the camera frame
+    lateral = across.gradient[:, :, 0] @ R
+    lateral /= np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)[..., None]
+    focal = session.focal[session.view][:, None, None]
+    depth = np.maximum(at[..., 2:], 1e-6)
+    xy = at[..., :2] / depth
+    u = session.u[session.pose] @ R
+    along, imaged = (focal / depth * (d[..., :2] - d[..., 2:] * xy) for d in (u, lateral))  # px/m
+    normal = np.stack([-along[..., 1], along[..., 0]], axis=2)
+    normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-300)
+    by_metre = np.sum(normal * imaged, axis=2, keepdims=True)
+    shift = np.concatenate([normal * xy, normal], axis=2) / np.where(by_metre, by_metre, 1.0)
+    return shift, np.concatenate([normal**2 / focal, np.zeros_like(normal)], axis=2)
+
+
+def _scales(session: Session, across: Across) -> tuple[Array, Array]:
+    """Return, both (n_images, n_legs), what weighs such changes.
+
+    The standard deviation of the axis across the leg [m], and by how many standard deviations a leg
+    as wide again looks nearer, as what is seen towards the camera counts it.
+    """
+    lateral, depth = across.gradient[:, :, 0], across.gradient[:, :, 1]
+    ray = across.point - session.camera[session.view][:, None]
+    sigma = 1.0 / np.maximum(np.linalg.norm(lateral, axis=2), 1e-300)
+    away = np.sign(np.sum(depth * ray, axis=2))
+    return sigma, -away * np.linalg.norm(ray, axis=2) * np.linalg.norm(depth, axis=2)

@@ -8,16 +8,16 @@ from functools import cached_property
 import numpy as np
 
 from legcal.calibration.identify.information import (
-    WhitenedDemands,
-    by_cameras,
-    compress,
-    demands_of,
+    WhitenedEquations,
     image_rows,
-    of_parameters,
+    leg_equations,
+    prior_of,
+    problem_of,
 )
+from legcal.calibration.identify.report import PlatformError, Ranks, StepRank, WeakDirection
 from legcal.calibration.identify.session import Session
 from legcal.calibration.identify.steps import (
-    LARGEST_SIGMA,
+    MAX_SIGMA,
     Located,
     Step,
     consecutive_distances,
@@ -29,7 +29,9 @@ from legcal.calibration.identify.steps import (
     offsets_from_distances,
     scalar_products,
 )
+from legcal.calibration.joint_fit import NO_CHOICES, Choices
 from legcal.errors import NotIdentifiable
+from legcal.estimation import GaussianPrior, compress, information_rows, marginal_rows
 from legcal.geometry import Array, IntArray
 from legcal.machine import (
     SHOWN,
@@ -39,22 +41,21 @@ from legcal.machine import (
     split_by_motion,
 )
 
-_ERROR = 1e-3  # [m], the largest component of a direction whose effect is told
+_ERROR = 1e-3  # [m], the largest component of a direction whose effect is reported
 _HARMLESS = 1e-3  # of that: the platform does not move
 
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What a session says of the parameters."""
+    """What a session determines, computed where it is needed."""
 
-    session: Session  # the session
-    # (m, p): what is known of the parameters without looking, as whitened rows [1/m]
-    known: Array | None = None
+    session: Session
+    choices: Choices = NO_CHOICES  # parameters that are fixed or have priors
 
     def elsewhere(self, session: Session, poses: IntArray) -> Analysis:
         """Return the analysis of other images of the same machine, at some of the same poses."""
-        other = Analysis(session, self.known)
-        other.__dict__.update(motion=self.motion, demands=self.demands.at(poses))
+        other = Analysis(session, self.choices)
+        other.__dict__.update(motion=self.motion, equations=self.equations.at(poses))
         return other
 
     def with_board(self, *, board: bool = True) -> Analysis:
@@ -66,13 +67,18 @@ class Analysis:
 
     @cached_property
     def images(self) -> Array:
-        """What the images say."""
+        """Whitened derivatives of what images show."""
         return image_rows(self.session)
 
     @cached_property
-    def demands(self) -> WhitenedDemands:
-        """What readings and legs demand."""
-        return demands_of(self.session)
+    def equations(self) -> WhitenedEquations:
+        """The equations of readings and legs."""
+        return leg_equations(self.session)
+
+    @cached_property
+    def prior(self) -> GaussianPrior:
+        """What is known of the parameters without images."""
+        return prior_of(self.session, self.choices)
 
     @cached_property
     def located(self) -> Located:
@@ -90,7 +96,7 @@ class Analysis:
         return (
             identify_base(self.session, self.located),
             offsets_from_distances(self.session, *self.distances),
-            identify_platform(self.session, self.located, self.images, self.demands),
+            identify_platform(self.session, self.located, self.images, self.equations),
         )
 
     @cached_property
@@ -105,18 +111,17 @@ class Analysis:
 
     @cached_property
     def of_cameras(self) -> Array:
-        """The joint fit, of cameras and parameters, (m, 6 n_frames + p)."""
-        return by_cameras(self.session, self.images, self.demands)
+        """The joint fit: rows by parameters and cameras, (m, p + 6 n_frames)."""
+        return information_rows(*problem_of(self.session, self.images, self.equations, self.prior))
 
     @cached_property
     def information(self) -> Array:
-        """The joint fit, (p, p)."""
-        found = of_parameters(self.session, self.of_cameras)
-        return found if self.known is None else compress(np.concatenate([found, self.known]))
+        """The joint fit: rows by parameters, (p, p)."""
+        return marginal_rows(self.of_cameras, np.arange(len(self.session.unit)))
 
     @cached_property
     def motion(self) -> PlatformMotion:
-        """What the platform does."""
+        """How the platform follows the parameters."""
         return PlatformMotion(self.session)
 
     @cached_property
@@ -156,58 +161,6 @@ class Analysis:
                 rank = determined(self.session, step.information)
                 found.append(StepRank(step.name, criteria, rank, len(step.columns)))
         return tuple(found)
-
-
-@dataclass(frozen=True)
-class Ranks:
-    """How many parameters are determined."""
-
-    rank: int  # rank, of: directions of the parameter space that are determined, and all of them
-    of: int
-    weak: tuple[WeakDirection, ...]  # the others
-
-    @property
-    def complete(self) -> bool:
-        """Whether all directions that move the platform are determined."""
-        return all(direction.harmless for direction in self.weak)
-
-
-@dataclass(frozen=True)
-class StepRank:
-    """The rank of one step's equations."""
-
-    name: str  # ``joints_in_cameras``, ``base_joints``, ``offsets`` or ``platform_joints``
-    # {"default", "literal"}: legcal's criteria, or the paper's as printed: (6) and (7), (9), (14),
-    # (16)
-    criteria: str
-    # rank, of: unknowns that are determined, and all of them. Those of the first step are joints
-    # and axes in the camera frames; the others are parameters
-    rank: int
-    of: int
-
-
-@dataclass(frozen=True)
-class WeakDirection:
-    """A combination of parameters that the observations do not determine."""
-
-    direction: str  # in words
-    parameters: tuple[str, ...]  # the parameters that change, the largest first
-    # by how much, when the largest changes by 1 mm (an angle by 1 mm at the leg's length) [m or
-    # rad]
-    components: tuple[float, ...]
-    # dX_m, dE_rad: the displacement [m] and rotation [rad] of the platform that this could hide,
-    # root mean square over the poses; None where the motors do not determine the pose
-    dX_m: float | None
-    dE_rad: float | None
-    harmless: bool  # whether the platform does not move
-
-
-@dataclass(frozen=True)
-class PlatformError:
-    """How far the platform moves, root mean square over poses."""
-
-    dX_m: float  # displacement of the origin of R_e [m]
-    dE_rad: float  # rotation [rad]
 
 
 class PlatformMotion:
@@ -312,4 +265,4 @@ def _direction(
 
 def _limit(session: Session) -> float:
     """Return the least singular value that counts [1/m]."""
-    return 1.0 / (LARGEST_SIGMA * session.mean_length)
+    return 1.0 / (MAX_SIGMA * session.mean_length)

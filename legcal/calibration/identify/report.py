@@ -1,4 +1,4 @@
-"""The identifiability report: ``identify --json`` is its document."""
+"""The identifiability report and its parts: ``identify --json`` is its document."""
 
 from __future__ import annotations
 
@@ -6,11 +6,118 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from legcal.calibration.identify.intrinsics import CameraIntrinsics
-from legcal.calibration.identify.ranks import PlatformError, Ranks, StepRank
-from legcal.calibration.identify.recommend import Recommendation
-from legcal.calibration.identify.remedies import BoardReport, Remedy
 from legcal.paper import Condition
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """How many parameters are determined."""
+
+    rank: int  # rank, of: directions of the parameter space that are determined, and all of them
+    of: int
+    weak: tuple[WeakDirection, ...]  # the others
+
+    @property
+    def complete(self) -> bool:
+        """Whether all directions that move the platform are determined."""
+        return all(direction.harmless for direction in self.weak)
+
+
+@dataclass(frozen=True)
+class StepRank:
+    """The rank of one step's equations."""
+
+    name: str  # ``joints_in_cameras``, ``base_joints``, ``offsets`` or ``platform_joints``
+    # {"default", "literal"}: legcal's criteria, or the paper's as printed: (6) and (7), (9), (14),
+    # (16)
+    criteria: str
+    # rank, of: unknowns that are determined, and all of them. Those of the first step are joints
+    # and axes in the camera frames; the others are parameters
+    rank: int
+    of: int
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A combination of parameters that the observations do not determine."""
+
+    direction: str  # in words
+    parameters: tuple[str, ...]  # the parameters that change, the largest first
+    # by how much, when the largest changes by 1 mm (an angle by 1 mm at the leg's length) [m or
+    # rad]
+    components: tuple[float, ...]
+    # dX_m, dE_rad: the displacement [m] and rotation [rad] of the platform that this could hide,
+    # root mean square over the poses; None where the motors do not determine the pose
+    dX_m: float | None
+    dE_rad: float | None
+    harmless: bool  # whether the platform does not move
+
+
+@dataclass(frozen=True)
+class PlatformError:
+    """How far the platform moves, root mean square over poses."""
+
+    dX_m: float  # displacement of the origin of R_e [m]
+    dE_rad: float  # rotation [rad]
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """A set of views that satisfies the paper's conditions and the ranks."""
+
+    # the legs that each camera position shows: neighbours around the base
+    views: tuple[tuple[str, ...], ...]
+    legs_a_view: int  # how many these are
+    # standard deviation of the platform to expect; None where the motors do not determine its pose
+    platform_sigma: PlatformError | None
+
+
+@dataclass(frozen=True)
+class BoardRanks:
+    """The ranks of all parameters, with a board in every image or with none."""
+
+    staged_rank: int  # staged_rank, full_rank: step by step, and the joint fit
+    full_rank: int
+    # whether the joint fit determines all directions that move the platform
+    identifiable: bool
+
+
+@dataclass(frozen=True)
+class BoardReport:
+    """What a calibration board does for a session."""
+
+    present: bool  # whether the session has one, in every view
+    # what fails without a board and holds with it: ``eq12``, ``two_directions``, ``staged`` (the
+    # four steps determine all that moves the platform), ``full`` (the joint fit does)
+    needed_for: tuple[str, ...]
+    without: BoardRanks  # without, with_board: the ranks without and with a board in every image
+    with_board: BoardRanks
+    # the directions that only a board lets step by step or at once determine, in words
+    mends: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """Something that would help, with the ranks that it gives."""
+
+    remedy: str  # what to do
+    # staged_rank, full_rank: the ranks that it gives, of all parameters; what is fixed counts as
+    # known
+    staged_rank: int
+    full_rank: int
+    # whether it determines everything that moves the platform, step by step and at once
+    enough: bool
+
+
+@dataclass(frozen=True)
+class CameraIntrinsics:
+    """What the legs tell of one camera, its four numbers looked for together with all others."""
+
+    camera: str  # the view after whose name the intrinsics are called
+    determined: bool  # whether the legs determine all four
+    # standard deviations of ``fx``, ``fy``, ``cx``, ``cy`` to expect with outlines good to 0.1 px,
+    # radii known to 2 % [px]; None for those that stay open
+    sigma: dict[str, float | None]
 
 
 @dataclass(frozen=True)

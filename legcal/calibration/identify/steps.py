@@ -11,15 +11,9 @@ from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 
-from legcal.calibration.identify.information import (
-    SIGMA_EXACT,
-    WhitenedDemands,
-    by_group,
-    compress,
-    eliminate,
-    pose_unit,
-)
+from legcal.calibration.identify.information import SIGMA_EXACT, WhitenedEquations, pose_unit
 from legcal.calibration.identify.session import Across, Session, at_base_joints, at_platform_joints
+from legcal.estimation import compress, eliminate, grouped
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
 from legcal.machine import freedoms
 
@@ -29,9 +23,9 @@ _LENGTH = (6,)
 _BASE_AXIS = (7, 8)
 _PLATFORM_AXIS = (9, 10)
 _TWIST = (11,)
-LARGEST_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
-_APART = 1e-3  # mean leg lengths: nearer joints count as one, whose distance has no direction
-_FLOOR = 1e-12  # of a variance [m^2]
+MAX_SIGMA = 1.0  # mean leg lengths: what is known to no better is not determined
+_MIN_DISTANCE = 1e-3  # mean leg lengths: nearer joints count as one
+_MIN_VARIANCE = 1e-12  # of a variance [m^2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +65,7 @@ def locate_joints(session: Session) -> Located:
                 found[f, j] = compress(_joint_and_axis(session, A, B, here, j))
             else:
                 found[f, j, :3, :3] = compress(A.gradient[here, j].reshape(-1, 3))
-    limit = 1.0 / (LARGEST_SIGMA * session.mean_length)
+    limit = 1.0 / (MAX_SIGMA * session.mean_length)
     singular = np.linalg.svd(found, compute_uv=False)
     joint = np.linalg.svd(found[..., :3], compute_uv=False)[..., -1] > limit
     axis = revolute & joint & (singular[..., -1] > limit)
@@ -102,7 +96,7 @@ def base_by_frames(session: Session, located: Located) -> tuple[IntArray, Array]
         row[:, :6] = _by_camera(session, j, F)
         scatter = session.local_to_parameters[j]
         row[:, 6:] = F[:, :3] @ scatter[:3] + F[:, 3:] @ scatter[7:9] * session.mean_length
-    return columns, by_group(rows, pairs[:, 0], session.n_frames)
+    return columns, grouped(rows, pairs[:, 0], session.n_frames)
 
 
 def distance_rows(session: Session, located: Located) -> tuple[Array, Array, IntArray]:
@@ -128,7 +122,7 @@ def distance_rows(session: Session, located: Located) -> tuple[Array, Array, Int
         for f in range(session.n_frames)
         for i in np.flatnonzero(frame == f)
         for j, g in combinations(np.flatnonzero(shown[i]).tolist(), 2)
-        if gaps[j, g] > _APART * session.mean_length
+        if gaps[j, g] > _MIN_DISTANCE * session.mean_length
     ]
     if not keys:
         return np.zeros((0, len(columns))), np.zeros(0), np.zeros((0, 4), dtype=np.intp)
@@ -151,16 +145,16 @@ def offsets_from_distances(session: Session, rows: Array, weight: Array, key: In
     _, pair = np.unique(key[:, 2:], axis=0, return_inverse=True)
     pair = pair.ravel()
     own = np.concatenate([weight[:, None], rows], axis=1)
-    laid = by_group(own[:, None], pair, int(pair.max(initial=-1)) + 1)
+    laid = grouped(own[:, None], pair, int(pair.max(initial=-1)) + 1)
     return Step("offsets", columns, eliminate(laid, 1))
 
 
 def identify_platform(
-    session: Session, located: Located, images: Array, demands: WhitenedDemands
+    session: Session, located: Located, images: Array, equations: WhitenedEquations
 ) -> Step:
     """Return what step 4 says of platform joints and axes, and of universal axes at the base.
 
-    *images* and *demands* are those of :func:`legcal.calibration.identify.ranks.information`.
+    *images* and *equations* are those of the joint fit.
     """
     universal = np.array([leg.base_joint == "U" for leg in session.legs], dtype=np.bool_)
     columns = np.unique(
@@ -178,10 +172,10 @@ def identify_platform(
     seen = seen * groups.used[groups.of_image][:, :, None, None]
     seen = seen * located.joint[session.frame[session.view]][:, :, None, None]
     seen = seen.reshape(len(session.view), 2 * session.n_legs, n_f + n_p)
-    rows = np.concatenate([demands.by_pose, demands.by_parameters], axis=2)[groups.pose]
-    wanted = _step_4_demands(demands, groups)
+    rows = np.concatenate([equations.by_pose, equations.by_parameters], axis=2)[groups.pose]
+    wanted = _step_4_equations(equations, groups)
     rows = np.concatenate(
-        [rows * wanted[..., None], by_group(seen, groups.of_image, len(groups.pose))], axis=1
+        [rows * wanted[..., None], grouped(seen, groups.of_image, len(groups.pose))], axis=1
     )
     return Step("platform_joints", columns, eliminate(rows[:, :, keep], n_f))
 
@@ -203,14 +197,16 @@ def scalar_products(session: Session, located: Located) -> Step:
         G = np.array([vectors[p] @ slopes[q] + vectors[q] @ slopes[p] for p, q in pairs])
         variance = np.einsum("pi,ij,pj->p", G, _covariance(session, located, f), G)
         by_local = np.concatenate([scatter[:, :3], session.mean_length * scatter[:, 7:9]], axis=1)
-        rows.append(G @ by_local.reshape(G.shape[1], -1) / np.sqrt(variance + _FLOOR)[:, None])
+        rows.append(
+            G @ by_local.reshape(G.shape[1], -1) / np.sqrt(variance + _MIN_VARIANCE)[:, None]
+        )
     return Step("base_joints", columns, np.concatenate(rows)[:, columns])
 
 
 def consecutive_distances(rows: Array, weight: Array, key: IntArray, columns: IntArray) -> Step:
     """Return what (14) says: distances equal those of the next position of the frame.
 
-    The rows, weights and keys are those of :func:`legcal.calibration.identify.ranks.distance_rows`.
+    The rows, weights and keys are those of :func:`distance_rows`.
     """
     last: dict[tuple[int, int, int], int] = {}
     found = [np.zeros((0, len(columns)))]
@@ -324,13 +320,13 @@ def _groups(session: Session, located: Located) -> _Groups:
     return _Groups(of_image, distinct[:, 0], distinct[:, 1] < 0, used, enough)
 
 
-def _step_4_demands(demands: WhitenedDemands, groups: _Groups) -> BoolArray:
+def _step_4_equations(equations: WhitenedEquations, groups: _Groups) -> BoolArray:
     """Return which equations of the legs step 4 uses in each group, (n_groups, m)."""
-    kinds = np.array([d.name for d in demands.demand])
+    kinds = np.array([d.name for d in equations.demand])
     length, base_axis, twist = (kinds == d for d in ("LENGTH", "BASE_AXIS", "TWIST"))
     others = ~length & ~base_axis & (~twist | groups.in_base[:, None])
     wanted = length | (others & groups.enough[:, None])
-    return np.asarray(wanted & groups.used[:, demands.leg])
+    return np.asarray(wanted & groups.used[:, equations.leg])
 
 
 def _vectors_of(session: Session, located: Located, f: int) -> tuple[list[Array], list[Array]]:

@@ -6,25 +6,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from legcal.calibration.identify.information import known_rows
-from legcal.calibration.identify.intrinsics import judge_intrinsics
-from legcal.calibration.identify.planning import (
-    THIN,
-    cameras_of,
-    orientations_of,
-    planned_session,
-    recorded_session,
-)
-from legcal.calibration.identify.ranks import Analysis, Ranks
-from legcal.calibration.identify.recommend import Recommendation, recommend
+from legcal.calibration.identify.information import expected_intrinsics
+from legcal.calibration.identify.ranks import Analysis
 from legcal.calibration.identify.remedies import (
     ENOUGH_IMAGES,
     Replanning,
     find_remedies,
     judge_board,
+    recommend,
 )
-from legcal.calibration.identify.report import Identifiability
-from legcal.calibration.identify.session import Session, legs_in_words
+from legcal.calibration.identify.report import Identifiability, Ranks, Recommendation
+from legcal.calibration.identify.session import (
+    THIN,
+    Session,
+    cameras_of,
+    legs_in_words,
+    orientations_of,
+    planned_session,
+    recorded_session,
+)
 from legcal.calibration.joint_fit import NO_CHOICES, Choices
 from legcal.data import Dataset
 from legcal.errors import NotIdentifiable, UsageError
@@ -159,10 +159,17 @@ def identifiability_of_dataset(
     """
     twists = any(name.endswith(".twist") for name in (*choices.free, *choices.priors))
     session = recorded_session(dataset, twists=twists)
-    analysis = Analysis(session, known=known_rows(session, choices))
+    analysis = Analysis(session, choices)
     report = _judge(dataset.machine, analysis, None, None)
     if dataset.axes is None:
-        found = judge_intrinsics(analysis, orientations_of(dataset, session), cameras_of(dataset))
+        found = expected_intrinsics(
+            session,
+            analysis.images,
+            analysis.equations,
+            analysis.prior,
+            orientations_of(dataset, session),
+            cameras_of(dataset),
+        )
         report = replace(report, intrinsics=found)
     if dataset.machine.is_determined:
         return report
