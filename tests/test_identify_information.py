@@ -35,6 +35,7 @@ from legcal.calibration.identify.session import (
     recorded_session,
 )
 from legcal.data import load_dataset
+from legcal.errors import DidNotConverge
 from legcal.estimation import (
     compress,
     eliminate,
@@ -45,7 +46,14 @@ from legcal.estimation import (
     marginal_rows,
 )
 from legcal.geometry import Array
-from legcal.machine import Demand, LegKind, forward_kinematics_many, parametrize
+from legcal.machine import (
+    Demand,
+    LegKind,
+    forward_kinematics_many,
+    geometries,
+    parametrize,
+    random_poses,
+)
 from legcal.machine import linearize as linearize_leg
 from legcal.vision import outlines_of_axis
 
@@ -129,10 +137,8 @@ def test_rows_equal_finite_differences_of_axes_cut_in_the_camera_and_of_legs(see
     images, legs = image_rows(session), leg_equations(session)
     exact = np.concatenate([legs.by_pose[0], legs.by_parameters[0]], axis=1)
     assert exact.shape[0] == len(legs.leg) == len(legs.demand)
-    # leg, end, lateral or depth
-    gradients = np.stack(
-        [at_base_joints(session).gradient, at_platform_joints(session).gradient], 2
-    )
+    ends = at_base_joints(session), at_platform_joints(session)
+    gradients = np.stack([end.gradient for end in ends], 2)  # leg, end, lateral or depth
     shown, demanded = [], []
     for column in np.eye(12 + n_p):
         sides = []
@@ -236,10 +242,8 @@ def edges(K: Array, X: Array, u: Array) -> Array:
     h = outlines_of_axis(u[None], X[None], np.array([1e-3]))[0]
     pixel, end = ((K @ Y)[:2] / Y[2] for Y in (X, X + 1e-3 * u))
     along = (end - pixel) / np.linalg.norm(end - pixel)
-    lines = h @ np.linalg.inv(K)  # of pixels
-    return np.asarray(
-        -(lines[:, :2] @ pixel + lines[:, 2]) / (lines[:, :2] @ [-along[1], along[0]])
-    )
+    lines, normal = h @ np.linalg.inv(K), np.array([-along[1], along[0]])  # of pixels
+    return np.asarray(-(lines[:, :2] @ pixel + lines[:, 2]) / (lines[:, :2] @ normal))
 
 
 @FAST
@@ -290,12 +294,9 @@ def test_intrinsics_are_known_less_by_fewer_images_and_where_radii_are_larger() 
     assert np.all((one > 0.1) & (one < 3.0))
     assert not np.any(three <= one)
     scaled = replace(example().session, radius=2.0 * example().session.radius)
-    wide = Analysis(scaled)
-    depth = np.abs(
-        image_rows(scaled)[:, :, 1::2]
-        / np.where(example().images, example().images, 1.0)[:, :, 1::2]
-    )
-    np.testing.assert_allclose(depth[depth > 0.0], 2.0)
+    wide, narrow = Analysis(scaled), example().images[:, :, 1::2]
+    depth = wide.images[:, :, 1::2][narrow != 0.0] / narrow[narrow != 0.0]
+    np.testing.assert_allclose(depth, 2.0)
     np.testing.assert_array_less(intrinsics_sigma(["c"] * 3, wide), one)
 
 
@@ -331,7 +332,7 @@ def test_planned_poses_close_every_leg_inside_its_travel(
             assert nominal.travel[0] - slack < q.min()
             assert q.max() < nominal.travel[1] + slack
     assert np.ptp(session.u, axis=0).max() > 0.02
-    if machine.is_determined:
+    if machine.is_determined and "strut" not in name:
         q = machine.sign * (session.length - machine.q0)
         q[:, [leg.kind is LegKind.CONSTANT for leg in machine.legs]] = 0.0
         for T, R, t in zip(
@@ -357,6 +358,22 @@ def test_planned_cameras_stand_outside_and_no_two_in_one_place() -> None:
     away = planar.camera - planar.A.mean(axis=0)  # from along the normal, tilted
     slant = away[:, 2] / np.linalg.norm(away, axis=1)
     assert np.all((slant > 0.7) & (slant < 0.99))
+
+
+def test_poses_out_of_reach_are_refused_and_rare_ones_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine, rng = legcal.load_mechanism("hexapod"), np.random.default_rng(1)
+    home = machine.T_base_Rb.inv() * machine.home * machine.T_platform_Re
+    away = np.tile([5.0, 5.0], (6, 1))
+    away[0] = [0.01, 0.01]
+    with pytest.raises(DidNotConverge, match="0 of 3 random poses"):
+        random_poses(geometries(machine), machine.frame_legs, home, away, 3, rng)
+    monkeypatch.setattr(
+        "legcal.machine.configurations._Drive.is_regular",
+        lambda _self, _R, t: rng.random(len(t)) < 0.75,  # in each of five steps
+    )
+    assert len(planned_session(machine, [range(6)], 60).t) == 60
 
 
 def test_more_motors_than_freedoms_are_followed(tmp_path_factory: pytest.TempPathFactory) -> None:
