@@ -1,0 +1,404 @@
+"""``legcal identify``: the report, a board, choices, datasets, words, tables and refusals."""
+
+import io
+import json
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hexapod_example import HEXAPOD
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mechanisms import SHIPPED_URDF, SHIPPED_YAML
+from rich.console import Console
+from thinned import thinned
+
+import legcal
+from legcal import cli
+from legcal.calibration import Identifiability, WeakDirection, legs_in_words, views_in_words
+from legcal.calibration.identify.identifiability import (
+    check_identifiable,
+    identifiability_of_dataset,
+)
+from legcal.calibration.identify.session import planned_session, recorded_session
+from legcal.calibration.identify.steps import locate_joints
+from legcal.calibration.joint_fit.choices import Choices, Prior
+from legcal.data import Dataset, load_dataset
+from legcal.data.corners import found_corners
+from legcal.data.holdout import dataset_at
+from legcal.errors import NotIdentifiable, UsageError
+from legcal.machine import (
+    Machine,
+    create_model,
+    describe_direction,
+    joined,
+    leg_labels,
+    parametrization_of,
+)
+from legcal.machine.family import Family, describe_family
+from legcal.report.identify import _hidden, _two_digits, identify_table
+from legcal.vision import Board
+
+MODELS = sorted(path.stem for path in SHIPPED_YAML.parent.glob("*.yaml"))
+LEGS = tuple(f"leg{j}" for j in range(1, 7))
+VIEWS = {
+    "paper": (LEGS[:4], LEGS[2:], (*LEGS[:2], *LEGS[4:])),
+    "weak joint": (LEGS[:5], LEGS[:5], LEGS[4:]),
+    "halves": (LEGS[:3], LEGS[3:], LEGS[:3]),
+}
+
+
+@cache
+def loaded(name: str) -> Machine:
+    return legcal.load_mechanism(name)
+
+
+@cache
+def report(views: str, **choices: Any) -> Identifiability:
+    return legcal.identifiability(loaded("hexapod"), VIEWS[views], **choices)
+
+
+@cache
+def example() -> Dataset:
+    return load_dataset(HEXAPOD, check_images=False)
+
+
+@cache
+def two_images() -> Dataset:
+    return dataset_at(example(), np.array([0, 15]))
+
+
+def said(found: Identifiability) -> str:
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(identify_table(found))
+    return " ".join(console.export_text().split())
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
+    """Run the command line in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["legcal", "identify", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert isinstance(stop.value.code, int)
+    return stop.value.code
+
+
+def options(views: Sequence[Sequence[str]]) -> Iterator[str]:
+    for view in views:
+        yield from ("--view", ",".join(view))
+
+
+# A calibration board
+
+
+@pytest.mark.parametrize(
+    ("views", "staged", "needed", "mends"),
+    [
+        ("weak joint", (26, 28), (), ("x and y of base joint 6", "z of base joint 6")),
+        ("halves", (18, 24), ("eq12",), None),
+        ("paper", (30, 30), (), ()),
+    ],
+)
+def test_a_board_does_what_the_report_says(
+    views: str, staged: tuple[int, int], needed: tuple[str, ...], mends: tuple[str, ...] | None
+) -> None:
+    without, given = report(views), report(views, board=True)
+    assert (without.board.without, without.board.with_board) == (
+        given.board.without, given.board.with_board,
+    )  # fmt: skip
+    board = without.board
+    assert (board.without.staged_rank, board.with_board.staged_rank) == staged
+    assert (board.without.full_rank, board.with_board.full_rank) == (30, 30)
+    assert (without.staged.rank, given.staged.rank) == staged
+    assert (board.present, given.board.present) == (False, True)
+    assert board.needed_for == needed
+    assert mends in (None, board.mends)
+    assert [c.needed for c in (without.conditions[0], given.conditions[0])] == [True, False]
+    assert not given.conditions[0].fails
+
+
+def test_only_a_board_lets_the_steps_use_a_camera_in_the_hand() -> None:
+    found = report("paper", board=True, hand_held=True)
+    assert (len(found.views), set(found.images)) == (45, {1})
+    assert found.staged.rank == found.full.rank == 30
+    assert found.conditions_hold
+    assert found.board.without.staged_rank == 0
+    assert {"two_directions", "staged"} <= set(found.board.needed_for)
+    assert "views 1 to 15: legs 1, 2, 3, 4 in 1 image each" in said(found)
+    # Step 1 with a board: joints in its frame, one for each leg, from all images together
+    views = [tuple(range(6))] * 8
+    located = locate_joints(planned_session(loaded("hexapod"), views, 1, board=True))
+    assert located.joint.shape == (1, 6)
+    assert np.all(located.joint)
+    assert not np.any(locate_joints(planned_session(loaded("hexapod"), views, 1)).joint)
+
+
+def test_smallest_views_with_a_board_suffice_with_it() -> None:
+    found = legcal.identifiability(loaded("tricept"), board=True)
+    assert found.recommendation
+    for choice in found.recommendation:
+        again = legcal.identifiability(loaded("tricept"), choice.views, board=True)
+        assert again.conditions_hold
+        assert again.staged.complete
+        assert again.identifiable
+
+
+def test_the_report_in_words_says_what_a_board_is_needed_for() -> None:
+    for choices, *texts in (
+        (("paper", False), "A calibration board is not needed"),
+        (("halves", False), "is needed for base joints and axes (12)",
+         "raises the ranks from 18 to 24 of 30 step by step, and from 30 to 30"),
+        (("halves", True), "fails, not needed with the board"),
+        (("weak joint", True), "a calibration board on the base in every view",
+         "and mends: x and y of base joint 6; z of base joint 6."),
+        (("weak joint", False), "add a fourth camera position",
+         "calibration starts from the nominal model"),
+    ):  # fmt: skip
+        shown = said(report(choices[0], board=choices[1]))
+        assert [text for text in texts if text not in shown] == []
+
+
+# The document and the command
+
+
+def test_the_document_is_that_of_the_report(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "hexapod", *options(VIEWS["halves"]), "--board", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    found = report("halves", board=True)
+    assert document == json.loads(json.dumps(found.document()))
+    sizes = {"spatial": True, "n": 6, "n_d": 3, "r": 0, "n_ac": 6}
+    assert {k: document[k] for k in sizes} == sizes
+    assert document["conditions"][0] == {
+        "name": "eq12", "equations": 9, "unknowns": 12, "ok": False, "needed": False,
+    }  # fmt: skip
+    assert "needed" not in document["conditions"][1]
+    assert document["paper"] == {"ok": found.conditions_hold}
+    assert document["board"]["with"] == {
+        "staged_rank": 24, "full_rank": 30, "identifiable": True,
+    }  # fmt: skip
+    assert document["board"]["present"] is True
+    assert document["views"] == [list(view) for view in VIEWS["halves"]]
+    assert document["recommendation"] is None
+    assert found == report("halves", images=15, board=True)
+
+
+@pytest.mark.parametrize("name", thinned(MODELS, ["hexapod", "3-upu"]))
+@pytest.mark.parametrize("views", [(), ((0, 1), (1, 2))])
+def test_tables_fit_80_columns_and_say_the_verdict(
+    name: str,
+    views: tuple[tuple[int, ...], ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    legs = loaded(name).leg_names
+    chosen = [[legs[j] for j in view] for view in views]
+    assert run(monkeypatch, name, *options(chosen), "--images", "6") == 0
+    out = capsys.readouterr().out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    assert "dentifiable: the joint fit" in out or "NOT identifiable" in out
+    assert ("smallest sets of views" in out) == (not views)
+
+
+@pytest.mark.parametrize(
+    ("words", "kind", "named"),
+    [
+        (("hexapod", "--view", "leg1,lge2"), "UsageError", ("View 1", "'lge2'", "'leg2'")),
+        (("hexapod", "--view", ""), "UsageError", ("--view",)),
+        (("hexapod", "--view", ","), "UsageError", ("no leg",)),
+        (("hexapod", "--view", "leg1,,leg2"), "UsageError", ("''", "a leg")),
+        (("hexapod", "--view", "leg1, leg1"), "UsageError", ("'leg1' 2 times",)),
+        (("hexapod", "--images", "0"), "UsageError", ("0 images",)),
+        (("hexapod", "--images", "2001"), "UsageError", ("2001", "2000")),
+        (("hexapod", *options([["leg1"]] * 51)), "UsageError", ("51", "50")),
+        (("hexapod", "--images", "many"), "UsageError", ("--images",)),
+        ((HEXAPOD, "--board"), "UsageError", ("--board",)),
+        ((HEXAPOD, "--hand-held"), "UsageError", ("--hand-held",)),
+        (("hexapod", "--hand-held", "--view", "leg1"), "UsageError", ("no board", "--board")),
+        (("hexapod", "--hand-held", "--board"), "UsageError", ("no views", "--view")),
+    ],
+)
+def test_refusals_are_one_sentence_in_one_document(
+    words: tuple[str | Path, ...],
+    kind: str,
+    named: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(monkeypatch, *words, "--json") == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["kind"] == kind
+    assert [word for word in named if word not in error["message"]] == []
+
+
+def test_all_problems_of_views_are_refused_at_once() -> None:
+    views: list[Any] = [["leg7"], [], ["leg1", "leg1"], ["leg1", 2], "leg1"]
+    with pytest.raises(UsageError) as refused:
+        legcal.identifiability(loaded("hexapod"), views, images=-1)
+    assert len(refused.value.problems) == 6
+    named = ("-1", "'leg7'", "View 2", "View 3", "View 4 could not be used: found 2", "'leg1'")
+    assert all(word in problem for word, problem in zip(named, refused.value.problems, strict=True))
+
+
+# Datasets
+
+
+def test_a_dataset_is_judged_by_itself() -> None:
+    found = identifiability_of_dataset(example())
+    assert found.identifiable
+    assert found.recommendation is None
+    assert (found.full.rank, sum(found.images)) == (30, example().measurements.n_rows)
+    (camera,) = found.intrinsics
+    assert (camera.camera, camera.determined) == ("c1", True)  # one for all views
+    assert found.document()["intrinsics"][0]["sigma"] == camera.sigma
+    assert "determine its intrinsics too (sigma to expect: fx 0." in said(found)
+    (camera,) = identifiability_of_dataset(two_images()).intrinsics
+    assert not camera.determined
+    assert None in camera.sigma.values()
+    assert "calibrate it with legcal camera" in said(identifiability_of_dataset(two_images()))
+
+
+def test_a_dataset_with_a_board_is_judged_with_it() -> None:
+    """Everywhere until somebody has looked for it, then in the views that show it."""
+    with_board = replace(example(), board=Board("chessboard", 9, 6, 0.03))
+    assert not recorded_session(example()).board.any()
+    assert recorded_session(with_board).board.all()
+    row = np.flatnonzero(example().measurements.view == 1)[:1]
+    one = found_corners(row, np.array([0]), np.array([[10.0, 20.0]]), np.array([0.05]))
+    shown = recorded_session(replace(with_board, corners=one)).board
+    np.testing.assert_array_equal(shown, [False, True, False])
+    found = identifiability_of_dataset(with_board)
+    assert found.board.present
+    assert not found.conditions[0].needed
+
+
+def test_the_legs_of_a_datasets_views_count(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    entry = yaml.safe_load((HEXAPOD / "dataset.yaml").read_text())
+    entry["mechanism"] = str((HEXAPOD / entry["mechanism"]).resolve())
+    for view in entry["views"].values():
+        view["legs"] = ["leg1", "leg2"]
+        (tmp_path / view["camera"]).write_bytes((HEXAPOD / view["camera"]).read_bytes())
+    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(entry))
+    table = entry["measurements"]
+    (tmp_path / table).write_bytes((HEXAPOD / table).read_bytes())
+    assert run(monkeypatch, tmp_path, "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["views"] == [["leg1", "leg2"]] * 3
+    assert not document["paper"]["ok"]
+
+
+def test_choices_determine_what_they_say_and_no_more() -> None:
+    names = parametrization_of(two_images().machine).names
+    with pytest.raises(NotIdentifiable, match="or state what is known of them with --prior"):
+        check_identifiable(two_images())
+    known, vague = (
+        Choices(priors={name: Prior(0.3, sigma) for name in names}) for sigma in (1e-4, 100.0)
+    )
+    assert all("The four steps alone" in note for note in check_identifiable(two_images(), known))
+
+    def rank(choices: Choices) -> int:
+        return identifiability_of_dataset(two_images(), choices).full.rank
+
+    alone = rank(Choices())
+    assert rank(Choices(fixed=frozenset(names))) == 30
+    assert rank(Choices(fixed=frozenset({"leg4.offset"}))) == alone + 1
+    assert rank(vague) == alone
+
+
+def test_what_is_odd_about_a_machine_is_noted(tmp_path: Path) -> None:
+    entry = yaml.safe_load(SHIPPED_YAML.read_text())
+    entry["name_mot"] = entry["name_mot"][:-1]
+    entry["legcal"]["urdf"] = "hexapod.urdf"
+    (tmp_path / "hexapod.urdf").write_bytes(SHIPPED_URDF.read_bytes())
+    (tmp_path / "hexapod.yaml").write_text(yaml.safe_dump(entry))
+    machine = legcal.load_mechanism(tmp_path / "hexapod.yaml")  # of five motors
+    found = legcal.identifiability(machine, [machine.leg_names] * 2)
+    assert (found.full.rank, found.full.of, found.n_ac) == (29, 29, 5)
+    assert found.platform_sigma is None
+    assert "5 motors do not determine the pose" in found.notes[0]
+    few = legcal.identifiability(machine, [["leg1", "leg2"]])
+    assert few.full.weak[0].dX_m is None
+    assert not few.identifiable
+    family = Family("6-SPS", "mm", 300.0, 150.0, 400.0, 60.0, 60.0)  # regular hexagons
+    machine = create_model(describe_family(family), tmp_path / "regular").machine
+    text = machine.urdf_path.read_text()
+    text = re.sub(r'(<link name="leg1_\w+">)<visual>.*</visual>', r"\1", text)
+    machine.urdf_path.write_text(text)
+    machine = legcal.load_mechanism(machine.yaml_path)
+    *_, hidden, singular = legcal.identifiability(machine, [machine.leg_names]).notes
+    assert hidden.startswith("The model has no <visual> cylinder along leg 1:")
+    assert singular.startswith("The mechanism is singular at home: the platform moves")
+
+
+@settings(deadline=None, max_examples=6)
+@given(data=st.data())
+def test_any_views_of_any_model_are_judged(data: st.DataObject) -> None:
+    machine = loaded(data.draw(st.sampled_from(MODELS)))
+    view = st.sets(st.sampled_from(machine.leg_names), min_size=1).map(sorted)
+    views = data.draw(st.lists(view, min_size=1, max_size=3))
+    images = data.draw(st.integers(1, 6))
+    found = legcal.identifiability(machine, views, images=images)
+    json.dumps(found.document(), allow_nan=False)
+    for ranks in (found.staged, found.full):
+        assert ranks.rank + len(ranks.weak) == ranks.of
+    assert found.identifiable == all(d.harmless for d in found.full.weak)
+    if images > 4 and found.staged.complete:  # a step takes those before it as known: with hardly
+        assert found.full.complete  # any data it determines what all together hardly do
+
+
+# Words
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ("leg4.platform.z leg2.platform.z", "z of platform joints 2 and 4 together"),
+        ("leg3.offset", "offset of leg 3"),
+        ("leg1.base.y leg1.base.x", "x and y of base joint 1"),
+        ("leg2.length leg1.base.x", "length of leg 2 and x of base joint 1 together"),
+        ("leg1.base_axis.2 leg1.platform_axis.2",
+         "angle 2 of base axis of leg 1 and angle 2 of platform axis of leg 1 together"),
+        ("leg1.base_axis.1 leg1.base_axis.2", "angles 1 and 2 of base axis of leg 1"),
+        ("leg2.twist leg3.twist", "twists of legs 2 and 3 together"),
+        ("leg2.radius.rod leg2.radius.tube", "radius of leg 2"),
+        ("leg3.radius.rod c1.fx", "radius of leg 3 and fx of camera c1 together"),
+        ("c1.fy c2.fx c1.fx", "fx and fy of camera c1 and fx of camera c2 together"),
+        ("leg1.left.k1", "k1 of camera leg1.left"),
+        ("leg1.offset leg1.base.x leg2.base.y leg3.base.z leg4.platform.x",
+         "offset of leg 1, x of base joint 1, y of base joint 2 and 2 more such changes together"),
+    ],
+)  # fmt: skip
+def test_directions_are_named_as_people_say_them(parameters: str, words: str) -> None:
+    assert describe_direction(tuple(parameters.split()), LEGS[:4]) == words
+
+
+def test_legs_views_and_numbers_in_words() -> None:
+    assert leg_labels(("leg1", "Leg_2")) == {"leg1": "1", "Leg_2": "2"}
+    assert leg_labels(("leg1", "centre")) == {"leg1": "1", "centre": "centre"}
+    assert leg_labels(("leg1", "1")) == {"leg1": "leg1", "1": "1"}
+    assert legs_in_words((0, 1), ("leg3", "centre")) == "legs 3 and centre"
+    assert legs_in_words((0, 2, 3), LEGS) == "legs 1, 3 and 4"
+    assert legs_in_words((1,), LEGS) == "leg 2"
+    assert joined([]) == ""
+    names = ("a", "a.b", "centre")  # dots, and each other
+    assert describe_direction(("a.b.base.x",), names) == "x of base joint a.b"
+    assert describe_direction(("a.base.x",), names) == "x of base joint a"
+    assert views_in_words(["1,2", "1,2"]) == "1,2 from two places"
+    assert views_in_words(["1,2", "2,3", "1,2", "1,2"]) == "1,2 from three places; 2,3"
+    for dX_m, dE_rad, shown in (
+        (0.0123, 0.01, ("12.30", "0.573")),
+        (14.9, 50.0, ("> 1000", "> 180")),
+    ):
+        assert _hidden(WeakDirection("x", ("a",), (1.0,), dX_m, dE_rad, False)) == shown
+    assert [_two_digits(x) for x in (0.0123, 12.3, 114.0)] == ["0.012", "12", "110"]
