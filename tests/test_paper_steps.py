@@ -12,10 +12,6 @@ from staged_hexapods import errors, exact_session, five_millimetres_away, noisy_
 from staged_machines import Observed, planned, shipped
 from thinned import thinned
 
-<<<<<<< HEAD
-from legcal.calibration.identify.session import planned_session
-=======
->>>>>>> 8232c77 (Tests of identify are three files: the report, predicted observations, counts and ranks)
 from legcal.calibration.identify.ranks import Analysis, determined
 from legcal.calibration.identify.session import planned_session
 from legcal.data import LegAxes, axes_from_outlines
