@@ -18,7 +18,7 @@ from legcal.simulation.rendering.scene import Canvas, develop, prepare_view
 from legcal.simulation.solids import Cylinder, Material, PlacedSolid, Solid
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
-from legcal.vision.in_view import Band, band_of_leg
+from legcal.vision.visibility import Band, band_of_leg
 
 PHOTOGRAPHS = 3  # of every scene
 FINE = 3  # times as many pixels are rendered in every row, so that the lens blurs before they count

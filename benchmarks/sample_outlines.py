@@ -23,7 +23,7 @@ from legcal.geometry.types import Array, Image
 from legcal.machine import Machine, forward_kinematics
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
-from legcal.perception.recognise import recognise
+from legcal.perception.recognition import recognise
 from legcal.vision.cylinder import EPSILON
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -34,13 +34,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array, Image
-from legcal.perception.agreement import Picture, Poses, targets_of
 from legcal.perception.camera_search import JOINT_ERROR, place_camera, refined, scores
 from legcal.perception.detection import measure_outlines
 from legcal.perception.light import to_grey
 from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
+from legcal.perception.pair_matching import Picture, Poses, leg_segments
 from legcal.perception.placement import Placement, Search, group_views
-from legcal.perception.recognise import recognise
+from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.simulation.visibility import field_of_view, silhouette
 
@@ -187,7 +187,7 @@ def ideal_pictures(scene: Scene) -> list[Picture]:
             length,
             pixel,
         )
-        targets = targets_of(given.A_base[row], given.B_base[row], given.cylinders, legs)
+        targets = leg_segments(given.A_base[row], given.B_base[row], given.cylinders, legs)
         pictures.append(Picture(bars, targets, np.array(field_of_view(camera))))
     return pictures
 

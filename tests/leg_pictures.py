@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.machine import Cylinder
-from legcal.perception.agreement import Picture, Targets, targets_of
-from legcal.perception.lines import Segments, find_edge_pairs
+from legcal.perception.lines import EdgeSegments, find_edge_pairs
+from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
 from legcal.vision.cylinder import outlines_of_axis
 
 PIXEL = 1.0 / 600.0  # of the pictures, on the sensor plane
@@ -70,12 +70,12 @@ def camera(rng: np.random.Generator) -> RigidTransform:
     return RigidTransform.from_components(where, upright * roll)
 
 
-def pieces(A: Array, B: Array, cylinders: Sequence[Cylinder] = CYLINDERS) -> Targets:
+def pieces(A: Array, B: Array, cylinders: Sequence[Cylinder] = CYLINDERS) -> LegSegments:
     """Return what can be seen of legs that are all alike."""
-    return targets_of(A, B, [tuple(cylinders)] * len(A), np.arange(len(A)))
+    return leg_segments(A, B, [tuple(cylinders)] * len(A), np.arange(len(A)))
 
 
-def edges(targets: Targets, T_base_camera: RigidTransform) -> Array:
+def edges(targets: LegSegments, T_base_camera: RigidTransform) -> Array:
     """Return the two outlines of each piece, brighter inside, (n, 2, 2, 2) on the sensor plane."""
     T = T_base_camera.inv()
     found = []
@@ -94,10 +94,10 @@ def edges(targets: Targets, T_base_camera: RigidTransform) -> Array:
     return np.array(found).reshape(-1, 2, 2, 2)
 
 
-def segments(lines: Array) -> Segments:
+def segments(lines: Array) -> EdgeSegments:
     """Return edges (..., 2, 2) as they are found."""
     lines = lines.reshape(-1, 2, 2)
-    return Segments(lines, np.ones(len(lines)), PIXEL)
+    return EdgeSegments(lines, np.ones(len(lines)), PIXEL)
 
 
 def clutter(n: int, rng: np.random.Generator) -> Array:

@@ -17,7 +17,7 @@ from legcal.geometry.types import Array
 from legcal.machine import Machine, load_mechanism, random_configurations
 from legcal.simulation.cameras import look_at
 from legcal.vision.camera import Camera
-from legcal.vision.in_view import visible_pieces
+from legcal.vision.visibility import visible_segments
 
 SIZE = (512, 384)
 NOISE = 3.0  # grey levels
@@ -122,6 +122,6 @@ def _picture(
         for j, leg in enumerate(machine.legs)
         for length in [float(np.linalg.norm(B[j] - A[j]))]
         for u in [(B[j] - A[j]) / length]
-        for piece in visible_pieces(leg.cylinders, length)
+        for piece in visible_segments(leg.cylinders, length)
     ]
     return render(_camera(), bars, 60.0, EVEN, blur=0.6, noise=0.0, supersample=3)

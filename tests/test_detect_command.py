@@ -19,7 +19,7 @@ from legcal.data.outlines import QUALITY, read_observations
 from legcal.data.rows import canonical_order
 from legcal.errors import UsageError
 from legcal.perception.overview import Detection, _caption, picture_names
-from legcal.perception.photographs import Observed, Photographs, observe
+from legcal.perception.photographs import Observations, Photographs, observe
 
 BLANK, ASIDE = "images/p1_1.png", "images/aside.png"
 
@@ -137,7 +137,7 @@ def test_captions_say_only_of_a_camera_with_a_hint_where_it_was_expected(
 def test_legs_are_drawn_by_the_radii_that_were_searched_by(
     one_image: RepeatedImages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def thicker(photographs: Photographs, *others: Any) -> Observed:
+    def thicker(photographs: Photographs, *others: Any) -> Observations:
         cylinders = [
             [replace(c, radius=c.radius * (2.0 + j)) for c in of_leg]
             for j, of_leg in enumerate(photographs.cylinders)
@@ -152,7 +152,7 @@ def test_legs_are_drawn_by_the_radii_that_were_searched_by(
     order = canonical_order(found.dataset.measurements, found.dataset.machine.leg_names).legs
     for at, j in enumerate(order.tolist()):
         nominal = {c.link: c.radius for c in found.dataset.machine.legs[j].cylinders}
-        for piece in legs[j].pieces:
+        for piece in legs[j].segments:
             assert piece.radius == pytest.approx((2.0 + at) * nominal[piece.link])
 
 

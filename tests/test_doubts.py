@@ -25,13 +25,13 @@ from legcal.perception.diagnostics import (
     _best,
     _usual,
     hint_notes,
-    judged,
+    image_verdict,
     reject_images,
 )
 from legcal.perception.image_quality import Exposure, expose, image_defects
 from legcal.perception.light import to_grey
 from legcal.perception.overview import Detection
-from legcal.perception.photographs import Observed, observe
+from legcal.perception.photographs import Observations, observe
 from legcal.progress import no_progress
 from legcal.workers import in_turn
 
@@ -175,7 +175,7 @@ def _work(made: Spoiled) -> Session:
     return start_session(dataset, in_turn, no_progress)
 
 
-def _observed(made: Spoiled) -> Observed:
+def _observed(made: Spoiled) -> Observations:
     work = _work(made)
     scene, _ = nominal_scene(work)
     return observe(work.photographs, scene, no_progress)
@@ -229,10 +229,10 @@ def test_an_image_alone_in_its_view_is_judged_by_those_of_other_views(tmp_path: 
     search = photographs.search(nominal_scene(work)[0])
     usual = _usual(search, observed.placement, found, [alone], in_turn)
     assert usual[1] > 0.3
-    reason, note = judged(work.measurements, alone, Explanation(0.0), usual, found)
+    reason, note = image_verdict(work.measurements, alone, Explanation(0.0), usual, found)
     assert reason == NOTHING_LIKE
     assert "was left out: found 1 of 12 outlines where its reading has the legs" in note
-    reason, note = judged(work.measurements, alone, Explanation(usual[1]), usual, found)
+    reason, note = image_verdict(work.measurements, alone, Explanation(usual[1]), usual, found)
     assert reason == ""
     assert "found 1 of 12 outlines where its reading has the legs, in other images most" in note
 

@@ -8,10 +8,10 @@ from rendering import Bar, Light, render
 from legcal.geometry.types import Array
 from legcal.perception.light import Grey, to_grey
 from legcal.perception.lines import (
-    LEAST_OVERLAP,
-    NARROWEST,
-    WIDEST,
-    Segments,
+    MAX_WIDTH,
+    MIN_OVERLAP,
+    MIN_WIDTH,
+    EdgeSegments,
     find_edge_pairs,
     find_segments,
 )
@@ -43,7 +43,7 @@ def _lines(bar: Bar) -> Array:
     return outlines_of_axis(u, bar.A, bar.radius)
 
 
-def _nearest(found: Segments, line: Array) -> int:
+def _nearest(found: EdgeSegments, line: Array) -> int:
     """Return the edge whose ends are nearest to a line of the sensor plane."""
     offset = found.ends @ line[:2] + line[2]
     return int(np.argmin(np.abs(offset).max(axis=1)))
@@ -167,10 +167,10 @@ def test_bars_turn_with_the_picture(turn: float) -> None:
 
 def test_edges_that_are_too_near_or_too_far_apart_or_too_short_are_no_bars() -> None:
     for width, length, n in (
-        (NARROWEST - 0.5, 60.0, 0),
-        (NARROWEST + 0.5, 60.0, 1),
-        (WIDEST + 5.0, 400.0, 0),
-        (WIDEST - 5.0, 400.0, 1),
+        (MIN_WIDTH - 0.5, 60.0, 0),
+        (MIN_WIDTH + 0.5, 60.0, 1),
+        (MAX_WIDTH + 5.0, 400.0, 0),
+        (MAX_WIDTH - 5.0, 400.0, 1),
         (40.0, 50.0, 0),  # more a square than a bar
     ):
         assert len(find_edge_pairs(lp.segments(_edges(width, length)))) == n
@@ -178,7 +178,7 @@ def test_edges_that_are_too_near_or_too_far_apart_or_too_short_are_no_bars() -> 
 
 def test_edges_beside_each_other_must_overlap_and_be_nearly_parallel() -> None:
     lines = _edges(12.0, 80.0)
-    for part, n in ((0.9 * (1.0 - LEAST_OVERLAP), 1), (1.1 * (1.0 - LEAST_OVERLAP), 0)):
+    for part, n in ((0.9 * (1.0 - MIN_OVERLAP), 1), (1.1 * (1.0 - MIN_OVERLAP), 0)):
         moved = lines.copy()
         moved[1, :, 0] += part * 80.0 * lp.PIXEL
         assert len(find_edge_pairs(lp.segments(moved))) == n

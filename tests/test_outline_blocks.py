@@ -115,7 +115,7 @@ def test_line_through_exact_blocks_is_exact() -> None:
     np.testing.assert_allclose(line.ends, [0.5, -0.3], atol=1e-9)
     assert line.first == pytest.approx(0.1)
     assert line.last == pytest.approx(0.9)
-    assert line.agreement == 1.0
+    assert line.inlier_share == 1.0
 
 
 def test_an_occlusion_does_not_move_the_line_and_is_left_out() -> None:
@@ -126,7 +126,7 @@ def test_an_occlusion_does_not_move_the_line_and_is_left_out() -> None:
     line = fitted(fit_straight(position, shift, np.full(50, 4e-4)))
     np.testing.assert_allclose(line.ends, 0.2, atol=0.03)
     assert not np.any(line.kept[20:35])
-    assert line.agreement == pytest.approx(0.7, abs=0.03)
+    assert line.inlier_share == pytest.approx(0.7, abs=0.03)
 
 
 def test_ends_that_bend_away_are_not_part_of_the_piece() -> None:

@@ -15,7 +15,7 @@ from legcal.geometry.types import Array, Image
 from legcal.machine import Cylinder
 from legcal.perception.detection import measure_outlines
 from legcal.perception.placement import Placement, Search
-from legcal.perception.recognise import recognise
+from legcal.perception.recognition import recognise
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 

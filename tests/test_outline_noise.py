@@ -5,7 +5,7 @@ import pytest
 from scipy.special import ndtr
 
 from legcal.geometry.types import Array, BoolArray
-from legcal.perception.light import LARGEST_RATIO, Samples, evened_weights
+from legcal.perception.light import MAX_NOISE_RATIO, Samples, evened_weights
 
 N_BLOCKS, ROWS, REACH, BLUR = 40, 8, 6, 0.6
 BOUNDS = np.array([0, N_BLOCKS // 2, N_BLOCKS])
@@ -66,7 +66,7 @@ def test_smooth_shading_is_no_noise() -> None:
 def test_a_side_without_any_noise_does_not_outweigh_the_other() -> None:
     d, light = blocks(np.array([[0.0, 200.0], [0.0, 200.0]]), np.random.default_rng(6))
     weight = evened(d, light, np.ones_like(d))
-    assert np.max(weight) / np.min(weight) <= LARGEST_RATIO * 1.001
+    assert np.max(weight) / np.min(weight) <= MAX_NOISE_RATIO * 1.001
 
 
 def test_an_edge_with_too_few_blocks_keeps_its_weights() -> None:

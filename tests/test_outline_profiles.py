@@ -6,7 +6,7 @@ import pytest
 from legcal.perception.light import Samples
 from legcal.perception.profiles import Edge, Profiles, read_profiles
 from legcal.vision.camera import Camera
-from legcal.vision.in_view import Band
+from legcal.vision.visibility import Band
 
 CAMERA = Camera(
     np.array([[500.0, 0.0, 200.0], [0.0, 500.0, 150.0], [0.0, 0.0, 1.0]]),

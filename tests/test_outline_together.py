@@ -7,9 +7,8 @@ import pytest
 from scipy.integrate import quad
 
 from legcal.geometry.types import Array
-from legcal.perception import joint_lines as pool
+from legcal.perception import line_fit as pool
 from legcal.perception.blocks import Blocks
-from legcal.perception.joint_lines import fit_together
 from legcal.perception.light import Samples, to_light
 from legcal.perception.limb import (
     HALF,
@@ -23,6 +22,7 @@ from legcal.perception.limb import (
     powers,
     profile_functions,
 )
+from legcal.perception.line_fit import fit_lines
 
 HALF_WIDTH, DEPTH = 15.0, 3.5
 BRIGHT = np.array([20.0, 0.0, 120.0, 90.0, -60.0, 0.0, 0.0])
@@ -106,7 +106,7 @@ def test_slopes_and_widenings_are_derivatives_of_profiles(blur: float) -> None:
 @pytest.mark.parametrize("change", [0.0, 0.6])
 def test_exact_profiles_give_line_and_blur(amplitude: Array, blur: float, change: float) -> None:
     blocks = outline(amplitude, (0.12, -0.06), blur, noise=0.3, change=change)
-    found = fit_together(blocks, np.ones(40, dtype=np.bool_), 1.15 * blur, DEPTH)
+    found = fit_lines(blocks, np.ones(40, dtype=np.bool_), 1.15 * blur, DEPTH)
     spread = np.sqrt(np.diag(found.covariance[0]))
     assert np.all(np.abs(found.ends[0] - [0.12, -0.06]) < 0.01 + 2.5 * spread)
     assert np.all(spread < 0.1)
@@ -117,7 +117,7 @@ def test_covariance_covers_the_errors_and_knows_low_contrast() -> None:
     pulls, sigma = [], []
     for contrast in (1.0, 0.1):
         found = [
-            fit_together(
+            fit_lines(
                 outline(contrast * BRIGHT, (0.05, 0.0), 0.5, noise=3.0, seed=seed),
                 np.ones(40, dtype=np.bool_),
                 0.5,
@@ -138,13 +138,13 @@ def test_blocks_of_something_else_do_not_move_the_line() -> None:
     other = outline(BRIGHT, (0.1, 0.1), 0.5, noise=0.5)
     other.grey[10:16] = 120.0 - 30.0 * other.d[10:16]
     everything = np.ones(40, dtype=np.bool_)
-    one, two = (fit_together(blocks, everything, 0.5, DEPTH).ends for blocks in (clean, other))
+    one, two = (fit_lines(blocks, everything, 0.5, DEPTH).ends for blocks in (clean, other))
     np.testing.assert_allclose(one, two, atol=0.02)
 
 
 def test_outlines_without_blocks_stay_where_they_are() -> None:
     blocks = outline(BRIGHT, (0.1, 0.1), 0.5)
-    found = fit_together(blocks, np.zeros(40, dtype=np.bool_), 0.5, DEPTH)
+    found = fit_lines(blocks, np.zeros(40, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_array_equal(found.ends, np.zeros((1, 2)))
     assert np.all(np.diag(found.covariance[0]) >= 1.0)
     assert found.blur == 0.5
@@ -155,9 +155,9 @@ def test_sums_over_pixels_tell_of_places_and_blurs_nearby(
     amplitude: Array, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     blocks, every = outline(amplitude, (0.1, -0.05), 0.5, noise=0.2), np.ones(40, dtype=np.bool_)
-    found = fit_together(blocks, every, 0.54, DEPTH)
-    monkeypatch.setattr(pool, "NEARBY", (0.0, 0.0))  # sums anew in every round
-    anew = fit_together(blocks, every, 0.54, DEPTH)
+    found = fit_lines(blocks, every, 0.54, DEPTH)
+    monkeypatch.setattr(pool, "MAX_MOVE_OF_PRODUCTS", (0.0, 0.0))  # sums anew in every round
+    anew = fit_lines(blocks, every, 0.54, DEPTH)
     np.testing.assert_allclose(found.ends, anew.ends, atol=8e-3)
     np.testing.assert_allclose(found.covariance, anew.covariance, rtol=0.2)
     assert found.blur == pytest.approx(anew.blur, rel=5e-3)
@@ -177,7 +177,7 @@ def test_outlines_that_have_settled_do_not_depend_on_others() -> None:
             )
         },
     )  # fmt: skip
-    found = fit_together(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
+    found = fit_lines(both, np.ones(80, dtype=np.bool_), 0.5, DEPTH)
     np.testing.assert_allclose(found.ends, [[0.2, -0.2], [0.0, 0.0]], atol=0.02)
 
 
@@ -195,7 +195,7 @@ def test_outlines_know_how_far_they_move_with_gamma(
 ) -> None:
     blocks, every = outline(amplitude, (0.1, 0.1), 0.6, noise=0.2), np.ones(40, dtype=np.bool_)
     less, here, more = (
-        fit_together(read_with(blocks, gamma * np.exp(step)), every, 0.6, DEPTH)
+        fit_lines(read_with(blocks, gamma * np.exp(step)), every, 0.6, DEPTH)
         for step in (-0.1, 0.0, 0.1)
     )
     moved = float(more.ends.mean() - less.ends.mean()) / 0.2
@@ -206,7 +206,7 @@ def test_outlines_know_how_far_they_move_with_gamma(
 def test_bright_and_dark_legs_move_to_opposite_sides_with_gamma() -> None:
     every = np.ones(40, dtype=np.bool_)
     bright, dark = (
-        fit_together(outline(amplitude, (0.0, 0.0), 0.6, noise=0.2), every, 0.6, DEPTH).by_gamma[0]
+        fit_lines(outline(amplitude, (0.0, 0.0), 0.6, noise=0.2), every, 0.6, DEPTH).by_gamma[0]
         for amplitude in (BRIGHT, DARK)
     )
     assert bright > 0.05
@@ -216,7 +216,7 @@ def test_bright_and_dark_legs_move_to_opposite_sides_with_gamma() -> None:
 def test_outlines_of_which_nothing_is_seen_know_no_gamma() -> None:
     blocks = outline(BRIGHT, (0.0, 0.0), 0.6)
     nothing = np.zeros(40, dtype=np.bool_)
-    assert np.isnan(fit_together(blocks, nothing, 0.6, DEPTH).by_gamma).all()
+    assert np.isnan(fit_lines(blocks, nothing, 0.6, DEPTH).by_gamma).all()
 
 
 def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
@@ -227,5 +227,5 @@ def test_lines_near_a_limb_that_rises_from_the_background_stay_there() -> None:
     assert np.abs(blocks.lines[0].ends).max() > 0.1
     blocks.unmove()
     np.testing.assert_array_equal(blocks.lines[0].ends, [0.0, 0.0])
-    found = fit_together(blocks, blocks.kept(), 0.55, DEPTH)
+    found = fit_lines(blocks, blocks.kept(), 0.55, DEPTH)
     assert np.all(np.abs(found.ends[0]) < 3.0 * np.sqrt(np.diag(found.covariance[0])))

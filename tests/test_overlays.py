@@ -21,7 +21,7 @@ from legcal.perception.overlays import (
 from legcal.perception.overview import HIDDEN_LEG, reason_class
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON
-from legcal.vision.in_view import PredictedLeg, predict_legs
+from legcal.vision.visibility import PredictedLeg, predict_legs
 
 A, B, RADIUS = np.array([-0.30, 0.22, 0.8]), np.array([0.25, 0.21, 0.9]), 0.012
 NAMES = ("leg1",)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.perception.agreement import Picture, Poses
 from legcal.perception.camera_search import (
     Candidates,
     _reversed,
@@ -17,6 +16,7 @@ from legcal.perception.camera_search import (
     place_camera,
     place_near,
 )
+from legcal.perception.pair_matching import Picture, Poses
 
 HARD = {"missing": 0.2, "n_clutter": 8, "noise": 0.4}
 

@@ -9,16 +9,16 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry.types import Array
 from legcal.machine import Cylinder
-from legcal.perception.agreement import (
-    Agreement,
+from legcal.perception.pair_matching import (
+    PairMatches,
     Picture,
     Poses,
     _equations,
     _moved,
-    agreement,
     distances,
-    improved,
-    targets_of,
+    gauss_newton_step,
+    leg_segments,
+    match_pairs,
 )
 
 TIGHT = 2e-3
@@ -41,22 +41,22 @@ def _scene(seed: int, **difficulty: float) -> tuple[list[Picture], RigidTransfor
 def test_the_true_pose_agrees_with_what_is_seen_and_others_do_not(seed: int) -> None:
     pictures, T = _scene(seed)
     true = _pose(T, 6)
-    found = [agreement(picture, true, TIGHT) for picture in pictures]
-    value = np.concatenate([f.value[0][f.visible[0] > 0.9] for f in found])
+    found = [match_pairs(picture, true, TIGHT) for picture in pictures]
+    value = np.concatenate([f.score[0][f.visible[0] > 0.9] for f in found])
     assert np.median(value) > 0.9
     assert np.mean(value > 0.5) > 0.8  # bars of legs that cross in the picture may be pairs of both
     away = replace(true, t=true.t + np.array([0.05, 0.0, 0.0]))
-    assert all(agreement(p, away, TIGHT).value.mean() < 0.2 for p in pictures)
+    assert all(match_pairs(p, away, TIGHT).score.mean() < 0.2 for p in pictures)
 
 
 def test_poses_are_judged_one_by_one_however_many_there_are() -> None:
     (picture, *_), T = _scene(0)
     poses = _pose(T, 6, 300)
     poses = replace(poses, t=poses.t + np.linspace(0.0, 0.1, 300)[:, None] * [1.0, 0.0, 0.0])
-    together = agreement(picture, poses, 0.01)
+    together = match_pairs(picture, poses, 0.01)
     for i in (0, 127, 128, 299):
-        alone = agreement(picture, poses.take(np.array([i])), 0.01)
-        np.testing.assert_allclose(alone.value[0], together.value[i], atol=1e-6)
+        alone = match_pairs(picture, poses.take(np.array([i])), 0.01)
+        np.testing.assert_allclose(alone.score[0], together.score[i], atol=1e-6)
         np.testing.assert_array_equal(alone.visible[0], together.visible[i])
 
 
@@ -65,41 +65,41 @@ def test_it_does_not_matter_in_which_frame_the_machine_is_described() -> None:
     G = RigidTransform.from_components([0.3, -0.2, 0.5], Rotation.from_rotvec([0.4, 1.0, -0.3]))
     ends = G.apply(picture.targets.ends.reshape(-1, 3)).reshape(-1, 2, 3)
     moved = replace(picture, targets=replace(picture.targets, ends=ends))
-    one, two = agreement(picture, _pose(T, 6), 0.01), agreement(moved, _pose(G * T, 6), 0.01)
-    np.testing.assert_allclose(one.value, two.value, atol=1e-4)
+    one, two = match_pairs(picture, _pose(T, 6), 0.01), match_pairs(moved, _pose(G * T, 6), 0.01)
+    np.testing.assert_allclose(one.score, two.score, atol=1e-4)
 
 
 def test_pictures_of_cameras_that_are_fixed_to_each_other_are_judged_in_one_frame() -> None:
     (picture, *_), T = _scene(2)
     C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, -0.5, 0.3]))
     joined = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
-    one, two = agreement(picture, _pose(T, 6), 0.01), agreement(joined, _pose(T * C, 6), 0.01)
-    np.testing.assert_allclose(one.value, two.value, atol=1e-4)
+    one, two = match_pairs(picture, _pose(T, 6), 0.01), match_pairs(joined, _pose(T * C, 6), 0.01)
+    np.testing.assert_allclose(one.score, two.score, atol=1e-4)
 
 
 def test_a_picture_without_bars_or_legs_agrees_with_nothing() -> None:
     (picture, *_), T = _scene(0)
     empty = replace(picture, pairs=picture.pairs.take(np.zeros(0, dtype=np.intp)))
-    found = agreement(empty, _pose(T, 6), 0.01)
-    assert not found.value.any()
+    found = match_pairs(empty, _pose(T, 6), 0.01)
+    assert not found.score.any()
     assert found.visible.any()
-    still = improved([empty], _pose(T, 6), [found], 0.01, 0.006)
+    still = gauss_newton_step([empty], _pose(T, 6), [found], 0.01, 0.006)
     np.testing.assert_allclose(still.t, _pose(T, 6).t)
 
 
 def test_legs_behind_the_camera_or_beside_the_picture_are_not_expected() -> None:
     (picture, *_), T = _scene(0)
     behind = T * RigidTransform.from_rotation(Rotation.from_euler("y", np.pi))
-    assert not agreement(picture, _pose(behind, 6), 0.01).visible.any()
+    assert not match_pairs(picture, _pose(behind, 6), 0.01).visible.any()
     aside = T * RigidTransform.from_rotation(Rotation.from_euler("y", 1.2))
-    assert not agreement(picture, _pose(aside, 6), 0.01).visible.any()
+    assert not match_pairs(picture, _pose(aside, 6), 0.01).visible.any()
 
 
 def _shifted(poses: Poses, rng: np.random.Generator) -> Poses:
     return replace(poses, shift=rng.uniform(-5e-3, 5e-3, poses.shift.shape))
 
 
-def _residual(picture: Picture, poses: Poses, found: Agreement) -> Array:
+def _residual(picture: Picture, poses: Poses, found: PairMatches) -> Array:
     return np.asarray(_equations(picture, poses, found, 0.01)[2][0])
 
 
@@ -111,8 +111,8 @@ def test_derivatives_are_those_by_differences(joined: bool) -> None:
         C = RigidTransform.from_components([0.1, 0.2, -0.1], Rotation.from_rotvec([0.2, 0.5, 0.3]))
         picture = replace(picture, R=C.rotation.as_matrix(), t=C.translation)
     poses = _shifted(_pose(T * C, 6), np.random.default_rng(0))
-    found = agreement(picture, poses, 0.02)
-    matched = found.value[0] > 0.3
+    found = match_pairs(picture, poses, 0.02)
+    matched = found.score[0] > 0.3
     assert matched.sum() > 5
     J, J_leg, _, weight = _equations(picture, poses, found, 0.01)
     assert np.all(weight[0, matched] > 0.0)
@@ -152,8 +152,8 @@ def test_steps_lead_back_to_the_true_pose(seed: int) -> None:
     poses = _pose(T * off, 6)
     before = lp.apart(T, T * off)
     for tolerance in (0.03, 0.02, 0.01, 0.006, 0.004):
-        found = [agreement(picture, poses, tolerance) for picture in pictures]
-        poses = improved(pictures, poses, found, tolerance)
+        found = [match_pairs(picture, poses, tolerance) for picture in pictures]
+        poses = gauss_newton_step(pictures, poses, found, tolerance)
     R = Rotation.from_matrix(poses.R[0])
     after = lp.apart(T, RigidTransform.from_components(poses.t[0], R).inv())
     assert after[0] < 0.025
@@ -170,8 +170,8 @@ def test_joints_that_are_elsewhere_are_found_in_the_picture() -> None:
     picture = lp.picture((made.A, made.posed(where)), (A, made.posed(where)), T, rng)
     poses = _pose(T, 6)
     for tolerance in (0.02, 0.01, 0.005, 0.003):
-        found = agreement(picture, poses, tolerance)
-        poses = improved([picture], poses, [found], tolerance, 0.02)
+        found = match_pairs(picture, poses, tolerance)
+        poses = gauss_newton_step([picture], poses, [found], tolerance, 0.02)
     u = made.posed(where)[2] - A[2]
     sideways = np.cross(u / np.linalg.norm(u), T.rotation.apply([0.0, 0.0, 1.0]))
     sideways /= np.linalg.norm(sideways)
@@ -183,8 +183,8 @@ def test_joints_that_are_elsewhere_are_found_in_the_picture() -> None:
 def test_distances_are_those_of_legs_beside_their_bars() -> None:
     (picture, *_), T = _scene(0)
     away = T * RigidTransform.from_translation([5e-3, 0.0, 0.0])
-    found = agreement(picture, _pose(T, 6), TIGHT)
-    sure = found.value[0] > 0.9
+    found = match_pairs(picture, _pose(T, 6), TIGHT)
+    sure = found.score[0] > 0.9
     assert np.median(distances(picture, _pose(T, 6), found)[0, sure]) < 2e-4
     off = distances(picture, _pose(away, 6), found)[0, sure]
     assert np.all(off < 6e-3)
@@ -213,6 +213,6 @@ def test_legs_that_are_not_wanted_or_show_nothing_have_no_pieces() -> None:
     made = lp.machine(3)
     B = made.posed(lp.platform())
     cylinders: list[tuple[Cylinder, ...]] = [lp.CYLINDERS, (), lp.CYLINDERS]
-    assert set(targets_of(made.A, B, cylinders, np.arange(3)).leg) == {0, 2}
-    assert set(targets_of(made.A, B, cylinders, np.array([2])).leg) == {2}
-    assert len(targets_of(made.A, B, cylinders, np.array([1]))) == 0
+    assert set(leg_segments(made.A, B, cylinders, np.arange(3)).leg) == {0, 2}
+    assert set(leg_segments(made.A, B, cylinders, np.array([2])).leg) == {2}
+    assert len(leg_segments(made.A, B, cylinders, np.array([1]))) == 0

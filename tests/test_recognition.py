@@ -12,13 +12,20 @@ from legcal import load_mechanism
 from legcal.data.measurements import Measurements, View
 from legcal.geometry.types import Array, Image
 from legcal.machine import Machine, forward_kinematics
-from legcal.perception import recognise as recognising
-from legcal.perception.agreement import Picture, Poses, Targets, agreement, improved, targets_of
+from legcal.perception import recognition as recognising
 from legcal.perception.camera_search import Candidates, place_camera, place_near
-from legcal.perception.lines import EdgePairs, Segments, find_edge_pairs, find_segments
+from legcal.perception.lines import EdgePairs, EdgeSegments, find_edge_pairs, find_segments
+from legcal.perception.pair_matching import (
+    LegSegments,
+    Picture,
+    Poses,
+    gauss_newton_step,
+    leg_segments,
+    match_pairs,
+)
 from legcal.perception.placement import Placement, Search
-from legcal.perception.pose_starts import pose_starts
-from legcal.perception.recognise import recognise
+from legcal.perception.pose_hypotheses import pose_hypotheses
+from legcal.perception.recognition import recognise
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
@@ -42,7 +49,7 @@ def looking_at(place: Array, target: Array, roll: float) -> RigidTransform:
 
 
 def bars_of(
-    targets: Targets, T_base_camera: RigidTransform, rng: Generator, clutter: int
+    targets: LegSegments, T_base_camera: RigidTransform, rng: Generator, clutter: int
 ) -> EdgePairs:
     """Return the bars that an ideal picture shows, with half a pixel of noise, and others."""
     X = T_base_camera.inv().apply(targets.ends.reshape(-1, 3)).reshape(-1, 2, 3)
@@ -90,8 +97,8 @@ def pictures_of(
     for q in readings:
         B = forward_kinematics(machine, q).apply(machine.B_platform)
         seen = np.sort(rng.permutation(n_legs)[: n_legs - hidden])
-        shown = targets_of(machine.A_base, B, cylinders, seen)
-        every = targets_of(machine.A_base, B, cylinders, np.arange(n_legs))
+        shown = leg_segments(machine.A_base, B, cylinders, seen)
+        every = leg_segments(machine.A_base, B, cylinders, np.arange(n_legs))
         found.append(Picture(bars_of(shown, T_base_camera, rng, clutter), every, CORNERS))
     return found
 
@@ -138,7 +145,9 @@ def test_a_model_a_centimetre_off_is_recognised_all_the_same(hexapod: Machine) -
     leg = pictures[0].targets.leg
     error = rng.uniform(-0.01, 0.01, (6, 2, 3))
     moved = [
-        Picture(p.pairs, Targets(leg, p.targets.ends + error[leg], *_rest(p.targets)), p.corners)
+        Picture(
+            p.pairs, LegSegments(leg, p.targets.ends + error[leg], *_rest(p.targets)), p.corners
+        )
         for p in pictures
     ]
     placed = place_camera(moved, 6)
@@ -148,7 +157,7 @@ def test_a_model_a_centimetre_off_is_recognised_all_the_same(hexapod: Machine) -
     assert angle < 4.0
 
 
-def _rest(targets: Targets) -> tuple[Array, Array, Array]:
+def _rest(targets: LegSegments) -> tuple[Array, Array, Array]:
     return targets.place, targets.radius, targets.share
 
 
@@ -183,7 +192,7 @@ def test_starts_lay_legs_on_bars(hexapod: Machine) -> None:
     rng = np.random.default_rng(4)
     T = looking_at(np.array([0.8, 0.6, 0.3]), CENTRE, 1.0)
     picture = pictures_of(hexapod, T, readings_of(hexapod, 1, rng), rng, clutter=0)[0]
-    starts = pose_starts(picture, 6)
+    starts = pose_hypotheses(picture, 6)
     assert np.allclose(starts.R @ starts.R.swapaxes(1, 2), np.eye(3), atol=1e-9)
     assert np.all(np.linalg.det(starts.R) > 0.0)
     cosine = 0.5 * (np.einsum("nij,ij->n", starts.R, T.inv().rotation.as_matrix()) - 1.0)
@@ -199,9 +208,9 @@ def test_steps_end_at_the_true_pose_and_shifts_are_found(hexapod: Machine) -> No
     poses = Poses.rigid(inverse.rotation.as_matrix()[None], inverse.translation[None], 6)
     values = []
     for _ in range(8):
-        found = [agreement(picture, poses, 0.05) for picture in pictures]
-        values.append(sum(float(one.value.sum()) for one in found))
-        poses = improved(pictures, poses, found, 0.05)
+        found = [match_pairs(picture, poses, 0.05) for picture in pictures]
+        values.append(sum(float(one.score.sum()) for one in found))
+        poses = gauss_newton_step(pictures, poses, found, 0.05)
     off = (
         T.inv() * RigidTransform.from_components(poses.t[0], Rotation.from_matrix(poses.R[0])).inv()
     )
@@ -232,7 +241,7 @@ def test_an_empty_picture_has_neither_edges_nor_bars() -> None:
     camera = Camera(np.array([[500.0, 0.0, 160.0], [0.0, 500.0, 120.0], [0.0, 0.0, 1.0]]), 320, 240)
     segments = find_segments(np.zeros((240, 320), dtype=np.float32), camera)
     assert len(segments) == 0
-    assert len(find_edge_pairs(Segments(segments.ends, segments.covered, segments.pixel))) == 0
+    assert len(find_edge_pairs(EdgeSegments(segments.ends, segments.covered, segments.pixel))) == 0
 
 
 class _Known(Search):

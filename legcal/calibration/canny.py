@@ -16,8 +16,8 @@ import numpy as np
 from legcal.data import Outlines, join_outlines
 from legcal.geometry import Array
 from legcal.perception import (
-    LEAST_LENGTH,
-    LONE_KEPT,
+    MIN_LENGTH,
+    MIN_LONE_KEPT,
     Grey,
     ImageSearch,
     Part,
@@ -92,7 +92,7 @@ def _measured(search: ImageSearch, part: Part, xy: Array) -> Outlines:
         for start, found in zip(part.edges.v, part.edges.found, strict=True)
     ]
     found = [None if line is None else (line.v, line.place, line.covariance) for line in lines]
-    leg, link, reasons = part.leg.leg, part.piece.link, _reasons(part, lines)
+    leg, link, reasons = part.leg.leg, part.segment.link, _reasons(part, lines)
     return part_outlines(search, leg, link, reasons, found, found=part)
 
 
@@ -102,7 +102,7 @@ def _line(t: Array, v: Array, start: Array, length: float, free: float) -> _Line
     chosen = np.zeros(len(t), dtype=np.bool_)
     for _ in range(N_ROUNDS):
         near = np.abs(v - ends[0] - (ends[1] - ends[0]) * t / length) < REACH
-        if np.count_nonzero(near) < 3 or np.ptp(t[near]) < LEAST_LENGTH[0]:
+        if np.count_nonzero(near) < 3 or np.ptp(t[near]) < MIN_LENGTH[0]:
             return None
         ends = _least_squares(t[near], v[near], length)
         if np.array_equal(near, chosen):
@@ -129,13 +129,13 @@ def _least_squares(t: Array, v: Array, length: float) -> Array:
 
 def _reasons(part: Part, lines: Sequence[_Line | None]) -> tuple[str, str]:
     """Return why each outline is not to be used, "" if it is."""
-    least = max(LEAST_LENGTH[0], LEAST_LENGTH[1] * 2.0 * part.half_width)
+    least = max(MIN_LENGTH[0], MIN_LENGTH[1] * 2.0 * part.half_width)
     reasons = []
     for line in lines:
         reason = "" if line is not None else "too few edge points"
         if line is not None and float(np.ptp(line.place)) * part.band.length < least:
             reason = "edge points too close together"
-        elif line is not None and line.kept < LONE_KEPT:
+        elif line is not None and line.kept < MIN_LONE_KEPT:
             reason = f"edge points on {100 * line.kept:.0f} % of the outline"
         reasons.append(reason)
     return reasons[0], reasons[1]

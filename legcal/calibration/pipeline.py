@@ -66,7 +66,7 @@ from legcal.geometry import IntArray
 from legcal.machine import Machine
 from legcal.paper import Criteria, Transformation
 from legcal.perception import (
-    Observed,
+    Observations,
     Placement,
     detection_settings,
     given_outlines,
@@ -303,7 +303,11 @@ def _fit(
 
 
 def _measure_again(
-    session: Session, estimate: Estimate, seen: Observed, board: BoardViews | None, options: Options
+    session: Session,
+    estimate: Estimate,
+    seen: Observations,
+    board: BoardViews | None,
+    options: Options,
 ) -> Estimate:
     """Search the photographs again close to the fit, and fit again."""
     cameras, view = seen.placement.T_base_camera, session.measurements.view
@@ -346,7 +350,7 @@ def _with_fitted_radii(machine: Machine, solution: Solution) -> Machine:
     return machine.with_cylinders(cylinders)
 
 
-def _fitted_placement(session: Session, solution: Solution, seen: Observed) -> Placement:
+def _fitted_placement(session: Session, solution: Solution, seen: Observations) -> Placement:
     """Return where a fit puts the legs, R_b laid on the nominal one; no camera is placed anew."""
     T_base_Rb = session.machine.T_base_Rb
     A = T_base_Rb.apply(np.array([leg.A for leg in solution.legs]))
@@ -389,7 +393,7 @@ def _notes_on_images(estimate: Estimate) -> tuple[str, ...]:
     return (*hints, *_outlier_images(estimate).values())
 
 
-def _refuse_too_few(session: Session, rows: IntArray, seen: Observed, choices: Choices) -> None:
+def _refuse_too_few(session: Session, rows: IntArray, seen: Observations, choices: Choices) -> None:
     """Raise NotIdentifiable if the images that are left do not determine the parameters."""
     cameras, notes = seen.placement.T_base_camera, seen.placement.all_notes
     left = [

@@ -11,8 +11,8 @@ from .diagnostics import hint_notes as hint_notes
 from .edge_pairs import Part as Part
 from .light import Grey as Grey
 from .outline import HIDDEN as HIDDEN
-from .outline import LEAST_LENGTH as LEAST_LENGTH
-from .outline import LONE_KEPT as LONE_KEPT
+from .outline import MIN_LENGTH as MIN_LENGTH
+from .outline import MIN_LONE_KEPT as MIN_LONE_KEPT
 from .outline import OUTSIDE as OUTSIDE
 from .outline import ImageSearch as ImageSearch
 from .outline import Method as Method
@@ -26,7 +26,7 @@ from .overview import check_detection_destination as check_detection_destination
 from .overview import detection_document as detection_document
 from .overview import picture_names as picture_names
 from .overview import write_detection as write_detection
-from .photographs import Observed as Observed
+from .photographs import Observations as Observations
 from .photographs import Photographs as Photographs
 from .photographs import detection_settings as detection_settings
 from .photographs import given_outlines as given_outlines

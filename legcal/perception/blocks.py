@@ -18,13 +18,13 @@ from legcal.perception.profiles import Edge, read_profiles
 from legcal.vision import Camera
 
 DEPTH = (2.0, 2.5)  # used distance from an outline: [px] and in blurs
-SHALLOWEST = 0.8  # largest used depth, in half-widths
+MAX_DEPTH = 0.8  # largest used depth, in half-widths
 ROWS = 8  # of a block in the first rounds, and in the last ones of a sharp picture
-LEAST_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
-SOME_CLIPPED = 0.1  # share of the blocks of an image from which on they are that long
-ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on longer ones are made, so many times
+MIN_ROWS_CLIPPED = 16  # of a block where the background saturates the picture
+MIN_SHARE_CLIPPED = 0.1  # share of the blocks of an image from which on they are that long
+ENOUGH_BLOCKS, MAX_BLOCK = 16, 3  # of an outline for longer blocks, so many times at most
 ROWS_PER_BLUR = 0.6  # of the blur for which such blocks are long enough [px]
-VAGUE = (1.3, 0.6)  # uncertainty from which on a block tells nothing: in blurs, and [px]
+MAX_BLOCK_SIGMA = (1.3, 0.6)  # of a block that counts: in blurs, and [px]
 CONVERGED = 0.1  # movement of every line below which the rounds end [px]
 
 BLURS = (0.3, 2.7, 6)  # trials, least to greatest [px]
@@ -33,14 +33,14 @@ BLUR_ROUNDS = 2
 # Prior precision of the amplitudes, in units of the contrast of a block.
 RIDGE = np.array([1e-6, 1.0, 1e-2, 0.05, 0.05])
 BEND = (0, 1, 4)  # functions of the limb model without an edge
-STEP = 0.8  # largest step of a block [px]
+MAX_STEP = 0.8  # largest step of a block [px]
 
 TUKEY = 4.0  # sigmas at which a block counts no longer
 N_ROUNDS = 10
 N_SCALES = 3  # rounds in which the scale of the scatter is estimated
-LEAST_SCATTER = 0.01  # [px]
+MIN_SCATTER = 0.01  # [px]
 COMMON_BIAS, TILT_BIAS = 0.03, 0.02  # of the outline model: of both ends, of each end [px]
-LEAST_BLOCKS = 4
+MIN_BLOCKS = 4
 
 
 def depth_for_blur(blur: float) -> float:
@@ -84,13 +84,13 @@ class Blocks:
         if most is None:
             rows *= int(np.clip(np.rint(blur / ROWS_PER_BLUR), 1, 4))
             shortest = min(edge.band.length * float(np.mean(~edge.hidden)) for edge in edges)
-            rows = max(rows, ROWS * int(np.clip(shortest / (ROWS * ENOUGH), 1, LONGEST)))
+            rows = max(rows, ROWS * int(np.clip(shortest / (ROWS * ENOUGH_BLOCKS), 1, MAX_BLOCK)))
         half_width = np.array([edge.half_width for edge in edges])
-        depths = outer, np.minimum(outer, SHALLOWEST * half_width)
+        depths = outer, np.minimum(outer, MAX_DEPTH * half_width)
         read = read_profiles(grey, camera, edges, v, depths, rows, most)
-        if rows < LEAST_ROWS_CLIPPED and np.mean(read.clipped > -np.inf) > SOME_CLIPPED:
+        if rows < MIN_ROWS_CLIPPED and np.mean(read.clipped > -np.inf) > MIN_SHARE_CLIPPED:
             # Too few pixels of a sharp step are left in short blocks.
-            read = read_profiles(grey, camera, edges, v, depths, LEAST_ROWS_CLIPPED, most)
+            read = read_profiles(grey, camera, edges, v, depths, MIN_ROWS_CLIPPED, most)
         light, weight = to_light(read.grey, read.inside, camera.gamma)
         n = len(read.position)
         return cls(
@@ -123,7 +123,7 @@ class Blocks:
         return np.split(values, self.bounds[1:-1])
 
     def merit(self) -> Array:
-        """Return how much each block tells of the blur: nothing where half of the step is cut."""
+        """Return the weight of each block for the blur: zero where half of the step is cut."""
         return np.where(self.clipped > self.moved, 0.0, np.abs(self.contrast))
 
     def kept(self) -> BoolArray:
@@ -135,7 +135,7 @@ class Blocks:
     def unmove(self) -> None:
         """Put lines back to where they were read; blocks that lay on them stay kept.
 
-        Blocks by themselves hardly tell where a limb is that rises from the level of the
+        Blocks by themselves hardly determine where a limb is that rises from the level of the
         background: lines that were near the outline must not converge elsewhere.
         """
         self.moved[:] = 0.0
@@ -147,7 +147,7 @@ class Blocks:
         """Fit the blocks and a line to each edge in turn, until no line moves any more."""
         active = np.ones(len(self.lines), dtype=np.bool_)
         counts = np.diff(self.bounds)
-        largest = min(VAGUE[0] * blur, VAGUE[1]) ** 2
+        largest = min(MAX_BLOCK_SIGMA[0] * blur, MAX_BLOCK_SIGMA[1]) ** 2
         for _ in range(n_rounds):
             chosen = np.repeat(active, counts)
             fit = fit_blocks(*self.samples(chosen), blur)
@@ -155,7 +155,7 @@ class Blocks:
             self.sharp[chosen] = fit.sharpness()
             bounds = np.concatenate([[0], np.cumsum(counts[active])])
             gain, position, before = (x[chosen] for x in (self.gain, self.position, self.moved))
-            shift = (before + fit.shift) / gain  # a line holds the whole shift
+            shift = (before + fit.shift) / gain  # a line has the whole shift
             lines = fit_lines(bounds, position, shift, fit.variance / gain**2, largest)
             after = before.copy()
             for k, (i, line) in enumerate(zip(np.flatnonzero(active).tolist(), lines, strict=True)):
@@ -229,7 +229,7 @@ def fit_blocks(
     step = np.where(seen, gradient / safe, 0.0)
     noise = np.maximum(_products(residual, residual) - step * gradient, 0.0) / freedom
     variance = np.where(seen, noise / safe, np.inf)
-    shift = np.clip(step, -STEP, STEP)
+    shift = np.clip(step, -MAX_STEP, MAX_STEP)
     return BlockFit(shift, variance, noise, freedom, amplitude, normal, right, power)
 
 
@@ -291,7 +291,7 @@ class Line:
 
     ends: Array  # (2,) shift of the outline at t = 0 and at t = length [px of the band]
     kept: BoolArray  # (n,) the blocks that lie on it
-    agreement: float  # share of the blocks that show an edge at all which lie on the line
+    inlier_share: float  # share of the blocks that show an edge at all which lie on the line
     position: Array  # (n_kept,) as fractions of the length
     residual: Array  # (n_kept,) distances from the line [px]
     variance: Array  # (n_kept,) of these by noise, scaled to the scatter seen [px^2]
@@ -329,7 +329,7 @@ def fit_lines(
 
     From positions (n,) as fractions of the length, shifts [px], and their variances by noise
     [px^2] of all blocks, one outline after the other; those of variance ``largest`` or more are
-    left out. None where fewer than ``LEAST_BLOCKS`` blocks agree.
+    left out. None where fewer than ``MIN_BLOCKS`` blocks agree.
     """
     counts = np.diff(bounds)
     filled = np.arange(int(counts.max(initial=0))) < counts[:, None]  # (n_edges, n_most)
@@ -342,9 +342,9 @@ def fit_lines(
     along, moved, noise = (padded(values) for values in (position, shift, variance))
     usable = filled & (noise < largest)
     n_usable = np.count_nonzero(usable, axis=1)
-    fits = n_usable >= LEAST_BLOCKS
+    fits = n_usable >= MIN_BLOCKS
     along, moved = np.where(usable, along, 0.0), np.where(usable, moved, 0.0)
-    floored = np.where(usable, noise + LEAST_SCATTER**2, 1.0)
+    floored = np.where(usable, noise + MIN_SCATTER**2, 1.0)
     start = _weighted_medians(np.where(usable, moved, np.inf), usable / floored)
     ends = np.repeat(np.where(fits, start, 0.0)[:, None], 2, axis=1)
     factor, robust = np.ones(len(counts)), np.zeros(filled.shape)
@@ -361,8 +361,8 @@ def fit_lines(
         counted = usable * np.maximum(1.0 - (pull / (TUKEY * factor[:, None])) ** 2, 0.0) ** 2
         a, b, c, p, q = np.einsum("knm,nm->kn", products, counted)
         determinant = a * c - b * b
-        lost = (np.count_nonzero(counted, axis=1) < LEAST_BLOCKS) | (determinant < 1e-9 * a * c)
-        fits &= ~(moving & lost)
+        singular = (np.count_nonzero(counted, axis=1) < MIN_BLOCKS) | (determinant < 1e-9 * a * c)
+        fits &= ~(moving & singular)
         moving &= fits
         safe = np.where(moving, determinant, 1.0)
         after = np.stack([c * p - b * q, a * q - b * p], axis=1) / safe[:, None]

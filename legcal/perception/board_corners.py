@@ -35,11 +35,11 @@ from legcal.workers import Run
 STAGE = "Searching the board"
 MAX_ASKED = 2  # images of a view that are searched for what they show instead
 
-_NEIGHBOURHOOD = 1.5  # squares within which corners tell how the board lies in the image around one
+_NEIGHBOURHOOD = 1.5  # squares within which corners give how the board lies in the image around one
 _STRAIGHT_AROUND = 0.9  # of what is straight around a corner that is used
 _FRAME = 0.2  # of the side of a tag that its black frame is wide, as Kalibr prints it
 _MAX_BLUR_RATIO, _MAX_MISFIT_RATIO = 1.5, 2.5  # times what is usual in the image
-_GOOD_FIT = 0.03  # of the contrast left over: never a reason for doubt
+_GOOD_FIT = 0.03  # of the contrast left over: always accepted
 
 
 def find_corners(
@@ -154,7 +154,7 @@ def _fit_saddle(
     turns = np.arctan2(axes[1], axes[0])
     x = np.array([*start, *turns, _START_BLUR])
     found = None
-    for _ in range(2):  # how far blur reaches from what else is printed, the first fit tells
+    for _ in range(2):  # the first fit gives how far blur reaches from what else is printed
         clear = max(band - (0.5 + _BLUR_SIGMAS * x[4]) / float(steps.min()), _MIN_BAND * band)
         used = (on_board.max(axis=0) <= length) & (on_board.min(axis=0) <= clear)
         if np.count_nonzero(used) < _MIN_PIXELS:
@@ -244,7 +244,7 @@ def _saddle(fit: _Fit) -> _Saddle | None:
 
 
 _PLAIN = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-# Slow searches where quick ones fail; corners near each other are told apart in a larger image.
+# Slow searches where quick ones fail; corners near each other are separate in a larger image.
 _SEARCHES = ((1, _PLAIN), (2, _PLAIN), (1, _PLAIN | cv2.CALIB_CB_EXHAUSTIVE))
 _STRAIGHT = 0.45  # of a square from a corner
 _MAX_STEP_RATIO = 1.6  # times as long as the one before it is no step to the next line

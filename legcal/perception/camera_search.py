@@ -1,8 +1,8 @@
 """The camera pose of a view, searched for anywhere or near a rough one, by its edge pairs.
 
 Two pairs taken for two legs suggest a pose; thousands are judged by one picture, the better ones
-refined and judged by more, the best by all. A pose is believed where enough legs agree and no other
-pose rivals it. A pose is found for mirrored images of many machines as well, with fewer legs on
+refined and scored by more, the best by all. A pose is accepted where enough legs match and no other
+pose comes near it. A pose is found for mirrored images of many machines as well, with fewer legs on
 their pairs: so one at which many legs are missing is held against the best one of the images with
 left and right exchanged.
 """
@@ -14,33 +14,33 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.perception.agreement import (
-    Agreement,
+from legcal.perception.lines import EdgePairs
+from legcal.perception.pair_matching import (
+    PairMatches,
     Picture,
     Poses,
-    agreement,
     distances,
     exchanged,
-    improved,
+    gauss_newton_step,
+    match_pairs,
 )
-from legcal.perception.lines import EdgePairs
-from legcal.perception.pose_starts import pose_starts
+from legcal.perception.pose_hypotheses import pose_hypotheses
 
-# Of a pose that leaves no doubt, and of one that is believed at all: share of the expected legs,
+# Of a pose that is clear, and of one that is accepted at all: share of the expected legs,
 # lead over the next pose in legs of all images together, and as a part.
 CLEAR_SUPPORT, CLEAR_LEAD, CLEAR_PART = 0.35, 1.2, 0.35
 ENOUGH_SUPPORT, ENOUGH_LEAD, ENOUGH_PART = 0.2, 0.6, 0.16
 FEW_SUPPORT, FEW_LEAD, FEW_PART = 0.12, 0.9, 0.3  # of one that shows few legs and has no rival
-HINTED_SUPPORT = 0.6  # share near a rough pose that leaves no doubt
-LEAST_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
-HINTED_LEAST = 1.6  # the same near a rough pose
+HINTED_SUPPORT = 0.6  # share near a rough pose that is clear
+MIN_SUPPORT = 2.8  # legs in all images together: two of them always fit some pose
+HINTED_MIN_SUPPORT = 1.6  # the same near a rough pose
 
 TOLERANCES = (0.05, 0.035, 0.025, 0.018, 0.012, 0.008, 0.006)  # of an axis [m]
-LAST = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
+LAST_TOLERANCES = (0.01, 0.007, 0.005, 0.004, 0.003)  # with the joints known better
 JOINT_ERROR = 6e-3  # standard deviation of the joint centres of the nominal model [m]
-START_PICTURES = 1, 1, 2, 4  # whose pairs suggest poses, as long as there is a doubt
+START_PICTURES = 1, 1, 2, 4  # whose pairs suggest poses, until one is clear
 SOME_PICTURES = 8  # that judge which poses are worth a comparison with all
-KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
+N_KEPT = (400, 40, 12, 6)  # poses: those of a picture, its refined ones, of some pictures, of all
 N_POLISHED, POLISHING = 2, 4  # poses around which better ones are sought, by so many pictures
 N_REVERSED = 4  # poses of which those with near and far exchanged are tried as well
 POLISH = (0.018, 0.012, 0.008)  # tolerances
@@ -48,18 +48,18 @@ POLISH_TURN, POLISH_FURTHER = np.deg2rad(3.0), 0.05  # angle, part of the distan
 SAME_TURN, SAME_PLACE = np.deg2rad(8.0), 0.08  # of one pose: angle, part of the distance
 SAME_MATCHES = 0.5  # share of common matches from which on two poses say the same
 OTHER_TURN, OTHER_PLACE = np.deg2rad(20.0), 0.25  # unless they are so far from each other
-SAME_PAIR = np.deg2rad(4.0), 0.6  # of two pairs on one leg: angle, distance in widths
-MATCHED = 0.15  # agreement of a piece with its pair that counts as a match
-JUDGED = 3e-3  # tolerance with which poses are judged in the end [m]
+SAME_LEG = np.deg2rad(4.0), 0.6  # of two pairs on one leg: angle, distance in widths
+MIN_MATCH_SCORE = 0.15  # score of a segment with its pair that counts as a match
+FINAL_TOLERANCE = 3e-3  # tolerance with which poses are scored in the end [m]
 SHIFT_COST = 0.06  # in legs, of shifts as likely as one standard deviation of all (in chi^2 / 2)
 NEAR_STARTS = np.deg2rad(2.5)  # turns of a rough pose that are tried as well
-FEW_MATCHES, FEW_ERROR = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
+MIN_MATCHES, MIN_ERROR_OF_FEW = 3, 3e-3  # below so many the place of a leg is this uncertain [m]
 
 LEFT_RIGHT = np.array([-1.0, 1.0])
 UP_DOWN = np.array([1.0, -1.0])
 UPSIDE_DOWN = np.array([-1.0, -1.0])
-PLAIN = 0.45  # share of the expected legs that mirrored images do not reach
-LEAD, LEAD_PART = 0.3, 0.06  # of the mirrored pictures over the own ones: legs of all images, part
+NOT_MIRRORED_SUPPORT = 0.45  # share of the expected legs that mirrored images do not reach
+MIRROR_LEAD, MIRROR_PART = 0.3, 0.06  # of mirrored pictures: legs of all images, part
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +73,15 @@ class Candidates:
     leg_error: Array  # (n_legs,) of legs from their pairs at the first pose, infinite without [m]
     hinted: bool = False  # whether it was searched for near a rough pose only
     by_outlines: bool | None = None  # whether outlines measured at the poses speak for the first
-    # one; None where pairs left no doubt
+    # one; None where pairs were clear
 
     @property
     def needed(self) -> float:
-        """How many legs must agree in a picture on average for a pose to be believed."""
+        """How many legs must match in a picture on average for a pose to be accepted."""
         n = self.support.shape[1]
         alone = not self.hinted and self._leads(FEW_LEAD, FEW_PART)
         share = FEW_SUPPORT if alone else ENOUGH_SUPPORT
-        least = HINTED_LEAST if self.hinted else LEAST_SUPPORT
+        least = HINTED_MIN_SUPPORT if self.hinted else MIN_SUPPORT
         return float(max(share * self.expected[0].mean(), least / n))
 
     @property
@@ -98,24 +98,24 @@ class Candidates:
 
     @property
     def leads_clearly(self) -> bool:
-        """Whether pairs leave no doubt that the first pose is better than the second one."""
+        """Whether the first pose is clearly better than the second one by pairs."""
         return self._leads(CLEAR_LEAD, CLEAR_PART)
 
     @property
     def leads(self) -> bool:
-        """Whether pairs tell the first pose from the second one."""
+        """Whether the first pose is better than the second one by pairs."""
         return self._leads(ENOUGH_LEAD, ENOUGH_PART)
 
     @property
     def is_convincing(self) -> bool:
-        """Whether the first pose is to be believed."""
+        """Whether the first pose is accepted."""
         if self.by_outlines is not None:
             return self.by_outlines
         return self.is_enough and (self.hinted or self.leads)
 
     @property
     def is_clear(self) -> bool:
-        """Whether the first pose leaves no doubt, so that no further search is needed."""
+        """Whether the first pose is so clear that no further search is needed."""
         if not self.is_enough or self.by_outlines is False:
             return False
         if self.hinted:
@@ -142,11 +142,11 @@ def place_camera(
     """Return the camera poses on which most legs of all pictures of a view agree.
 
     Pictures are of one camera pose at different readings; ``starts`` says how many more of them
-    suggest poses, as long as there is a doubt.
+    suggest poses, until one is clear.
     """
     merits = [float(p.pairs.merit[:8].sum()) if len(p.pairs) else 0.0 for p in pictures]
     best_first = [pictures[k] for k in np.argsort(-np.array(merits), kind="stable").tolist()]
-    best = _judged(pictures, Poses.none(n_legs))
+    best = _candidates(pictures, Poses.none(n_legs))
     done = 0
     for n in starts:
         if done >= len(pictures):
@@ -159,15 +159,15 @@ def place_camera(
         poses = refined(best_first[:done], poses, TOLERANCES[2:4], JOINT_ERROR)
         some = best_first[: max(SOME_PICTURES, done)]
         score = scores(some, poses, TOLERANCES[3])
-        poses = poses.take(_distinct(poses, score, KEPT[2]))
+        poses = poses.take(_distinct(poses, score, N_KEPT[2]))
         poses = Poses.joined(
             [poses, _reversed(some, poses.take(np.arange(min(N_REVERSED, len(poses)))))]
         )
         poses = refined(some, poses, TOLERANCES[3:], JOINT_ERROR)
         score = scores(some, poses, TOLERANCES[-1])
-        poses = poses.take(_best(score, KEPT[3]))
+        poses = poses.take(_best(score, N_KEPT[3]))
         poses = Poses.joined([poses, _polished(some[:POLISHING], poses)])
-        best = _judged(pictures, refined(pictures, poses, LAST, JOINT_ERROR))
+        best = _candidates(pictures, refined(pictures, poses, LAST_TOLERANCES, JOINT_ERROR))
         if best.is_clear:
             break
     return best
@@ -213,8 +213,8 @@ def place_near(
     R = Rotation.from_rotvec(turns).as_matrix() @ T.rotation.as_matrix()
     poses = Poses.rigid(R, np.tile(T.translation, (len(R), 1)), n_legs)
     poses = refined(pictures, poses, TOLERANCES[:3])
-    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST), JOINT_ERROR)
-    found = _judged(pictures, poses)
+    poses = refined(pictures, poses, (*TOLERANCES[2:], *LAST_TOLERANCES), JOINT_ERROR)
+    found = _candidates(pictures, poses)
     return replace(found, hinted=True)
 
 
@@ -231,20 +231,20 @@ def with_first(placed: Candidates, i: int, pose: Poses, pictures: Sequence[Pictu
     )
 
 
-def _judged(pictures: Sequence[Picture], poses: Poses) -> Candidates:
+def _candidates(pictures: Sequence[Picture], poses: Poses) -> Candidates:
     """Return poses with their support, best first, without those that say the same."""
     n_legs = poses.shift.shape[1]
     if len(poses) == 0:
         empty = np.zeros((0, len(pictures)))
         return Candidates(poses, empty, empty, np.zeros(0), np.full(n_legs, np.inf))
-    found = [agreement(picture, poses, JUDGED) for picture in pictures]
-    values = [one.one_pair_each for one in found]
+    found = [match_pairs(picture, poses, FINAL_TOLERANCE) for picture in pictures]
+    values = [one.exclusive_score for one in found]
     shares = [picture.targets.share for picture in pictures]
     support = np.stack([v @ s for v, s in zip(values, shares, strict=True)], axis=1)
     expected = np.stack([f.visible @ s for f, s in zip(found, shares, strict=True)], axis=1)
     cost = 0.5 * np.sum(poses.shift**2, axis=(1, 2, 3)) / JOINT_ERROR**2
     score = support.sum(axis=1) - SHIFT_COST * cost
-    order = _different(pictures, poses, found, [v >= MATCHED for v in values], score)
+    order = _different(pictures, poses, found, [v >= MIN_MATCH_SCORE for v in values], score)
     best = poses.take(order[:1])
     error = _leg_error(pictures, best)
     return Candidates(poses.take(order), support[order], expected[order], score[order], error)
@@ -253,7 +253,7 @@ def _judged(pictures: Sequence[Picture], poses: Poses) -> Candidates:
 def _different(
     pictures: Sequence[Picture],
     poses: Poses,
-    found: Sequence[Agreement],
+    found: Sequence[PairMatches],
     matched: Sequence[BoolArray],
     score: Array,
 ) -> IntArray:
@@ -284,8 +284,8 @@ def _one_leg(pairs: EdgePairs) -> BoolArray:
     apart = np.abs(
         np.einsum("ijx,ix->ij", pairs.middle[None] - pairs.middle[:, None], pairs.normal)
     )
-    near = np.maximum(apart, apart.T) <= SAME_PAIR[1] * pairs.width.mean(axis=1)[:, None]
-    return np.asarray(near & (np.abs(pairs.along @ pairs.along.T) >= np.cos(SAME_PAIR[0])))
+    near = np.maximum(apart, apart.T) <= SAME_LEG[1] * pairs.width.mean(axis=1)[:, None]
+    return np.asarray(near & (np.abs(pairs.along @ pairs.along.T) >= np.cos(SAME_LEG[0])))
 
 
 def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
@@ -295,28 +295,28 @@ def _leg_error(pictures: Sequence[Picture], pose: Poses) -> Array:
     for picture in pictures:
         if len(picture.pairs) == 0 or len(picture.targets) == 0:
             continue
-        found = agreement(picture, pose, JUDGED)
-        matched = found.one_pair_each[0] >= MATCHED
+        found = match_pairs(picture, pose, FINAL_TOLERANCE)
+        matched = found.exclusive_score[0] >= MIN_MATCH_SCORE
         distance = distances(picture, pose, found)[0]
         np.add.at(square, picture.targets.leg[matched], distance[matched] ** 2)
         np.add.at(count, picture.targets.leg[matched], 1.0)
     error = np.sqrt(square / np.maximum(count, 1.0))
-    error = np.where(count < FEW_MATCHES, np.maximum(error, FEW_ERROR), error)
+    error = np.where(count < MIN_MATCHES, np.maximum(error, MIN_ERROR_OF_FEW), error)
     return np.where(count > 0, error, np.inf)
 
 
 def _starts(picture: Picture, n_legs: int) -> Poses:
     """Return the poses that suit a picture best, among those that two of its pairs suggest."""
-    poses = pose_starts(picture, n_legs)
+    poses = pose_hypotheses(picture, n_legs)
     if len(poses) == 0:
         return poses
     # From the frame of the picture to that of the poses.
     back = picture.R.T
     poses = Poses.rigid(back @ poses.R, (poses.t - picture.t) @ picture.R, n_legs)
-    poses = poses.take(_best(scores([picture], poses, TOLERANCES[0]), KEPT[0]))
+    poses = poses.take(_best(scores([picture], poses, TOLERANCES[0]), N_KEPT[0]))
     poses = refined([picture], poses, TOLERANCES[:3])
     score = scores([picture], poses, TOLERANCES[2])
-    return poses.take(_distinct(poses, score, KEPT[1]))
+    return poses.take(_distinct(poses, score, N_KEPT[1]))
 
 
 def refined(
@@ -327,14 +327,14 @@ def refined(
 ) -> Poses:
     """Return poses after a step towards the pairs for each of some tolerances."""
     for tolerance in tolerances:
-        found = [agreement(picture, poses, tolerance) for picture in pictures]
-        poses = improved(pictures, poses, found, tolerance, joint_error)
+        found = [match_pairs(picture, poses, tolerance) for picture in pictures]
+        poses = gauss_newton_step(pictures, poses, found, tolerance, joint_error)
     return poses
 
 
 def scores(pictures: Sequence[Picture], poses: Poses, tolerance: float) -> Array:
     """Return how many legs agree with each pose in all pictures together, (n_poses,)."""
-    found = [agreement(picture, poses, tolerance).one_pair_each for picture in pictures]
+    found = [match_pairs(picture, poses, tolerance).exclusive_score for picture in pictures]
     shares = [picture.targets.share for picture in pictures]
     support = [value @ share for value, share in zip(found, shares, strict=True)]
     return np.asarray(np.stack(support, axis=1).sum(axis=1))
@@ -381,7 +381,7 @@ def mirrored(pictures: Sequence[Picture]) -> list[Picture]:
 
 def may_be_mirrored(own: Candidates) -> bool:
     """Say whether a placed view needs to be held against its mirror image."""
-    return not own.is_convincing or own.share < PLAIN
+    return not own.is_convincing or own.share < NOT_MIRRORED_SUPPORT
 
 
 def is_mirrored(own: Candidates, other: Candidates) -> bool:
@@ -392,4 +392,4 @@ def is_mirrored(own: Candidates, other: Candidates) -> bool:
     if not own.is_convincing:
         return other.is_clear
     lead = float(other.score[0] - own.score[0])
-    return other.is_convincing and lead >= max(LEAD, LEAD_PART * float(other.score[0]))
+    return other.is_convincing and lead >= max(MIRROR_LEAD, MIRROR_PART * float(other.score[0]))

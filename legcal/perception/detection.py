@@ -56,7 +56,7 @@ def _of_image(
     window = np.where(search.wanted[view], 0.0, np.nan)
     if placement.window is not None:
         window += placement.window[row]
-    asked = [leg for leg in np.flatnonzero(~np.isnan(window)).tolist() if search.cylinders[leg]]
+    wanted = [leg for leg in np.flatnonzero(~np.isnan(window)).tolist() if search.cylinders[leg]]
     predicted: list[PredictedLeg] = []
     if T is not None:
         A, B = placement.A_base[row], placement.B_base[row]
@@ -73,14 +73,14 @@ def _of_image(
         predicted,
         search.leg_names,
         window,
-        vouched=placement.window is not None,
+        guided=placement.window is not None,
         blur=None if np.isnan(known) else known,
     )
     found, blur = (join_outlines([]), np.nan) if T is None else method(one)
     seen = {leg.leg for leg in predicted}
     why = NOT_PLACED if T is None else OUTSIDE
     others = [
-        part_outlines(one, j, _longest(search, j), (why, why)) for j in asked if j not in seen
+        part_outlines(one, j, _longest(search, j), (why, why)) for j in wanted if j not in seen
     ]
     return join_outlines([found, *others]), blur
 

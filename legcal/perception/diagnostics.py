@@ -1,6 +1,6 @@
 """What is wrong with images, views and rough poses, each named once.
 
-Images in which few legs were found where the others of their view show theirs are judged once more:
+Images in which few legs were found where the others of their view show theirs are examined again:
 with the readings of all other images, with the cameras of the other views, and mirrored. An
 explanation must be clearly better than the reading itself. Whatever is wrong is left out with a
 reason.
@@ -17,34 +17,34 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Measurements, Outlines, is_edited
 from legcal.geometry import BoolArray, IntArray
-from legcal.perception.agreement import Picture, Poses, agreement, targets_of
 from legcal.perception.camera_search import LEFT_RIGHT, UP_DOWN, UPSIDE_DOWN, flipped
 from legcal.perception.detection import NOT_PLACED
 from legcal.perception.lines import EdgePairs
 from legcal.perception.outline import HIDDEN, OUTSIDE
+from legcal.perception.pair_matching import Picture, Poses, leg_segments, match_pairs
 from legcal.perception.placement import Placement, Search, corners_of
 from legcal.workers import Run
 
 TOLERANCE = 0.006  # of an axis from its edge pair [m]
-UNPLACED = 0.015  # the same of a leg that nothing has moved from where the model has it
-CLEAR = 0.35  # share of the legs that explain
-BETTER = 2.0, 0.15  # the same against the reading's: factor, more
-AS_USUAL = 0.5  # of the share that the other images of the view reach
-ALIKE = 0.85  # of the best explanation: then another one is about as good
+NOMINAL_TOLERANCE = 0.015  # the same of a leg that nothing has moved from where the model has it
+MIN_SHARE = 0.35  # share of the legs that explain
+MIN_GAIN = 2.0, 0.15  # the same against the reading's: factor, more
+MIN_SHARE_OF_USUAL = 0.5  # of the share that the other images of the view reach
+AMBIGUOUS = 0.85  # of the best explanation: then another one is about as good
 MIRRORED = "the image is mirrored"  # reasons
 TURNED = "the image is upside down"
 _FLIPS = ((LEFT_RIGHT, MIRRORED), (UP_DOWN, MIRRORED), (UPSIDE_DOWN, TURNED))
 
-FEW = 0.5  # found, against other images
-WITNESSES = 3  # good images that tell how much of the legs they show
-SHOWN = 0.5  # share of a leg's length in each of them, from which on it is clearly visible
-USUALLY = 0.3  # the least that images of a view must find to be compared with
-GOOD = 75.0  # percentile of what images find, for what good ones do
+MAX_SHARE_OF_OTHERS = 0.5  # found, against other images
+N_REFERENCES = 3  # good images that others are compared with
+MIN_VISIBLE = 0.5  # share of a leg's length in each of them, if it is clearly visible
+MIN_USUAL_SHARE = 0.3  # the least that images of a view must find to be compared with
+GOOD_PERCENTILE = 75.0  # percentile of what images find, for what good ones do
 NOTHING_LIKE = "it does not show the legs where its reading has them"  # a reason
 NOT_IN_SIGHT = (OUTSIDE, HIDDEN)  # beginnings of reasons
 
 FAR_OFF = (0.06, np.deg2rad(6.0))  # three times what a rough pose is good to: [m], angle
-FAR_PART = 0.06  # of the distance of the camera, where that is more
+FAR_OFF_PART = 0.06  # of the distance of the camera, where that is more
 BEFORE_FIT = 2.5  # times more, while the cameras are only where legs were recognised
 
 
@@ -76,27 +76,27 @@ def diagnose(
     defects: Mapping[int, str],
     run: Run,
 ) -> tuple[Placement, dict[int, str]]:
-    """Return the placement with what is to be said, and why images are left out, by row.
+    """Return the placement with notes, and why images are left out, by row.
 
     Of the rows searched, some with defects by themselves. Views all of whose images have one are
-    not placed, and said once.
+    not placed, with one note.
     """
     view = search.measurements.view
     usable = [row for row in rows.tolist() if row not in defects]
-    lost = set(view[rows].tolist()) - set(view[usable].tolist())
-    placement = _without_views(search.measurements, placement, sorted(lost), defects)
+    defective = set(view[rows].tolist()) - set(view[usable].tolist())
+    placement = _without_views(search.measurements, placement, sorted(defective), defects)
     found = _found(outlines, [r for r in usable if placement.T_base_camera[view[r]] is not None])
-    doubted = _doubted(found, view)
-    usual = _usual(search, placement, found, doubted, run)
-    task = partial(explain, search, placement, usual, doubted=frozenset(doubted))
+    suspects = _suspects(found, view)
+    usual = _usual(search, placement, found, suspects, run)
+    task = partial(explain, search, placement, usual, suspects=frozenset(suspects))
     reasons = dict(defects)
     notes = [
         f"{_image_name(search.measurements, row)}: was left out: {why}; take it again."
         for row, why in sorted(defects.items())
-        if view[row] not in lost
+        if view[row] not in defective
     ]
-    for row, explanation in zip(doubted, run(task, doubted), strict=True):
-        reason, note = judged(search.measurements, row, explanation, usual, found)
+    for row, explanation in zip(suspects, run(task, suspects), strict=True):
+        reason, note = image_verdict(search.measurements, row, explanation, usual, found)
         notes.append(note)
         if reason:
             reasons[row] = reason
@@ -129,12 +129,12 @@ def is_visible(outlines: Outlines) -> BoolArray:
 def _without_views(
     measurements: Measurements,
     placement: Placement,
-    lost: Sequence[int],
+    defective: Sequence[int],
     defects: Mapping[int, str],
 ) -> Placement:
     """Return the placement with views unplaced all of whose images show nothing."""
     cameras, unplaced = list(placement.T_base_camera), dict(placement.unplaced)
-    for v in lost:
+    for v in defective:
         name = measurements.views[v].name
         own = [row for row in defects if measurements.view[row] == v]
         cameras[v] = None
@@ -146,7 +146,7 @@ def _without_views(
     return replace(placement, T_base_camera=tuple(cameras), unplaced=unplaced)
 
 
-def judged(
+def image_verdict(
     measurements: Measurements,
     row: int,
     explanation: Explanation,
@@ -162,7 +162,7 @@ def judged(
             f"{name}: was left out: {explanation.reason}; {explanation.remedy}.",
         )
     view = int(measurements.view[row])
-    if explanation.own >= FEW * usual[view]:
+    if explanation.own >= MAX_SHARE_OF_OTHERS * usual[view]:
         return "", (
             f"{name}: shows little of the legs: found {much}, in other images most; look at "
             "its light and sharpness."
@@ -178,11 +178,11 @@ def share_shown(
 ) -> float:
     """Return the share of the legs, by visible length, that an image shows where they should be.
 
-    Of the legs that its view is said to show, or of others; the view must have been placed.
+    Of the legs that its view is stated to show, or of others; the view must have been placed.
     """
     view = int(search.measurements.view[row])
     picture = _picture(search, search.pairs(row, view), row, view, legs)
-    return _share(picture, placement, view, TOLERANCE if legs is None else UNPLACED)
+    return _share(picture, placement, view, TOLERANCE if legs is None else NOMINAL_TOLERANCE)
 
 
 def explain(
@@ -191,12 +191,12 @@ def explain(
     usual: Mapping[int, float],
     row: int,
     *,
-    doubted: Collection[int] = (),
+    suspects: Collection[int] = (),
 ) -> Explanation:
     """Return what an image of a placed view shows whose legs are not where its reading has them.
 
     ``usual`` is the share of the legs that good images of each view show, by :func:`share_shown`;
-    ``doubted`` are all images in doubt: readings that others show are hardly those of this one.
+    ``suspects`` are all suspect images: readings that others show are hardly those of this one.
     """
     measurements = search.measurements
     view = int(measurements.view[row])
@@ -215,7 +215,7 @@ def explain(
     readings = [
         (_share(_picture(search, pairs, other, view), placement, view), other) for other in rows
     ]
-    for share, other in _best(readings, doubted):
+    for share, other in _best(readings, suspects):
         why = f"it shows the reading given for image {measurements.image[other]}"
         tried.append((share, why, "check which image belongs to which row"))
     for w, other_view in enumerate(measurements.views):
@@ -228,7 +228,7 @@ def explain(
         readings = [
             (_share(_picture(search, seen, other, w), placement, w), other) for other in there
         ]
-        for share, other in _best(readings, doubted):
+        for share, other in _best(readings, suspects):
             at = (
                 ""
                 if other == row
@@ -237,22 +237,22 @@ def explain(
             why = f"it was taken by the camera of view {other_view.name}{at}"
             tried.append((share, why, "check which image belongs to which row"))
     share, why, remedy = max(tried, key=lambda one: one[0])
-    factor, more = BETTER
-    least = max(CLEAR, AS_USUAL * usual.get(view, 0.0), factor * own, own + more)
+    factor, more = MIN_GAIN
+    least = max(MIN_SHARE, MIN_SHARE_OF_USUAL * usual.get(view, 0.0), factor * own, own + more)
     return Explanation(own, why, remedy) if share >= least else Explanation(own)
 
 
 def _best(
-    readings: Sequence[tuple[float, int]], doubted: Collection[int]
+    readings: Sequence[tuple[float, int]], suspects: Collection[int]
 ) -> list[tuple[float, int]]:
     """Return the reading that suits best, if no other one suits about as well.
 
-    Where its own image is in doubt, images were exchanged: then only readings of such are rivals.
+    Where its own image is a suspect, images were exchanged: then only readings of such are rivals.
     """
     ranked = sorted(readings, key=lambda one: -one[0])
-    if ranked and ranked[0][1] in doubted:
-        ranked = [one for one in ranked if one[1] in doubted]
-    if len(ranked) > 1 and ranked[1][0] > ALIKE * ranked[0][0]:
+    if ranked and ranked[0][1] in suspects:
+        ranked = [one for one in ranked if one[1] in suspects]
+    if len(ranked) > 1 and ranked[1][0] > AMBIGUOUS * ranked[0][0]:
         return []
     return ranked[:1]
 
@@ -274,7 +274,7 @@ def _picture(
 ) -> Picture:
     """Return pairs with what a view should show at the reading of a row."""
     wanted = np.flatnonzero(search.wanted[view]) if legs is None else legs
-    targets = targets_of(search.A_base[row], search.B_base[row], search.cylinders, wanted)
+    targets = leg_segments(search.A_base[row], search.B_base[row], search.cylinders, wanted)
     return Picture(pairs, targets, corners_of(search.measurements.views[view].camera))
 
 
@@ -286,10 +286,10 @@ def _share(
     if T is None or len(picture.targets) == 0:
         return 0.0
     pose = Poses.one(T, placement.shift[view])
-    seen = agreement(picture, pose, tolerance)
+    seen = match_pairs(picture, pose, tolerance)
     share = picture.targets.share
     visible = float((seen.visible @ share)[0])
-    return float(seen.one_pair_each[0] @ share) / visible if visible > 0.0 else 0.0
+    return float(seen.exclusive_score[0] @ share) / visible if visible > 0.0 else 0.0
 
 
 def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
@@ -303,48 +303,48 @@ def _found(outlines: Outlines, rows: Sequence[int]) -> dict[int, OutlineCount]:
     return counts
 
 
-def _doubted(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
+def _suspects(found: Mapping[int, OutlineCount], view: IntArray) -> list[int]:
     """Return the images in which far fewer outlines were found than in others of their view.
 
     Where a view has few images, all others are compared with.
     """
-    doubted = []
+    suspects = []
     for row, count in found.items():
         own = [other.share for r, other in found.items() if view[r] == view[row]]
         every = [other.share for other in found.values()]
-        usual = float(np.percentile(own if len(own) >= WITNESSES else every, GOOD))
-        if usual >= USUALLY and count.share < FEW * usual:
-            doubted.append(row)
-    return doubted
+        usual = float(np.percentile(own if len(own) >= N_REFERENCES else every, GOOD_PERCENTILE))
+        if usual >= MIN_USUAL_SHARE and count.share < MAX_SHARE_OF_OTHERS * usual:
+            suspects.append(row)
+    return suspects
 
 
 def _usual(
     search: Search,
     placement: Placement,
     found: Mapping[int, OutlineCount],
-    doubted: Sequence[int],
+    suspects: Sequence[int],
     run: Run,
 ) -> dict[int, float]:
-    """Return how much of the legs good images show, for views with images in doubt.
+    """Return how much of the legs good images show, for views with suspect images.
 
-    There is always a good one: an image is in doubt where others show far more.
+    There is always a good one: an image is a suspect where others show far more.
     """
-    views = np.unique(search.measurements.view[list(doubted)]).tolist() if doubted else []
+    views = np.unique(search.measurements.view[list(suspects)]).tolist() if suspects else []
     usual = {}
     for v in views:
-        good = {row: count for row, count in found.items() if row not in doubted}
-        rows = _witnesses(search.measurements, good, v)
+        good = {row: count for row, count in found.items() if row not in suspects}
+        rows = _references(search.measurements, good, v)
         task = partial(share_shown, search, placement)
         usual[v] = float(np.median(list(run(task, rows))))
     return usual
 
 
-def _witnesses(
+def _references(
     measurements: Measurements, found: Mapping[int, OutlineCount], view: int
 ) -> list[int]:
     """Return the images of a view in which most was found; of all views if it has none."""
     own = [row for row in found if measurements.view[row] == view]
-    return sorted(own or found, key=lambda row: -found[row].share)[:WITNESSES]
+    return sorted(own or found, key=lambda row: -found[row].share)[:N_REFERENCES]
 
 
 def _image_name(measurements: Measurements, row: int) -> str:
@@ -360,7 +360,7 @@ def _leg_notes(
     found: Mapping[int, OutlineCount],
     reasons: Mapping[int, str],
 ) -> list[str]:
-    """Return what is to be said of the legs that views are said to show."""
+    """Return notes on the legs that views are stated to show."""
     measurements, names = search.measurements, search.leg_names
     notes = []
     for v, view in enumerate(measurements.views):
@@ -380,7 +380,7 @@ def _leg_notes(
                 "or leave it out there."
             )
         good = {row: found[row] for row in rows}
-        notes += _left_out_legs(search, placement, v, _witnesses(measurements, good, v))
+        notes += _left_out_legs(search, placement, v, _references(measurements, good, v))
     return notes
 
 
@@ -391,7 +391,9 @@ def _left_out_legs(search: Search, placement: Placement, v: int, rows: Sequence[
         for leg, name in enumerate(search.leg_names)
         if not search.wanted[v, leg]
         and search.cylinders[leg]
-        and all(share_shown(search, placement, row, legs=np.array([leg])) >= SHOWN for row in rows)
+        and all(
+            share_shown(search, placement, row, legs=np.array([leg])) >= MIN_VISIBLE for row in rows
+        )
     ]
     if not clear:
         return []
@@ -405,7 +407,7 @@ def _far_off(hint: RigidTransform, T_base_camera: RigidTransform, reach: float =
     """Say whether a rough pose is farther from a pose than rough ones are."""
     distance = float(np.linalg.norm(T_base_camera.translation))
     apart, angle = _apart(hint, T_base_camera)
-    nearest, part = reach * FAR_OFF[0], reach * FAR_PART
+    nearest, part = reach * FAR_OFF[0], reach * FAR_OFF_PART
     return apart > max(nearest, part * distance) or angle > reach * FAR_OFF[1]
 
 
@@ -415,7 +417,7 @@ def hint_notes(
     cameras: Sequence[RigidTransform | None],
     reach: float = 1.0,
 ) -> list[str]:
-    """Return what is to be said of rough T_base_camera of views that the images contradict.
+    """Return notes on rough T_base_camera of views that the images contradict.
 
     ``cameras`` are as the images have them, None where a view could not be placed; ``reach`` is how
     many times farther than rough poses are they may be.

@@ -17,22 +17,22 @@ import numpy as np
 
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import Grey, Samples
-from legcal.vision import Band, Camera, Piece, PredictedLeg
+from legcal.vision import Band, Camera, PredictedLeg, Segment
 
 BLOCK_LENGTH = 8.0  # [px]
 ROWS = 4  # rows of a block
 MAX_BLOCKS = 80
 MARGIN = 6  # columns beyond the search window, to judge what an edge is
-KEPT = 8
+MAX_LINES = 8
 WIDTH_TOLERANCE = (1.0, 0.02)  # [px] and share of the width: one standard deviation
-LEAST_SCORE = 0.15
-LONE_SCORE = 0.5  # of an edge that may stand alone
-LONE_VOUCHED = 0.35  # the same where other legs say where it is
-RIVAL = 0.6  # of its score, which no other line may reach
-RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
+MIN_SCORE = 0.15
+MIN_LONE_SCORE = 0.5  # of an edge that may stand alone
+MIN_LONE_SCORE_GUIDED = 0.35  # the same near a fit to other legs
+MAX_RIVAL = 0.6  # of its score, which no other line may reach
+MIN_RIVAL_DISTANCE = 3.0  # from which on a line is another one, in the middle [px]
 NOISE_LEVELS = 4.0  # an edge this many times as steep as the median counts half
-BESIDE = 0.8  # what an edge counts in the columns beside it
-NEAR_PREDICTION = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
+BESIDE_WEIGHT = 0.8  # what an edge counts in the columns beside it
+MAX_PREDICTION_ERROR = 1.0  # an edge that was found to a pixel may be where it is predicted [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class EdgePair:
     """The two edges of a part, good to about a pixel."""
 
     v: Array  # (2, 2) offsets of edge 1 and edge 2 at both ends of the band [px]
-    found: BoolArray  # (2,) False for an edge that is put where the width of the part demands
+    found: BoolArray  # (2,) False for an edge that is put where the width of the part has it
     alone: BoolArray  # (2,) whether each edge is convincing without the other
 
     def suits(self, width: Array) -> bool:
@@ -55,12 +55,12 @@ class Part:
     """A part of a leg where it is predicted in an image, and its edges once they are found."""
 
     leg: PredictedLeg
-    piece: Piece
+    segment: Segment
     band: Band  # the frame along the part
     predicted: Array  # (2, 2) offsets of edge 1 and 2 at both ends of the band [px]
     hidden: BoolArray  # (n_blocks,) which of the block_positions other legs hide
     window: float  # largest distance of an edge from its prediction, at either end [px]
-    vouched: bool  # whether other legs vouch for the prediction: one edge near it is enough
+    guided: bool  # whether a fit to other legs predicts it: one edge near there is enough
     pair: EdgePair | None = None
 
     @property
@@ -81,7 +81,7 @@ class Part:
 
         One is enough: the width says where the other outline is, which shading hides.
         """
-        is_near = np.abs(self.edges.v - self.predicted).max(axis=1) <= NEAR_PREDICTION
+        is_near = np.abs(self.edges.v - self.predicted).max(axis=1) <= MAX_PREDICTION_ERROR
         return self.predicted if np.any(is_near & self.edges.found) else self.edges.v
 
 
@@ -97,7 +97,7 @@ def _pair(part: Part, *lines: tuple[Array, Array]) -> EdgePair | None:
     """Return the two outlines of a part among lines near each of them."""
     predicted = part.predicted
     together = _best_pair(lines[0], lines[1], predicted[1] - predicted[0], part.window)
-    least = LONE_VOUCHED if part.vouched else LONE_SCORE
+    least = MIN_LONE_SCORE_GUIDED if part.guided else MIN_LONE_SCORE
     lone = [_alone(*candidates, least) for candidates in lines]
     if together is not None:
         shifts = np.stack([lines[edge][0][i] for edge, i in enumerate(together)])
@@ -106,8 +106,8 @@ def _pair(part: Part, *lines: tuple[Array, Array]) -> EdgePair | None:
     scores = [0.0 if i is None else lines[edge][1][i] for edge, i in enumerate(lone)]
     edge = int(np.argmax(scores))
     i = lone[edge]
-    rivalled = max(lines[1 - edge][1], default=0.0) >= LONE_SCORE
-    if i is None or (rivalled and not part.vouched):
+    rivalled = max(lines[1 - edge][1], default=0.0) >= MIN_LONE_SCORE
+    if i is None or (rivalled and not part.guided):
         return None  # two clear edges at another distance are not those of this part
     found = np.arange(2) == edge
     return EdgePair(predicted + lines[edge][0][i], found, found)
@@ -128,7 +128,7 @@ def _best_pair(
     value = value - 0.1 * np.mean(mismatch**2, axis=-1) - 0.1 * np.mean(drift**2, axis=-1)
     value[np.abs(mismatch).max(axis=-1) > 3.0] = -np.inf
     i, j = np.unravel_index(int(np.argmax(value)), value.shape)
-    if not np.isfinite(value[i, j]) or min(score1[i], score2[j]) < LEAST_SCORE:
+    if not np.isfinite(value[i, j]) or min(score1[i], score2[j]) < MIN_SCORE:
         return None
     return int(i), int(j)
 
@@ -138,8 +138,8 @@ def _alone(shift: Array, score: Array, least: float) -> int | None:
     if not len(score) or score[0] < least:
         return None
     middle = shift.mean(axis=1)
-    other = np.abs(middle - middle[0]) > RIVAL_DISTANCE
-    return None if np.any(score[other] > RIVAL * score[0]) else 0
+    other = np.abs(middle - middle[0]) > MIN_RIVAL_DISTANCE
+    return None if np.any(score[other] > MAX_RIVAL * score[0]) else 0
 
 
 def block_positions(band: Band) -> Array:
@@ -199,7 +199,7 @@ def _sharpness(profiles: Samples, seen: BoolArray, bounds: IntArray) -> Samples:
     level = np.repeat((NOISE_LEVELS * np.array(typical)) ** 2 + 1e-3, np.diff(bounds))
     sharpness = np.asarray(peak**2 / (peak**2 + level[:, None]), dtype=np.float32)
     widened = np.asarray(cv2.dilate(sharpness, beside), dtype=np.float32)
-    return np.asarray(np.maximum(sharpness, np.float32(BESIDE) * widened), dtype=np.float32)
+    return np.asarray(np.maximum(sharpness, np.float32(BESIDE_WEIGHT) * widened), dtype=np.float32)
 
 
 def _median(values: Samples) -> float:
@@ -215,7 +215,7 @@ def _lines(votes: Array, half: int) -> tuple[Array, Array]:
     padded[:, reach:-reach] = votes
     score = padded.take(_along_lines(len(votes), half)).sum(axis=1)
     shifts, scores = [], []
-    for _ in range(KEPT):
+    for _ in range(MAX_LINES):
         i, j = divmod(int(score.argmax()), n_columns)
         best = float(score[i, j])
         if best <= 0.0:

@@ -14,16 +14,16 @@ import numpy as np
 
 from legcal.geometry import Array
 from legcal.perception.blocks import Blocks, Line, depth_for_blur, estimate_blur
-from legcal.perception.joint_lines import JointLines, fit_together
 from legcal.perception.light import Grey
+from legcal.perception.line_fit import FittedLines, fit_lines
 from legcal.perception.profiles import Edge
 from legcal.vision import Camera
 
 FIRST_BLUR = 1.0  # [px]
-LEAST_GAIN = 30  # in chi^2, by which a block shows an edge at all
+MIN_GAIN = 30  # in chi^2, by which a block shows an edge at all
 FIRST_BLOCKS = 12  # of an outline
 FIRST_ROUNDS, LAST_ROUNDS = 2, 2  # the last ones at most
-TRIALS, SIMILAR = 3, 0.25  # of the blur, until its logarithm changes by less than this
+MAX_BLUR_TRIALS, BLUR_CONVERGED = 3, 0.25  # until its logarithm changes by less
 SHADING = 0.5  # that the model leaves out [grey levels]
 WIDENING = 1.3  # of the standard deviations of a fit of all blocks, which share what is left out
 COMMON_BIAS, TILT_BIAS = 0.012, 0.02  # of both ends, of each end [px]
@@ -75,7 +75,7 @@ def measure_edges(
             blur = estimate_blur(*blocks.samples(slice(None)), blocks.merit())
         v = [_moved(edge, at, line) for edge, at, line in zip(edges, v, blocks.lines, strict=True)]
     joint = None
-    for _ in range(TRIALS):
+    for _ in range(MAX_BLUR_TRIALS):
         tried = blur
         blocks = Blocks.read(grey, camera, edges, v, tried)
         if len(blocks.moved) == 0:
@@ -87,15 +87,19 @@ def measure_edges(
             blocks.unmove()
         kept = blocks.kept()
         blocks.even_noise(kept, tried)
-        joint = fit_together(blocks, kept, tried, depth_for_blur(tried))
+        joint = fit_lines(blocks, kept, tried, depth_for_blur(tried))
         blur = joint.blur
-        if abs(np.log(blur / tried)) < SIMILAR:
+        if abs(np.log(blur / tried)) < BLUR_CONVERGED:
             break
     return _measured(edges, v, blocks, blur, joint), blur
 
 
 def _measured(
-    edges: Sequence[Edge], v: Sequence[Array], blocks: Blocks, blur: float, joint: JointLines | None
+    edges: Sequence[Edge],
+    v: Sequence[Array],
+    blocks: Blocks,
+    blur: float,
+    joint: FittedLines | None,
 ) -> list[MeasuredEdge | None]:
     """Return the lines of edges by their blocks, one by one or all together."""
     found: list[MeasuredEdge | None] = []
@@ -108,7 +112,7 @@ def _measured(
             found.append(None)
             continue
         contrast = float(np.median(contrasts[line.kept]))
-        is_step = float(np.median(sharp[line.kept])) > LEAST_GAIN
+        is_step = float(np.median(sharp[line.kept])) > MIN_GAIN
         # How far shading moves an outline: its grey levels over the slope of the step.
         bias = float(SHADING * np.sqrt(2.0 * np.pi) * blur / max(contrast, 1e-3))
         moved = _moved(edge, at, line)

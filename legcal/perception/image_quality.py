@@ -14,22 +14,22 @@ import numpy as np
 from legcal.perception.light import Grey, reduce
 
 BLACK, WHITE = 8.0, 247.0  # what nearly all of an image is below or above [grey levels]
-NEARLY_ALL = 0.5  # percent of an image that may be otherwise
-LEAST_RANGE = 10.0  # of an image in which something can be seen [grey levels]
+TAIL_PERCENT = 0.5  # percent of an image that may be otherwise
+MIN_RANGE = 10.0  # of an image in which something can be seen [grey levels]
 REDUCTION = 8  # before the range is taken, so that noise does not count
 SCALES = (0.95, 2.5)  # at which slopes are compared, standard deviations [px]
 # The first is that of the filter of slopes alone. The second is taken from means of four pixels,
 # where that filter is twice as wide.
 _BLUR_OF_HALF = 0.5 * math.sqrt(SCALES[1] ** 2 - 4.0 * SCALES[0] ** 2 - 0.25)
-SPARSE = 6  # every such row and column is enough for percentiles
+STRIDE = 6  # every such row and column is enough for percentiles
 DIRECTIONS = 4  # of edges: what moves is blurred in one
 WEAK = 70.0  # percentile of the slopes from which on a place may be an edge
 STRONG = 95.0  # percentile of the slopes from which on they count
-FEWEST_EDGES, FEWEST_PART = 40, 0.1  # places of a direction, and of all
-LARGEST_BLUR = 8.0  # that the scales can tell [px]
-MUCH_BLURRED = (2.0, 1.2)  # against others: factor, and more [px]
-SHARP = 40.0  # percentile of blurs, for what is usual
-FEWEST = 3  # images of a view or camera, to be compared
+MIN_EDGES, MIN_EDGES_PART = 40, 0.1  # places of a direction, and of all
+MAX_BLUR = 8.0  # that the scales can measure [px]
+MAX_BLUR_OF_OTHERS = (2.0, 1.2)  # against others: factor, and more [px]
+USUAL_PERCENTILE = 40.0  # percentile of blurs, for what is usual
+MIN_IMAGES = 3  # images of a view or camera, to be compared
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Exposure:
             return f"the image is black, at most {self.bright:.0f} of 255 grey levels"
         if self.dark > WHITE:
             return f"the image is overexposed, at least {self.dark:.0f} of 255 grey levels"
-        if self.range < LEAST_RANGE:
+        if self.range < MIN_RANGE:
             return f"the image shows nothing, all of it within {self.range:.0f} of 255 grey levels"
         return ""
 
@@ -56,8 +56,8 @@ class Exposure:
 def expose(grey: Grey) -> Exposure:
     """Return how an image was exposed."""
     small = reduce(grey, max(1, min(REDUCTION, min(grey.shape) // 16)))
-    low, high = np.percentile(small, [NEARLY_ALL, 100.0 - NEARLY_ALL])
-    dark, bright = np.percentile(grey[::SPARSE, ::SPARSE], [NEARLY_ALL, 100.0 - NEARLY_ALL])
+    low, high = np.percentile(small, [TAIL_PERCENT, 100.0 - TAIL_PERCENT])
+    dark, bright = np.percentile(grey[::STRIDE, ::STRIDE], [TAIL_PERCENT, 100.0 - TAIL_PERCENT])
     return Exposure(float(dark), float(bright), float(high - low), _blur(grey))
 
 
@@ -65,7 +65,7 @@ def _blur(grey: Grey) -> float:
     """Return the blur of sharp edges [px], in all directions but one."""
     fine, coarse, angle = _edges(grey)
     direction = np.rint(angle / (np.pi / DIRECTIONS)).astype(np.intp) % DIRECTIONS
-    least = max(FEWEST_EDGES, int(FEWEST_PART * len(fine)))  # else they are corners of others
+    least = max(MIN_EDGES, int(MIN_EDGES_PART * len(fine)))  # else they are corners of others
     of_direction = [direction == d for d in range(DIRECTIONS)]
     chosen = [own for own in of_direction if np.count_nonzero(own) >= least]
     blurs = sorted(_blur_of(fine[own], coarse[own]) for own in chosen)
@@ -84,20 +84,20 @@ def _edges(grey: Grey) -> tuple[Grey, Grey, Grey]:
     coarse = cv2.magnitude(x, y)
     # Beside the middle of an edge the ratio says nothing.
     edge = fine >= cv2.dilate(fine, np.ones((3, 3), np.uint8))
-    edge &= coarse >= np.percentile(coarse[::SPARSE, ::SPARSE], WEAK)
+    edge &= coarse >= np.percentile(coarse[::STRIDE, ::STRIDE], WEAK)
     coarse = np.maximum(0.5 * coarse[edge], np.float32(1e-3))  # by pixels of the whole image
     return fine[edge], coarse, np.arctan2(y[edge], x[edge])
 
 
 def _blur_of(fine: Grey, coarse: Grey) -> float:
     """Return the blur of the strongest of some edges by their slopes, fine and coarse."""
-    strong = coarse >= np.partition(coarse, -FEWEST_EDGES)[-FEWEST_EDGES]
+    strong = coarse >= np.partition(coarse, -MIN_EDGES)[-MIN_EDGES]
     strong |= coarse >= np.percentile(coarse, STRONG)
     ratio = float(np.median(fine[strong] / coarse[strong]))
     one, two = (s**2 for s in SCALES)
     # ratio^2 = (sigma^2 + s2^2) / (sigma^2 + s1^2)
     squared = (two - ratio**2 * one) / max(ratio**2 - 1.0, 1e-3)
-    return float(np.sqrt(np.clip(squared, 0.0, LARGEST_BLUR**2)))
+    return float(np.sqrt(np.clip(squared, 0.0, MAX_BLUR**2)))
 
 
 def _slopes(grey: Grey) -> tuple[Grey, Grey]:
@@ -118,12 +118,12 @@ def image_defects(
     good = {row: exposure.blur for row, exposure in exposures.items() if row not in found}
     for row, blur in good.items():
         others, whose = [b for r, b in good.items() if view[r] == view[row]], "view"
-        if len(others) < FEWEST:
+        if len(others) < MIN_IMAGES:
             others, whose = [b for r, b in good.items() if camera[r] == camera[row]], "camera"
-        if len(others) < FEWEST:
+        if len(others) < MIN_IMAGES:
             continue
-        usual = float(np.percentile(others, SHARP))
-        factor, more = MUCH_BLURRED
+        usual = float(np.percentile(others, USUAL_PERCENTILE))
+        factor, more = MAX_BLUR_OF_OTHERS
         if blur > max(factor * usual, usual + more):
             found[row] = (
                 f"the image is blurred by {blur:.1f} px, the others of its {whose} by {usual:.1f}"

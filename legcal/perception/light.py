@@ -2,7 +2,7 @@
 
 Grey levels are light to the power 1 / gamma. Noise grows with light, and a surface has texture: a
 dark background is several times quieter than a lit leg in front of it, so that the foot of the
-blurred step tells more of its place than the top.
+blurred step determines its place better than the top.
 """
 
 from itertools import pairwise
@@ -20,10 +20,10 @@ Samples = NDArray[np.float32]
 DARK = 12.0  # grey level below which noise is taken to be that of this level
 BEYOND = (1.0, 2.5)  # distance from an outline from which on the step is over: [px] and in blurs
 N_SMOOTH = 3  # functions by which a side of a block is smooth: constant, linear, quadratic
-ENOUGH = 8  # pixels on a side of a block
-LEAST_NOISE = 0.3  # of rounded grey levels: their standard deviation
-LARGEST_RATIO = 8.0  # of the noise on both sides that is believed
-FEWEST = 3  # blocks of an outline that tell its noise
+MIN_PIXELS = 8  # pixels on a side of a block
+MIN_NOISE = 0.3  # of rounded grey levels: their standard deviation
+MAX_NOISE_RATIO = 8.0  # of the noise on both sides
+MIN_BLOCKS = 3  # blocks of an outline that give its noise
 
 
 def to_grey(image: Image) -> Grey:
@@ -49,7 +49,7 @@ def reduce(grey: Grey, factor: int) -> Grey:
 
 
 def to_light(grey: Samples, inside: BoolArray, gamma: float) -> tuple[Samples, Samples]:
-    """Return light (n, m) in blocks of pixels, and the weights that noise of grey levels asks for.
+    """Return light (n, m) in blocks of pixels, and the weights by noise of grey levels.
 
     Light changes as grey levels do at the mean of the block; weights are zero outside. Noise of
     grey levels is taken to be even in a block: shot noise grows like the root of light, so that it
@@ -79,10 +79,10 @@ def evened_weights(
         _of_edges(_variance(side, light, weight * (side > beyond)), kept, bounds)
         for side in (-d, d)
     )
-    least = LEAST_NOISE**2
+    least = MIN_NOISE**2
     outer, inner = np.maximum(outer, least), np.maximum(inner, least)
     ratio = np.where(np.isfinite(outer) & np.isfinite(inner), inner / outer, 1.0)
-    ratio = np.clip(ratio, LARGEST_RATIO**-2, LARGEST_RATIO**2)
+    ratio = np.clip(ratio, MAX_NOISE_RATIO**-2, MAX_NOISE_RATIO**2)
     of_block = np.repeat(ratio, np.diff(bounds)).astype(np.float32)[:, None]
     rise = ndtr(d / np.float32(blur)).astype(np.float32)
     # In units of the noise in the middle of the step, which keeps the mean noise about the same.
@@ -100,14 +100,16 @@ def _variance(distance: Samples, light: Samples, weight: Samples) -> Array:
     right = functions @ y[..., None]
     explained = np.sum(right * np.linalg.solve(normal, right), axis=(1, 2))
     free = np.maximum(n - N_SMOOTH, 1)
-    return np.where(n >= ENOUGH, np.maximum(np.sum(y * y, axis=1) - explained, 0.0) / free, np.nan)
+    return np.where(
+        n >= MIN_PIXELS, np.maximum(np.sum(y * y, axis=1) - explained, 0.0) / free, np.nan
+    )
 
 
 def _of_edges(variance: Array, kept: BoolArray, bounds: IntArray) -> Array:
-    """Return the median variance of the kept blocks of each edge, NaN where too few tell it."""
+    """Return the median variance of the kept blocks of each edge, NaN where too few have it."""
     of_edge = np.full(len(bounds) - 1, np.nan)
     for i, (first, last) in enumerate(pairwise(bounds.tolist())):
-        told = variance[first:last][kept[first:last] & np.isfinite(variance[first:last])]
-        if len(told) >= FEWEST:
-            of_edge[i] = np.median(told)
+        known = variance[first:last][kept[first:last] & np.isfinite(variance[first:last])]
+        if len(known) >= MIN_BLOCKS:
+            of_edge[i] = np.median(known)
     return of_edge

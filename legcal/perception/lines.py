@@ -1,8 +1,8 @@
 """Straight edges of a whole picture, and pairs of them that may be the outlines of a cylinder.
 
 A cylinder shows two nearly parallel edges, one where the picture gets brighter across it and one
-where it gets darker; a lit one before something grey may do the same at both. What it is not told
-here: how thick it is, and whether it is a leg at all.
+where it gets darker; a lit one before something grey may do the same at both. How thick it
+is, and whether it is a leg at all, is not known here.
 """
 
 import math
@@ -19,28 +19,28 @@ from legcal.perception.light import Grey, reduce
 from legcal.vision import Camera
 
 LONG_SIDE = 480  # of the reduced picture at least [px]
-LARGEST_FACTOR = 4  # by which a picture is reduced: legs are 12 px wide and more
-SHORTEST = 7.0  # of a piece [reduced px]
-LEAST_LENGTH = 14.0  # of a joined edge [reduced px]
-ASIDE = 1.6  # of the ends of a piece from the line that it continues [reduced px]
-TURN = np.deg2rad(4.0)  # between pieces of one edge
-GAP = 3.0  # between them, in lengths of the shorter one
+MAX_REDUCTION = 4  # by which a picture is reduced: legs are 12 px wide and more
+MIN_PIECE_LENGTH = 7.0  # of a piece [reduced px]
+MIN_LENGTH = 14.0  # of a joined edge [reduced px]
+MAX_OFFSET = 1.6  # of the ends of a piece from the line that it continues [reduced px]
+MAX_TURN = np.deg2rad(4.0)  # between pieces of one edge
+MAX_GAP = 3.0  # between them, in lengths of the shorter one
 DARK = 1.0 / 30.0  # part of the brightest light
-MOST = 400  # pieces of a picture, longest first
-STEEPNESSES = 64  # that are told apart in the order of pixels: each one takes time
+MAX_PIECES = 400  # pieces of a picture, longest first
+N_GRADIENT_BINS = 64  # of the order in which pixels are visited: each one takes time
 
-CONVERGENCE = np.deg2rad(9.0)  # of two outlines: a leg that points at the camera
-NARROWEST, WIDEST = 2.5, 130.0  # [reduced px]
-SLENDER = 1.5  # length in widths
-LEAST_OVERLAP = 0.35  # of the longer edge
-SAME_WAY = 0.5  # what a pair counts at both of whose edges the picture changes the same way
-MOST_PAIRS = 48  # pairs of a picture
-MOST_OF_EDGE = 4  # pairs to which one edge belongs
-ALIKE = 0.35, 0.2  # of a pair that says the same as another: distance, widths in widths
+MAX_CONVERGENCE = np.deg2rad(9.0)  # of two outlines: a leg that points at the camera
+MIN_WIDTH, MAX_WIDTH = 2.5, 130.0  # [reduced px]
+MIN_SLENDERNESS = 1.5  # length in widths
+MIN_OVERLAP = 0.35  # of the longer edge
+SAME_POLARITY = 0.5  # weight of a pair at both of whose edges the picture changes the same way
+MAX_PAIRS = 48  # pairs of a picture
+MAX_PAIRS_OF_EDGE = 4  # pairs to which one edge belongs
+DUPLICATE = 0.35, 0.2  # of a pair that says the same as another: distance, widths in widths
 
 
 @dataclass(frozen=True, eq=False)
-class Segments:
+class EdgeSegments:
     """Straight edges on the sensor plane."""
 
     ends: Array  # (n, 2, 2) on the way from the first to the second the picture is brighter on the
@@ -53,31 +53,31 @@ class Segments:
         return len(self.ends)
 
 
-def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> Segments:
+def find_segments(grey: Grey, camera: Camera, long_side: int = LONG_SIDE) -> EdgeSegments:
     """Return the straight edges of a picture, whose longer side is reduced to ``long_side`` px."""
-    factor = int(np.clip(max(grey.shape) // long_side, 1, LARGEST_FACTOR))
+    factor = int(np.clip(max(grey.shape) // long_side, 1, MAX_REDUCTION))
     pieces = _pieces(reduce(grey, factor))
     focal = float(np.sqrt(abs(np.linalg.det(camera.K[:2, :2]))))
     pixel = factor / focal
     if len(pieces) == 0:
-        return Segments(np.zeros((0, 2, 2)), np.zeros(0), pixel)
+        return EdgeSegments(np.zeros((0, 2, 2)), np.zeros(0), pixel)
     ends = camera.undistort((pieces.reshape(-1, 2) + 0.5) * factor - 0.5).reshape(-1, 2, 2)
     ends, covered = _join(ends / pixel)
-    return Segments(ends * pixel, covered, pixel)
+    return EdgeSegments(ends * pixel, covered, pixel)
 
 
 def _pieces(small: Grey) -> Array:
     """Return pieces of edges (n, 2, 2) in a reduced picture [px]."""
     levels = _stretched(small)
     # Reduced enough already. Whether steep pixels come first matters, not in which order.
-    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, 1.0, n_bins=STEEPNESSES)
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, 1.0, n_bins=N_GRADIENT_BINS)
     lines = detector.detect(levels)[0]
     if lines is None:
         return np.zeros((0, 2, 2))
     pieces = np.asarray(lines, dtype=np.float64).reshape(-1, 2, 2)  # of middles of pixels
     length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
-    order = np.argsort(-length, kind="stable")[:MOST]
-    return np.asarray(pieces[order[length[order] >= SHORTEST]])
+    order = np.argsort(-length, kind="stable")[:MAX_PIECES]
+    return np.asarray(pieces[order[length[order] >= MIN_PIECE_LENGTH]])
 
 
 def _stretched(small: Grey) -> NDArray[np.uint8]:
@@ -97,21 +97,21 @@ def _join(ends: Array) -> tuple[Array, Array]:
     along = along / length[:, None]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     middle = ends.mean(axis=1)
-    # Piece j against the line of piece i, the longer one (pieces come longest first).
-    i, j = np.nonzero(np.triu(along @ along.T >= np.cos(TURN), 1))
+    # Segment j against the line of piece i, the longer one (pieces come longest first).
+    i, j = np.nonzero(np.triu(along @ along.T >= np.cos(MAX_TURN), 1))
     to_ends = ends[j] - middle[i, None]
-    aside = np.abs(np.einsum("nkx,nx->nk", to_ends, normal[i])).max(axis=1)
+    offset = np.abs(np.einsum("nkx,nx->nk", to_ends, normal[i])).max(axis=1)
     place = np.einsum("nkx,nx->nk", to_ends, along[i])
     gap = np.maximum(place.min(axis=1), -place.max(axis=1)) - 0.5 * length[i]
     # A long way ahead a line is known less well.
-    allowed = ASIDE * (1.0 + 0.5 * np.maximum(gap, 0.0) / length[i])
-    near = (gap <= GAP * length[j]) & (aside <= np.minimum(allowed, 2 * ASIDE))
+    allowed = MAX_OFFSET * (1.0 + 0.5 * np.maximum(gap, 0.0) / length[i])
+    near = (gap <= MAX_GAP * length[j]) & (offset <= np.minimum(allowed, 2 * MAX_OFFSET))
     i, j = i[near], j[near]
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(len(ends), len(ends)))
     label: IntArray = np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
     order = np.argsort(label, kind="stable")
     found, covered = _fitted(ends[order], length[order], label[order])
-    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= LEAST_LENGTH
+    long = np.linalg.norm(found[:, 1] - found[:, 0], axis=1) >= MIN_LENGTH
     return found[long], covered[long]
 
 
@@ -134,11 +134,11 @@ def _fitted(pieces: Array, length: Array, label: IntArray) -> tuple[Array, Array
     longest = pieces[first, 1] - pieces[first, 0]
     direction *= np.sign(np.sum(direction * longest, axis=1))[:, None]
     x, y = direction[label].T[..., None]
-    place, aside = away[..., 0] * x + away[..., 1] * y, away[..., 1] * x - away[..., 0] * y
+    place, offset = away[..., 0] * x + away[..., 1] * y, away[..., 1] * x - away[..., 0] * y
     start = np.minimum.reduceat(place.min(axis=1), first)
     stop = np.maximum.reduceat(place.max(axis=1), first)
     lines = centre[:, None] + np.stack([start, stop], axis=1)[..., None] * direction[:, None]
-    straight = np.maximum.reduceat(np.abs(aside).max(axis=1), first) <= 1.5 * ASIDE
+    straight = np.maximum.reduceat(np.abs(offset).max(axis=1), first) <= 1.5 * MAX_OFFSET
     bent = ~straight[label]
     order = np.argsort(np.concatenate([np.flatnonzero(straight), label[bent]]), kind="stable")
     share = np.minimum(total / (stop - start), 1.0)
@@ -180,7 +180,7 @@ class EdgePairs:
         )
 
 
-def find_edge_pairs(segments: Segments, most: int = MOST_PAIRS) -> EdgePairs:
+def find_edge_pairs(segments: EdgeSegments, most: int = MAX_PAIRS) -> EdgePairs:
     """Return the best pairs of edges that may be a cylinder."""
     ends, pixel = segments.ends, segments.pixel
     i, j = np.triu_indices(len(ends), 1)
@@ -188,7 +188,7 @@ def find_edge_pairs(segments: Segments, most: int = MOST_PAIRS) -> EdgePairs:
     length = np.linalg.norm(along, axis=1)
     along = along / np.where(length > 0.0, length, 1.0)[:, None]
     cosine = np.sum(along[i] * along[j], axis=1)
-    i, j, cosine = (x[np.abs(cosine) >= np.cos(CONVERGENCE)] for x in (i, j, cosine))
+    i, j, cosine = (x[np.abs(cosine) >= np.cos(MAX_CONVERGENCE)] for x in (i, j, cosine))
     axis = along[i] * length[i, None] + np.sign(cosine)[:, None] * along[j] * length[j, None]
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     across = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
@@ -209,12 +209,14 @@ def find_edge_pairs(segments: Segments, most: int = MOST_PAIRS) -> EdgePairs:
     offsets = [at + slope * np.stack([first, last]) for at, slope in lines]  # each (2, n)
     gap = offsets[1] - offsets[0]
     width = np.abs(gap)
-    good = (overlap >= LEAST_OVERLAP * longer) & (gap[0] * gap[1] > 0.0)
-    good &= (width.min(axis=0) >= NARROWEST * pixel) & (width.max(axis=0) <= WIDEST * pixel)
-    good &= overlap >= SLENDER * width.mean(axis=0)
+    good = (overlap >= MIN_OVERLAP * longer) & (gap[0] * gap[1] > 0.0)
+    good &= (width.min(axis=0) >= MIN_WIDTH * pixel) & (width.max(axis=0) <= MAX_WIDTH * pixel)
+    good &= overlap >= MIN_SLENDERNESS * width.mean(axis=0)
     merit = overlap * np.minimum(segments.covered[i], segments.covered[j])
     merit = (
-        merit * np.where(cosine < 0.0, 1.0, SAME_WAY) * np.sqrt(np.maximum(overlap, 0.0) / longer)
+        merit
+        * np.where(cosine < 0.0, 1.0, SAME_POLARITY)
+        * np.sqrt(np.maximum(overlap, 0.0) / longer)
     )
     centre = 0.5 * (offsets[0] + offsets[1])  # (2, n) of the axis at both ends
     start, stop = (
@@ -242,7 +244,7 @@ def _best(merit: Array, i: IntArray, j: IntArray, n_edges: int, most: int) -> In
     for k in np.argsort(-merit, kind="stable").tolist():
         if merit[k] <= 0.0 or len(chosen) == 2 * most:
             break
-        if max(used[i[k]], used[j[k]]) < MOST_OF_EDGE:
+        if max(used[i[k]], used[j[k]]) < MAX_PAIRS_OF_EDGE:
             used[[i[k], j[k]]] += 1
             chosen.append(k)
     return np.array(chosen, dtype=np.intp)
@@ -256,11 +258,11 @@ def _distinct(start: Array, stop: Array, width: Array) -> BoolArray:
     # Ends of pair j in the frame of pair i.
     to_ends = np.stack([start, stop], axis=1)[None] - start[:, None, None]
     place = np.einsum("ijkx,ix->ijk", to_ends, along)
-    aside = to_ends[..., 1] * along[:, None, None, 0] - to_ends[..., 0] * along[:, None, None, 1]
+    offset = to_ends[..., 1] * along[:, None, None, 0] - to_ends[..., 0] * along[:, None, None, 1]
     middle = place.mean(axis=2)
-    alike = np.abs(aside).max(axis=2) <= ALIKE[0] * width[:, None]
+    alike = np.abs(offset).max(axis=2) <= DUPLICATE[0] * width[:, None]
     alike &= (middle > 0.0) & (middle < length[:, None])
-    alike &= np.abs(width[None, :] - width[:, None]) <= ALIKE[1] * width[:, None]
+    alike &= np.abs(width[None, :] - width[:, None]) <= DUPLICATE[1] * width[:, None]
     kept = np.ones(len(start), dtype=np.bool_)
     for j in range(1, len(start)):
         kept[j] = not np.any(alike[:j, j] & kept[:j])

@@ -24,21 +24,21 @@ OUTSIDE = "outside the image"  # a reason
 HIDDEN = "hidden by"  # the beginning of one
 WRONG_WIDTH = "width inconsistent with the radius"  # the beginning of another one
 MARGIN = 4.0  # beside a leg in front [px]
-NARROWEST = 5.0  # [px]
-NARROW = 0.8  # of the width, up to which a window tells both outlines apart
-LEAST_LENGTH = (30.0, 1.0)  # of an outline: [px] and in widths of the leg
-LEAST_CONTRAST = 4.0  # [grey levels]
-LEAST_AGREEMENT = 0.6  # share of the blocks with an edge that must lie on the line
-LEAST_KEPT = 0.25  # share of all unhidden blocks that must
-LONE_KEPT = 0.5  # the same of an edge without its partner
-LARGEST_SCATTER = (0.6, 1.2)  # of the blocks of an edge: [px] and in blurs
-LARGEST_SIGMA = 1.0  # [px]
+MIN_WIDTH = 5.0  # [px]
+MAX_GUIDED_WINDOW = 0.8  # of the width, up to which a window separates both outlines
+MIN_LENGTH = (30.0, 1.0)  # of an outline: [px] and in widths of the leg
+MIN_CONTRAST = 4.0  # [grey levels]
+MIN_INLIER_SHARE = 0.6  # share of the blocks with an edge that must lie on the line
+MIN_KEPT = 0.25  # share of all unhidden blocks that must
+MIN_LONE_KEPT = 0.5  # the same of an edge without its partner
+MAX_SCATTER = (0.6, 1.2)  # of the blocks of an edge: [px] and in blurs
+MAX_SIGMA = 1.0  # [px]
 STEP_END = 1.5  # depth up to which the blurred step reaches [blurs]
-LEAST_STEP = 1.15  # of it that a saturated background must leave [px]
+MIN_STEP = 1.15  # of it that a saturated background must leave [px]
 WIDTH_TOLERANCE = (0.7, 0.035)  # [px] and share of the predicted width
 NEAR_TOLERANCE = (0.2, 3.0)  # the same where both are predicted well: [px], standard deviations
-SURER = 0.75  # by which factor an outline must be surer than the edge of a shade
-NEAR, NEARER = 0.5, 0.5  # of an outline that needs no partner: part of the window, of its distance
+MAX_SIGMA_RATIO = 0.75  # of an outline to the edge of a shade
+MAX_LONE_OFFSET, MAX_LONE_RATIO = 0.5, 0.5  # of a lone outline: of the window, of its partner's
 NARROW_BIAS = 0.15  # of such an outline, in what the width is too small
 
 
@@ -52,7 +52,7 @@ class ImageSearch:
     legs: Sequence[PredictedLeg]  # all that it should show: also those not looked for hide others
     names: Sequence[str]  # of all legs, for reasons
     window: Array  # (n_legs,) largest distance from a prediction [px]; NaN: not looked for
-    vouched: bool = False  # whether other legs vouch for the predictions: one edge is enough
+    guided: bool = False  # whether a fit to other legs predicts them: one edge is enough
     blur: float | None = None  # as other images show it, where outlines are known to tenths [px]
 
 
@@ -77,7 +77,7 @@ def measure(search: ImageSearch, *, together: bool = True) -> tuple[Outlines, fl
         ]
         measured, blur = measure_edges(search.grey, search.camera, edges, together, search.blur)
         for part, one, two in zip(parts, measured[::2], measured[1::2], strict=True):
-            tables.append(_judged(search, part, (one, two), near_fit=near))
+            tables.append(_with_verdict(search, part, (one, two), near_fit=near))
     return join_outlines(tables), blur
 
 
@@ -91,46 +91,46 @@ def find_parts(search: ImageSearch) -> tuple[list[Part], list[Outlines]]:
     def reject(leg: PredictedLeg, part: str, why: str) -> None:
         rejected.append(part_outlines(search, leg.leg, part, (why, why)))
 
-    sought: list[tuple[Part, Array]] = []  # with the predicted outlines (2, 3)
+    searched: list[tuple[Part, Array]] = []  # with the predicted outlines (2, 3)
     for leg in search.legs:
         window = float(search.window[leg.leg])
         if math.isnan(window):
             continue
-        for piece, h in zip(leg.pieces, leg.outlines, strict=True):
+        for segment, h in zip(leg.segments, leg.outlines, strict=True):
             band = leg.band
-            if len(leg.pieces) > 1:
-                args = leg.A_camera, leg.B_camera, piece.start, piece.end
+            if len(leg.segments) > 1:
+                args = leg.A_camera, leg.B_camera, segment.start, segment.end
                 own = band_of_leg(search.camera, *args)
                 if own is None:
-                    reject(leg, piece.link, OUTSIDE)
+                    reject(leg, segment.link, OUTSIDE)
                     continue
                 band = own
             predicted = band.offsets(h[:, None, :], np.array([0.0, band.length]))
             width = float(np.mean(predicted[1] - predicted[0]))
-            if width < NARROWEST:
-                reject(leg, piece.link, f"too narrow, {width:.1f} px wide")
-            elif band.length < _least_length(width):
-                reject(leg, piece.link, f"too short, {band.length:.0f} px in the image")
+            if width < MIN_WIDTH:
+                reject(leg, segment.link, f"too narrow, {width:.1f} px wide")
+            elif band.length < _min_length(width):
+                reject(leg, segment.link, f"too short, {band.length:.0f} px in the image")
             else:
-                vouched = search.vouched and window <= NARROW * width
+                guided = search.guided and window <= MAX_GUIDED_WINDOW * width
                 free = np.zeros(len(block_positions(band)), dtype=np.bool_)
-                part = Part(leg, piece, band, predicted, free, window, vouched)
-                sought.append((part, h))
+                part = Part(leg, segment, band, predicted, free, window, guided)
+                searched.append((part, h))
     free_parts: list[Part] = []
-    for (part, _), front in zip(sought, _in_front(search.legs, sought), strict=True):
+    for (part, _), front in zip(searched, _in_front(search.legs, searched), strict=True):
         hidden = np.any(front >= 0, axis=0)
         width = float(np.mean(part.predicted[1] - part.predicted[0]))
-        if np.mean(~hidden) * part.band.length < _least_length(width):
+        if np.mean(~hidden) * part.band.length < _min_length(width):
             values, counts = np.unique(front[front >= 0], return_counts=True)
             why = f"{HIDDEN} {search.names[values[np.argmax(counts)]]}"
-            reject(part.leg, part.piece.link, why)
+            reject(part.leg, part.segment.link, why)
         else:
             free_parts.append(replace(part, hidden=hidden))
     parts: list[Part] = []
     pairs = find_pairs(search.grey, search.camera, free_parts)
     for part, pair in zip(free_parts, pairs, strict=True):
         if pair is None:
-            reject(part.leg, part.piece.link, "no convincing pair of edges")
+            reject(part.leg, part.segment.link, "no convincing pair of edges")
         else:
             parts.append(replace(part, pair=pair))
     return parts, rejected
@@ -149,7 +149,7 @@ def part_outlines(
     """Return both outlines of a part, NaN where there is no line.
 
     A line of a part that was found: offsets (2,) at both ends of its band [px], where the used
-    piece begins and ends (2,) as fractions of the band, covariance (2, 2) there [px^2].
+    segment begins and ends (2,) as fractions of the band, covariance (2, 2) there [px^2].
     """
     h, ends, covariance = np.full((2, 3), np.nan), np.full((2, 2, 2), np.nan), np.zeros((2, 2, 2))
     covariance[:] = np.nan
@@ -175,29 +175,31 @@ def part_outlines(
     )
 
 
-def _least_length(width: float) -> float:
+def _min_length(width: float) -> float:
     """Return how much of a part of a width must be seen [px]."""
-    return max(LEAST_LENGTH[0], LEAST_LENGTH[1] * width)
+    return max(MIN_LENGTH[0], MIN_LENGTH[1] * width)
 
 
-def _in_front(legs: Sequence[PredictedLeg], sought: Sequence[tuple[Part, Array]]) -> list[IntArray]:
+def _in_front(
+    legs: Sequence[PredictedLeg], searched: Sequence[tuple[Part, Array]]
+) -> list[IntArray]:
     """Return which leg hides the outlines (2, n_blocks) of each part, -1 where they are free."""
-    if not sought:
+    if not searched:
         return []
     points = []
-    for part, h in sought:
+    for part, h in searched:
         s = part.leg.distance_along(part.band, block_positions(part.band))
         axis = part.leg.A_camera + s[:, None] * part.leg.u
         radius = EPSILON * (h @ part.leg.A_camera)
         points.append((axis - (EPSILON * radius)[:, None, None] * h[:, None]).reshape(-1, 3))
     n = [len(of_part) for of_part in points]
-    own = np.repeat([part.leg.leg for part, _ in sought], n)
-    margin = np.repeat([MARGIN / part.band.scale for part, _ in sought], n)
+    own = np.repeat([part.leg.leg for part, _ in searched], n)
+    margin = np.repeat([MARGIN / part.band.scale for part, _ in searched], n)
     front = hidden_by(legs, own, np.concatenate(points), margin)
     return [of_part.reshape(2, -1) for of_part in np.split(front, np.cumsum(n)[:-1])]
 
 
-def _judged(
+def _with_verdict(
     search: ImageSearch,
     part: Part,
     measured: tuple[MeasuredEdge | None, MeasuredEdge | None],
@@ -205,7 +207,7 @@ def _judged(
     near_fit: bool,
 ) -> Outlines:
     """Turn the measured edges of a part into outlines with verdicts and how well they were seen."""
-    length, window = part.band.length, part.window if part.vouched else None
+    length, window = part.band.length, part.window if part.guided else None
     judged = verdict(part.edges, part.predicted, length, measured, window, near_fit=near_fit)
     lines: list[tuple[Array, Array, Array] | None] = []
     quality = np.full((2, 4), np.nan)  # rounded to what says something
@@ -226,7 +228,7 @@ def _judged(
     return part_outlines(
         search,
         part.leg.leg,
-        part.piece.link,
+        part.segment.link,
         judged.reasons,
         lines,
         found=part,
@@ -256,12 +258,12 @@ def verdict(
 ) -> Verdict:
     """Judge both edges of a part, predicted at offsets (2, 2) [px] of a band of a length [px].
 
-    Two edges vouch for each other by their distance, as they were measured or at least as they were
+    Two edges confirm each other by their distance, as they were measured or at least as they were
     found. One whose partner fails otherwise must be convincing by itself. Where they are too
     near to each other, one is where light and shade meet on the leg: a bend that is known less
     well than the other one, which is an outline. ``window`` is how far outlines are from their
-    predictions at most, where other legs vouch for these [px]; ``near_fit`` that a joint fit has
-    them there, so that their distance is known well.
+    predictions at most, where a fit to other legs predicts these [px]; ``near_fit`` that a joint
+    fit has them there, so that their distance is known well.
     """
     expected = predicted[1] - predicted[0]
     width = float(np.mean(pair.v[1] - pair.v[0]))
@@ -276,11 +278,13 @@ def verdict(
         if reach is None or not all(by_width.reasons):
             return by_width
         return _by_place((one, two), predicted, reach, by_width)
-    vouched = pair.suits(expected)
+    confirmed = pair.suits(expected)
     stands = [
         edge is not None
         and _is_clear_step(edge)
-        and bool(vouched or (may if window is None else _off(edge, at) <= NEAR * window))
+        and bool(
+            confirmed or (may if window is None else _off(edge, at) <= MAX_LONE_OFFSET * window)
+        )
         for edge, may, at in zip(measured, pair.alone, predicted, strict=True)
     ]
     first, second = (
@@ -303,13 +307,18 @@ def _by_width(one: MeasuredEdge, two: MeasuredEdge, expected: Array, *, near_fit
         return Verdict(("", ""))
     i = int(np.argmax(mismatch))
     reason = f"{WRONG_WIDTH}, {widths[i]:.1f} px for {expected[i]:.1f} px"
-    surer, ratio = (
+    better, ratio = (
         (one, sigma_one / sigma_two) if sigma_one < sigma_two else (two, sigma_two / sigma_one)
     )
-    if near_fit or np.any(widths >= expected) or ratio > SURER or not _is_clear_step(surer):
+    if (
+        near_fit
+        or np.any(widths >= expected)
+        or ratio > MAX_SIGMA_RATIO
+        or not _is_clear_step(better)
+    ):
         return Verdict((reason, reason))
     bias = NARROW_BIAS * float(np.abs(widths - expected).max())
-    return Verdict(("", reason) if surer is one else (reason, ""), bias)
+    return Verdict(("", reason) if better is one else (reason, ""), bias)
 
 
 def _by_place(
@@ -318,7 +327,9 @@ def _by_place(
     """Judge two edges at a wrong distance, one of which is where an outline should be."""
     off = [_off(edge, at) for edge, at in zip(measured, predicted, strict=True)]
     near = int(np.argmin(off))
-    if off[near] > min(NEAR * window, NEARER * off[1 - near]) or not _is_clear_step(measured[near]):
+    if off[near] > min(
+        MAX_LONE_OFFSET * window, MAX_LONE_RATIO * off[1 - near]
+    ) or not _is_clear_step(measured[near]):
         return judged
     return Verdict((judged.reasons[0] if near else "", "" if near else judged.reasons[1]))
 
@@ -330,7 +341,7 @@ def _off(edge: MeasuredEdge, predicted: Array) -> float:
 
 def _is_clear_step(edge: MeasuredEdge) -> bool:
     """Say whether an edge is a step of the picture on most of its length."""
-    return edge.is_step and float(np.mean(edge.line.kept)) >= LONE_KEPT
+    return edge.is_step and float(np.mean(edge.line.kept)) >= MIN_LONE_KEPT
 
 
 def _reason(edge: MeasuredEdge | None, length: float, width: float) -> str:
@@ -338,23 +349,23 @@ def _reason(edge: MeasuredEdge | None, length: float, width: float) -> str:
     if edge is None:
         return "edge hardly visible"
     step = (STEP_END - edge.clipped) * edge.blur
-    if step < LEAST_STEP:
+    if step < MIN_STEP:
         return f"the background is overexposed, {max(step, 0.0):.1f} px of the step are left"
     line = edge.line
-    least = max(LEAST_LENGTH[0], LEAST_LENGTH[1] * width)
+    least = max(MIN_LENGTH[0], MIN_LENGTH[1] * width)
     visible = (line.last - line.first) * length
     if visible < least:
         return f"too short, {visible:.0f} px visible"
-    if line.agreement < LEAST_AGREEMENT:
-        return f"edge not straight, {100 * line.agreement:.0f} % of it on one line"
+    if line.inlier_share < MIN_INLIER_SHARE:
+        return f"edge not straight, {100 * line.inlier_share:.0f} % of it on one line"
     kept = float(np.mean(line.kept))
-    if kept < LEAST_KEPT:
+    if kept < MIN_KEPT:
         return f"edge hardly visible, found on {100 * kept:.0f} % of it"
-    if edge.contrast < LEAST_CONTRAST:
+    if edge.contrast < MIN_CONTRAST:
         return f"low contrast, {edge.contrast:.1f} grey levels"
-    if line.scatter > max(LARGEST_SCATTER[0], LARGEST_SCATTER[1] * edge.blur):
+    if line.scatter > max(MAX_SCATTER[0], MAX_SCATTER[1] * edge.blur):
         return f"edge too rough, scatter {line.scatter:.2f} px"
     sigma = edge.sigma
-    if sigma > LARGEST_SIGMA:
+    if sigma > MAX_SIGMA:
         return f"edge too uncertain, sigma {sigma:.2f} px"
     return ""

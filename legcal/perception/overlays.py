@@ -26,7 +26,7 @@ OTHER_FAILS = "other outline fails"
 Picture = NDArray[np.uint8]
 
 SCREEN = 1600  # longer side from which on a picture is not enlarged [px]
-MOST_ENLARGED = 4
+MAX_ENLARGEMENT = 4
 PER_LINE, PER_LETTER = 1000.0, 75.0  # longer sides in a line's width, and in a letter's height
 COLOURS: dict[Kind, tuple[int, int, int]] = {  # blue, green, red
     "edge 1": (80, 230, 60),
@@ -89,7 +89,7 @@ def marks_of_image(
     By its outlines, and where its legs should be.
     """
     of_leg = {leg.leg: leg for leg in predicted}
-    several = {leg.leg for leg in predicted if len(leg.pieces) > 1}
+    several = {leg.leg for leg in predicted if len(leg.segments) > 1}
     pairs: dict[tuple[int, str], list[int]] = {}
     for i, key in enumerate(zip(outlines.leg.tolist(), outlines.part, strict=True)):
         pairs.setdefault(key, []).append(i)
@@ -106,13 +106,13 @@ def marks_of_image(
         if "edited" in pair.source:
             name += " (edited)"
         found.append(PartMarks(name, _reason(pair), marks))
-    for lost in predicted:  # legs of which the table has nothing
-        if any(lost.leg == j for j, _ in pairs):
+    for absent in predicted:  # legs of which the table has nothing
+        if any(absent.leg == j for j, _ in pairs):
             continue
-        parts = range(len(lost.pieces))
-        marks = tuple(mark for i in parts for mark in _prediction(camera, lost, i))
+        parts = range(len(absent.segments))
+        marks = tuple(mark for i in parts for mark in _prediction(camera, absent, i))
         if marks:
-            found.append(PartMarks(leg_names[lost.leg], "", marks))
+            found.append(PartMarks(leg_names[absent.leg], "", marks))
     return found
 
 
@@ -147,8 +147,8 @@ def _part_marks(
         ends = np.mean([camera.undistort(pair.ends[i]) for i in np.flatnonzero(used)], axis=0)
         marks.append(Mark("axis", _curve(camera, pair.h[used].sum(axis=0), ends)))
     if leg is not None and not np.all(found) and OUTSIDE not in pair.reason:
-        for i, piece in enumerate(leg.pieces):
-            if piece.link == part:
+        for i, segment in enumerate(leg.segments):
+            if segment.link == part:
                 edges = [e - 1 for e, seen in zip(pair.edge, found, strict=True) if not seen]
                 marks += [mark for k, mark in enumerate(_prediction(camera, leg, i)) if k in edges]
     return tuple(marks)
@@ -163,9 +163,9 @@ def _curve(camera: Camera, h: Array, ends: Array) -> Array:
 
 
 def _prediction(camera: Camera, leg: PredictedLeg, i: int) -> list[Mark]:
-    """Return both predicted outlines of piece i of a leg; none where the image misses it."""
-    piece = leg.pieces[i]
-    band = band_of_leg(camera, leg.A_camera, leg.B_camera, piece.start, piece.end)
+    """Return both predicted outlines of segment i of a leg; none where it is outside the image."""
+    segment = leg.segments[i]
+    band = band_of_leg(camera, leg.A_camera, leg.B_camera, segment.start, segment.end)
     if band is None:
         return []
     t = np.linspace(0.0, band.length, N_POINTS)
@@ -181,7 +181,7 @@ def draw(image: Image, parts: Sequence[PartMarks], caption: str) -> Picture:
     The caption stands in the legend.
     """
     longer = max(image.shape)
-    factor = int(np.clip(np.ceil(SCREEN / longer), 1, MOST_ENLARGED))
+    factor = int(np.clip(np.ceil(SCREEN / longer), 1, MAX_ENLARGEMENT))
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     if factor > 1:
         grey = np.asarray(

@@ -1,9 +1,9 @@
 """The photographs of a dataset turned into outlines: detected, kept, given or edited.
 
-:func:`observe` reads as the method: images are looked at, legs are recognised and the cameras
+:func:`observe` reads as the method: images are inspected, legs are recognised and the cameras
 placed, outlines are measured near there, parts that were not found are tried with other radii,
 views are fitted to their outlines and missing legs looked for, and what is wrong with an image is
-said. Once a joint fit has told where everything is, :func:`measure_photographs` measures near it.
+noted. Once a joint fit has placed everything, :func:`measure_photographs` measures near it.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ from legcal.perception.placement import (
     group_views,
 )
 from legcal.perception.radii import Part, radius_notes
-from legcal.perception.recognise import recognise
+from legcal.perception.recognition import recognise
 from legcal.perception.view_fit import refine_views
 from legcal.progress import Report
 from legcal.vision import camera_numbers
 from legcal.workers import Run
 
 DETECTOR_VERSION = 1  # raise it whenever outlines or notes that are kept come out differently
-HARDLY = 0.3  # of the outlines of a part that should be seen
+MAX_USED_SHARE = 0.3  # of the outlines of a part that should be seen
 
 
 def detection_settings() -> dict[str, object]:
@@ -122,7 +122,7 @@ class Photographs:
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class Observations:
     """What the images show."""
 
     photographs: Photographs  # the images, and the mechanism with the radii that they show
@@ -154,25 +154,25 @@ def observe(
     joined: Joined = None,
     *,
     together: bool = True,
-) -> Observed:
+) -> Observations:
     """Place the cameras, measure the outlines, and leave out the images that are wrong.
 
     ``joined`` are T_board_camera of views that show a calibration board, which are placed together;
     ``together`` is as for :func:`legcal.perception.outline.measure`.
     """
-    defects, pairs = _looked_at(photographs, nominal, report, joined)
+    defects, pairs = _inspect_images(photographs, nominal, report, joined)
     usable = np.array([row for row in photographs.detect if row not in defects], dtype=np.intp)
     search = photographs.search(nominal, pairs)
     hints = nominal.T_base_camera
 
-    def recognised(doubtful: Collection[Part] = ()) -> Placement:
-        return _recognised(photographs, search, usable, hints, report, joined, doubtful)
+    def recognised(suspects: Collection[Part] = ()) -> Placement:
+        return _recognised(photographs, search, usable, hints, report, joined, suspects)
 
     placement = recognised()
     outlines, blur = _measured(photographs, search, placement, report, together=together)
-    doubtful = _parts_not_found(photographs, outlines)
-    if doubtful:
-        other = recognised(doubtful)
+    suspects = _parts_not_found(photographs, outlines)
+    if suspects:
+        other = recognised(suspects)
         if other.radii.factor:
             machine = photographs.machine.with_cylinders(other.radii.corrected(search.cylinders))
             corrected = replace(photographs, machine=machine)
@@ -200,7 +200,7 @@ def observe(
     view, known = photographs.measurements.view, ~np.isnan(blur)
     of_views = [blur[known & (view == v)] for v in range(len(photographs.measurements.views))]
     usual = tuple(float(np.median(own)) if len(own) else np.nan for own in of_views)
-    return Observed(photographs, placement, reject_images(outlines, reasons), reasons, usual)
+    return Observations(photographs, placement, reject_images(outlines, reasons), reasons, usual)
 
 
 def place(
@@ -237,12 +237,12 @@ def _recognised(
     hints: Sequence[RigidTransform | None],
     report: Report,
     joined: Joined,
-    doubtful: Collection[Part] = (),
+    suspects: Collection[Part] = (),
 ) -> Placement:
     """Return what is recognised in some images, with notes on radii."""
     progress = _counted(report, "Recognising legs", len(rows))
     found = recognise(
-        search, rows, hints, joined, doubtful=doubtful, run=photographs.run, progress=progress
+        search, rows, hints, joined, suspects=suspects, run=photographs.run, progress=progress
     )
     return replace(found, notes=tuple(radius_notes(found.radii, search.leg_names)))
 
@@ -272,7 +272,7 @@ def _measured(
     return photographs.with_found(found), blur
 
 
-def _looked_at(
+def _inspect_images(
     photographs: Photographs, nominal: Placement, report: Report, joined: Joined
 ) -> tuple[dict[int, str], dict[int, EdgePairs]]:
     """Return why images show nothing, and edge pairs of those recognised first, by row."""
@@ -282,7 +282,7 @@ def _looked_at(
     first = {r for g in groups for r in (g.rows if g.hint is None else g.some)}
     exposures, pairs = dict[int, Exposure](), dict[int, EdgePairs]()
     count = _counted(report, "Looking at images", len(rows))
-    look = partial(_look, photographs.search(nominal), first)
+    look = partial(_inspect, photographs.search(nominal), first)
     for row, (exposure, own) in zip(rows, photographs.run(look, rows), strict=True):
         exposures[row] = exposure
         if own is not None:
@@ -294,7 +294,7 @@ def _looked_at(
     return image_defects(exposures, view, {row: camera[v] for row, v in view.items()}), pairs
 
 
-def _look(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, EdgePairs | None]:
+def _inspect(search: Search, rows: Collection[int], row: int) -> tuple[Exposure, EdgePairs | None]:
     """Return how an image was exposed, and the edge pairs of those that are to be recognised."""
     image = search.load(row)
     view = int(search.measurements.view[row])
@@ -319,7 +319,7 @@ def _parts_not_found(photographs: Photographs, outlines: Outlines) -> list[Part]
         for link, radius in leg.radius_of_part.items():
             own = visible & (outlines.leg == j) & (part == link)
             is_seen = own.any() or not visible.any()
-            if is_seen and used[own].sum() <= HARDLY * own.sum():
+            if is_seen and used[own].sum() <= MAX_USED_SHARE * own.sum():
                 parts.append((j, radius))
     return parts
 

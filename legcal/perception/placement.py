@@ -1,4 +1,4 @@
-"""What is searched for in images, and where their cameras and legs are believed to be.
+"""What is searched for in images, and where their cameras and legs are estimated to be.
 
 A :class:`Search` is the nominal model at every reading. A :class:`Placement` is what flows through
 the room: first rough cameras and the nominal model, then what was recognised, then what views
@@ -16,10 +16,10 @@ from legcal.data import Measurements
 from legcal.errors import NotVisible
 from legcal.geometry import Array, BoolArray, Image, IntArray
 from legcal.machine import Cylinder
-from legcal.perception.agreement import Picture, Targets, targets_of
 from legcal.perception.light import to_grey
 from legcal.perception.lines import EdgePairs, find_edge_pairs, find_segments
-from legcal.perception.radii import NO_OTHER_RADII, OtherRadii
+from legcal.perception.pair_matching import LegSegments, Picture, leg_segments
+from legcal.perception.radii import NO_RADIUS_FACTORS, RadiusFactors
 from legcal.vision import Camera
 
 Load = Callable[[int], Image]  # of a row, 8 or 16 bit, grey or colour (BGR)
@@ -40,7 +40,7 @@ class Search:
     A_base: Array  # (n_rows, n_legs, 3) joint centres by the nominal model, in the base link [m]
     B_base: Array
     cylinders: Sequence[Sequence[Cylinder]]  # what can be seen of each leg
-    wanted: BoolArray  # (n_views, n_legs) legs that each view is said to show
+    wanted: BoolArray  # (n_views, n_legs) legs that each view is stated to show
     leg_names: Sequence[str]
     edge_pairs: Mapping[int, EdgePairs] = field(default_factory=dict)  # of rows seen before
 
@@ -62,10 +62,10 @@ class Search:
         camera = self.measurements.views[view].camera
         return find_edge_pairs(find_segments(to_grey(self.load(row)), camera))
 
-    def targets(self, row: int, view: int) -> Targets:
-        """Return the legs at the reading of a row that a view is said to show."""
+    def targets(self, row: int, view: int) -> LegSegments:
+        """Return the legs at the reading of a row that a view is stated to show."""
         legs = np.flatnonzero(self.wanted[view])
-        return targets_of(self.A_base[row], self.B_base[row], self.cylinders, legs)
+        return leg_segments(self.A_base[row], self.B_base[row], self.cylinders, legs)
 
     def retargeted(self, row: int, picture: Picture) -> Picture:
         """Return what an image shows with what it should show by other cylinders."""
@@ -84,10 +84,10 @@ def corners_of(camera: Camera) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where cameras and joint centres are believed to be, and how far outlines may be from there.
+    """Where cameras and joint centres are estimated to be, and how far outlines may be from there.
 
     Outlines are looked for within ``pixel_error`` and what ``joint_error`` makes in an image, or
-    within ``window``, for which other legs vouch.
+    within ``window`` about a fit to other legs.
     """
 
     A_base: Array  # (n_rows, n_legs, 3) where the view of each row sees them, in the base link [m]
@@ -98,7 +98,7 @@ class Placement:
     window: Array | None = None  # (n_rows, n_legs) [px]; NaN: not looked for
     blur: tuple[float, ...] = ()  # of each view near a fit [px]; NaN or (): not known
     shift: Array = field(default_factory=lambda: np.zeros(0))  # (n_views, n_legs, 2, 3), see below
-    radii: OtherRadii = NO_OTHER_RADII  # that images contradict; cameras are placed by theirs
+    radii: RadiusFactors = NO_RADIUS_FACTORS  # that images contradict; cameras are placed by theirs
     unplaced: dict[str, str] = field(default_factory=dict)  # why views have no camera, by name
     notes: tuple[str, ...] = ()  # what else a reader should know
 

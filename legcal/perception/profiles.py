@@ -14,10 +14,10 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.perception.light import Grey, Samples
 from legcal.vision import Band, Camera
 
-SATURATED = 250.0  # grey level from which a pixel tells no more than "bright"
-FEW = 4  # such pixels of a block that may be noise
-ROUGHLY = 1.0  # how far an outline may be off [px]
-MOSTLY = 0.5  # share of them from some distance on with which a background is clipped
+SATURATED = 250.0  # grey level from which a pixel is saturated
+MAX_NOISY = 4  # such pixels of a block that may be noise
+MAX_OFFSET = 1.0  # how far an outline may be off [px]
+MIN_SHARE_CLIPPED = 0.5  # share of them from some distance on with which a background is clipped
 MAX_ROWS = 512  # along one outline
 NODE_SPACING = 16.0  # between points at which the lens distortion is computed [px]
 
@@ -203,16 +203,20 @@ def _unsaturated(d: Samples, grey: Grey, inside: BoolArray) -> tuple[Samples, Sa
     """
     first, last = (np.full(len(d), at, dtype=np.float32) for at in (-np.inf, np.inf))
     bright = inside & (grey >= SATURATED)
-    some = np.flatnonzero(np.count_nonzero(bright, axis=1) > FEW)
+    some = np.flatnonzero(np.count_nonzero(bright, axis=1) > MAX_NOISY)
     if len(some) == 0:
         return first, last
     d, bright, inside = d[some], bright[some], inside[some]
-    behind = np.partition(np.where(bright & (d < 0.0), d, -np.inf), -1 - FEW, axis=1)[:, -1 - FEW]
+    behind = np.partition(np.where(bright & (d < 0.0), d, -np.inf), -1 - MAX_NOISY, axis=1)[
+        :, -1 - MAX_NOISY
+    ]
     beyond = inside & (d <= behind[:, None])
     n_bright = np.count_nonzero(beyond & bright, axis=1)
-    clipped = (n_bright > MOSTLY * np.count_nonzero(beyond, axis=1))[:, None]
+    clipped = (n_bright > MIN_SHARE_CLIPPED * np.count_nonzero(beyond, axis=1))[:, None]
     # The line may be off: what is bright near it is the background, where that is clipped.
-    near = np.where(clipped, np.float32(ROUGHLY), np.float32(0.0))
+    near = np.where(clipped, np.float32(MAX_OFFSET), np.float32(0.0))
     first[some] = np.max(np.where(bright & clipped & (d < near), d, -np.inf), axis=1)
-    last[some] = np.partition(np.where(bright & (d > near), d, np.inf), FEW, axis=1)[:, FEW]
+    last[some] = np.partition(np.where(bright & (d > near), d, np.inf), MAX_NOISY, axis=1)[
+        :, MAX_NOISY
+    ]
     return first, last

@@ -2,7 +2,7 @@
 
 Lines place a camera, widths hardly do; so a leg that is seen wider or thinner at its place has
 another radius than the model says. Pairs of wrong edges agree on nothing: those of most views must.
-Where light and shade meet on a leg they may agree all the same, so that only parts are asked whose
+Where light and shade meet on a leg they may agree all the same, so that only parts are enough whose
 outlines were not found.
 """
 
@@ -14,29 +14,35 @@ import numpy as np
 
 from legcal.geometry import Array
 from legcal.machine import Cylinder
-from legcal.perception.agreement import Agreement, Picture, Poses, agreement, improved
+from legcal.perception.pair_matching import (
+    PairMatches,
+    Picture,
+    Poses,
+    gauss_newton_step,
+    match_pairs,
+)
 from legcal.vision import EQUAL_RADII
 
 FACTORS = (1.0, 0.93, 1.075, 0.86, 1.16, 0.8, 1.25, 0.72, 1.38)  # of radii that are tried
 TOLERANCES = (0.018, 0.018, 0.012, 0.012)  # of an axis from its pair, on the sensor plane
-MATCHED = 0.25  # agreement of a piece with its pair that counts
+MIN_MATCH_SCORE = 0.25  # score of a segment with its pair that counts
 PREFERRED = 1.15  # by what a farther factor must be better than a nearer one
-DIFFERENT = 0.08  # from the model, as a logarithm: less does no harm
-LEFT = 0.02  # the same once corrected
-SURE = 4.0  # standard errors
-FEWEST = 3  # pairs of a part in a view
-TIGHT = 0.025  # robust standard deviation of their logarithms: else some are of other edges
+MIN_CHANGE = 0.08  # from the model, as a logarithm: less does no harm
+CONVERGED = 0.02  # the same once corrected
+MIN_SIGMAS = 4.0  # standard errors
+MIN_PAIRS = 3  # pairs of a part in a view
+MAX_SPREAD = 0.025  # robust standard deviation of their logarithms: else some are of other edges
 NOISE = 0.01  # of what a view says
 CONSISTENT = 0.09  # logarithms from views of one part, or of parts that are wrong alike
-MOST_PARTS = 0.75  # of the parts that must be wrong alike, to be all
-MOST_TURNS = 4  # of correcting radii and placing cameras by them
+MIN_SHARE_ALIKE = 0.75  # of the parts that must be wrong alike, to be all
+MAX_ITERATIONS = 4  # of correcting radii and placing cameras by them
 
 Part = tuple[int, float]  # leg, and radius in the model [m]
 
 
 @dataclass(frozen=True, eq=False)
-class OtherRadii:
-    """What pictures say of radii, by leg and radius in the model."""
+class RadiusFactors:
+    """Factors of radii that pictures show, by leg and radius in the model."""
 
     factor: dict[Part, float]  # by how much they differ from the model; others are left out
     common: float = 0.0  # the factor of all parts, if they differ alike; 0 otherwise
@@ -55,32 +61,32 @@ class OtherRadii:
                 return factor
         return self.common or 1.0
 
-    def only(self, doubtful: Collection[Part]) -> "OtherRadii":
-        """Return what is said of some parts; of all only where most of them are among these."""
+    def only(self, suspects: Collection[Part]) -> "RadiusFactors":
+        """Return the factors of some parts; of all only where most of them are among these."""
         mine = {
             part: factor
             for part, factor in self.factor.items()
-            if any(part[0] == leg and _alike(part[1], radius) for leg, radius in doubtful)
+            if any(part[0] == leg and _alike(part[1], radius) for leg, radius in suspects)
         }
-        if self.common and len(mine) >= MOST_PARTS * len(self.factor):
+        if self.common and len(mine) >= MIN_SHARE_ALIKE * len(self.factor):
             return self
-        return OtherRadii(mine)
+        return RadiusFactors(mine)
 
-    def of_the_same(self, step: "OtherRadii") -> "OtherRadii":
+    def of_the_same(self, step: "RadiusFactors") -> "RadiusFactors":
         """Return what a step says of the parts whose radii this one has corrected."""
         if self.common:
-            return step if step.common else NO_OTHER_RADII
+            return step if step.common else NO_RADIUS_FACTORS
         mine = {(leg, r * factor) for (leg, r), factor in self.factor.items()}
-        return OtherRadii({part: f for part, f in step.factor.items() if part in mine})
+        return RadiusFactors({part: f for part, f in step.factor.items() if part in mine})
 
-    def then(self, step: "OtherRadii") -> "OtherRadii":
+    def then(self, step: "RadiusFactors") -> "RadiusFactors":
         """Return both corrections, the second one of radii that the first had corrected."""
         if not self.factor:
             return step
         factor = {
             (leg, r): f * step.of(leg, r * self.of(leg, r)) for (leg, r), f in self.factor.items()
         }
-        return OtherRadii(factor, self.common * (step.common or 1.0))
+        return RadiusFactors(factor, self.common * (step.common or 1.0))
 
 
 def _alike(one: float, other: float) -> bool:
@@ -88,15 +94,15 @@ def _alike(one: float, other: float) -> bool:
     return abs(one - other) <= EQUAL_RADII * other
 
 
-NO_OTHER_RADII = OtherRadii({})
+NO_RADIUS_FACTORS = RadiusFactors({})
 
 
-def other_radii(
+def estimate_radii(
     views: Iterable[tuple[int, Sequence[Picture], Poses]],
-    different: float = DIFFERENT,
+    different: float = MIN_CHANGE,
     *,
     alone: bool = False,
-) -> OtherRadii:
+) -> RadiusFactors:
     """Return the radii that differ from the model.
 
     By views, pictures of them, and T_camera_base where they put the camera; ``different`` is the
@@ -112,20 +118,20 @@ def other_radii(
     agreed = {part: _agreed(list(of_part.values())) for part, of_part in samples.items()}
     known = {part: found for part, found in agreed.items() if found is not None}
     if not known:
-        return NO_OTHER_RADII
+        return NO_RADIUS_FACTORS
     common = float(np.median([value for value, _ in known.values()]))
     alike = np.mean([abs(value - common) < CONSISTENT for value, _ in known.values()])
-    of_several = alike >= MOST_PARTS and len({leg for leg, _ in known}) > 1
+    of_several = alike >= MIN_SHARE_ALIKE and len({leg for leg, _ in known}) > 1
     if not alone and abs(common) > different and of_several:
         factor = float(np.exp(common))
-        return OtherRadii(dict.fromkeys(samples, factor), factor)
+        return RadiusFactors(dict.fromkeys(samples, factor), factor)
     bias = common if of_several else 0.0  # of pairs, whatever the leg
     differing = {
         part: float(np.exp(value - bias))
         for part, (value, sigma) in known.items()
-        if abs(value - bias) > max(different, SURE * sigma)
+        if abs(value - bias) > max(different, MIN_SIGMAS * sigma)
     }
-    return OtherRadii(differing)
+    return RadiusFactors(differing)
 
 
 def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
@@ -134,16 +140,16 @@ def _agreed(views: Sequence[Sequence[float]]) -> tuple[float, float] | None:
     EdgePairs of a part that something hides, or of wrong edges, do not agree with each other.
     """
     middles: list[float] = []
-    asked = [np.array(values) for values in views if len(values) >= FEWEST]
-    for values in asked:
+    enough = [np.array(values) for values in views if len(values) >= MIN_PAIRS]
+    for values in enough:
         values = values[np.abs(values - _densest(values)) <= CONSISTENT]
-        if len(values) < FEWEST:
+        if len(values) < MIN_PAIRS:
             continue
         middle = float(np.median(values))
         spread = 1.48 * float(np.median(np.abs(values - middle)))
-        if spread < TIGHT:
+        if spread < MAX_SPREAD:
             middles.append(middle)
-    if not middles or 2 * len(middles) < len(asked) or np.ptp(middles) > CONSISTENT:
+    if not middles or 2 * len(middles) < len(enough) or np.ptp(middles) > CONSISTENT:
         return None
     sigma = max(float(np.std(middles)), NOISE) / float(np.sqrt(len(middles)))
     return float(np.mean(middles)), sigma
@@ -165,20 +171,20 @@ def _by_lines(pictures: Sequence[Picture], placed: Poses) -> Poses:
     pose = Poses.rigid(placed.R[:1], placed.t[:1], placed.shift.shape[1])
     for tolerance in TOLERANCES:
         found = [_whatever_the_width(picture, pose, tolerance) for picture in pictures]
-        pose = improved(pictures, pose, found, tolerance)
+        pose = gauss_newton_step(pictures, pose, found, tolerance)
     return pose
 
 
-def _whatever_the_width(picture: Picture, pose: Poses, tolerance: float) -> Agreement:
-    """Return the pairs that suit the pieces best with some radius; farther ones need be better."""
+def _whatever_the_width(picture: Picture, pose: Poses, tolerance: float) -> PairMatches:
+    """Return the best pairs of segments with any radius; farther factors must be clearly better."""
     targets = picture.targets
-    best = agreement(picture, pose, tolerance)
+    best = match_pairs(picture, pose, tolerance)
     for factor in FACTORS[1:]:
         scaled = replace(picture, targets=replace(targets, radius=factor * targets.radius))
-        found = agreement(scaled, pose, tolerance)
-        better = found.value > np.maximum(PREFERRED * best.value, MATCHED)
-        best = Agreement(
-            np.where(better, found.value, best.value),
+        found = match_pairs(scaled, pose, tolerance)
+        better = found.score > np.maximum(PREFERRED * best.score, MIN_MATCH_SCORE)
+        best = PairMatches(
+            np.where(better, found.score, best.score),
             np.where(better, found.pair, best.pair),
             best.visible,
         )
@@ -192,8 +198,8 @@ def _logarithms(picture: Picture, pose: Poses) -> list[tuple[Part, float]]:
         return []
     R, t = picture.R @ pose.R[0], picture.R @ pose.t[0] + picture.t
     found = _whatever_the_width(picture, pose, TOLERANCES[-1])
-    best, pair = found.value[0], found.pair[0]
-    best = np.where(best >= MATCHED, best, 0.0)
+    best, pair = found.score[0], found.pair[0]
+    best = np.where(best >= MIN_MATCH_SCORE, best, 0.0)
     logarithms = []
     for k in np.flatnonzero(best > 0.0).tolist():
         if np.count_nonzero((pair == pair[k]) & (best > 0.0)) > 1:  # whose pair it is, is not known
@@ -217,8 +223,8 @@ def _width(ends: Array, radius: float, middle: Array) -> float:
     return float(2.0 * radius * max(inverse_depth, 1e-9) / max(flat, 0.1))
 
 
-def radius_notes(found: OtherRadii, legs: Sequence[str]) -> list[str]:
-    """Return what is to be said of radii that differ from the model."""
+def radius_notes(found: RadiusFactors, legs: Sequence[str]) -> list[str]:
+    """Return notes on radii that differ from the model."""
     if not found.factor:
         return []
     if found.common:

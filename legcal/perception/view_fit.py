@@ -10,8 +10,8 @@ better known. A group of views is one :class:`legcal.estimation.Problem`:
 Outlines, priors of shifts and of offsets are its factors; the standard deviations of the priors are
 estimated on the way, and a Cauchy weight of each leg in each image makes it robust.
 :func:`refine_views` rejects legs that do not fit, looks for missing ones within what the fit knows,
-and fits again. Outlines of wrong edges agree on no fit, which also tells camera poses from each
-other that edge pairs do not.
+and fits again. Outlines of wrong edges agree on no fit, which also separates camera poses
+that edge pairs do not.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,9 +37,9 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import main_cylinders
-from legcal.perception.agreement import NEAREST, Poses, exchanged
 from legcal.perception.detection import NOT_PLACED, measure_outlines
 from legcal.perception.outline import OUTSIDE
+from legcal.perception.pair_matching import MIN_DEPTH, Poses, exchanged
 from legcal.perception.placement import Group, Placement, Search
 from legcal.vision import Camera, outlines_of_axis
 from legcal.workers import Run, in_turn
@@ -110,7 +110,7 @@ class ViewFit:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the outlines tell the pose from those around it: else legs may be others."""
+        """Whether the outlines determine the pose: else legs may be others."""
         return bool(self.turn_sigma <= MAX_TURN_SIGMA)
 
     @property
@@ -327,7 +327,7 @@ def sideways_sigmas(search: Search, group: Group, fit: ViewFit) -> Array:
         T, camera = group.T_group_camera[v].inv(), m.views[v].camera
         X_group = T_group_base.apply(np.stack([A[rows], B[rows]], axis=2).reshape(-1, 3))
         X = T.apply(X_group).reshape(-1, 2, 3)
-        front = X[..., 2].min(axis=1) > NEAREST
+        front = X[..., 2].min(axis=1) > MIN_DEPTH
         X = np.where(front[:, None, None], X, [[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
         ends = X[..., :2] / X[..., 2:]
         thin, edge = np.zeros(len(X)), np.zeros(len(X), dtype=np.intp)
@@ -490,8 +490,8 @@ def refine_views(
         search, groups, _placed_by_fits(search, groups, placement, fits), fits
     )
     placed = np.array([T is not None for T in placement.T_base_camera])
-    lost = ~placed[search.measurements.view[outlines.row]]
-    return placement, outlines.reject(lost & ~is_edited(outlines), NOT_PLACED), fits
+    unplaced_rows = ~placed[search.measurements.view[outlines.row]]
+    return placement, outlines.reject(unplaced_rows & ~is_edited(outlines), NOT_PLACED), fits
 
 
 def _fits(

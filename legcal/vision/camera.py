@@ -103,7 +103,7 @@ class Camera:
     distortion: Array = field(default_factory=lambda: np.zeros(0))  # (n,)
     model: DistortionModel = "plumb_bob"  # meaning of the coefficients
     gamma: float = 1.0  # grey levels are light to the power 1 / gamma
-    gamma_is_given: bool = True  # false if nobody said so
+    gamma_is_given: bool = True  # false where it is assumed
     sigma: Mapping[str, float] = field(default_factory=dict)  # standard deviations of its numbers
 
     @property
@@ -243,7 +243,7 @@ def shared_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> tuple[str
 
 
 def camera_numbers(camera: Camera) -> dict[str, float | str]:
-    """Return all that tells one camera from another: size, model and numbers, by their names."""
+    """Return all that distinguishes cameras: size, model and intrinsics, by their names."""
     numbers = zip(intrinsic_names(camera), intrinsic_values(camera).tolist(), strict=True)
     skew = float(camera.K[0, 1])
     size = {"width": camera.width, "height": camera.height, "model": camera.model}

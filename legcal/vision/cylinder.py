@@ -2,7 +2,7 @@
 
 The paper names the Euler angles of Table 1 and does not define them. Here psi is the tilt out of
 the plane of the image and theta the angle in the image, from its y axis: the axis is the camera's y
-axis turned by psi about x and then by theta about z, ``u = Rz(theta) Rx(psi) e_y``. An image tells
+axis turned by psi about x and then by theta about z, ``u = Rz(theta) Rx(psi) e_y``. An image fixes
 theta far better than psi.
 """
 

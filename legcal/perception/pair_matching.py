@@ -1,7 +1,7 @@
-"""How camera poses agree with the edge pairs of a picture, and steps towards them.
+"""Camera poses matched to the edge pairs of pictures, and Gauss-Newton steps of poses.
 
 A leg that is where a pose has it shows an edge pair along its axis, as wide as its radius says. A
-few hundred poses are judged at once by all pictures of a view, and improved by Gauss-Newton steps
+few hundred poses are scored at once by all pictures of a view, and improved by Gauss-Newton steps
 in which joints may be off what the model says.
 """
 
@@ -15,55 +15,55 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.geometry import Array, IntArray, cross, cross_matrices, rotation_matrices
 from legcal.machine import Cylinder
 from legcal.perception.lines import EdgePairs
-from legcal.vision import visible_pieces
+from legcal.vision import visible_segments
 
-NEAREST = 0.02  # depth of the nearest point of a leg [m]
+MIN_DEPTH = 0.02  # depth of the nearest point of a leg [m]
 WIDTH_ERROR = 0.08  # of a pair and of what is predicted: relative, one standard deviation
 WIDTH_PIXELS = 1.0  # and of a pair in its pixels
-WIDTH_REACH = 2.5  # standard deviations
-TOO_NARROW = 0.4  # by which pairs are found, since shading ends inside an outline [px of a pair]
-SLACK_PIXELS = 1.5  # added to every tolerance [px of a pair]
-LINE_ERROR, LINE_PIXELS = 2e-3, 0.7  # of an axis beside its pair, one standard deviation: [m], [px]
-PLACE_ERROR = 0.1  # of the middle of a pair that is as long as its piece, in its length
-LINE_PART = 1.0 / 6.0  # at least this part of the tolerance
-INSIDE = 0.8  # share of a pair that should lie along the leg
-CHUNK = 128  # poses judged together
-TURN_PRIOR, PLACE_PRIOR = 0.3, 0.1  # of one step: angle [rad], of the machine, in its distance
-MOST_TURN, MOST_PLACE = 0.4, 0.2  # the same, at most
+MAX_WIDTH_SIGMAS = 2.5  # standard deviations
+WIDTH_BIAS_PIXELS = 0.4  # of pairs: shading ends inside an outline [px of a pair]
+TOLERANCE_PIXELS = 1.5  # added to every tolerance [px of a pair]
+LINE_ERROR, LINE_PIXELS = 2e-3, 0.7  # of an axis beside its pair: [m], [px]
+ALONG_ERROR = 0.1  # of the middle of a pair that is as long as its segment, in its length
+MIN_LINE_SHARE = 1.0 / 6.0  # at least this part of the tolerance
+MIN_OVERLAP = 0.8  # share of a pair that should lie along the leg
+CHUNK = 128  # poses scored together
+TURN_SIGMA, DISPLACEMENT_SIGMA = 0.3, 0.1  # prior of a step: angle [rad], by the distance
+MAX_TURN, MAX_DISPLACEMENT = 0.4, 0.2  # the same, at most
 
 
 @dataclass(frozen=True, eq=False)
-class Targets:
-    """The visible pieces of all legs at the reading of a picture."""
+class LegSegments:
+    """The visible segments of all legs at the reading of a picture."""
 
-    leg: IntArray  # (n,) the leg of each piece
+    leg: IntArray  # (n,) the leg of each segment
     ends: Array  # (n, 2, 3) of its axis in the base link, the first nearer to the base joint [m]
     place: Array  # (n, 2) where these ends are along the leg, 0 at A and 1 at B
     radius: Array  # (n,) [m]
     share: Array  # (n,) its part of the visible length of its leg
 
     def __len__(self) -> int:
-        """Return the number of pieces."""
+        """Return the number of segments."""
         return len(self.leg)
 
 
-def targets_of(
+def leg_segments(
     A_base: Array, B_base: Array, cylinders: Sequence[Sequence[Cylinder]], legs: IntArray
-) -> Targets:
-    """Return the pieces of some legs (m,), joint centres (n_legs, 3) in the base link [m]."""
+) -> LegSegments:
+    """Return the segments of some legs (m,), joint centres (n_legs, 3) in the base link [m]."""
     leg, place, ends, radius, share = [], [], [], [], []
     for j in legs.tolist():
         AB = B_base[j] - A_base[j]
         length = float(np.linalg.norm(AB))
-        pieces = visible_pieces(cylinders[j], length)
-        total = sum(piece.end - piece.start for piece in pieces)
-        for piece in pieces:
+        segments = visible_segments(cylinders[j], length)
+        total = sum(segment.end - segment.start for segment in segments)
+        for segment in segments:
             leg.append(j)
-            place.append((piece.start / length, piece.end / length))
+            place.append((segment.start / length, segment.end / length))
             ends.append(A_base[j] + np.outer(place[-1], AB))
-            radius.append(piece.radius)
-            share.append((piece.end - piece.start) / total)
-    return Targets(
+            radius.append(segment.radius)
+            share.append((segment.end - segment.start) / total)
+    return LegSegments(
         np.array(leg, dtype=np.intp),
         np.array(ends).reshape(-1, 2, 3),
         np.array(place).reshape(-1, 2),
@@ -122,40 +122,40 @@ class Picture:
     """What is known of a picture: its edge pairs, and the legs that it may show."""
 
     pairs: EdgePairs
-    targets: Targets  # pieces of legs at its reading
+    targets: LegSegments  # segments of legs at its reading
     corners: Array  # (2, 2) least and greatest x and y of the sensor plane that it shows
     # Its camera frame, where poses are those of another one that is fixed to it: X_camera = R X + t
     R: Array = field(default_factory=lambda: np.eye(3))
     t: Array = field(default_factory=lambda: np.zeros(3))
 
 
-class Agreement(NamedTuple):
-    """How poses agree with a picture, (n_poses, n_targets) each."""
+class PairMatches(NamedTuple):
+    """How well poses explain a picture, (n_poses, n_segments) each."""
 
-    value: Array  # of each piece, 0 to 1: how well, times how much of its visible length
-    pair: IntArray  # the edge pair that agrees best
-    visible: Array  # share of each piece that is inside the picture
+    score: Array  # of each segment, 0 to 1: how well, times how much of its visible length
+    pair: IntArray  # the edge pair with that score
+    visible: Array  # share of each segment that is inside the picture
 
     @property
-    def one_pair_each(self) -> Array:
-        """The values, where a pair counts for the piece that it suits best."""
+    def exclusive_score(self) -> Array:
+        """The scores, where a pair counts only for the segment that it suits best."""
         same = self.pair[:, :, None] == self.pair[:, None, :]
-        better = self.value[:, None, :] > self.value[:, :, None]
-        return np.where(np.any(same & better, axis=2), 0.0, self.value)
+        better = self.score[:, None, :] > self.score[:, :, None]
+        return np.where(np.any(same & better, axis=2), 0.0, self.score)
 
 
-def agreement(picture: Picture, poses: Poses, tolerance: float) -> Agreement:
-    """Judge poses by a picture; ``tolerance`` is how far axes may be from pairs [m]."""
+def match_pairs(picture: Picture, poses: Poses, tolerance: float) -> PairMatches:
+    """Match poses to a picture; ``tolerance`` is how far axes may be from pairs [m]."""
     n, n_targets = len(poses), len(picture.targets)
     if n == 0 or n_targets == 0 or len(picture.pairs) == 0:
         visible = _in_picture(picture, poses)[3] if n and n_targets else np.zeros((n, n_targets))
-        return Agreement(np.zeros((n, n_targets)), np.zeros((n, n_targets), np.intp), visible)
+        return PairMatches(np.zeros((n, n_targets)), np.zeros((n, n_targets), np.intp), visible)
     parts = [
-        _judge(picture, poses.take(np.arange(k, min(k + CHUNK, len(poses)))), tolerance)
+        _match_chunk(picture, poses.take(np.arange(k, min(k + CHUNK, len(poses)))), tolerance)
         for k in range(0, len(poses), CHUNK)
     ]
     value, pair, visible = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return Agreement(value, pair, visible)
+    return PairMatches(value, pair, visible)
 
 
 def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Array]:
@@ -170,13 +170,13 @@ def _in_picture(picture: Picture, poses: Poses) -> tuple[Array, Array, Array, Ar
     R, t = picture.R @ poses.R, poses.t @ picture.R.T + picture.t
     X = ends.reshape(-1, n_ends, 3) @ R.swapaxes(1, 2) + t[:, None, :]
     X = X.reshape(-1, len(targets), 2, 3)
-    z = np.maximum(X[..., 2:], NEAREST)
+    z = np.maximum(X[..., 2:], MIN_DEPTH)
     xy = X[..., :2] / z
     normal = cross(X[:, :, 0], X[:, :, 1])
     level = normal[..., 0] ** 2 + normal[..., 1] ** 2
     flat = np.sqrt(level / (level + normal[..., 2] ** 2 + 1e-24))
     width = 2.0 * targets.radius[:, None] / (z[..., 0] * np.maximum(flat, 0.1)[..., None])
-    front = (X[..., 2] > NEAREST).all(axis=-1)
+    front = (X[..., 2] > MIN_DEPTH).all(axis=-1)
     return X, xy, width, np.where(front, _shown(xy, picture.corners), 0.0)
 
 
@@ -190,11 +190,11 @@ def _shown(xy: Array, corners: Array) -> Array:
     return np.asarray(np.clip(np.minimum(leave, 1.0) - np.maximum(enter, 0.0), 0.0, 1.0))
 
 
-def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, IntArray, Array]:
-    """Return value, pair and visible of :class:`Agreement`."""
+def _match_chunk(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, IntArray, Array]:
+    """Return score, pair and visible of :class:`PairMatches`."""
     pairs = picture.pairs
     X, xy, width, visible = _in_picture(picture, poses)
-    reach = _reach(pairs, X, tolerance)[..., None].astype(np.float32)
+    reach = _tolerances(pairs, X, tolerance)[..., None].astype(np.float32)
     xy, width = xy.astype(np.float32), width.astype(np.float32)
     frame = np.concatenate([pairs.along, pairs.normal]).T.astype(np.float32)  # (2, 2 n_pairs)
     own = np.concatenate(
@@ -212,13 +212,13 @@ def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, Int
     value = np.maximum(1.0 - (gap / reach) ** 2, 0.0)
     w0, w1 = width[:, :, 0, None], width[:, :, 1, None]
     expected = np.maximum(w0 - (w1 - w0) * a0 / run, np.float32(1e-6))
-    seen = seen_width(pairs).astype(np.float32)
+    seen = pair_widths(pairs).astype(np.float32)
     sigma = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * pairs.pixel / seen).astype(np.float32)
-    pull = np.log(expected / seen) / (np.float32(WIDTH_REACH) * sigma)
+    pull = np.log(expected / seen) / (np.float32(MAX_WIDTH_SIGMAS) * sigma)
     value *= np.maximum(1.0 - pull**2, 0.0)
     overlap = np.minimum(half, np.maximum(a0, a1)) - np.maximum(-half, np.minimum(a0, a1))
     overlap = np.maximum(overlap, 0.0)
-    value *= np.minimum(overlap / (np.float32(2.0 * INSIDE) * half), 1.0)
+    value *= np.minimum(overlap / (np.float32(2.0 * MIN_OVERLAP) * half), 1.0)
     length = np.abs(run) * np.maximum(visible, 0.05)[..., None].astype(np.float32)
     value *= np.minimum(overlap / length, 1.0)
     best = np.argmax(value, axis=2)
@@ -226,27 +226,27 @@ def _judge(picture: Picture, poses: Poses, tolerance: float) -> tuple[Array, Int
     return np.where(visible > 0.0, found, 0.0).astype(np.float64), best, visible
 
 
-def _reach(pairs: EdgePairs, X: Array, tolerance: float) -> Array:
-    """Return a tolerance [m] on the sensor plane at pieces X (n, T, 2, 3), (n, T)."""
-    depth = np.maximum(X[..., 2].mean(axis=-1), NEAREST)
-    return np.asarray(tolerance / depth + SLACK_PIXELS * pairs.pixel)
+def _tolerances(pairs: EdgePairs, X: Array, tolerance: float) -> Array:
+    """Return a tolerance [m] on the sensor plane at segments X (n, T, 2, 3), (n, T)."""
+    depth = np.maximum(X[..., 2].mean(axis=-1), MIN_DEPTH)
+    return np.asarray(tolerance / depth + TOLERANCE_PIXELS * pairs.pixel)
 
 
-def seen_width(pairs: EdgePairs) -> Array:
+def pair_widths(pairs: EdgePairs) -> Array:
     """Return the widths of pairs (n,) in their middle, as wide as legs are that look like this."""
-    return np.asarray(pairs.width.mean(axis=1) + TOO_NARROW * pairs.pixel)
+    return np.asarray(pairs.width.mean(axis=1) + WIDTH_BIAS_PIXELS * pairs.pixel)
 
 
-def improved(
+def gauss_newton_step(
     pictures: Sequence[Picture],
     poses: Poses,
-    agreements: Sequence[Agreement],
+    matches: Sequence[PairMatches],
     tolerance: float,
     joint_error: float = 0.0,
 ) -> Poses:
-    """Return poses after one Gauss-Newton step towards the pairs that agree with them.
+    """Return poses after one Gauss-Newton step towards the pairs that they match.
 
-    By pictures of one camera and agreements with each, for a tolerance as in :func:`agreement`;
+    By pictures of one camera and matches with each, for a tolerance as in :func:`match_pairs`;
     ``joint_error`` is the standard deviation of the model's joints [m], 0 to leave them in place.
     """
     n, n_legs = poses.shift.shape[:2]
@@ -254,7 +254,7 @@ def improved(
     H, b = _step_prior(centre), np.zeros((n, 6))
     H_leg, H_cross = np.zeros((n, n_legs, 6, 6)), np.zeros((n, n_legs, 6, 6))
     b_leg = np.zeros((n, n_legs, 6))
-    for picture, found in zip(pictures, agreements, strict=True):
+    for picture, found in zip(pictures, matches, strict=True):
         if len(picture.pairs) == 0 or len(picture.targets) == 0:
             continue
         J, J_leg, residual, weight = _equations(picture, poses, found, tolerance)
@@ -265,10 +265,10 @@ def improved(
             weighted_leg = (J_leg * weight[..., None]).swapaxes(2, 3)
             of_leg, cross = weighted_leg @ J_leg, weighted @ J_leg
             gradient = (weighted_leg @ residual[..., None])[..., 0]
-            for piece, leg in enumerate(picture.targets.leg.tolist()):
-                H_leg[:, leg] += of_leg[:, piece]
-                H_cross[:, leg] += cross[:, piece]
-                b_leg[:, leg] -= gradient[:, piece]
+            for segment, leg in enumerate(picture.targets.leg.tolist()):
+                H_leg[:, leg] += of_leg[:, segment]
+                H_cross[:, leg] += cross[:, segment]
+                b_leg[:, leg] -= gradient[:, segment]
     if joint_error == 0.0:
         xi = np.asarray(np.linalg.solve(H, b[..., None])[..., 0])
         return _moved(poses, xi, poses.shift, centre)
@@ -294,16 +294,16 @@ def _step_prior(centre: Array) -> Array:
     J = np.concatenate(
         [-cross_matrices(centre), np.broadcast_to(np.eye(3), (len(centre), 3, 3))], axis=2
     )
-    distance = PLACE_PRIOR * np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
+    distance = DISPLACEMENT_SIGMA * np.maximum(np.linalg.norm(centre, axis=1), MIN_DEPTH)
     H = J.swapaxes(1, 2) @ J / (distance**2)[:, None, None]
-    H[:, :3, :3] += np.eye(3) / TURN_PRIOR**2
+    H[:, :3, :3] += np.eye(3) / TURN_SIGMA**2
     return np.asarray(H)
 
 
 def _equations(
-    picture: Picture, poses: Poses, found: Agreement, tolerance: float
+    picture: Picture, poses: Poses, found: PairMatches, tolerance: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return what each piece demands: two equations of its line, one of its width, of its place.
+    """Return residuals of each segment: two of its line, one of its width, one of its place.
 
     Derivatives (n, T, 4, 6) by the motion of the camera, and by shifts of A and B of the leg;
     residuals and weights (n, T, 4).
@@ -317,7 +317,7 @@ def _equations(
     run = a[..., 1] - a[..., 0]
     run = np.where(np.abs(run) < 1e-6, 1e-6, run)
     half = pairs.half_length[found.pair]
-    z = np.maximum(X[..., 2], NEAREST)
+    z = np.maximum(X[..., 2], MIN_DEPTH)
     depth = z.mean(axis=-1)
     # Derivatives of the offset of each end across the pair and along it, (n, T, 2, 3).
     g, g_along = _of_offset(xy, across, z), _of_offset(xy, along, z)
@@ -326,10 +326,10 @@ def _equations(
     residual = np.einsum("ntpe,nte->ntp", parts, o)
     share = -a[..., 0] / run
     expected = np.maximum(width[..., 0] + (width[..., 1] - width[..., 0]) * share, 1e-6)
-    seen = seen_width(pairs)[found.pair]
+    seen = pair_widths(pairs)[found.pair]
     P = (1.0 - share)[..., None] * X[:, :, 0] + share[..., None] * X[:, :, 1]
     of_depth = np.zeros_like(P)
-    of_depth[..., 2] = -1.0 / np.maximum(P[..., 2], NEAREST)
+    of_depth[..., 2] = -1.0 / np.maximum(P[..., 2], MIN_DEPTH)
     # Derivatives (n, T, 4, 2, 3) of the residuals by the two ends in the camera frame.
     D = np.empty((*P.shape[:2], 4, 2, 3))
     D[:, :, :2] = parts[..., None] * g[:, :, None]
@@ -345,20 +345,20 @@ def _equations(
     J_leg = np.concatenate(
         [((1.0 - at) * in_base).sum(axis=3), (at * in_base).sum(axis=3)], axis=-1
     )
-    J_leg[:, :, 2:] = 0.0  # too vague to tell where joints are
+    J_leg[:, :, 2:] = 0.0  # not accurate enough to move joints
     sigma_width = np.hypot(WIDTH_ERROR, WIDTH_PIXELS * pairs.pixel / seen)
-    sigma = max(LINE_ERROR, LINE_PART * tolerance) / depth
-    line = found.value / (sigma**2 + (LINE_PIXELS * pairs.pixel) ** 2)
-    # A pair as long as the piece has its middle where the piece has it.
+    sigma = max(LINE_ERROR, MIN_LINE_SHARE * tolerance) / depth
+    line = found.score / (sigma**2 + (LINE_PIXELS * pairs.pixel) ** 2)
+    # A pair as long as the segment has its middle where the segment has it.
     length = np.abs(run)
-    sigma_place = PLACE_ERROR * length + 0.5 * np.abs(length - 2.0 * half)
+    sigma_place = ALONG_ERROR * length + 0.5 * np.abs(length - 2.0 * half)
     return (
         J,
         J_leg,
         np.concatenate(
             [residual, np.stack([np.log(expected / seen), a.mean(axis=-1)], axis=-1)], axis=-1
         ),
-        np.stack([line, line, found.value / sigma_width**2, found.value / sigma_place**2], axis=-1),
+        np.stack([line, line, found.score / sigma_width**2, found.score / sigma_place**2], axis=-1),
     )
 
 
@@ -372,10 +372,10 @@ def _of_offset(xy: Array, normal: Array, z: Array) -> Array:
     return np.asarray(np.concatenate([across, in_depth], axis=-1) / z[..., None])
 
 
-def distances(picture: Picture, poses: Poses, found: Agreement) -> Array:
-    """Return how far pieces are from the pairs that agree with them, (n_poses, n_targets) [m].
+def distances(picture: Picture, poses: Poses, found: PairMatches) -> Array:
+    """Return how far segments are from the pairs that agree with them, (n_poses, n_targets) [m].
 
-    Sideways, at the ends of the pairs and at the depth of the pieces.
+    Sideways, at the ends of the pairs and at the depth of the segments.
     """
     _, _, residual, _ = _equations(picture, poses, found, 1.0)
     X, _, _, _ = _in_picture(picture, poses)
@@ -384,10 +384,10 @@ def distances(picture: Picture, poses: Poses, found: Agreement) -> Array:
 
 def _moved(poses: Poses, xi: Array, shift: Array, centre: Array) -> Poses:
     """Return poses moved by rotation vectors and translations in their frame, (n, 6), not far."""
-    turned = np.linalg.norm(xi[:, :3], axis=1) / MOST_TURN
+    turned = np.linalg.norm(xi[:, :3], axis=1) / MAX_TURN
     moved = np.linalg.norm(np.cross(xi[:, :3], centre) + xi[:, 3:], axis=1)
-    distance = np.maximum(np.linalg.norm(centre, axis=1), NEAREST)
-    xi = xi / np.maximum(np.maximum(turned, moved / (MOST_PLACE * distance)), 1.0)[:, None]
+    distance = np.maximum(np.linalg.norm(centre, axis=1), MIN_DEPTH)
+    xi = xi / np.maximum(np.maximum(turned, moved / (MAX_DISPLACEMENT * distance)), 1.0)[:, None]
     turn = rotation_matrices(xi[:, :3])
     t = np.einsum("nij,nj->ni", turn, poses.t) + xi[:, 3:]
     return Poses(turn @ poses.R, t, shift)

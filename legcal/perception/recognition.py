@@ -2,7 +2,7 @@
 
 Edge pairs of every image vote, all images of a view together. A rough camera pose is where the
 search of its view begins; if the images do not agree near it, the view is searched as if there were
-none, and a pose that they agree on elsewhere is used and said. Where edge pairs leave a doubt,
+none, and a pose that they agree on elsewhere is used, with a note. Where edge pairs are ambiguous,
 outlines measured at the best poses decide.
 """
 
@@ -15,7 +15,6 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.data import Outlines
 from legcal.geometry import Array, IntArray
-from legcal.perception.agreement import Picture, Poses
 from legcal.perception.camera_search import (
     START_PICTURES,
     Candidates,
@@ -27,18 +26,26 @@ from legcal.perception.camera_search import (
     with_first,
 )
 from legcal.perception.detection import measure_outlines
+from legcal.perception.pair_matching import Picture, Poses
 from legcal.perception.placement import Group, Joined, Placement, Search, group_views
-from legcal.perception.radii import LEFT, MOST_TURNS, NO_OTHER_RADII, OtherRadii, Part, other_radii
+from legcal.perception.radii import (
+    CONVERGED,
+    MAX_ITERATIONS,
+    NO_RADIUS_FACTORS,
+    Part,
+    RadiusFactors,
+    estimate_radii,
+)
 from legcal.perception.view_fit import ViewFit, fit_view, group_name, min_evidence, refine_views
 from legcal.workers import Run, in_turn
 
 Pictures = Mapping[int, Picture]  # by row
 
-RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
+MIN_RADII_GAIN = 1.18  # of the support, by which radii that all differ must explain more
 SCALED = (0.8, 1.25)  # radii, in a view that could not be placed
 MIRRORED_STARTS = 1, 1  # as START_PICTURES, for mirrored pictures
-UNSEEN_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
-LEAST_ERROR, ERROR_REACH = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
+UNOBSERVED_ERROR = 6e-3  # of the joint centres of a leg that a view did not show [m]
+MIN_ERROR, ERROR_SIGMAS = 1.5e-3, 2.5  # of those of a leg that it did: [m], standard deviations
 
 N_POSES, N_AGAIN = 4, 3  # that are looked at, and at the best of which missing legs are sought
 # How many times the evidence for any other pose one needs, and how much more than the least.
@@ -56,7 +63,7 @@ def recognise(
     hints: Sequence[RigidTransform | None],
     joined: Joined = None,
     *,
-    doubtful: Collection[Part] = (),
+    suspects: Collection[Part] = (),
     progress: Callable[[int], None] | None = None,
     run: Run = in_turn,
 ) -> Placement:
@@ -64,7 +71,7 @@ def recognise(
 
     ``hints`` are rough T_base_camera of views; those of views without images are kept. ``joined``
     are T_board_camera of views that know how they stand to each other by a board: they are placed
-    together. ``doubtful`` parts, by leg and radius [m], are those whose outlines were not found
+    together. ``suspects`` parts, by leg and radius [m], are those whose outlines were not found
     with the radii of the model: they may have others. ``progress`` is called with each row.
     """
     groups = group_views(search.measurements, rows, hints, joined)
@@ -77,18 +84,18 @@ def recognise(
         for g in groups
     ]
     # Views without a rough pose, and those whose images do not agree near it: all images, anywhere.
-    doubted = [k for k, near in enumerate(found) if near is None or not near.is_clear]
-    missing = [r for k in doubted for r in groups[k].rows if r not in pictures]
+    unclear = [k for k, near in enumerate(found) if near is None or not near.is_clear]
+    missing = [r for k in unclear for r in groups[k].rows if r not in pictures]
     pictures |= _pictures(search, missing, progress, run)
-    of_groups = [groups[k].pictures(pictures, groups[k].rows) for k in doubted]
+    of_groups = [groups[k].pictures(pictures, groups[k].rows) for k in unclear]
     anywhere = _anywhere(of_groups, n_legs, START_PICTURES, run)
-    for k, of_group, one in zip(doubted, of_groups, anywhere, strict=True):
+    for k, of_group, one in zip(unclear, of_groups, anywhere, strict=True):
         hint = groups[k].hint
         found[k] = one if hint is None else _better(place_near(of_group, hint, n_legs), one)
-    placed, radii = [one for one in found if one is not None], NO_OTHER_RADII
-    if doubtful:
+    placed, radii = [one for one in found if one is not None], NO_RADIUS_FACTORS
+    if suspects:
         search, pictures, placed, radii = _by_other_radii(
-            search, groups, pictures, placed, doubtful, run
+            search, groups, pictures, placed, suspects, run
         )
     decide = partial(_decided_by_outlines, search, groups, placed, pictures)
     placed = list(run(decide, range(len(groups))))
@@ -135,23 +142,23 @@ def _by_other_radii(
     groups: Sequence[Group],
     pictures: dict[int, Picture],
     placed: list[Candidates],
-    doubtful: Collection[Part],
+    suspects: Collection[Part],
     run: Run,
-) -> tuple[Search, dict[int, Picture], list[Candidates], OtherRadii]:
-    """Return everything by the radii that the images show of doubtful parts, corrected in turns."""
-    as_given = search, pictures, placed, NO_OTHER_RADII
-    radii = _first_radii(search, groups, placed, pictures, run).only(doubtful)
+) -> tuple[Search, dict[int, Picture], list[Candidates], RadiusFactors]:
+    """Return everything by the radii that the images show of suspects parts, corrected in turns."""
+    as_given = search, pictures, placed, NO_RADIUS_FACTORS
+    radii = _first_radii(search, groups, placed, pictures, run).only(suspects)
     given, step = search.cylinders, radii
-    for _ in range(MOST_TURNS):
+    for _ in range(MAX_ITERATIONS):
         if not step.factor:
             break
         search = replace(search, cylinders=radii.corrected(given))
         pictures = {row: search.retargeted(row, one) for row, one in pictures.items()}
         placed = _placed_again(search, groups, placed, pictures, run)
         few = _for_radii(groups, placed, pictures)
-        step = radii.of_the_same(other_radii(few, LEFT, alone=not radii.common))
+        step = radii.of_the_same(estimate_radii(few, CONVERGED, alone=not radii.common))
         radii = radii.then(step)
-    if radii.common and _mean_support(placed) < RADII_GAIN * _mean_support(as_given[2]):
+    if radii.common and _mean_support(placed) < MIN_RADII_GAIN * _mean_support(as_given[2]):
         return as_given  # the scale is not known well
     return search, pictures, placed, radii
 
@@ -162,7 +169,7 @@ def _first_radii(
     placed: Sequence[Candidates],
     pictures: Pictures,
     run: Run,
-) -> OtherRadii:
+) -> RadiusFactors:
     """Return the radii that the images contradict, as far as the views can be placed."""
     if not any(one.is_convincing for one in placed):
         for factor in SCALED:
@@ -175,7 +182,7 @@ def _first_radii(
             placed = _anywhere(of_groups, search.n_legs, START_PICTURES, run)
             if any(one.is_clear for one in placed):
                 break
-    return other_radii(_for_radii(groups, placed, pictures))
+    return estimate_radii(_for_radii(groups, placed, pictures))
 
 
 def _for_radii(
@@ -201,10 +208,10 @@ def _placed_again(
 ) -> list[Candidates]:
     """Return the cameras by other radii: near where they were, or anywhere if they were not."""
     found = list(placed)
-    lost = [g for g, one in enumerate(placed) if not one.is_convincing]
-    of_groups = [groups[g].pictures(pictures, groups[g].rows) for g in lost]
+    unplaced_groups = [g for g, one in enumerate(placed) if not one.is_convincing]
+    of_groups = [groups[g].pictures(pictures, groups[g].rows) for g in unplaced_groups]
     anywhere = _anywhere(of_groups, search.n_legs, START_PICTURES, run)
-    for g, one in zip(lost, anywhere, strict=True):
+    for g, one in zip(unplaced_groups, anywhere, strict=True):
         found[g] = one
     for g, one in enumerate(placed):
         if one.is_convincing:
@@ -215,8 +222,8 @@ def _placed_again(
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """What outlines say of a pose."""
+class _Trial:
+    """A pose with the outlines that were measured at it, and their fit."""
 
     placement: Placement
     outlines: Outlines
@@ -235,33 +242,33 @@ def _decided_by_outlines(
     pictures: Pictures,
     g: int,
 ) -> Candidates:
-    """Return the poses of a group, first the one that outlines speak for if pairs leave a doubt."""
+    """Return the poses of a group, first the one that outlines support if pairs are ambiguous."""
     group, candidates = groups[g], placed[g]
     near = candidates.hinted and candidates.is_convincing
     n = len(candidates.poses)
     if n == 0 or near or candidates.is_clear:
         return candidates
     few = replace(group, rows=group.some)
-    looks = [_look(search, few, candidates, 0)]
-    if not (candidates.leads_clearly and _is_decided(looks, candidates, few)):
-        looks += [_look(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
-        if not (candidates.is_convincing and _is_decided(looks, candidates, few)):
-            by_both = candidates.score[: len(looks)] + [look.evidence for look in looks]
+    trials = [_measure_at(search, few, candidates, 0)]
+    if not (candidates.leads_clearly and _is_decided(trials, candidates, few)):
+        trials += [_measure_at(search, few, candidates, i) for i in range(1, min(N_POSES, n))]
+        if not (candidates.is_convincing and _is_decided(trials, candidates, few)):
+            by_both = candidates.score[: len(trials)] + [trial.evidence for trial in trials]
             for i in np.argsort(-by_both, kind="stable")[:N_AGAIN].tolist():
-                one = looks[i]
+                one = trials[i]
                 if one.fit is not None:
                     again = refine_views(search, [few], one.placement, one.outlines)
-                    looks[i] = _Look(again[0], again[1], again[2][0])
-    best = _best(looks)
-    fit = looks[best].fit
-    if fit is None or not _is_decided(looks, candidates, few):
+                    trials[i] = _Trial(again[0], again[1], again[2][0])
+    best = _best(trials)
+    fit = trials[best].fit
+    if fit is None or not _is_decided(trials, candidates, few):
         return replace(candidates, by_outlines=False)
     pose = Poses.one(fit.T_base_group, fit.shift)
     of_group = group.pictures(pictures, [r for r in group.rows if r in pictures])
     return replace(with_first(candidates, best, pose, of_group), by_outlines=True)
 
 
-def _look(search: Search, group: Group, candidates: Candidates, i: int) -> _Look:
+def _measure_at(search: Search, group: Group, candidates: Candidates, i: int) -> _Trial:
     """Measure outlines at a pose, and fit it to them."""
     shift, n_views = candidates.poses.shift[i], len(search.measurements.views)
     T: list[RigidTransform | None] = [None] * n_views
@@ -272,24 +279,24 @@ def _look(search: Search, group: Group, candidates: Candidates, i: int) -> _Look
     placement = placement.shifted(search, shifts)
     outlines, _ = measure_outlines(search, placement, group.rows)
     fit = fit_view(search, group, candidates.pose(i), shift, outlines)
-    return _Look(placement, outlines, fit)
+    return _Trial(placement, outlines, fit)
 
 
-def _best(looks: Sequence[_Look]) -> int:
+def _best(trials: Sequence[_Trial]) -> int:
     """Return the pose that outlines speak for most."""
-    return int(np.argmax([look.evidence for look in looks]))
+    return int(np.argmax([trial.evidence for trial in trials]))
 
 
-def _is_decided(looks: Sequence[_Look], candidates: Candidates, group: Group) -> bool:
+def _is_decided(trials: Sequence[_Trial], candidates: Candidates, group: Group) -> bool:
     """Say whether outlines speak for one pose, and not nearly as much for another one."""
-    best = _best(looks)
+    best = _best(trials)
     others = [
-        look.evidence
-        for i, look in enumerate(looks)
-        if i != best and not _same(look.outlines, looks[best].outlines)
+        trial.evidence
+        for i, trial in enumerate(trials)
+        if i != best and not _same(trial.outlines, trials[best].outlines)
     ]
     more, times = (MORE, TIMES) if len(group.rows) > 1 else (MORE_ALONE, TIMES_ALONE)
-    fit, other = looks[best].fit, max(others, default=0.0)
+    fit, other = trials[best].fit, max(others, default=0.0)
     if fit is None or not fit.is_determined:
         return False
     if best == 0 and candidates.is_convincing:
@@ -329,22 +336,22 @@ def _gathered(
     found: Sequence[Candidates],
     pictures: Pictures,
     hints: Sequence[RigidTransform | None],
-    radii: OtherRadii,
+    radii: RadiusFactors,
     run: Run,
 ) -> Placement:
-    """Put the views together, with what is to be said of those that could not be placed."""
+    """Put the views together, with the reasons of those that could not be placed."""
     views = search.measurements.views
     T, unplaced = list(hints), dict[str, str]()
     shift = np.zeros((len(views), search.n_legs, 2, 3))
-    error: Array = np.full((len(views), search.n_legs), UNSEEN_ERROR)
-    doubted = [g for g, one in enumerate(found) if may_be_mirrored(one)]
+    error: Array = np.full((len(views), search.n_legs), UNOBSERVED_ERROR)
+    unclear = [g for g, one in enumerate(found) if may_be_mirrored(one)]
     flipped = []
-    for g in doubted:  # those pictures by which it was placed, with left and right exchanged
+    for g in unclear:  # those pictures by which it was placed, with left and right exchanged
         few = found[g].hinted and found[g].support.shape[1] == len(groups[g].some)
         rows = groups[g].some if few else groups[g].rows
         flipped.append(mirrored(groups[g].pictures(pictures, rows)))
     mirrors = _anywhere(flipped, search.n_legs, MIRRORED_STARTS, run)
-    exchanged = {g for g, m in zip(doubted, mirrors, strict=True) if is_mirrored(found[g], m)}
+    exchanged = {g for g, m in zip(unclear, mirrors, strict=True) if is_mirrored(found[g], m)}
     for g, (group, one) in enumerate(zip(groups, found, strict=True)):
         names = [views[v].name for v in group.views]
         if g in exchanged or not one.is_convincing:
@@ -357,7 +364,7 @@ def _gathered(
         for v in group.views:
             T[v], shift[v] = one.pose() * group.T_group_camera[v], one.poses.shift[0]
             seen = np.isfinite(one.leg_error)
-            error[v] = np.where(seen, LEAST_ERROR + ERROR_REACH * one.leg_error, UNSEEN_ERROR)
+            error[v] = np.where(seen, MIN_ERROR + ERROR_SIGMAS * one.leg_error, UNOBSERVED_ERROR)
     placement = Placement(search.A_base, search.B_base, tuple(T), error, radii=radii)
     return replace(placement.shifted(search, shift), unplaced=unplaced)
 

@@ -21,20 +21,20 @@ COMMON = np.array([1e3, 0.3, 1e3, 1.5, 1.5, 1.0, 1.0])
 ALONG = np.array([1.0, 0.3, 1.0, 1.0, 1.0, 1.0, 1.0])
 OF_BLOCKS = np.array([2.0, 1.0, 0.3, 0.1, 0.1, 0.05, 0.05])
 N_ALONG = 3  # polynomials along an outline: constant, linear, quadratic
-OPEN_BLUR = 0.7  # of the logarithm of the blur, before outlines tell it
-UNEQUAL_BLUR = 0.05  # that outlines of one image seem to have, in its logarithm
-ROUGH = 0.02  # displacement of single blocks [px]
-NEAR = (0.02, 0.35)  # standard deviation of the lines that it starts from: [px] and in blurs
+PRIOR_BLUR = 0.7  # of the logarithm of the blur, a priori
+BLUR_SCATTER = 0.05  # that outlines of one image seem to have, in its logarithm
+ROUGHNESS = 0.02  # displacement of single blocks [px]
+START_SIGMA = (0.02, 0.35)  # standard deviation of the lines that it starts from: [px] and in blurs
 BLURS = (0.2, 4.0)  # [px]
-LEAST_SAMPLES = 30  # of a block
-ENOUGH, LONGEST = 16, 3  # blocks of an outline from which on some are joined, so many at most
-LARGEST_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
-NEARBY = (0.08, 0.05)  # the same up to which products of powers tell of a place and a blur
+MIN_SAMPLES = 30  # of a block
+ENOUGH_BLOCKS, MAX_JOINED = 16, 3  # of an outline, to join some blocks, so many at most
+MAX_STEP = (0.7, 0.4)  # of one round: of the line [blurs], of the logarithm of the blur
+MAX_MOVE_OF_PRODUCTS = (0.08, 0.05)  # the same up to which products of powers are not summed again
 CONVERGED = 0.01  # step of a line below which its rounds end [px]
-ODD = (1.5, 4.0)  # noise in that of a typical block from where on one counts less, and not at all
-LEAST_NOISE = 0.05  # [grey levels^2]
-DARKEST = 1e-3  # of the mean light of a block
-ANYTHING = 1e3  # standard deviation of what is not known
+ODD_NOISE = (1.5, 4.0)  # of a typical block, from where on one counts less, and not at all
+MIN_NOISE = 0.05  # [grey levels^2]
+MIN_LIGHT = 1e-3  # of the mean light of a block
+UNKNOWN_SIGMA = 1e3  # standard deviation of what is not known
 
 EVEN_BLUR = 0.03  # of the logarithm of the blur, from edge to edge
 FIRST_ROUNDS, LAST_ROUNDS = 2, 8  # at most
@@ -43,7 +43,7 @@ ONE, OTHER = (0, 1, 2, 1, 2, 2), (0, 0, 0, 1, 1, 2)  # pairs of polynomials
 SHIFT, BLUR, N_UNKNOWNS = N_AMPLITUDES, N_AMPLITUDES + 1, N_AMPLITUDES + 2  # unknowns of a block
 
 
-class JointLines(NamedTuple):
+class FittedLines(NamedTuple):
     """Lines of outlines, by how far they lie inside those on which the blocks had converged."""
 
     ends: Array  # (n_edges, 2) where the band begins and where it ends [px of the band]
@@ -62,7 +62,7 @@ class _Round(NamedTuple):
     inverse: Array  # (n_edges, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)
 
 
-def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> JointLines:
+def fit_lines(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> FittedLines:
     """Fit the blocks (n,) that lie on the lines of their edges, of each outline together.
 
     From a rough blur [px]; ``depth`` is the distance from the outlines at which blocks end [px].
@@ -71,7 +71,7 @@ def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> 
     n = len(pool.half_width)
     if n == 0 or not np.any(pool.seen):
         nothing = np.full(n, np.nan)
-        return JointLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
+        return FittedLines(np.zeros((n, 2)), np.tile(np.eye(2), (n, 1, 1)), blur, nothing)
     start = _Round(
         np.zeros((n, N_ALONG, N_AMPLITUDES)),
         np.zeros((n, 2)),
@@ -79,7 +79,7 @@ def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> 
         np.full(n, 4.0),
         np.zeros((n, N_ALONG * N_UNKNOWNS, N_ALONG * N_UNKNOWNS)),
     )
-    found = pool.rounds(pool.first_amplitudes(start), np.log(blur), OPEN_BLUR, FIRST_ROUNDS)
+    found = pool.rounds(pool.first_amplitudes(start), np.log(blur), PRIOR_BLUR, FIRST_ROUNDS)
     even, sigma = _even_blur(found, pool.seen)
     found = found._replace(log_blur=np.full(n, even))
     sigma = float(np.hypot(sigma, EVEN_BLUR))
@@ -88,13 +88,13 @@ def fit_together(blocks: Blocks, kept: BoolArray, blur: float, depth: float) -> 
     line = [SHIFT, N_UNKNOWNS + SHIFT]
     covariance = at_ends @ found.inverse[:, line][:, :, line] @ at_ends.T
     by_gamma = _shifts_by_gamma(pool, found, sigma)
-    return JointLines(found.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
+    return FittedLines(found.line @ at_ends.T, covariance, float(np.exp(even)), by_gamma)
 
 
 def _even_blur(found: _Round, seen: BoolArray) -> tuple[float, float]:
     """Return the logarithm of the blur that most outlines of an image agree on, and its sigma."""
     log_blur = found.log_blur[seen]
-    weight = 1.0 / (found.inverse[seen, BLUR, BLUR] + UNEQUAL_BLUR**2)
+    weight = 1.0 / (found.inverse[seen, BLUR, BLUR] + BLUR_SCATTER**2)
     even, robust = 0.0, weight
     for _ in range(6):
         even = float(robust @ log_blur / robust.sum())
@@ -135,7 +135,7 @@ class _Pixels:
         light, weight = self.light + self.level[self.edge][:, None] * self.weight, self.weight
         of_block = np.maximum(light.sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9), 1e-9)
         part = light / np.maximum(weight * of_block[:, None], 1e-9)
-        change = light * np.log(np.maximum(part, DARKEST))
+        change = light * np.log(np.maximum(part, MIN_LIGHT))
         totals = (np.bincount(self.edge, x.sum(axis=1), len(self.level)) for x in (change, weight))
         total, weights = totals
         mean = total / np.maximum(weights, 1e-9)
@@ -167,7 +167,7 @@ class _Pool:
         """Return what is needed of some blocks."""
         n_edges = len(blocks.bounds) - 1
         of_edge = np.repeat(np.arange(n_edges), np.diff(blocks.bounds))
-        usable = kept & (np.count_nonzero(blocks.weight, axis=1) >= LEAST_SAMPLES)
+        usable = kept & (np.count_nonzero(blocks.weight, axis=1) >= MIN_SAMPLES)
         d, grey, weight, _ = (np.asarray(x, np.float64) for x in blocks.samples(usable))
         edge = of_edge[usable]
         n_samples = np.count_nonzero(weight, axis=1)
@@ -245,12 +245,12 @@ class _Pool:
         blur = np.exp(self.at_log_blur)
         moved = np.abs(at.line - self.at_line).sum(axis=1) / blur
         widened = np.abs(at.log_blur - self.at_log_blur)
-        lost = edges & ~((moved < NEARBY[0]) & (widened < NEARBY[1]))
-        if np.any(lost):
-            own = lost[self.edge]
+        stale = edges & ~((moved < MAX_MOVE_OF_PRODUCTS[0]) & (widened < MAX_MOVE_OF_PRODUCTS[1]))
+        if np.any(stale):
+            own = stale[self.edge]
             if np.any(own):
-                self.products[own] = self.pixels.products(at.line, at.log_blur, lost)
-            self.at_line[lost], self.at_log_blur[lost] = at.line[lost], at.log_blur[lost]
+                self.products[own] = self.pixels.products(at.line, at.log_blur, stale)
+            self.at_line[stale], self.at_log_blur[stale] = at.line[stale], at.log_blur[stale]
 
     def _part(self, edges: BoolArray) -> "_Pool":
         """Return the blocks of some edges."""
@@ -292,9 +292,9 @@ class _Pool:
         whole = system + _diagonal(precision.reshape(shape))
         inverse = np.linalg.inv(whole)
         step = (inverse @ (target + pull).reshape(*shape, 1)).reshape(n, N_ALONG, N_UNKNOWNS)
-        largest = LARGEST_STEP[0] * np.exp(at.log_blur)[:, None]
+        largest = MAX_STEP[0] * np.exp(at.log_blur)[:, None]
         move = np.clip(step[:, :2, SHIFT], -largest, largest)
-        widen = np.clip(step[:, 0, BLUR], -LARGEST_STEP[1], LARGEST_STEP[1])
+        widen = np.clip(step[:, 0, BLUR], -MAX_STEP[1], MAX_STEP[1])
         least, most = np.log(BLURS).tolist()
         widened = np.clip(at.log_blur + widen, least, most)
         return _Round(
@@ -323,7 +323,7 @@ class _Pool:
         fitted = (free @ (right[:, :BLUR] + own * expected)[..., None])[..., 0]
         _, weight = self._noise(at, normal[:, :BLUR, :BLUR], right[:, :BLUR], fitted)
         system, target = self._in_common(_eliminated(normal, change, free, own), weight)
-        precision, _ = self._known_before(at, 0.0, ANYTHING)
+        precision, _ = self._known_before(at, 0.0, UNKNOWN_SIGMA)
         shape = len(every), N_ALONG * N_UNKNOWNS
         return system + _diagonal(precision.reshape(shape)), target.reshape(shape)
 
@@ -369,15 +369,15 @@ class _Pool:
         of_edge = np.ones(len(self.half_width))
         middle = (self.bounds[:-1] + self.bounds[1:]) // 2
         of_edge[self.seen] = of_block[np.lexsort((of_block, self.edge))][middle[self.seen]]
-        of_edge = np.asarray(np.maximum(of_edge, LEAST_NOISE))
+        of_edge = np.asarray(np.maximum(of_edge, MIN_NOISE))
         excess = of_block / of_edge[self.edge]
-        return of_edge, np.clip((ODD[1] - excess) / (ODD[1] - ODD[0]), 0.0, 1.0)
+        return of_edge, np.clip((ODD_NOISE[1] - excess) / (ODD_NOISE[1] - ODD_NOISE[0]), 0.0, 1.0)
 
     def _own_precision(self) -> Array:
         """Return how little amplitudes and places of single blocks scatter, (n, BLUR)."""
         precision = np.empty((len(self.edge), BLUR))
         precision[:, :N_AMPLITUDES] = (OF_BLOCKS * self.contrast[self.edge][:, None]) ** -2
-        precision[:, SHIFT] = ROUGH**-2
+        precision[:, SHIFT] = ROUGHNESS**-2
         return precision
 
     def _known_before(self, at: _Round, log_blur: float, sigma: float) -> tuple[Array, Array]:
@@ -387,7 +387,7 @@ class _Pool:
         contrast = self.contrast[:, None]
         precision[:, 0, :N_AMPLITUDES] = (COMMON * contrast) ** -2
         precision[:, 1:, :N_AMPLITUDES] = ((ALONG * contrast) ** -2)[:, None, :]
-        near = (NEAR[0] + NEAR[1] * np.exp(log_blur)) ** -2
+        near = (START_SIGMA[0] + START_SIGMA[1] * np.exp(log_blur)) ** -2
         precision[:, :2, SHIFT] = near
         pull[:, :2, SHIFT] = -at.line * near
         precision[:, 0, BLUR] = sigma**-2
@@ -412,7 +412,7 @@ def _joined(counts: IntArray) -> IntArray:
     """Return which of successive blocks become one, given how many there are of each edge."""
     joined, n_before = [np.empty(0, dtype=np.intp)], 0
     for n in counts.tolist():
-        index = np.arange(n) // int(np.clip(n // ENOUGH, 1, LONGEST))
+        index = np.arange(n) // int(np.clip(n // ENOUGH_BLOCKS, 1, MAX_JOINED))
         joined.append(n_before + index)
         n_before += int(index[-1]) + 1 if n else 0
     return np.concatenate(joined)
@@ -447,8 +447,8 @@ def _shifts_by_gamma(pool: _Pool, at: _Round, even_blur: float) -> Array:
     ``even_blur`` is by how much the logarithms of blurs differ in the image.
     """
     normal, right = pool.response_to_gamma(at)
-    moved, inverse = _solved(normal, right, 0.0, OPEN_BLUR)
-    counts = pool.seen / (inverse[:, BLUR, BLUR] + UNEQUAL_BLUR**2)
+    moved, inverse = _solved(normal, right, 0.0, PRIOR_BLUR)
+    counts = pool.seen / (inverse[:, BLUR, BLUR] + BLUR_SCATTER**2)
     widened = float(counts @ moved[:, BLUR] / counts.sum())
     moved, _ = _solved(normal, right, widened, even_blur)
     return np.where(pool.seen, moved[:, SHIFT], np.nan)

@@ -1,6 +1,6 @@
 """Camera poses that two edge pairs suggest, each taken for a leg.
 
-A pair taken for a leg tells its axis but for how much it leans towards the camera, and by its width
+A pair taken for a leg gives its axis but for how much it leans towards the camera, and by its width
 how far it is; what is left is a turn about that axis, which lays a second leg into the plane of a
 second pair. Many poses per picture come out of it, most of them wrong.
 """
@@ -10,31 +10,31 @@ from typing import NamedTuple
 import numpy as np
 
 from legcal.geometry import Array, IntArray
-from legcal.perception.agreement import WIDTH_ERROR, Picture, Poses, Targets, seen_width
 from legcal.perception.lines import EdgePairs
+from legcal.perception.pair_matching import WIDTH_ERROR, LegSegments, Picture, Poses, pair_widths
 
 N_FIRST, N_SECOND = 20, 40  # best pairs that are tried as the first one, and as the second
 LEANS = np.deg2rad([-55.0, -33.0, -11.0, 11.0, 33.0, 55.0])
-LONGER = 1.25, 3.0  # a pair is at most so much longer than the piece that it shows: factor, radii
+MAX_LENGTH_RATIO = 1.25, 3.0  # of a pair to the segment that it shows: factor, radii
 CONE = 0.12  # error of the logarithm of the ratio of the widths at both ends
-WIDTH_REACH = 2.5  # standard deviations of the width of the second pair
-SLACK = 0.2  # of the place along a piece, in its lengths
-TURNED = 1.05  # how far from a solution pairs and legs may be that allow none, as a cosine
-CROSSING = 0.03  # sine between axes seen, below which the second pair does not tell the place
-MOST = 3000  # poses of a picture
+MAX_WIDTH_SIGMAS = 2.5  # standard deviations of the width of the second pair
+PLACE_TOLERANCE = 0.2  # of the place along a segment, in its lengths
+MAX_COSINE = 1.05  # how far from a solution pairs and legs may be that allow none, as a cosine
+MIN_CROSSING = 0.03  # sine between axes seen, below which the second pair does not fix the place
+MAX_POSES = 3000  # poses of a picture
 
 
 class _Firsts(NamedTuple):
     """Pairs taken for legs, each with a lean: all about a start but the turn and the place."""
 
     u: Array  # (n, 3) direction in the camera frame, from base to platform
-    P: Array  # (n, 3) where the middle of the piece is put [m]
-    slack: Array  # (n,) how far along the leg it may be instead [m]
+    P: Array  # (n, 3) where the middle of the segment is put [m]
+    tolerance: Array  # (n,) how far along the leg it may be instead [m]
     pair: IntArray  # (n,)
     target: IntArray  # (n,)
 
 
-def pose_starts(picture: Picture, n_legs: int) -> Poses:
+def pose_hypotheses(picture: Picture, n_legs: int) -> Poses:
     """Return camera poses that put two legs where two pairs of a picture are."""
     pairs, targets = (
         picture.pairs.take(np.arange(min(N_SECOND, len(picture.pairs)))),
@@ -47,9 +47,9 @@ def pose_starts(picture: Picture, n_legs: int) -> Poses:
     if len(firsts.u) == 0:
         return nothing
     middle = targets.ends.mean(axis=1)
-    piece = targets.ends[:, 1] - targets.ends[:, 0]
-    length = np.linalg.norm(piece, axis=1)
-    direction = piece / length[:, None]
+    segment = targets.ends[:, 1] - targets.ends[:, 0]
+    length = np.linalg.norm(segment, axis=1)
+    direction = segment / length[:, None]
     # All in frames whose x axis is the first leg: of the camera, and of the base link.
     U_c, U_b = _triads(firsts.u), _triads(direction)[firsts.target]
     rays, planes = _rays(pairs), _planes(pairs)
@@ -60,8 +60,8 @@ def pose_starts(picture: Picture, n_legs: int) -> Poses:
     f, k, m, cosine, sine = _turns(firsts, targets, n_all, w_all)
     n, P, d = n_all[f, k], P_all[f], _turned(d_all[f, m], cosine, sine)
     across = n[:, 0]
-    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < CROSSING, np.inf, across)
-    good = np.flatnonzero(np.abs(place) <= firsts.slack[f])
+    place = -(_dot(n, d) + _dot(n, P)) / np.where(np.abs(across) < MIN_CROSSING, np.inf, across)
+    good = np.flatnonzero(np.abs(place) <= firsts.tolerance[f])
     f, k, m = f[good], k[good], m[good]
     cosine, sine, place = cosine[good], sine[good], place[good]
     # Where the second pair's middle is on the second leg, and how wide it should be there.
@@ -74,14 +74,14 @@ def pose_starts(picture: Picture, n_legs: int) -> Poses:
     depth = _dot(U_c[f, 2], X + along[:, None] * v)
     flat = np.linalg.norm(planes[k][:, :2], axis=1)
     expected = 2.0 * targets.radius[m] / (np.where(depth > 0.0, depth, 1.0) * flat)
-    seen = seen_width(pairs)[k]
+    seen = pair_widths(pairs)[k]
     # The depth of the first leg is no better known.
     sigma = np.sqrt(2.0) * np.hypot(WIDTH_ERROR, pairs.pixel / seen)
-    off = np.abs(np.log(expected / seen)) / (WIDTH_REACH * sigma)
-    good_along = np.abs(along) <= (0.5 + 0.5 * SLACK) * length[m]
+    off = np.abs(np.log(expected / seen)) / (MAX_WIDTH_SIGMAS * sigma)
+    good_along = np.abs(along) <= (0.5 + 0.5 * PLACE_TOLERANCE) * length[m]
     good = np.flatnonzero((off <= 1.0) & good_along & (depth > 0.0))
     merit = pairs.merit[k] + pairs.merit[firsts.pair[f]]
-    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MOST]]
+    good = good[np.argsort(-(merit * (1.0 - 0.5 * off**2))[good], kind="stable")[:MAX_POSES]]
     f, place = f[good], place[good]
     R = U_c[f] @ _about_x(cosine[good], sine[good]) @ U_b[f].swapaxes(1, 2)
     where = firsts.P[f] + place[:, None] * firsts.u[f]
@@ -90,19 +90,19 @@ def pose_starts(picture: Picture, n_legs: int) -> Poses:
 
 
 def _turns(
-    firsts: _Firsts, targets: Targets, n: Array, w: Array
+    firsts: _Firsts, targets: LegSegments, n: Array, w: Array
 ) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
     """Return the turns about a first leg that lay a second one into the plane of a second pair.
 
-    Indices of the first, the second pair and the second piece, and cosine and sine of the turn,
+    Indices of the first, the second pair and the second segment, and cosine and sine of the turn,
     from the normals n (n_firsts, n_pairs, 3) of the planes and the directions w (n_firsts,
-    n_targets, 3) of the pieces.
+    n_targets, 3) of the segments.
     """
     n, w = n[:, :, None, :].astype(np.float32), w[:, None, :, :].astype(np.float32)
     c0 = n[..., 0] * w[..., 0]
     c1 = n[..., 1] * w[..., 1] + n[..., 2] * w[..., 2]
     c2 = n[..., 2] * w[..., 1] - n[..., 1] * w[..., 2]
-    good = c0**2 <= TURNED**2 * (c1**2 + c2**2)
+    good = c0**2 <= MAX_COSINE**2 * (c1**2 + c2**2)
     good &= (np.arange(n.shape[1]) != firsts.pair[:, None])[:, :, None]
     good &= (targets.leg != targets.leg[firsts.target][:, None])[:, None, :]
     f, k, m = np.nonzero(good)
@@ -114,8 +114,8 @@ def _turns(
     return f, k, m, np.cos(turn), np.sin(turn)
 
 
-def _firsts(pairs: EdgePairs, targets: Targets) -> _Firsts:
-    """Take the best pairs for every piece, with all leans that their edges allow."""
+def _firsts(pairs: EdgePairs, targets: LegSegments) -> _Firsts:
+    """Take the best pairs for every segment, with all leans that their edges allow."""
     n = min(N_FIRST, len(pairs))
     first = pairs.take(np.arange(n))
     rays, planes = _rays(first), _planes(first)
@@ -123,7 +123,7 @@ def _firsts(pairs: EdgePairs, targets: Targets) -> _Firsts:
     ray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     side = np.cross(ray, planes)  # in the plane of the axis, across the ray
     side *= np.sign(_dot(side, along))[:, None]
-    width = seen_width(first)
+    width = pair_widths(first)
     cone = np.log(first.width[:, 1] / first.width[:, 0])[:, None, None]
     sigma = (CONE + 1.5 * pairs.pixel / width)[:, None, None]
     length = np.linalg.norm(targets.ends[:, 1] - targets.ends[:, 0], axis=1)
@@ -134,14 +134,14 @@ def _firsts(pairs: EdgePairs, targets: Targets) -> _Firsts:
     steep = np.maximum(np.abs(np.einsum("nlx,nx->nl", v, along)), 0.2)
     reach = (first.half_length[:, None] / steep)[:, None, :] * z[..., None]  # (n, n_targets, leans)
     z0, z1 = z[..., None] - reach * v[:, None, :, 2], z[..., None] + reach * v[:, None, :, 2]
-    longest = LONGER[0] * length + LONGER[1] * targets.radius
+    longest = MAX_LENGTH_RATIO[0] * length + MAX_LENGTH_RATIO[1] * targets.radius
     good = (np.minimum(z0, z1) > 0.0) & (2.0 * reach <= longest[:, None])
     ratio = np.log(np.where(good, z0, 1.0) / np.where(good, z1, 1.0))
     good &= np.abs(ratio - cone) <= 3.0 * sigma
     i, j, lean = np.nonzero(good)
-    slack = np.maximum(0.5 * length[j] - reach[good], 0.0) + SLACK * length[j]
+    tolerance = np.maximum(0.5 * length[j] - reach[good], 0.0) + PLACE_TOLERANCE * length[j]
     u, P = v[i, lean], z[i, j][:, None] * rays[i]
-    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, slack, i, j)))
+    return _Firsts(np.concatenate([u, -u]), *(np.concatenate([x, x]) for x in (P, tolerance, i, j)))
 
 
 def _rays(pairs: EdgePairs) -> Array:

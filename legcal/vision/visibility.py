@@ -17,7 +17,7 @@ END_COVER = 2.0  # length that may be hidden at a joint and beside a thicker cyl
 
 
 @dataclass(frozen=True)
-class Piece:
+class Segment:
     """A visible stretch of one cylinder of a leg."""
 
     link: str  # the URDF link that names the part
@@ -26,14 +26,14 @@ class Piece:
     end: float  # distances from A along the leg between which its outline is looked for [m]
 
 
-def visible_pieces(
+def visible_segments(
     cylinders: Sequence[Cylinder],
     length: float,  # leg length AB [m]
-) -> tuple[Piece, ...]:
-    """Return the visible piece of every part of a leg, from base to platform."""
+) -> tuple[Segment, ...]:
+    """Return the visible segment of every part of a leg, from base to platform."""
     main = main_cylinders(cylinders)
     parts = _merge_equal(cylinders, length)
-    pieces = []
+    segments = []
     for link, radius, start, end in parts:
         cover = END_COVER * radius
         stretches = [(max(start, cover), min(end, length - cover))]
@@ -47,8 +47,8 @@ def visible_pieces(
                 ]
         low, high = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
         if high > low and _look_alike(radius, main[link].radius):
-            pieces.append(Piece(link, radius, low, high))
-    return tuple(sorted(pieces, key=lambda piece: (piece.start, piece.link)))
+            segments.append(Segment(link, radius, low, high))
+    return tuple(sorted(segments, key=lambda segment: (segment.start, segment.link)))
 
 
 def _merge_equal(
@@ -124,7 +124,7 @@ def band_of_leg(
     start: float,
     end: float,
 ) -> Band | None:
-    """Return the band along the visible stretch of a leg, or None if the image misses it."""
+    """Return the band along the visible stretch of a leg, or None if it is outside the image."""
     ends = np.array([[start], [end]])
     return bands_of_legs(camera, A_camera[None], B_camera[None], *ends)[0]
 
@@ -203,8 +203,8 @@ class PredictedLeg:
     leg: int  # the image and the leg
     A_camera: Array  # (3,) joint centres in the camera frame [m]
     B_camera: Array  # (3,) joint centres in the camera frame [m]
-    pieces: tuple[Piece, ...]  # the parts that can be seen, from base to platform
-    outlines: Array  # (n_pieces, 2, 3) their outlines h1, h2, eq (3)
+    segments: tuple[Segment, ...]  # the parts that can be seen, from base to platform
+    outlines: Array  # (n_segments, 2, 3) their outlines h1, h2, eq (3)
     band: Band  # the frame along the visible stretch of the whole leg
 
     @cached_property
@@ -233,22 +233,22 @@ def predict_legs(
     A_camera, B_camera = T_camera_base.apply(A_base), T_camera_base.apply(B_base)
     length = np.linalg.norm(B_camera - A_camera, axis=1)
     u = (B_camera - A_camera) / length[:, None]
-    pieces = [visible_pieces(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
-    ends = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in pieces]
+    segments = [visible_segments(of_leg, of) for of_leg, of in zip(cylinders, length, strict=True)]
+    ends = [(some[0].start, max(p.end for p in some)) if some else (0.0, 0.0) for some in segments]
     bands = bands_of_legs(camera, A_camera, B_camera, *np.array(ends).reshape(-1, 2).T)
-    radius = np.array([max((piece.radius for piece in some), default=0.0) for some in pieces])
+    radius = np.array([max((segment.radius for segment in some), default=0.0) for some in segments])
     distance = np.linalg.norm(A_camera - u * np.sum(u * A_camera, axis=1, keepdims=True), axis=1)
     seen = {
         leg: band
         for leg, band in enumerate(bands)
         if band is not None and distance[leg] > 1.01 * radius[leg]
     }
-    axes = [leg for leg in seen for _ in pieces[leg]]
-    radii = np.array([piece.radius for leg in seen for piece in pieces[leg]])
+    axes = [leg for leg in seen for _ in segments[leg]]
+    radii = np.array([segment.radius for leg in seen for segment in segments[leg]])
     outlines = outlines_of_axis(u[axes], A_camera[axes], radii)
-    of_leg = np.split(outlines, np.cumsum([len(pieces[leg]) for leg in seen])[:-1])
+    of_leg = np.split(outlines, np.cumsum([len(segments[leg]) for leg in seen])[:-1])
     return [
-        PredictedLeg(row, leg, A_camera[leg], B_camera[leg], pieces[leg], own, band)
+        PredictedLeg(row, leg, A_camera[leg], B_camera[leg], segments[leg], own, band)
         for (leg, band), own in zip(seen.items(), of_leg, strict=False)
     ]
 
@@ -266,7 +266,7 @@ def hidden_by(
         np.array(x) for x in zip(*((o.u, o.A_camera, o.B_camera) for o in legs), strict=True)
     )
     length = np.linalg.norm(B - A, axis=1)
-    radius = np.array([max(piece.radius for piece in other.pieces) for other in legs])
+    radius = np.array([max(segment.radius for segment in other.segments) for other in legs])
     # The points of the legs' axes nearest to the viewing rays, and the rays' nearest points.
     c, to_A = ray @ u.T, ray @ A.T  # (n, n_legs)
     sine2 = np.maximum(1.0 - c**2, 1e-12)
