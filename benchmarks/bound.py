@@ -24,14 +24,16 @@ from outline_bound import (
     nse_figure,
     ratio_figure,
 )
-from outline_study import (
+from outline_sessions import (
     Design,
-    Found,
     OutlineSession,
-    OutlineStudy,
     StartErrors,
-    failures_of,
     one_fit,
+)
+from outline_study import (
+    Found,
+    OutlineStudy,
+    failures_of,
     printed,
     run,
 )

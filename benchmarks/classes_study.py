@@ -31,20 +31,22 @@ from outline_bound import (
     ratio_figure,
     unit_of,
 )
-from outline_study import (
+from outline_sessions import (
     SHIPPED,
     Design,
-    Found,
     Noise,
     OutlineSession,
-    OutlineStudy,
     StartErrors,
-    failures_of,
     one_fit,
     platform_errors,
+    staged_legs,
+)
+from outline_study import (
+    Found,
+    OutlineStudy,
+    failures_of,
     printed,
     run,
-    staged_legs,
 )
 from rich.console import Group, RenderableType
 from rich.text import Text

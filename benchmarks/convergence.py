@@ -16,15 +16,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 from bound import errors_of
-from outline_study import (
+from outline_sessions import (
     Design,
-    Found,
     OutlineSession,
-    OutlineStudy,
     StartErrors,
-    failures_of,
     one_fit,
     platform_errors,
+)
+from outline_study import (
+    Found,
+    OutlineStudy,
+    failures_of,
     printed,
     run,
 )

@@ -11,7 +11,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from outline_study import Design, moved_poses
+from outline_sessions import (
+    Design,
+    moved_poses,
+)
 from scipy.linalg import null_space
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm

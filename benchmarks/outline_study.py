@@ -1,8 +1,7 @@
-"""What the studies of outlines share: machines, sessions before cameras, fits and runs.
+"""What the studies of outlines share: how they repeat sessions, and how they are run.
 
-``bound.py``, ``convergence.py`` and ``classes_study.py`` repeat the same sessions: outlines whose
-covariance is known, readings, a wrong nominal model and rough camera poses. They differ in what
-they record of a session and in what must come out.
+``bound.py``, ``convergence.py`` and ``classes_study.py`` differ in what they record of a session of
+:mod:`outline_sessions` and in what must come out.
 """
 
 from __future__ import annotations
@@ -10,362 +9,36 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tempfile
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from outline_sessions import (
+    MACHINES,
+    Design,
+    Noise,
+    OutlineSession,
+    StartErrors,
+    design_of,
+    draw_session,
+)
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration import (
-    FittedLegs,
-    RefinementSettings,
-    Solution,
-    Start,
-    cameras_from_hints,
-    platform_poses,
-    refine,
-    start_from,
-)
 from legcal.cli.options import print_failure
-from legcal.data import Measurements, Outlines, View, axes_from_outlines
-from legcal.errors import DidNotConverge, LegcalError, UsageError
-from legcal.geometry import Array, IntArray
-from legcal.machine import (
-    Leg,
-    LegKind,
-    Machine,
-    Parametrization,
-    geometries,
-    load_mechanism,
-    moved_legs,
-    parametrize,
-    platform_in_base,
-    pose_differences,
-    radius_name,
-    solve_poses,
-)
-from legcal.paper import Criteria, NominalMachine, run_steps
+from legcal.errors import LegcalError, UsageError
 from legcal.processors import processors
 from legcal.simulation import (
-    RAISED,
-    OutlineNoise,
     Record,
-    Scene,
-    cameras_around,
-    draw_poses,
-    dressed,
     failure_of,
     has_keys,
-    mild_lens,
-    noisy_outlines,
-    outlines_of,
-    pose_machine,
     run_study,
-    take_images,
-    write_model_with,
 )
-from legcal.vision import Camera
-
-COPLANAR, NONCOPLANAR = "6-spu-coplanar", "6-spu-noncoplanar"
-MACHINES = (NONCOPLANAR, COPLANAR, "3-upu-tilted", "3-rpr")
-SHIPPED = (
-    "hexapod",
-    "nategh-agheli",
-    "6-sps",
-    "hexapod-rod",
-    "hexapod-strut",
-    "3-rps",
-    "3-spr",
-    "3-upu",
-    "3-upu-tilted",
-    "tricept",
-    "3-rpr",
-)
-_SIX_LEGS = (NONCOPLANAR, COPLANAR, *SHIPPED[:5])
-_MOST_LEGS = 4  # of six that a view is said to see, as in the paper
-_SEED = 2002  # of what is the same in all runs
-_CLOSED = 1e-13  # [m]
-
-
-# True machines before their cameras
-
-
-def true_mechanism(name: str) -> Machine:
-    """Return a true machine of the studies: one of ``MACHINES``, or a shipped model."""
-    if name not in (COPLANAR, NONCOPLANAR):
-        return load_mechanism(name)
-    flat = load_mechanism("hexapod")
-    if name == COPLANAR:
-        return flat
-    up = np.array([0.0, 0.0, RAISED])
-    legs = tuple(
-        replace(leg, A=leg.A + up, B=leg.B - up) if j % 2 else leg
-        for j, leg in enumerate(geometries(flat))
-    )
-    with tempfile.TemporaryDirectory(prefix="legcal-study-") as folder:
-        return load_mechanism(write_model_with(flat, legs, flat.home, Path(folder), {}))
-
-
-@dataclass(frozen=True, eq=False)
-class Design:
-    """A true machine, its poses, its cameras and its outlines without noise."""
-
-    legs: FittedLegs  # the true ones
-    home: RigidTransform  # T_Rb_Re of the pose that the model calls home
-    R: Array  # (n_poses, 3, 3) true orientations of R_e in R_b
-    t: Array  # (n_poses, 3) [m]
-    q: Array  # (n_poses, n_legs) exact readings [m]; zero for constant legs, NaN for passive ones
-    camera: Camera  # of all views
-    T_Rb_camera: tuple[RigidTransform, ...]
-    seen: tuple[tuple[str, ...] | None, ...]  # legs that each view is said to see; None for all
-    view: IntArray  # (n_rows,)
-    pose: IntArray  # (n_rows,)
-    outlines: Outlines  # with the covariance of the noise
-
-    @property
-    def parametrization(self) -> Parametrization:
-        """The kinematic parameters; twists are known."""
-        return parametrize(self.legs.names, self.legs.nominal, self.legs.frame_legs)
-
-    @property
-    def parts(self) -> tuple[tuple[int, str], ...]:
-        """Leg and part of each radius that is observed, by leg and name."""
-        shown = zip(self.outlines.leg.tolist(), self.outlines.part, strict=True)
-        return tuple(sorted(set(shown)))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of what is to be found: the kinematic parameters, then the radii observed."""
-        radii = (radius_name(self.legs.names[leg], part) for leg, part in self.parts)
-        return (*self.parametrization.names, *radii)
-
-    @property
-    def poses(self) -> tuple[RigidTransform, ...]:
-        """The true poses T_Rb_Re."""
-        together = RigidTransform.from_components(self.t, Rotation.from_matrix(self.R))
-        return tuple(together[k] for k in range(len(self.t)))
-
-
-@lru_cache(maxsize=32)  # a study goes through all of its machines in every run
-def design_of(name: str, n_views: int, n_poses: int, sigma_px: float) -> Design:
-    """Return the design of a machine, the same one in all processes; no two views share a pose."""
-    machine = true_mechanism(name)
-    rng = np.random.default_rng(_SEED)
-    lens = mild_lens()
-    drawn = draw_poses(machine, n_views * n_poses, rng)
-    machines = pose_machine(machine, dressed(machine), drawn)
-    cameras = {f"c{v + 1}": lens for v in range(n_views)}
-    views, _ = cameras_around(machine, machines, cameras, rng)
-    poses_of = [range(v * n_poses, (v + 1) * n_poses) for v in range(n_views)]
-    images = take_images(machine.legs, machines, views, poses_of, 1)
-    legs = geometries(machine)
-    at = RigidTransform.concatenate([platform_in_base(machine, T) for T in drawn.poses])
-    rotation: Rotation = at.rotation
-    R, t = closed_poses(legs, machine.frame_legs, rotation.as_matrix(), at.translation)
-    # Joint centres stand where the equations of the legs put them, to the last digit.
-    B = np.einsum("kij,lj->kli", R, np.array([leg.B for leg in legs])) + t[:, None]
-    B_base = np.array([machine.T_base_Rb.apply(points) for points in B])
-    A_base = np.array([machine.A for machine in machines])
-    outlines = outlines_of(Scene(A_base, B_base, views, images), OutlineNoise(sigma_px, None))
-    most = _MOST_LEGS if name in _SIX_LEGS else machine.n_legs
-    seen = []
-    for v in range(n_views):
-        rows = np.flatnonzero(images.view == v)
-        length = [[leg.length_px * leg.is_seen for leg in images.shown[r]] for r in rows]
-        longest = np.argsort(-np.mean(length, axis=0), kind="stable")
-        seen.append(sorted(longest[:most].tolist()))
-    shown = zip(outlines.row.tolist(), outlines.leg.tolist(), strict=True)
-    told = np.flatnonzero([j in seen[images.view[r]] for r, j in shown])
-    q = np.zeros((len(t), len(legs)))
-    for j, leg in enumerate(legs):
-        if leg.kind is LegKind.PASSIVE:
-            q[:, j] = np.nan
-        elif leg.kind is LegKind.ACTUATED:
-            q[:, j] = machine.sign[j] * (np.linalg.norm(B[:, j] - leg.A, axis=-1) - leg.q0)
-    radii = {
-        (j, part): radius
-        for j, leg in enumerate(machine.legs)
-        for part, radius in leg.radius_of_part.items()
-    }
-    return Design(
-        legs=FittedLegs(
-            machine.leg_names, legs, machine.sign.astype(np.intp), machine.frame_legs, radii
-        ),
-        home=platform_in_base(machine, machine.home),
-        R=R,
-        t=t,
-        q=q,
-        camera=lens,
-        T_Rb_camera=tuple(machine.T_base_Rb.inv() * view.T_base_camera for view in views),
-        seen=tuple(
-            None if len(s) == machine.n_legs else tuple(machine.leg_names[j] for j in s)
-            for s in seen
-        ),
-        view=images.view,
-        pose=images.pose,
-        outlines=outlines.choose(told),
-    )
-
-
-def closed_poses(
-    legs: Sequence[Leg], frame_legs: Sequence[int], R: Array, t: Array
-) -> tuple[Array, Array]:
-    """Return the nearest poses at which everything holds that legs demand without a reading."""
-    if len(frame_legs) < 3:  # turned and lifted into the plane of motion
-        angle = np.arctan2(R[:, 1, 0], R[:, 0, 0])
-        R = Rotation.from_euler("z", angle[:, None]).as_matrix()
-        t = np.column_stack([t[:, :2], np.full(len(t), np.mean([x.A[2] - x.B[2] for x in legs]))])
-    found = solve_poses(legs, frame_legs, R, t)
-    if found.missed.max(initial=0.0) < _CLOSED:
-        return found.R, found.t
-    raise DidNotConverge(
-        f"Simulated poses could not be closed: found legs {1e3 * found.missed.max():.2g} mm off "
-        "what they demand, needed poses that they allow; check the model's home."
-    )
-
-
-def moved_poses(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
-    """Return poses after a rotation [rad] and a displacement [m] in R_b, (k, 6)."""
-    turn = Rotation.from_rotvec(step[..., :3]).as_matrix()
-    return np.asarray(turn @ R), np.asarray(t + step[..., 3:])
-
-
-# Sessions
-
-
-@dataclass(frozen=True)
-class StartErrors:
-    """How wrong the nominal model and the rough camera poses are."""
-
-    length: float  # of every coordinate of the joints, every offset and constant length [m]
-    angle: float  # of every axis [rad]
-    camera_shift: float  # of every camera, in any direction [m]
-    camera_turn: float  # about any axis [rad]
-    full: bool  # all errors have this size, up or down; else it is the most of uniform ones
-
-
-@dataclass(frozen=True)
-class Noise:
-    """What is measured how well."""
-
-    sigma_px: float = 0.1  # of an edge point; every pixel along an outline has one
-    sigma_q: float = 2e-6  # of a reading [m]
-    radius_sigma: float = 0.02  # of the nominal radii, as a part of the true ones
-
-
-@dataclass(frozen=True, eq=False)
-class OutlineSession:
-    """What was measured, and what was known before."""
-
-    legs: FittedLegs  # the nominal ones
-    measurements: Measurements  # with rough camera poses; the base link's frame is R_b
-    outlines: Outlines
-    home: RigidTransform  # T_Rb_Re near which the nominal legs meet
-
-
-def draw_session(
-    design: Design, noise: Noise, errors: StartErrors, rng: np.random.Generator
-) -> OutlineSession:
-    """Return a measurement of a design, and what is known of it before."""
-    step = _parameter_errors(design.parametrization, errors, rng)
-    true = design.legs
-    is_read = [leg.kind is LegKind.ACTUATED for leg in true.nominal]
-    q = design.q + np.where(is_read, noise.sigma_q, 0.0) * rng.normal(size=design.q.shape)
-    views = tuple(
-        View(f"c{v + 1}", design.camera, _rough(T, errors, rng), seen)
-        for v, (T, seen) in enumerate(zip(design.T_Rb_camera, design.seen, strict=True))
-    )
-    image = ("",) * len(design.view)
-    measurements = Measurements(
-        views, image, design.view, design.pose, q[design.pose], noise.sigma_q
-    )
-    outlines = noisy_outlines(design.outlines, design.camera, rng)
-    nominal = moved_legs(true.nominal, design.parametrization.place, step)
-    radii = {
-        part: radius * float(1.0 + noise.radius_sigma * rng.normal())
-        for part, radius in true.radii.items()
-    }
-    legs = replace(true, nominal=nominal, radii=radii)
-    return OutlineSession(legs, measurements, outlines, design.home)
-
-
-def _parameter_errors(
-    parametrization: Parametrization, errors: StartErrors, rng: np.random.Generator
-) -> Array:
-    """Return by how much the nominal parameters are wrong [m, rad]."""
-    unit = rng.uniform(-1.0, 1.0, len(parametrization))
-    if errors.full:
-        unit = np.sign(unit)
-        for place in parametrization.place:
-            for axis in (place[7:9], place[9:11]):
-                if axis[0] >= 0:
-                    unit[axis] = _direction(rng, 2)
-    is_angle = np.array([u == "rad" for u in parametrization.units], dtype=np.bool_)
-    return np.asarray(np.where(is_angle, errors.angle, errors.length) * unit)
-
-
-def _rough(T: RigidTransform, errors: StartErrors, rng: np.random.Generator) -> RigidTransform:
-    """Return the pose of a camera as somebody noted it."""
-    shift, turn = (1.0, 1.0) if errors.full else rng.random(2)
-    turned = Rotation.from_rotvec(errors.camera_turn * turn * _direction(rng, 3))
-    moved = errors.camera_shift * shift * _direction(rng, 3)
-    return RigidTransform.from_components(T.translation + moved, turned * T.rotation)
-
-
-def _direction(rng: np.random.Generator, n: int) -> Array:
-    """Return a unit vector (n,) that points anywhere."""
-    v = rng.normal(size=n)
-    return np.asarray(v / np.linalg.norm(v))
-
-
-# Estimators
-
-
-def one_fit(session: OutlineSession, radius_sigma: float) -> Solution:
-    """Return what the joint fit finds from the nominal model and rough cameras."""
-    settings = RefinementSettings(radius_sigma=radius_sigma)
-    start = nominal_start(session)
-    return refine(session.legs, session.measurements, session.outlines, start, settings)
-
-
-def nominal_start(session: OutlineSession) -> Start:
-    """Return the nominal model, moved from home to the readings, and the rough cameras."""
-    measurements, legs = session.measurements, session.legs
-    cameras = cameras_from_hints(measurements, RigidTransform.identity())
-    home = (session.home,) * measurements.n_poses
-    return start_from(legs.nominal, measurements, legs, cameras, home, "nominal")
-
-
-def staged_legs(session: OutlineSession, criteria: Criteria) -> tuple[Leg, ...]:
-    """Return the legs that the four steps find from the axes which the outlines give."""
-    legs = session.legs
-    radii = {part: radius for (_, part), radius in legs.radii.items()}
-    axes = axes_from_outlines(session.outlines, session.measurements, radii)
-    machine = NominalMachine(legs.names, legs.nominal, legs.sign, legs.frame_legs)
-    return run_steps(machine, axes, session.measurements, criteria=criteria).legs
-
-
-def platform_errors(design: Design, legs: Sequence[Leg]) -> tuple[Array, Array]:
-    """Return displacement [m] and angle [rad] of R_e that legs cause at exact readings, (n_poses,).
-
-    Where legs cannot have these readings, the platform stands where it misses them least.
-    """
-    poses = design.poses
-    lengths = design.legs.sign * design.q + np.array([leg.q0 for leg in legs])
-    there = platform_poses(legs, lengths, poses, design.legs.frame_legs)
-    return pose_differences(there, poses)
-
-
-# Studies
 
 Found = dict[str, Any]
 """What all sessions of a machine showed, as in the document: its name, ``met``, figures."""

@@ -7,7 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from outline_study import closed_poses, moved_poses
+from outline_sessions import (
+    closed_poses,
+    moved_poses,
+)
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, fitted_legs, start_from

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from outline_study import Noise, StartErrors, design_of, draw_session
+from outline_sessions import Noise, StartErrors, design_of, draw_session
 from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 

@@ -20,20 +20,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from machine_session import machine_session, shown_outlines
 from outline_bound import Bound, Determined, at_best, band_of_ratio, bound_of
-from outline_study import (
+from outline_sessions import (
     MACHINES,
     SHIPPED,
     Design,
-    Found,
     Noise,
     OutlineSession,
-    OutlineStudy,
     StartErrors,
     closed_poses,
     design_of,
     draw_session,
     nominal_start,
     one_fit,
+)
+from outline_study import (
+    Found,
+    OutlineStudy,
 )
 from rich.console import Console
 from test_cli import run

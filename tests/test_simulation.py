@@ -79,11 +79,11 @@ def test_poses_followed_from_home_have_their_lengths_and_others_stay_on_the_way(
     machine = hexapod()
     lengths = np.array([np.full(6, 0.42), [0.40, 0.41, 0.42, 0.43, 0.42, 0.41], np.full(6, 5.0)])
     lengths[2, ::2] = 0.01
-    followed = follow_from_home(machine, lengths)
-    assert followed.reached.tolist() == [True, True, False]
-    found = np.linalg.norm(leg_vectors(machine.parameters, followed.T_Rb_Re), axis=-1)
+    poses, reached = follow_from_home(machine, lengths)
+    assert reached.tolist() == [True, True, False]
+    found = np.linalg.norm(leg_vectors(machine.parameters, poses), axis=-1)
     assert np.abs(found - lengths)[:2].max() < 1e-13
-    assert np.linalg.norm(followed.t[2] - machine.home.translation) < 0.2
+    assert np.linalg.norm(poses[2].translation - machine.home.translation) < 0.2
 
 
 def test_poses_solved_together_are_those_solved_alone() -> None:
@@ -122,7 +122,7 @@ def test_errors_of_readings_have_their_standard_deviation_and_shape(uniform: boo
 def test_a_machine_that_reaches_no_pose_of_its_travel_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("legcal.simulation.hexapod._ROUNDS", 20)
+    monkeypatch.setattr("legcal.simulation.hexapod._MAX_ROUNDS", 20)
     machine = replace(hexapod(), travel=np.tile([[0.1, 0.1], [0.9, 0.9]], (3, 1)))
     with pytest.raises(DidNotConverge, match="Only 0 of 2 random poses"):
         extreme_poses(machine, 2, np.random.default_rng(0))

@@ -2,6 +2,9 @@ from .board import PlacedBoard as PlacedBoard
 from .cameras import cameras_around as cameras_around
 from .cameras import look_at as look_at
 from .cameras import mild_lens as mild_lens
+from .checkpoint import has_keys as has_keys
+from .checkpoint import is_failure as is_failure
+from .checkpoint import is_number as is_number
 from .dataset import SimulatedDataset as SimulatedDataset
 from .dataset import simulate as simulate
 from .dataset import summary_document as summary_document
@@ -27,9 +30,6 @@ from .solids import pose_machine as pose_machine
 from .study import Record as Record
 from .study import Study as Study
 from .study import failure_of as failure_of
-from .study import has_keys as has_keys
-from .study import is_failure as is_failure
-from .study import is_number as is_number
 from .study import run_study as run_study
 from .truth import write_model_with as write_model_with
 from .visibility import silhouette as silhouette

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -17,9 +16,9 @@ from legcal.errors import DidNotConverge
 from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
 from legcal.machine import (
     KinematicParameters,
-    SolvedPoses,
     from_vector,
     point_like_legs,
+    pose_equations,
     solve_poses,
     to_vector,
 )
@@ -39,10 +38,10 @@ from legcal.vision import Camera
 PAPER_VIEWS = ((0, 1, 2, 3), (2, 3, 4, 5), (0, 1, 4, 5))  # four legs seen at a time
 RAISED = 0.030  # [m] out of the plane of the others
 
-_EXACT = 1e-12  # of the lengths
-_SINGULAR = 0.1  # smallest singular value of the scaled Jacobian that a pose may have
-_STEPS = 6  # from home
-_ROUNDS = 1000  # of draws of poses
+_MAX_ERROR = 1e-12  # of the lengths
+_MIN_SINGULAR = 0.1  # value of the scaled Jacobian that a pose may have
+_N_STEPS = 6  # from home
+_MAX_ROUNDS = 1000  # of draws of poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,79 +142,49 @@ def _without_rounding(
 
 def leg_vectors(parameters: KinematicParameters, T_Rb_Re: RigidTransform) -> Array:
     """Return A_j B_j of every leg in R_b at one or several poses, (..., n_legs, 3) [m]."""
-    return legs_and_arms(parameters, T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation)[0]
-
-
-def legs_and_arms(parameters: KinematicParameters, R: Array, t: Array) -> tuple[Array, Array]:
-    """Return A B and R B of all legs at poses R, t of R_e in R_b, both (..., n_legs, 3) [m]."""
-    arms = parameters.platform_joints @ np.swapaxes(R, -1, -2)
-    return arms + t[..., None, :] - parameters.base_joints, arms
-
-
-def length_jacobian(parameters: KinematicParameters, R: Array, t: Array) -> Array:
-    """Return d lengths / d (translation, rotation vector in R_b), (..., n_legs, 6)."""
-    legs, arms = legs_and_arms(parameters, R, t)
-    u = legs / np.linalg.norm(legs, axis=-1, keepdims=True)
-    return np.concatenate([u, np.cross(arms, u)], axis=-1)
-
-
-class Followed(NamedTuple):
-    """Where a machine came to from home."""
-
-    # R, t: (n, 3, 3) poses of R_e in R_b [m]; where the lengths were not reached, the last one on
-    # the way
-    R: Array
-    t: Array
-    reached: BoolArray  # (n,) which have the lengths that were asked for
-
-    @property
-    def T_Rb_Re(self) -> RigidTransform:
-        """The poses."""
-        return RigidTransform.from_components(self.t, Rotation.from_matrix(self.R))
+    arms = parameters.platform_joints @ np.swapaxes(T_Rb_Re.rotation.as_matrix(), -1, -2)
+    return np.asarray(arms + T_Rb_Re.translation[..., None, :] - parameters.base_joints)
 
 
 def poses_with_lengths(
     parameters: KinematicParameters, lengths: Array, start: RigidTransform
 ) -> RigidTransform:
     """Return the platform poses with given leg lengths that are nearest to a start."""
-    found = _solved(parameters, lengths, start.rotation.as_matrix(), start.translation)
-    if np.any(found.missed > _EXACT * lengths.max(axis=1, initial=0.0)):
+    legs, R, t = point_like_legs(parameters), start.rotation.as_matrix(), start.translation
+    solved = solve_poses(legs, range(3), R, t, lengths - parameters.offsets)
+    if np.any(solved.missed > _MAX_ERROR * lengths.max(axis=1, initial=0.0)):
         raise DidNotConverge(
             f"A simulated pose was not found: leg lengths are still "
-            f"{1e3 * found.missed.max():.2g} mm off; choose lengths that the machine can reach."
+            f"{1e3 * solved.missed.max():.2g} mm off; choose lengths that the machine can reach."
         )
-    return RigidTransform.from_components(found.t, Rotation.from_matrix(found.R))
+    return RigidTransform.from_components(solved.t, Rotation.from_matrix(solved.R))
 
 
-def follow_from_home(machine: PaperHexapod, lengths: Array) -> Followed:
-    """Return the poses with given leg lengths that are reached from home in small steps.
+def follow_from_home(machine: PaperHexapod, lengths: Array) -> tuple[RigidTransform, BoolArray]:
+    """Return the poses with leg lengths (n, n_legs) by small steps from home, and which have them.
 
-    They are in the assembly mode of home; those beyond or beside a singularity are not reached.
+    They are in the assembly mode of home; those beyond or beside a singularity are not reached, and
+    are the last pose on the way.
     """
-    n = len(lengths)
+    parameters, n = machine.parameters, len(lengths)
+    legs = point_like_legs(parameters)
     R = np.tile(machine.home.rotation.as_matrix(), (n, 1, 1))
     t = np.tile(machine.home.translation, (n, 1))
     reached = np.ones(n, dtype=np.bool_)
-    first = np.linalg.norm(leg_vectors(machine.parameters, machine.home), axis=-1)
-    size = float(np.mean(np.linalg.norm(machine.parameters.platform_joints, axis=-1)))
-    unit = np.array([1.0, 1.0, 1.0, size, size, size])
-    for part in np.linspace(0.0, 1.0, _STEPS + 1)[1:]:
+    first = np.linalg.norm(leg_vectors(parameters, machine.home), axis=-1)
+    size = float(np.mean(np.linalg.norm(parameters.platform_joints, axis=-1)))
+    unit = np.repeat([size, 1.0], 3)
+    for part in np.linspace(0.0, 1.0, _N_STEPS + 1)[1:]:
         here = np.flatnonzero(reached)
         wanted = first + part * (lengths[here] - first)
-        found = _solved(machine.parameters, wanted, R[here], t[here])
-        J = length_jacobian(machine.parameters, found.R, found.t) / unit
+        solved = solve_poses(legs, range(3), R[here], t[here], wanted - parameters.offsets)
+        J = pose_equations(legs, solved.R, solved.t, by_local=False).by_pose / unit
         smallest = np.linalg.svd(J, compute_uv=False)[:, -1]
-        exact = found.missed <= _EXACT * wanted.max(axis=1, initial=0.0)
-        well = exact & (smallest >= _SINGULAR)
-        R[here[well]], t[here[well]] = found.R[well], found.t[well]
-        reached[here] = well
-    return Followed(R, t, reached)
-
-
-def _solved(parameters: KinematicParameters, lengths: Array, R: Array, t: Array) -> SolvedPoses:
-    """Return the poses with given leg lengths, or with those nearest to them."""
-    legs = point_like_legs(parameters)
-    return solve_poses(legs, range(3), R, t, lengths - parameters.offsets)
+        exact = solved.missed <= _MAX_ERROR * wanted.max(axis=1, initial=0.0)
+        regular = exact & (smallest >= _MIN_SINGULAR)
+        R[here[regular]], t[here[regular]] = solved.R[regular], solved.t[regular]
+        reached[here] = regular
+    return RigidTransform.from_components(t, Rotation.from_matrix(R)), reached
 
 
 def extreme_poses(machine: PaperHexapod, n_poses: int, rng: np.random.Generator) -> RigidTransform:
@@ -242,20 +211,17 @@ def _drawn(machine: PaperHexapod, n_poses: int, draw: Callable[[], Array]) -> Ri
     Each round draws as many as are missing, so that the draws are those of one pose at a time.
     """
     lowest, highest = machine.travel.T
-    R, t = np.zeros((0, 3, 3)), np.zeros((0, 3))
-    for _ in range(_ROUNDS):
-        if len(R) == n_poses:
-            break
-        part = np.array([draw() for _ in range(n_poses - len(R))])
-        new = follow_from_home(machine, lowest + part * (highest - lowest))
-        R = np.concatenate([R, new.R[new.reached]])
-        t = np.concatenate([t, new.t[new.reached]])
-    if len(R) < n_poses:
-        raise DidNotConverge(
-            f"Only {len(R)} of {n_poses} random poses of a simulated machine were found; "
-            "check its travel."
-        )
-    return RigidTransform.from_components(t, Rotation.from_matrix(R))
+    found: list[RigidTransform] = []
+    for _ in range(_MAX_ROUNDS):
+        if len(found) == n_poses:
+            return RigidTransform.concatenate(found)
+        part = np.array([draw() for _ in range(n_poses - len(found))])
+        poses, reached = follow_from_home(machine, lowest + part * (highest - lowest))
+        found += poses[reached]
+    raise DidNotConverge(
+        f"Only {len(found)} of {n_poses} random poses of a simulated machine were found; "
+        "check its travel."
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,8 +293,7 @@ def hexapod_session(
     view = np.repeat(np.arange(n_views), n_poses * n_images)
     pose = np.repeat(np.arange(n_views * n_poses), n_images)
     pose = (pose % n_poses if share_poses else pose).astype(np.intp)
-    R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
-    legs, arms = legs_and_arms(machine.parameters, R, t)
+    legs = leg_vectors(machine.parameters, T_Rb_Re)
     q = (np.linalg.norm(legs, axis=-1) - machine.parameters.offsets) * machine.sign
     if noisy and uniform_readings:
         half_width = np.sqrt(3.0) * sigma_q
@@ -351,8 +316,8 @@ def hexapod_session(
         sigma_q=sigma_q,
     )
     scene = plain_scene(
-        np.broadcast_to(machine.parameters.base_joints, arms.shape),
-        arms + t[:, None],
+        np.broadcast_to(machine.parameters.base_joints, legs.shape),
+        machine.parameters.base_joints + legs,
         [
             Viewpoint(view.name, c.camera, c.T_Rb_camera)
             for view, c in zip(views, cameras, strict=True)

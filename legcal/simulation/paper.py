@@ -23,8 +23,15 @@ from legcal.calibration import (
 from legcal.data import LegAxes, no_outlines
 from legcal.errors import LegcalError
 from legcal.geometry import Array
-from legcal.machine import KinematicParameters, free_coordinates, point_like_legs, to_vector
+from legcal.machine import (
+    KinematicParameters,
+    parametrize,
+    point_like_legs,
+    pose_sensitivity,
+    to_vector,
+)
 from legcal.paper import NominalMachine, point_like_machine, run_steps
+from legcal.simulation.checkpoint import has_keys, is_failure, is_number
 from legcal.simulation.hexapod import (
     PAPER_VIEWS,
     RAISED,
@@ -35,7 +42,6 @@ from legcal.simulation.hexapod import (
     hexapod,
     hexapod_session,
     leg_vectors,
-    length_jacobian,
     noncoplanar_hexapod,
     observed,
     perturb,
@@ -44,7 +50,7 @@ from legcal.simulation.hexapod import (
 )
 from legcal.simulation.observe import TableNoise
 from legcal.simulation.paper_report import BOUND, INITIAL, SCALARS, PaperSummary
-from legcal.simulation.study import Record, failure_of, has_keys, is_failure, is_number
+from legcal.simulation.study import Record, failure_of
 
 MACHINES = {"coplanar": hexapod, "noncoplanar": noncoplanar_hexapod}
 _N_PARAMETERS = 30  # of a 6-SPU
@@ -187,31 +193,14 @@ def expected_errors(
     machine: PaperHexapod, covariance: Array, T_Rb_Re: RigidTransform
 ) -> PlatformErrors:
     """Return the errors of eq (20) to expect of Gaussian parameters, to first order."""
-    follow = platform_by_parameters(machine, T_Rb_Re)
-    of_pose = follow @ covariance @ np.swapaxes(follow, -1, -2)
-    dX = float(expected_norm(of_pose[:, :3, :3]).mean())
-    dE = float(expected_norm(of_pose[:, 3:, 3:]).mean())
-    return PlatformErrors(dX, dE, dE)
-
-
-def platform_by_parameters(machine: PaperHexapod, T_Rb_Re: RigidTransform) -> Array:
-    """Return d (translation, rotation vector in R_b) / d parameters at fixed readings.
-
-    The legs keep their lengths but for the offsets: u . (dt + w x R B + R dB - dA) = dq0.
-    """
+    legs, frame_legs = point_like_legs(machine.parameters), machine.frame_legs
     R, t = T_Rb_Re.rotation.as_matrix(), T_Rb_Re.translation
-    J = length_jacobian(machine.parameters, R, t)
-    n_poses, n_legs = J.shape[:2]
-    u = J[..., :3]
-    to_base = np.zeros((n_poses, n_legs, n_legs, 3))
-    to_platform = np.zeros((n_poses, n_legs, n_legs, 3))
-    leg = np.arange(n_legs)
-    to_base[:, leg, leg] = u
-    to_platform[:, leg, leg] = -(u @ R)
-    free = free_coordinates(n_legs, machine.frame_legs)
-    to_offsets = np.tile(np.eye(n_legs), (n_poses, 1, 1))
-    change = np.concatenate([to_base[:, :, free], to_platform[:, :, free], to_offsets], axis=-1)
-    return np.asarray(np.linalg.pinv(J) @ change)
+    parametrization = parametrize(machine.leg_names, legs, frame_legs)
+    motion = pose_sensitivity(legs, parametrization, frame_legs, R, t)
+    of_pose = motion @ covariance @ np.swapaxes(motion, -1, -2)
+    dX = float(expected_norm(of_pose[:, 3:, 3:]).mean())
+    dE = float(expected_norm(of_pose[:, :3, :3]).mean())
+    return PlatformErrors(dX, dE, dE)
 
 
 def expected_norm(covariance: Array) -> Array:
@@ -254,7 +243,7 @@ def one_fit(session: HexapodSession, nominal: PaperHexapod) -> KinematicParamete
         measurements,
         legs,
         cameras_from_hints(measurements, RigidTransform.identity()),
-        tuple(follow_from_home(nominal, lengths).T_Rb_Re),
+        tuple(follow_from_home(nominal, lengths)[0]),
         "nominal",
     )
     return refine(legs, measurements, no_outlines(), start, axes=axes).parameters

@@ -15,14 +15,12 @@ import tempfile
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from io import FileIO
-from math import isfinite
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from joblib import Parallel, delayed, parallel_config
@@ -32,10 +30,22 @@ from legcal.errors import DidNotConverge, LegcalError, OutOfResources, UsageErro
 from legcal.files import TEMPORARY_SUFFIX, write_atomically
 from legcal.processors import processors
 from legcal.progress import Report, no_progress
-from legcal.version import __version__
+from legcal.simulation.checkpoint import (
+    CHECKPOINT_NAME,
+    Checkpoint,
+    header,
+    is_begun,
+    open_checkpoint,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+DOCUMENT_NAME = "study.json"
+MOST_RUNS = 1_000_000
+_LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
+_PROCESSES = 4  # for each core; more only wait for each other
+_CHUNKS = 16  # for each process: the work is shared evenly to the end
 
 Record = dict[str, Any]
 """What one run found, as a JSON document: numbers, texts, lists, null; never NaN."""
@@ -77,334 +87,6 @@ class Study(Protocol):
 
     def summary(self, records: Iterable[Record]) -> Summary:
         """Return what the records of all runs that did not fail say, read once and in order."""
-
-
-_KEY = "legcal_study"
-_VERSION = 1
-
-_LARGEST_CHUNK = 10  # runs between two lines of the checkpoint reaching the disk
-_PROCESSES = 4  # for each core; more only wait for each other
-_CHUNKS = 16  # for each process: the work is shared evenly to the end
-
-IsRecord = Callable[[Any], bool]
-"""Tells what a study records from anything else."""
-
-
-def header(name: str, settings: dict[str, Any], seed: int) -> dict[str, Any]:
-    """Return the first line of the checkpoint of a study."""
-    found: dict[str, Any] = json.loads(
-        encoded(
-            {
-                _KEY: _VERSION,
-                "study": name,
-                "version": __version__,
-                "seed": seed,
-                "settings": settings,
-            }
-        )
-    )
-    return found
-
-
-def encoded(document: dict[str, Any]) -> bytes:
-    """Return a document as one line."""
-    return json.dumps(document, allow_nan=False, separators=(",", ":")).encode() + b"\n"
-
-
-def parsed(line: bytes) -> Any:
-    """Return the document on a line, None if there is none."""
-    try:
-        return json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-
-
-def is_run(found: Any, is_record: IsRecord) -> bool:
-    """Return whether a document says what a run found, or how it failed."""
-    if not isinstance(found, dict) or type(found.get("run")) is not int or found["run"] < 0:
-        return False
-    if found.keys() == {"run", "record"}:
-        return is_record(found["record"])
-    return found.keys() == {"run", "failure"} and is_failure(found["failure"])
-
-
-def is_failure(found: Any) -> bool:
-    """Return whether a document describes a failure: its kind and its message."""
-    return (
-        isinstance(found, dict)
-        and found.keys() == {"kind", "message"}
-        and all(isinstance(text, str) for text in found.values())
-    )
-
-
-def has_keys(found: Any, keys: set[str]) -> bool:
-    """Return whether a document is an object with exactly these keys."""
-    return isinstance(found, dict) and found.keys() == keys
-
-
-def is_number(found: Any) -> bool:
-    """Return whether a document is a finite number."""
-    return isinstance(found, float | int) and not isinstance(found, bool) and isfinite(found)
-
-
-def check_header(path: Path, line: bytes, expected: dict[str, Any]) -> None:
-    """Refuse a first line that is not the expected one."""
-    start = f"{path}: the study could not be continued: found"
-    end = "give another output folder, or this one the command that began it."
-    found = parsed(line)
-    if not isinstance(found, dict) or found.get(_KEY) != _VERSION:
-        raise UsageError(
-            f"{start} a file that is no checkpoint of legcal, needed one or none; "
-            "give another output folder."
-        )
-    if found.get("study") != expected["study"]:
-        raise UsageError(
-            f"{start} the checkpoint of the study '{found.get('study')}', needed one of "
-            f"'{expected['study']}'; {end}"
-        )
-    if found != expected:
-        different = "; ".join(_differences(found, expected))
-        raise UsageError(f"{start} a checkpoint of other settings ({different}); {end}")
-
-
-def _differences(found: Any, expected: Any, name: str = "") -> Iterator[str]:
-    """Name what two documents differ in."""
-    if isinstance(found, dict) and isinstance(expected, dict):
-        for key in dict.fromkeys([*expected, *found]):
-            if found.get(key) != expected.get(key):
-                inner = key if name in ("", "settings") else f"{name}.{key}"
-                yield from _differences(found.get(key), expected.get(key), inner)
-    else:
-        yield f"{name} {json.dumps(found)} instead of {json.dumps(expected)}"
-
-
-CHECKPOINT_NAME = "runs.jsonl"
-_NEXT = "free some space and start the same command again; the runs before are kept"
-_NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keeps what is done"
-
-
-class Checkpoint:
-    """The runs of a study that are done, in a file."""
-
-    def __init__(
-        self,
-        path: Path,
-        reader: BinaryIO,
-        writer: FileIO,
-        offsets: dict[int, int],
-        *,
-        kept: bool,
-    ) -> None:
-        self.path = path
-        self.offsets = offsets
-        self._kept = kept
-        self._reader = reader
-        self._writer = writer
-
-    def append(self, lines: Sequence[dict[str, Any]]) -> None:
-        """Add the lines of some runs; they are on the disk when this returns."""
-        place = self._writer.seek(0, os.SEEK_END)
-        places, content = {}, [encoded(line) for line in lines]
-        for line, text in zip(lines, content, strict=True):
-            places[int(line["run"])] = place
-            place += len(text)
-        self._write(b"".join(content))
-        self.offsets.update(places)
-
-    def begin(self, first: dict[str, Any]) -> None:
-        """Write the first line of an empty checkpoint; raises as :meth:`append`."""
-        self._write(encoded(first))
-
-    def lines(self, n_runs: int) -> Iterator[dict[str, Any]]:
-        """Return the lines of the first runs, in the order of their numbers."""
-        for run in range(n_runs):
-            self._reader.seek(self.offsets[run])
-            yield json.loads(self._reader.readline())
-
-    def _write(self, content: bytes) -> None:
-        """Append bytes and wait until the disk has them."""
-        try:
-            rest = memoryview(content)
-            while rest:
-                rest = rest[self._writer.write(rest) :]
-            os.fsync(self._writer.fileno())
-        except OSError as error:
-            raise OutOfResources(
-                f"{self.path}: the checkpoint could not be written: found '{error.strerror}', "
-                f"needed a folder that takes its lines; {_NEXT if self._kept else _NEXT_WITHOUT}."
-            ) from error
-
-
-@contextmanager
-def open_checkpoint(
-    path: Path, expected: dict[str, Any], is_record: IsRecord, *, kept: bool = True
-) -> Iterator[Checkpoint]:
-    """Open the checkpoint of a study, or begin it."""
-    with ExitStack() as files:
-        try:
-            writer = files.enter_context(open(path, "ab", buffering=0))
-            reader = files.enter_context(open(path, "rb"))
-        except OSError as error:
-            raise OutOfResources(
-                f"{path}: the checkpoint could not be opened: found '{error.strerror}', needed a "
-                "file that can be read and written; give another output folder."
-            ) from error
-        _lock(path, writer)
-        offsets, end = _read(path, reader, expected, is_record)
-        writer.truncate(end)
-        checkpoint = Checkpoint(path, reader, writer, offsets, kept=kept)
-        if end == 0:
-            checkpoint.begin(expected)
-        yield checkpoint
-
-
-def is_begun(path: Path) -> bool:
-    """Return whether a file holds the first line of a checkpoint, or of something else."""
-    if not path.is_file():
-        return False
-    with open(path, "rb") as file:
-        return file.readline().endswith(b"\n")
-
-
-def _read(
-    path: Path, file: BinaryIO, expected: dict[str, Any], is_record: IsRecord
-) -> tuple[dict[int, int], int]:
-    """Return where the line of each run begins, and where the last complete line ends."""
-    first = file.readline()
-    if not first.endswith(b"\n") and encoded(expected).startswith(first):
-        return {}, 0  # empty, or killed while it was begun
-    check_header(path, first, expected)
-    offsets: dict[int, int] = {}
-    end, broken, number = len(first), 0, 1
-    for line in file:
-        number += 1
-        if broken:
-            raise _damaged(path, broken)
-        found = parsed(line) if line.endswith(b"\n") else None
-        if found is None:
-            broken = number  # only the last line may be
-            continue
-        if not is_run(found, is_record):
-            raise _damaged(path, number)
-        offsets.setdefault(found["run"], end)
-        end += len(line)
-    return offsets, end
-
-
-def _damaged(path: Path, number: int) -> UsageError:
-    """Return the refusal of a line that cannot be what a killed run left of it."""
-    return UsageError(
-        f"{path}: the checkpoint could not be continued: found line {number} damaged, "
-        "needed a complete JSON object of a run on every line but the last; remove that line, or "
-        "give another output folder."
-    )
-
-
-def _lock(path: Path, file: FileIO) -> None:
-    """Refuse a file that another process is writing, where the system can tell."""
-    try:
-        import fcntl
-    except ImportError:
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise UsageError(
-            f"{path}: the study could not be continued: found that another process writes this "
-            "checkpoint, needed it alone; wait for that one, or give another output folder."
-        ) from error
-
-
-def child_seed(seed: int, run: int) -> np.random.SeedSequence:
-    """Return the seed of a run: child ``run`` of the study's seed, however many there are."""
-    return np.random.SeedSequence(seed, spawn_key=(run,))
-
-
-def lines_of_runs(
-    study: Study, seed: int, runs: Sequence[int], workers: int
-) -> Generator[list[dict[str, Any]]]:
-    """Return the lines of runs, chunk by chunk, in the order in which they are finished.
-
-    Chunks are handed out as processes get free, so that memory does not grow with their number.
-    """
-    workers = min(workers, max(len(runs), 1), _PROCESSES * processors())
-    chunks = _chunks(runs, workers)
-    if workers == 1:
-        for chunk in chunks:
-            yield run_chunk(study, seed, chunk)
-        return
-    with (
-        _without_advice(),
-        parallel_config(
-            "loky",
-            n_jobs=workers,
-            inner_max_num_threads=1,
-            initializer=_follow,
-            initargs=(os.getpid(),),
-        ),
-    ):
-        parallel = Parallel(
-            return_as="generator_unordered", pre_dispatch="2 * n_jobs", batch_size=1
-        )
-        tasks = (delayed(run_chunk)(study, seed, chunk) for chunk in chunks)
-        try:
-            yield from parallel(tasks)
-        except BrokenProcessPool as error:
-            raise OutOfResources(
-                f"The study could not be finished: found that one of {workers} processes was "
-                "ended from outside, needed all of them to the end; see that there is enough "
-                "memory and start the same command again."
-            ) from error
-
-
-def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[dict[str, Any]]:
-    """Return the line of each run; one that legcal refuses is a failure, and no other error is."""
-    lines: list[dict[str, Any]] = []
-    for run in runs:
-        try:
-            lines.append({"run": run, "record": study.one_run(child_seed(seed, run))})
-        except LegcalError as error:
-            lines.append({"run": run, "failure": failure_of(error)})
-    return lines
-
-
-def failure_of(error: LegcalError) -> dict[str, str]:
-    """Return what a record says about a failure."""
-    return {"kind": type(error).__name__, "message": str(error)}
-
-
-def _chunks(runs: Sequence[int], workers: int) -> Iterator[Sequence[int]]:
-    size = min(max(len(runs) // (_CHUNKS * workers), 1), _LARGEST_CHUNK)
-    return (runs[first : first + size] for first in range(0, len(runs), size))
-
-
-@contextmanager
-def _without_advice() -> Iterator[None]:
-    """Keep joblib from advising its user where a study is stopped or killed before its end."""
-    of_processes = "ignore:resource_tracker"  # handed to those that joblib starts
-    sys.warnoptions.append(of_processes)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", r"\d+ tasks (which were|have been) ", UserWarning)
-            yield
-    finally:
-        sys.warnoptions.remove(of_processes)
-
-
-def _follow(parent: int) -> None:
-    """Leave the answer to Ctrl-C to the process that started this one, and end when it does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
-
-
-DOCUMENT_NAME = "study.json"
-MOST_RUNS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -577,3 +259,94 @@ def _check_numbers(n_runs: int, seed: int, workers: int) -> None:
                 f"The study could not be run: found {name} = {found}, needed {least} or more; "
                 "give another number."
             )
+
+
+# Runs in processes
+
+
+def child_seed(seed: int, run: int) -> np.random.SeedSequence:
+    """Return the seed of a run: child ``run`` of the study's seed, however many there are."""
+    return np.random.SeedSequence(seed, spawn_key=(run,))
+
+
+def lines_of_runs(
+    study: Study, seed: int, runs: Sequence[int], workers: int
+) -> Generator[list[dict[str, Any]]]:
+    """Return the lines of runs, chunk by chunk, in the order in which they are finished.
+
+    Chunks are handed out as processes get free, so that memory does not grow with their number.
+    """
+    workers = min(workers, max(len(runs), 1), _PROCESSES * processors())
+    chunks = _chunks(runs, workers)
+    if workers == 1:
+        for chunk in chunks:
+            yield run_chunk(study, seed, chunk)
+        return
+    with (
+        _without_advice(),
+        parallel_config(
+            "loky",
+            n_jobs=workers,
+            inner_max_num_threads=1,
+            initializer=_follow,
+            initargs=(os.getpid(),),
+        ),
+    ):
+        parallel = Parallel(
+            return_as="generator_unordered", pre_dispatch="2 * n_jobs", batch_size=1
+        )
+        tasks = (delayed(run_chunk)(study, seed, chunk) for chunk in chunks)
+        try:
+            yield from parallel(tasks)
+        except BrokenProcessPool as error:
+            raise OutOfResources(
+                f"The study could not be finished: found that one of {workers} processes was "
+                "ended from outside, needed all of them to the end; see that there is enough "
+                "memory and start the same command again."
+            ) from error
+
+
+def run_chunk(study: Study, seed: int, runs: Iterable[int]) -> list[dict[str, Any]]:
+    """Return the line of each run; one that legcal refuses is a failure, and no other error is."""
+    lines: list[dict[str, Any]] = []
+    for run in runs:
+        try:
+            lines.append({"run": run, "record": study.one_run(child_seed(seed, run))})
+        except LegcalError as error:
+            lines.append({"run": run, "failure": failure_of(error)})
+    return lines
+
+
+def failure_of(error: LegcalError) -> dict[str, str]:
+    """Return what a record says about a failure."""
+    return {"kind": type(error).__name__, "message": str(error)}
+
+
+def _chunks(runs: Sequence[int], workers: int) -> Iterator[Sequence[int]]:
+    size = min(max(len(runs) // (_CHUNKS * workers), 1), _LARGEST_CHUNK)
+    return (runs[first : first + size] for first in range(0, len(runs), size))
+
+
+@contextmanager
+def _without_advice() -> Iterator[None]:
+    """Keep joblib from advising its user where a study is stopped or killed before its end."""
+    of_processes = "ignore:resource_tracker"  # handed to those that joblib starts
+    sys.warnoptions.append(of_processes)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"\d+ tasks (which were|have been) ", UserWarning)
+            yield
+    finally:
+        sys.warnoptions.remove(of_processes)
+
+
+def _follow(parent: int) -> None:
+    """Leave the answer to Ctrl-C to the process that started this one, and end when it does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)

@@ -1,0 +1,251 @@
+"""The checkpoint of a study: a file with a line for every run that is done.
+
+The first line says which study this is, with all of its settings; runs follow in the order in which
+they end. A line that was being written when the process was killed is done again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from io import FileIO
+from math import isfinite
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from legcal.errors import OutOfResources, UsageError
+from legcal.version import __version__
+
+CHECKPOINT_NAME = "runs.jsonl"
+_KEY = "legcal_study"
+_VERSION = 1
+_NEXT = "free some space and start the same command again; the runs before are kept"
+_NEXT_WITHOUT = "free some space, or give an output folder elsewhere, which keeps what is done"
+
+IsRecord = Callable[[Any], bool]
+"""Tells what a study records from anything else."""
+
+
+@contextmanager
+def open_checkpoint(
+    path: Path, expected: dict[str, Any], is_record: IsRecord, *, kept: bool = True
+) -> Iterator[Checkpoint]:
+    """Open the checkpoint of a study, or begin it."""
+    with ExitStack() as files:
+        try:
+            writer = files.enter_context(open(path, "ab", buffering=0))
+            reader = files.enter_context(open(path, "rb"))
+        except OSError as error:
+            raise OutOfResources(
+                f"{path}: the checkpoint could not be opened: found '{error.strerror}', needed a "
+                "file that can be read and written; give another output folder."
+            ) from error
+        _lock(path, writer)
+        offsets, end = _read(path, reader, expected, is_record)
+        writer.truncate(end)
+        checkpoint = Checkpoint(path, reader, writer, offsets, kept=kept)
+        if end == 0:
+            checkpoint.begin(expected)
+        yield checkpoint
+
+
+class Checkpoint:
+    """The runs of a study that are done, in a file."""
+
+    def __init__(
+        self,
+        path: Path,
+        reader: BinaryIO,
+        writer: FileIO,
+        offsets: dict[int, int],
+        *,
+        kept: bool,
+    ) -> None:
+        self.path = path
+        self.offsets = offsets
+        self._kept = kept
+        self._reader = reader
+        self._writer = writer
+
+    def append(self, lines: Sequence[dict[str, Any]]) -> None:
+        """Add the lines of some runs; they are on the disk when this returns."""
+        place = self._writer.seek(0, os.SEEK_END)
+        places, content = {}, [_encoded(line) for line in lines]
+        for line, text in zip(lines, content, strict=True):
+            places[int(line["run"])] = place
+            place += len(text)
+        self._write(b"".join(content))
+        self.offsets.update(places)
+
+    def begin(self, first: dict[str, Any]) -> None:
+        """Write the first line of an empty checkpoint; raises as :meth:`append`."""
+        self._write(_encoded(first))
+
+    def lines(self, n_runs: int) -> Iterator[dict[str, Any]]:
+        """Return the lines of the first runs, in the order of their numbers."""
+        for run in range(n_runs):
+            self._reader.seek(self.offsets[run])
+            yield json.loads(self._reader.readline())
+
+    def _write(self, content: bytes) -> None:
+        """Append bytes and wait until the disk has them."""
+        try:
+            rest = memoryview(content)
+            while rest:
+                rest = rest[self._writer.write(rest) :]
+            os.fsync(self._writer.fileno())
+        except OSError as error:
+            raise OutOfResources(
+                f"{self.path}: the checkpoint could not be written: found '{error.strerror}', "
+                f"needed a folder that takes its lines; {_NEXT if self._kept else _NEXT_WITHOUT}."
+            ) from error
+
+
+def is_begun(path: Path) -> bool:
+    """Return whether a file holds the first line of a checkpoint, or of something else."""
+    if not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        return file.readline().endswith(b"\n")
+
+
+def header(name: str, settings: dict[str, Any], seed: int) -> dict[str, Any]:
+    """Return the first line of the checkpoint of a study."""
+    found: dict[str, Any] = json.loads(
+        _encoded(
+            {
+                _KEY: _VERSION,
+                "study": name,
+                "version": __version__,
+                "seed": seed,
+                "settings": settings,
+            }
+        )
+    )
+    return found
+
+
+def _encoded(document: dict[str, Any]) -> bytes:
+    """Return a document as one line."""
+    return json.dumps(document, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+
+
+def _parsed(line: bytes) -> Any:
+    """Return the document on a line, None if there is none."""
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _read(
+    path: Path, file: BinaryIO, expected: dict[str, Any], is_record: IsRecord
+) -> tuple[dict[int, int], int]:
+    """Return where the line of each run begins, and where the last complete line ends."""
+    first = file.readline()
+    if not first.endswith(b"\n") and _encoded(expected).startswith(first):
+        return {}, 0  # empty, or killed while it was begun
+    _check_header(path, first, expected)
+    offsets: dict[int, int] = {}
+    end, broken, number = len(first), 0, 1
+    for line in file:
+        number += 1
+        if broken:
+            raise _damaged(path, broken)
+        found = _parsed(line) if line.endswith(b"\n") else None
+        if found is None:
+            broken = number  # only the last line may be
+            continue
+        if not _is_run(found, is_record):
+            raise _damaged(path, number)
+        offsets.setdefault(found["run"], end)
+        end += len(line)
+    return offsets, end
+
+
+def _damaged(path: Path, number: int) -> UsageError:
+    """Return the refusal of a line that cannot be what a killed run left of it."""
+    return UsageError(
+        f"{path}: the checkpoint could not be continued: found line {number} damaged, "
+        "needed a complete JSON object of a run on every line but the last; remove that line, or "
+        "give another output folder."
+    )
+
+
+def _lock(path: Path, file: FileIO) -> None:
+    """Refuse a file that another process is writing, where the system can tell."""
+    try:
+        import fcntl
+    except ImportError:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UsageError(
+            f"{path}: the study could not be continued: found that another process writes this "
+            "checkpoint, needed it alone; wait for that one, or give another output folder."
+        ) from error
+
+
+def _check_header(path: Path, line: bytes, expected: dict[str, Any]) -> None:
+    """Refuse a first line that is not the expected one."""
+    start = f"{path}: the study could not be continued: found"
+    end = "give another output folder, or this one the command that began it."
+    found = _parsed(line)
+    if not isinstance(found, dict) or found.get(_KEY) != _VERSION:
+        raise UsageError(
+            f"{start} a file that is no checkpoint of legcal, needed one or none; "
+            "give another output folder."
+        )
+    if found.get("study") != expected["study"]:
+        raise UsageError(
+            f"{start} the checkpoint of the study '{found.get('study')}', needed one of "
+            f"'{expected['study']}'; {end}"
+        )
+    if found != expected:
+        different = "; ".join(_differences(found, expected))
+        raise UsageError(f"{start} a checkpoint of other settings ({different}); {end}")
+
+
+def _differences(found: Any, expected: Any, name: str = "") -> Iterator[str]:
+    """Name what two documents differ in."""
+    if isinstance(found, dict) and isinstance(expected, dict):
+        for key in dict.fromkeys([*expected, *found]):
+            if found.get(key) != expected.get(key):
+                inner = key if name in ("", "settings") else f"{name}.{key}"
+                yield from _differences(found.get(key), expected.get(key), inner)
+    else:
+        yield f"{name} {json.dumps(found)} instead of {json.dumps(expected)}"
+
+
+# Records
+
+
+def _is_run(found: Any, is_record: IsRecord) -> bool:
+    """Return whether a document says what a run found, or how it failed."""
+    if not isinstance(found, dict) or type(found.get("run")) is not int or found["run"] < 0:
+        return False
+    if found.keys() == {"run", "record"}:
+        return is_record(found["record"])
+    return found.keys() == {"run", "failure"} and is_failure(found["failure"])
+
+
+def is_failure(found: Any) -> bool:
+    """Return whether a document describes a failure: its kind and its message."""
+    return (
+        isinstance(found, dict)
+        and found.keys() == {"kind", "message"}
+        and all(isinstance(text, str) for text in found.values())
+    )
+
+
+def has_keys(found: Any, keys: set[str]) -> bool:
+    """Return whether a document is an object with exactly these keys."""
+    return isinstance(found, dict) and found.keys() == keys
+
+
+def is_number(found: Any) -> bool:
+    """Return whether a document is a finite number."""
+    return isinstance(found, float | int) and not isinstance(found, bool) and isfinite(found)
