@@ -1,4 +1,4 @@
-"""What is predicted at the platform is what written models do there, of every class."""
+"""What errors of parameters do to the platform is what written models do there, of every class."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,16 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from parameter_steps import random_covariance, written_with
+from thinned import thinned
 
+from legcal import evaluate
 from legcal.calibration.joint_fit.platform import (
-    PlatformError,
+    PlatformAccuracy,
     expected_error,
     moved_by,
+    platform_accuracy,
     platform_by_parameters,
     predict_platform_error,
 )
+from legcal.calibration.joint_fit.sensitivity import Sensitivity
 from legcal.errors import NotIdentifiable
-from legcal.geometry.types import Array
+from legcal.geometry import Array
 from legcal.machine import (
     LegKind,
     Machine,
@@ -25,10 +29,11 @@ from legcal.machine import (
     parametrization_of,
     parametrize,
     platform_in_base,
+    pose_differences,
     random_configurations,
 )
 
-MACHINES = ("hexapod-rod", "hexapod-strut", "3-rpr", "3-rps", "3-spr", "3-upu-tilted", "tricept")
+MACHINES = ("hexapod-rod", "3-rpr", "3-rps", "3-spr", "3-upu-tilted", "tricept")
 
 
 def _motions(nominal: Machine, other: Machine, q: Array) -> Array:
@@ -80,13 +85,6 @@ def test_a_change_of_the_parameters_moves_the_platform_as_its_covariance_says() 
     np.testing.assert_allclose(moved.rotation, expected.rotation, rtol=1e-9)
 
 
-def test_means_and_maxima_are_those_over_the_poses() -> None:
-    error = PlatformError(np.array([1.0, 3.0]), np.array([0.2, 0.1]))
-    assert (error.mean_displacement, error.max_displacement) == (2.0, 3.0)
-    assert error.mean_rotation == pytest.approx(0.15)
-    assert error.max_rotation == 0.2
-
-
 def test_a_pose_that_readings_do_not_determine_is_refused() -> None:
     nominal = load_mechanism("hexapod")
     legs = geometries(nominal)
@@ -100,3 +98,83 @@ def test_a_pose_that_readings_do_not_determine_is_refused() -> None:
             nominal.frame_legs,
             [platform_in_base(nominal, nominal.home)],
         )
+
+
+# Of a calibration: what it changed, how well that is known, and what wrong assumptions do
+
+
+def _accuracy(
+    nominal: Machine, calibrated: Machine, q: Array, root: Array, *effects: Sensitivity
+) -> PlatformAccuracy:
+    """Return the accuracy of a calibration that ended at a given model."""
+    accuracy = platform_accuracy(
+        nominal,
+        geometries(calibrated),
+        parametrization_of(nominal, twists=True),
+        root @ root.T,
+        q,
+        [platform_in_base(calibrated, T) for T in forward_kinematics_many(calibrated, q)],
+        effects,
+    )
+    assert accuracy is not None
+    return accuracy
+
+
+@pytest.mark.parametrize("name", thinned(["3-rpr", "3-rps", "tricept"], ["tricept"]))
+def test_the_change_and_the_workspace_are_those_of_written_models(
+    name: str, tmp_path: Path
+) -> None:
+    nominal = load_mechanism(name)
+    parameters = parametrization_of(nominal, twists=True)
+    rng = np.random.default_rng(3)
+    step = 5e-4 * rng.normal(size=len(parameters))
+    calibrated = written_with(nominal, parameters, step, tmp_path / "a")
+    q = random_configurations(nominal, 3, rng).readings
+    root = random_covariance(parameters, rng, 1, 1e-6)
+    accuracy = _accuracy(nominal, calibrated, q, root)
+    before, after = (
+        [platform_in_base(m, T) for T in forward_kinematics_many(m, q)]
+        for m in (nominal, calibrated)
+    )
+    displacement, rotation = pose_differences(after, before)
+    np.testing.assert_allclose(accuracy.change.displacement, displacement, rtol=1e-6)
+    np.testing.assert_allclose(accuracy.change.rotation, rotation, rtol=1e-6)
+    apart = evaluate(calibrated, written_with(calibrated, parameters, root[:, 0], tmp_path / "b"))
+    assert accuracy.workspace is not None
+    assert len(accuracy.workspace.displacement) == len(apart.displacement) == 100
+    for found, expected, rel in (
+        (accuracy.workspace.mean_displacement, apart.displacement.mean(), 0.03),
+        (accuracy.workspace.max_displacement, apart.displacement.max(), 0.1),
+        (accuracy.workspace.mean_rotation, apart.rotation.mean(), 0.03),
+        (accuracy.workspace.max_rotation, apart.rotation.max(), 0.1),
+    ):
+        assert found == pytest.approx(expected, rel=rel)
+
+
+@pytest.mark.parametrize("workspace", [True, False])
+def test_wrong_assumptions_count_over_the_workspace_or_at_the_readings(
+    workspace: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nominal = load_mechanism("hexapod")
+    longer = np.zeros(30)
+    longer[-6:] = 1e-3  # all offsets: the platform is lifted
+    q = random_configurations(nominal, 2, 0).readings
+    if not workspace:
+        monkeypatch.setattr("legcal.machine.configurations.NEARER", np.zeros(0))
+    accuracy = _accuracy(
+        nominal, nominal, q, np.zeros((30, 1)), Sensitivity("legs 1 mm longer", longer[:, None])
+    )
+    (effect,) = accuracy.effects
+    assert effect.what == "legs 1 mm longer"
+    assert len(effect.error.displacement) == (100 if workspace else 2)
+    assert (accuracy.workspace is None) == (not workspace)
+    assert 0.9e-3 < effect.error.mean_displacement < 2e-3
+    assert accuracy.sigma.max_displacement == 0.0
+    assert accuracy.change.max_displacement < 1e-9
+
+
+def test_a_machine_whose_motors_do_not_determine_the_pose_has_no_platform_error() -> None:
+    nominal = load_mechanism("hexapod")
+    q = random_configurations(nominal, 2, 0).readings
+    known = geometries(nominal), parametrization_of(nominal), np.eye(30), q, [nominal.home] * 2
+    assert platform_accuracy(replace(nominal, mobility=7), *known) is None
