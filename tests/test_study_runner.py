@@ -227,14 +227,14 @@ def test_a_folder_or_a_file_of_somebody_else_is_refused_and_kept(tmp_path: Path)
 
 
 def test_numbers_that_make_no_sense_are_refused() -> None:
-    for numbers, message in (
-        ({"n_runs": 0}, "runs = 0, needed 1 or more"),
-        ({"n_runs": 10**9}, "runs = 1000000000, needed 1000000 at most"),
-        ({"seed": -1}, "seed = -1, needed 0 or more"),
-        ({"workers": 0}, "workers = 0, needed 1 or more"),
+    for n_runs, seed, workers, message in (
+        (0, 0, 1, "runs = 0, needed 1 or more"),
+        (10**9, 0, 1, "runs = 1000000000, needed 1000000 at most"),
+        (1, -1, 1, "seed = -1, needed 0 or more"),
+        (1, 0, 0, "workers = 0, needed 1 or more"),
     ):
         with pytest.raises(UsageError, match=message):
-            run_study(Draws(), **{"n_runs": 1, **numbers})
+            run_study(Draws(), n_runs, seed=seed, workers=workers)
     run_study(Draws(), 2, workers=10**11)  # more than are of use are not started
 
 
