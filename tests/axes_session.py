@@ -5,12 +5,17 @@ from functools import cache
 
 import numpy as np
 
-from legcal.calibration.joint_fit.solution import joints_of
 from legcal.calibration.joint_fit.variables import FittedLegs, Start, start_from
 from legcal.data.axes import LegAxes, axes_of_table, table_of_axes
 from legcal.data.measurements import Measurements
 from legcal.geometry.types import Array
-from legcal.machine import KinematicParameters, from_vector, point_like_legs, to_vector
+from legcal.machine import (
+    KinematicParameters,
+    from_vector,
+    parameters_of_legs,
+    point_like_legs,
+    to_vector,
+)
 from legcal.simulation.hexapod import PAPER_VIEWS, cameras_around, hexapod, hexapod_session, perturb
 from legcal.simulation.observe import TableNoise
 
@@ -27,7 +32,7 @@ class AxesSession:
     @property
     def parameters(self) -> KinematicParameters:
         """The true parameters [m]."""
-        return joints_of(self.truth.legs)
+        return parameters_of_legs(self.truth.legs)
 
     def noisy(self, seed: int) -> tuple[Measurements, LegAxes]:
         """Return readings and axes with the errors that they claim."""

@@ -10,6 +10,7 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
 from legcal.machine import (
+    JointType,
     KinematicParameters,
     Leg,
     LegKind,
@@ -116,7 +117,7 @@ def geometry_of(parameters: KinematicParameters) -> tuple[Leg, ...]:
     """Return legs with point-like joints."""
     joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
     return tuple(
-        Leg("S", "S", LegKind.ACTUATED, A, B, float(q0))
+        Leg(JointType("S"), JointType("S"), LegKind.ACTUATED, A, B, float(q0))
         for (A, B), q0 in zip(joints, parameters.offsets, strict=True)
     )
 

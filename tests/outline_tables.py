@@ -7,7 +7,7 @@ import numpy as np
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import ENCODING, QUALITY, Outlines
 from legcal.geometry.types import Array
-from legcal.machine import Cylinder, Leg, LegKind
+from legcal.machine import Cylinder, JointType, Leg, LegKind
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import EPSILON, outlines_of_axis
 
@@ -20,8 +20,8 @@ LENS = Camera(
 LEGS = tuple(
     Leg(
         name=name,
-        base_joint="U",
-        platform_joint="S",
+        base_joint=JointType("U"),
+        platform_joint=JointType("S"),
         kind=LegKind.ACTUATED,
         prismatic=f"{name}_slider",
         A=np.zeros(3),

@@ -12,12 +12,12 @@ from legcal.machine import (
     Leg,
     Machine,
     Parametrization,
-    footed,
     geometries,
     load_mechanism,
     moved_legs,
+    with_platform_foot,
 )
-from legcal.machine.written import write_calibrated_yaml, write_urdf
+from legcal.machine.model_writer import write_calibrated_yaml, write_urdf
 
 
 def random_covariance(
@@ -33,7 +33,7 @@ def written_with(
     """Return a mechanism with changed parameters, as loaded from the files written of it."""
     folder.mkdir(exist_ok=True)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
-    legs = footed(moved_legs(geometries(nominal), parametrization.place, step), origin)
+    legs = with_platform_foot(moved_legs(geometries(nominal), parametrization.place, step), origin)
     write_urdf(nominal, legs, folder / "other.urdf")
     write_calibrated_yaml(nominal, folder / "other.yaml", "other.urdf")
     return load_mechanism(folder / "other.yaml")
@@ -43,6 +43,6 @@ def with_joints(geometry: Sequence[Leg], parameters: KinematicParameters) -> tup
     """Return legs with other joint centres and offsets; passive legs keep theirs."""
     joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
     return tuple(
-        replace(leg, A=A, B=B, q0=leg.q0 if np.isnan(q0) else float(q0))
+        replace(leg, A=A, B=B, q0=float(q0))
         for leg, (A, B), q0 in zip(geometry, joints, parameters.offsets, strict=True)
     )

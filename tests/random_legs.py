@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry import Array, normal_basis
-from legcal.machine import Leg, LegKind, linearize
+from legcal.machine import JointType, Leg, LegKind, leg_equations
 
 
 def leg_and_pose(joints: str, seed: int) -> tuple[Leg, Array, Array]:
@@ -37,8 +37,8 @@ def closed_leg(
     if platform == "":
         b = R.T @ u
     leg = Leg(
-        base_joint=base,  # type: ignore[arg-type]
-        platform_joint=platform,  # type: ignore[arg-type]
+        base_joint=JointType(base),
+        platform_joint=JointType(platform),
         kind=kind,
         A=A,
         B=B,
@@ -66,7 +66,7 @@ def twist_of(leg: Leg, R: Array, t: Array) -> float:
         In (-pi/2, pi/2] [rad].
     """
     sine, cosine = (
-        float(linearize(replace(leg, twist=twist), R[None], t[None]).values[0, -1])
+        float(leg_equations(replace(leg, twist=twist), R[None], t[None]).values[0, -1])
         for twist in (0.0, -0.5 * np.pi)
     )
     angle = math.atan2(sine, cosine)

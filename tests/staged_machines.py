@@ -11,7 +11,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from legcal.calibration.identify.session import Session, at_base_joints, at_platform_joints
 from legcal.data import LegAxes, Measurements, View, axes_from_outlines
 from legcal.geometry import Array, BoolArray, normal_basis
-from legcal.machine import Leg, LegKind, Parametrization, moved_legs, parametrize, vector_of
+from legcal.machine import (
+    JointType,
+    Leg,
+    LegKind,
+    Parametrization,
+    moved_legs,
+    parametrize,
+    vector_of,
+)
 from legcal.paper import Criteria, NominalMachine, run_base_steps, run_steps
 from legcal.paper.four_steps import StagedResult
 from legcal.paper.joints_in_base import JointsInBase
@@ -135,9 +143,9 @@ def made_up_base(A_Rb: Array, v_Rb: Array) -> NominalMachine:
     """Return a machine of RPS legs, or SPS where the axis is NaN, with R_b on joints 1, 2, 3."""
     up = np.array([0.0, 0.0, 1.0])
     legs = tuple(
-        Leg("R", "S", LegKind.ACTUATED, A, A + up, 0.5, v)
+        Leg(JointType("R"), JointType("S"), LegKind.ACTUATED, A, A + up, 0.5, v)
         if np.isfinite(v[0])
-        else Leg("S", "S", LegKind.ACTUATED, A, A + up, 0.5)
+        else Leg(JointType("S"), JointType("S"), LegKind.ACTUATED, A, A + up, 0.5)
         for A, v in zip(A_Rb, v_Rb, strict=True)
     )
     names = tuple(f"leg{j + 1}" for j in range(len(legs)))

@@ -11,7 +11,7 @@ from random_legs import changed, leg_and_pose, twist_of
 from scipy.spatial.transform import Rotation
 
 from legcal.geometry.lines import normal_basis
-from legcal.machine import Demand, linearize
+from legcal.machine import EquationKind, leg_equations
 
 FAST = settings(deadline=None, max_examples=20)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -24,13 +24,13 @@ STEP = 1e-6
 @given(seed=SEEDS)
 def test_all_demands_but_the_length_are_met_where_a_leg_closes(joints: str, seed: int) -> None:
     leg, R, t = leg_and_pose(joints, seed)
-    found = linearize(leg, R[None], t[None])
+    found = leg_equations(leg, R[None], t[None])
     np.testing.assert_allclose(found.values[0, 1:], 0.0, atol=1e-12)
     assert found.values[0, 0] == pytest.approx(np.linalg.norm(R @ leg.B + t - leg.A) - leg.q0)
     freedoms = {"R": 1, "U": 2, "S": 3, "": 0}
     idle = joints == "SS"
     free = freedoms[joints[0]] + 1 + freedoms[joints[1:]] - idle
-    assert len(leg.demands) - 1 == 6 - free
+    assert len(leg.equations) - 1 == 6 - free
 
 
 @pytest.mark.parametrize("joints", TYPES)
@@ -38,12 +38,12 @@ def test_all_demands_but_the_length_are_met_where_a_leg_closes(joints: str, seed
 @given(seed=SEEDS)
 def test_derivatives_by_pose_equal_finite_differences(joints: str, seed: int) -> None:
     leg, R, t = leg_and_pose(joints, seed)
-    exact = linearize(leg, R[None], t[None]).by_pose[0]
+    exact = leg_equations(leg, R[None], t[None]).by_pose[0]
     for column, step in enumerate(STEP * np.eye(6)):
         ends = []
         for sign in (1.0, -1.0):
             turn = Rotation.from_rotvec(sign * step[:3]).as_matrix() @ R
-            ends.append(linearize(leg, turn[None], (t + sign * step[3:])[None]).values[0])
+            ends.append(leg_equations(leg, turn[None], (t + sign * step[3:])[None]).values[0])
         difference = (ends[0] - ends[1]) / (2.0 * STEP)
         np.testing.assert_allclose(exact[:, column], difference, atol=1e-6, rtol=1e-5)
 
@@ -53,10 +53,11 @@ def test_derivatives_by_pose_equal_finite_differences(joints: str, seed: int) ->
 @given(seed=SEEDS)
 def test_derivatives_by_parameters_equal_finite_differences(joints: str, seed: int) -> None:
     leg, R, t = leg_and_pose(joints, seed)
-    exact = linearize(leg, R[None], t[None]).by_local[0]
+    exact = leg_equations(leg, R[None], t[None]).by_local[0]
     for column, step in enumerate(STEP * np.eye(12)):
         ends = [
-            linearize(changed(leg, sign * step), R[None], t[None]).values[0] for sign in (1.0, -1.0)
+            leg_equations(changed(leg, sign * step), R[None], t[None]).values[0]
+            for sign in (1.0, -1.0)
         ]
         difference = (ends[0] - ends[1]) / (2.0 * STEP)
         np.testing.assert_allclose(exact[:, column], difference, atol=1e-6, rtol=1e-5)
@@ -70,7 +71,7 @@ def test_a_turn_of_the_direction_in_the_platform_is_a_turn_of_the_platform(
 ) -> None:
     """Turning everything tied to the platform together is the same as turning the platform."""
     leg, R, t = leg_and_pose(joints, seed)
-    found = linearize(leg, R[None], t[None])
+    found = leg_equations(leg, R[None], t[None])
     assert leg.platform_axis is not None
     for column, e in zip((9, 10), normal_basis(leg.platform_axis), strict=True):
         rows = found.by_pose[0, 1:, :3] @ (R @ e)
@@ -89,12 +90,12 @@ def test_the_demands_of_a_leg_do_not_depend_on_the_frames(seed: int) -> None:
     s = rng.normal(size=3)
     assert leg.base_axis is not None
     elsewhere = replace(leg, A=Q @ leg.A + s, base_axis=Q @ leg.base_axis)
-    here = linearize(leg, R[None], t[None]).values
-    there = linearize(elsewhere, (Q @ R)[None], (Q @ t + s)[None]).values
+    here = leg_equations(leg, R[None], t[None]).values
+    there = leg_equations(elsewhere, (Q @ R)[None], (Q @ t + s)[None]).values
     np.testing.assert_allclose(there, here, atol=1e-12)
     flipped = replace(leg, base_axis=-leg.base_axis)
     np.testing.assert_allclose(
-        linearize(flipped, R[None], t[None]).values[0, 1:], here[0, 1:], atol=1e-12
+        leg_equations(flipped, R[None], t[None]).values[0, 1:], here[0, 1:], atol=1e-12
     )
 
 
@@ -108,5 +109,5 @@ def test_the_twist_is_that_of_a_line() -> None:
 
 
 def test_a_leg_without_an_s_joint_says_what_it_demands() -> None:
-    assert leg_and_pose("UU", 0)[0].demands == (Demand.LENGTH, Demand.TWIST)
-    assert leg_and_pose("RS", 0)[0].demands == (Demand.LENGTH, Demand.BASE_AXIS)
+    assert leg_and_pose("UU", 0)[0].equations == (EquationKind.LENGTH, EquationKind.TWIST)
+    assert leg_and_pose("RS", 0)[0].equations == (EquationKind.LENGTH, EquationKind.BASE_AXIS)

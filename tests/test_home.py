@@ -18,11 +18,11 @@ from legcal.machine import (
     leg_scale,
     load_mechanism,
     platform_pose,
+    project_pose,
     readings_at,
-    settle,
 )
-from legcal.machine.equations import constraints_at, demands_at, is_constrained
-from legcal.machine.home import closed_home, find_home, settle_home
+from legcal.machine.equations import constraints_at, equations_at, is_constrained
+from legcal.machine.home import closed_home, find_home, project_home
 from legcal.machine.kinematics import close_at
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -67,7 +67,7 @@ def test_a_rounded_home_closes_in_every_class(
 def test_settling_moves_the_platform_only_across_the_constraint() -> None:
     machine = load_mechanism("hexapod-rod")
     start = displaced(machine.home, [0.0, 0.0, 0.0, 0.0, 0.0, 1e-4])
-    settled, problem = settle(machine, start)
+    settled, problem = project_pose(machine, start)
     assert problem is None
     constraint = constraints_at(machine, settled)
     assert abs(constraint.values[0, 0]) < 1e-13
@@ -96,7 +96,7 @@ def test_a_home_far_from_closed_is_refused_by_leg_and_amount(
 ) -> None:
     machine = load_mechanism(name)
     with pytest.raises(ModelError, match=f"legcal.home could not be used: found {found}"):
-        settle_home(machine, displaced(machine.home, [*turn, *shift]))
+        project_home(machine, displaced(machine.home, [*turn, *shift]))
 
 
 @pytest.mark.parametrize("name", thinned(SHIPPED, ["hexapod", "3-rpr", "3-upu", "tricept"]))
@@ -119,7 +119,7 @@ def test_a_home_is_found_for_general_machines(description: str, tmp_path: Path) 
     machine = load_mechanism(write_machine(tmp_path, MACHINES[description](), Layout()))
     home, configuration = closed_home(machine, None)
     assert _gap(machine, configuration) < 1e-12
-    values = demands_at(machine, home)
+    values = equations_at(machine, home)
     middle = [leg.sign * 0.5 * sum(leg.travel) for leg in machine.legs]
     wanted = np.array([middle[j] for j in machine.motors])
     np.testing.assert_allclose(values.values[0, values.measured], wanted, atol=1e-9)

@@ -47,14 +47,14 @@ from legcal.estimation import (
 )
 from legcal.geometry import Array
 from legcal.machine import (
-    Demand,
+    EquationKind,
     LegKind,
     forward_kinematics_many,
     geometries,
     parametrize,
     random_poses,
 )
-from legcal.machine import linearize as linearize_leg
+from legcal.machine import leg_equations as linearize_leg
 from legcal.vision import outlines_of_axis
 
 FAST = settings(deadline=None, max_examples=8)
@@ -323,8 +323,8 @@ def test_planned_poses_close_every_leg_inside_its_travel(
     assert len(session.t) == 8
     for j, (leg, nominal) in enumerate(zip(session.legs, machine.legs, strict=True)):
         found = linearize_leg(leg, session.R, session.t)
-        for demand, value in zip(found.demands, found.values.T, strict=True):
-            if demand is not Demand.LENGTH or leg.kind is LegKind.CONSTANT:
+        for demand, value in zip(found.kinds, found.values.T, strict=True):
+            if demand is not EquationKind.LENGTH or leg.kind is LegKind.CONSTANT:
                 assert np.abs(value).max() < 1e-8
         if leg.kind is not LegKind.CONSTANT:
             q = nominal.sign * (session.length[:, j] - nominal.q0)

@@ -25,8 +25,8 @@ from legcal.machine import (
     random_configurations,
     slider_columns,
 )
-from legcal.machine.equations import constraints_at, demands_at
-from legcal.machine.mobility import free_motions, generic_configurations, mobility, side
+from legcal.machine.equations import constraints_at, equations_at
+from legcal.machine.mobility import determinant_sign, free_motions, generic_configurations, mobility
 from legcal.machine.mobility import freedoms_at as freedoms
 
 MOBILITY = {
@@ -65,7 +65,7 @@ def test_mobility_of_the_shipped_models(shipped: Machine) -> None:
 
 
 def test_what_is_free_beyond_the_platform_are_idle_spins(shipped: Machine) -> None:
-    spins = sum(chain.idle_spins for chain in shipped.leg_chains)
+    spins = sum(leg.idle_spins for leg in shipped.legs)
     for configuration in generic_configurations(shipped, 3):
         every, of_platform = freedoms(shipped, configuration)
         assert every - of_platform == spins
@@ -84,14 +84,14 @@ def test_random_configurations_are_closed_inside_unflipped_and_in_one_mode(
     shipped: Machine,
 ) -> None:
     drawn = random_configurations(shipped, 12, 5)
-    sides = {side(shipped, shipped.home)}
+    sides = {determinant_sign(shipped, shipped.home)}
     lower, upper = np.array([leg.travel for leg in shipped.legs]).T
     for configuration, q, T in zip(*drawn, strict=True):
         assert np.abs(shipped.chain.residual(configuration)).max() < 1e-12
         assert np.abs(constraints_at(shipped, T).values).max(initial=0.0) < 1e-11
         assert np.all((q >= lower - 1e-9) & (q <= upper + 1e-9))
         np.testing.assert_allclose(inverse_kinematics(shipped, T), q, atol=1e-11)
-        sides.add(side(shipped, T))
+        sides.add(determinant_sign(shipped, T))
     assert len(sides) == 1
     assert np.ptp(drawn.readings[:, list(shipped.motors)], axis=0).min() > 1e-3
 
@@ -123,19 +123,19 @@ def test_closed_forms_have_the_derivatives_of_the_closures(shipped: Machine) -> 
         local = shipped.chain.twist(shipped.base, shipped.platform) @ motions
         R = T.rotation.as_matrix()
         twist = np.concatenate([R @ local[3:], R @ local[:3]])  # as the legs' equations have it
-        rates = demands_at(shipped, T).by_pose[0] @ twist
-        measured = demands_at(shipped, T).measured
+        rates = equations_at(shipped, T).by_pose[0] @ twist
+        measured = equations_at(shipped, T).measured
         assert np.abs(rates[~measured]).max(initial=0.0) < 1e-9  # no demand is broken
         columns = slider_columns(shipped, shipped.motors)[1]
         signs = shipped.sign[list(shipped.motors)]
         np.testing.assert_allclose(rates[measured], signs[:, None] * motions[columns], atol=1e-9)
         for numeric in np.eye(6):
             ahead, behind = (
-                demands_at(shipped, displaced(T, s * numeric)).values[0] for s in (step, -step)
+                equations_at(shipped, displaced(T, s * numeric)).values[0] for s in (step, -step)
             )
             np.testing.assert_allclose(
                 (ahead - behind) / (2.0 * step),
-                demands_at(shipped, T).by_pose[0] @ numeric,
+                equations_at(shipped, T).by_pose[0] @ numeric,
                 atol=1e-7,
             )
 
@@ -231,7 +231,7 @@ def test_without_a_determinant_a_path_is_followed_in_small_changes(
 ) -> None:
     machine = load_mechanism(name)
     drawn = random_configurations(machine, 3, 9)
-    monkeypatch.setattr("legcal.machine.kinematics.side", lambda *_: 0.0)
+    monkeypatch.setattr("legcal.machine.kinematics.determinant_sign", lambda *_: 0.0)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
         found = forward_kinematics(machine, q)
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)

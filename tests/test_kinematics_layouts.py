@@ -20,9 +20,9 @@ from legcal.machine import (
     random_configurations,
     slider_columns,
 )
-from legcal.machine.kinematics import SHORTEST, follow_pose
-from legcal.machine.mobility import side
-from legcal.machine.solver import walk
+from legcal.machine.kinematics import MIN_STEP, follow_pose
+from legcal.machine.mobility import determinant_sign
+from legcal.machine.solver import walk_in_steps
 
 
 def _square(seed: int, *, hung: str = "base", sphere: bool = True) -> Layout:
@@ -106,7 +106,7 @@ def test_the_platform_alone_goes_where_the_chain_goes(name: str) -> None:
     first = machine.home_configuration[slider_columns(machine, machine.motors)[0]]
     drawn = random_configurations(machine, 5, 3)
     for q, T in zip(drawn.readings, drawn.poses, strict=True):
-        found, part = follow_pose(machine, machine.home, first, q[motors], SHORTEST)
+        found, part = follow_pose(machine, machine.home, first, q[motors], MIN_STEP)
         assert part == 1.0
         np.testing.assert_allclose(found.as_matrix(), T.as_matrix(), atol=1e-9)
 
@@ -121,7 +121,7 @@ def test_the_platform_alone_crosses_no_singularity() -> None:
     for _ in range(10):
         last = rng.uniform(lower, upper)
         T, part = follow_pose(machine, machine.home, first, last, 1.0 / 64.0)
-        assert side(machine, T) == side(machine, machine.home)
+        assert determinant_sign(machine, T) == determinant_sign(machine, machine.home)
         parts.append(part)
     assert min(parts) < 1.0
 
@@ -133,9 +133,9 @@ def test_a_way_is_walked_in_halved_steps_up_to_what_is_in_the_way() -> None:
         tried.append(part)
         return part <= 0.6
 
-    assert walk(attempt, 0.01) == pytest.approx(0.6, abs=0.02)
+    assert walk_in_steps(attempt, 0.01) == pytest.approx(0.6, abs=0.02)
     assert tried[:3] == [1.0, 0.5, 1.0]
-    assert walk(lambda _: True, 0.01) == 1.0
+    assert walk_in_steps(lambda _: True, 0.01) == 1.0
 
 
 def test_machines_that_share_no_reading_are_given_up_early(monkeypatch: pytest.MonkeyPatch) -> None:

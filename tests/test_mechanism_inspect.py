@@ -12,7 +12,7 @@ from rich.console import Console
 
 from legcal.machine import describe, load_mechanism
 from legcal.machine.family import Family, describe_family
-from legcal.machine.new_model import create_model
+from legcal.machine.model_builder import create_model
 from legcal.report import inspect_table
 
 

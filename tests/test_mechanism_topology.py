@@ -134,7 +134,7 @@ def test_a_passive_slider_is_found_and_takes_a_motor_away(tmp_path: Path) -> Non
     machine = load_mechanism(path)
     assert [leg.kind for leg in machine.legs].count(LegKind.PASSIVE) == 1
     assert machine.legs[1].kind is LegKind.PASSIVE
-    assert np.isnan(machine.parameters.offsets[1])
+    assert machine.parameters.passive == (1,)
     assert any("mobility 6, motors 5" in note for note in machine.diagnostics)
 
 
@@ -338,7 +338,7 @@ def test_without_a_home_sizes_beyond_reason_are_asked_about_at_once(
     scale: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if scale > 1.0:  # no home is looked for
-        monkeypatch.delattr("legcal.machine.load.closed_home")
+        monkeypatch.delattr("legcal.machine.loader.closed_home")
     description = geometry()
     A, B, q0 = scale * description.A, scale * description.B, scale * description.q0
     scaled = Geometry(A, B, q0, description.home, (0.0, 0.15 * scale))

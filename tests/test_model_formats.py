@@ -28,7 +28,7 @@ from legcal.machine import (
 )
 from legcal.machine.chain import ClosedChain
 from legcal.machine.mjcf import Values, closing_joints, read_bodies
-from legcal.machine.tree import close_loop
+from legcal.machine.spanning_tree import close_loop
 from legcal.machine.urdf import Problems, parse_xml
 
 machine_of = cache(load_mechanism)

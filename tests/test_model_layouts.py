@@ -125,7 +125,7 @@ def _check(machine: Machine, description: MachineSpec, layout: Layout) -> None:
         _close(leg.twist, twist)
         length = np.linalg.norm(description.home.apply(B) - A)
         _close(leg.q0, length - (0.0 if spec.kind == "constant" else PASSED))
-        spins = machine.leg_chains[j].idle_spins
+        spins = machine.legs[j].idle_spins
         assert spins == (spec.type == "SS") + (layout.of(j).spin == "S" and "S" in spec.type)
 
 
@@ -273,7 +273,7 @@ def test_a_revolute_along_the_leg_is_part_of_an_s_or_idle(
     layouts = LegLayout(spin=side, sphere=False), LegLayout(spin=side, cut="mid", slid=0.03)
     machine = load_mechanism(write_machine(tmp_path, description, Layout(layouts)))
     assert [leg.type for leg in machine.legs] == [found] * 3
-    assert [chain.idle_spins for chain in machine.leg_chains] == [idle] * 3
+    assert [leg.idle_spins for leg in machine.legs] == [idle] * 3
     assert all(leg.twist is None for leg in machine.legs)
     for j, leg in enumerate(machine.legs):
         _close(leg.A, description.legs[j].A)
@@ -407,7 +407,7 @@ def test_a_slider_that_nothing_drives_is_passive_and_frees_the_platform(tmp_path
     path.write_text(path.read_text().replace("- leg2_slider\n", "", 1))
     machine = load_mechanism(path)
     assert [j for j, leg in enumerate(machine.legs) if leg.kind is LegKind.PASSIVE] == [1]
-    assert np.isnan(machine.parameters.offsets[1])
+    assert machine.parameters.passive == (1,)
     assert any("mobility 6, motors 5" in note for note in machine.diagnostics)
 
 

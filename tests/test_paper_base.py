@@ -14,7 +14,7 @@ from staged_machines import Observed, made_up_base, seen_from, shipped
 from legcal.data import LegAxes, Measurements, View
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
-from legcal.machine import Leg, LegKind
+from legcal.machine import JointType, Leg, LegKind
 from legcal.paper import Criteria, NominalMachine, joints_in_camera, run_base_steps
 from legcal.paper.camera_poses import camera_poses
 from legcal.paper.joints_in_base import locate_joints_in_base
@@ -446,7 +446,10 @@ def plane_with_joints_on_a_line(A: Array, B: Array, nominal_A: Array) -> Observe
     M = np.array([T[v].apply(p) for v, p in zip(view, M, strict=True)]).reshape(-1, 3)
     covariance = np.tile(np.diag([1e-6, 1e-6, 1e-8, 1e-8]), (36, 1, 1))
     nominal, true = (
-        tuple(Leg("R", "R", LegKind.ACTUATED, a, b, 0.1) for a, b in zip(P, B, strict=True))
+        tuple(
+            Leg(JointType("R"), JointType("R"), LegKind.ACTUATED, a, b, 0.1)
+            for a, b in zip(P, B, strict=True)
+        )
         for P in (nominal_A, A)
     )
     return Observed(

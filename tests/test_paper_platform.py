@@ -16,7 +16,7 @@ from staged_machines import planned, shipped
 from legcal.calibration.identify.session import planned_session
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, IntArray, normal_basis
-from legcal.machine import Demand, LegKind, linearize, load_mechanism
+from legcal.machine import EquationKind, LegKind, leg_equations, load_mechanism
 from legcal.paper import Transformation, platform, run_base_steps, run_platform_steps
 from legcal.paper.least_squares import LeastSquares, Solution, solve_least_squares
 from legcal.paper.leg_directions import LegDirections, directions_through_joints
@@ -393,17 +393,17 @@ def test_equations_of_a_leg_and_their_derivatives_are_those_of_the_machine(
     local = np.concatenate([leg.B[:2], [0.0, leg.q0], np.zeros(5), step])
     known = np.array([0.0, 0.0, leg.B[2]]), R, t, leg.A
     kind, twist = (leg.base_joint, leg.platform_joint), float(leg.twist or 0.0)
-    expected = linearize(leg, R[None], (t + step[:3])[None])
+    expected = leg_equations(leg, R[None], (t + step[:3])[None])
     x = ca.SX.sym("x", N_UNKNOWNS)
-    for row, about in enumerate(expected.demands):
-        if about in (Demand.BASE_AXIS, Demand.ALONG_2):
+    for row, about in enumerate(expected.kinds):
+        if about in (EquationKind.BASE_AXIS, EquationKind.DIRECTION_2):
             continue
         function = constraint_of_leg(about, *kind) if row else length_of_leg()
         arguments = (*known, a, b, twist, 1.0) if row else (*known, 0.0, 1.0)
-        rows = slice(row, row + (2 if about is Demand.ALONG_1 else 1))
+        rows = slice(row, row + (2 if about is EquationKind.DIRECTION_1 else 1))
         value = function(local, *arguments).full().ravel()
         np.testing.assert_allclose(value, expected.values[0, rows], atol=1e-12)
-        if about is Demand.TWIST:
+        if about is EquationKind.TWIST:
             u = unit(R @ leg.B + t + step[:3] - leg.A)
             closure = closure_of_leg(*kind)(np.zeros(5), u, R, a, b, twist, 0.5)
             np.testing.assert_allclose(float(closure), 2.0 * value[0], atol=1e-12)

@@ -14,11 +14,12 @@ from legcal import load_mechanism
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.machine import (
+    JointType,
     Leg,
     LegKind,
     Parametrization,
     geometries,
-    linearize,
+    leg_equations,
     parametrization_of,
     parametrize,
     pose_equations,
@@ -73,7 +74,9 @@ def test_the_parameters_of_each_class_are_counted(
 
 def test_a_planar_mechanism_has_neither_heights_nor_axes() -> None:
     legs, _, _ = legs_of(["SS"] * 3, 1)
-    planar = [replace(leg, base_joint="R", platform_joint="R") for leg in legs]
+    planar = [
+        replace(leg, base_joint=JointType("R"), platform_joint=JointType("R")) for leg in legs
+    ]
     found = parametrized(planar, frame=(0, 1))
     assert found.names == (
         "leg2.base.x", "leg3.base.x", "leg3.base.y",
@@ -166,7 +169,7 @@ def _residual(legs: Sequence[Leg], readings: Sequence[float], R: Array, t: Array
     """Return how far a pose is from readings and demands, rows as in ``pose_equations``."""
     rows = []
     for leg, reading in zip(legs, readings, strict=True):
-        values = linearize(leg, R[None], t[None]).values[0]
+        values = leg_equations(leg, R[None], t[None]).values[0]
         length = values[0] + leg.q0
         if leg.kind is not PASSIVE:
             rows.append(values[0] - (reading if leg.kind is ACTUATED else 0.0))

@@ -11,12 +11,13 @@ from thinned import thinned
 from legcal.calibration.joint_fit.factors import average_images, observed_axes
 from legcal.calibration.joint_fit.fit import bound, refine
 from legcal.calibration.joint_fit.problem import FitProblem, build_fit
-from legcal.calibration.joint_fit.solution import Solution, joints_of
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.data.axes import LegAxes, axes_from_outlines
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import no_outlines
 from legcal.errors import DatasetError, DidNotConverge, NotIdentifiable
 from legcal.estimation import linearize
+from legcal.machine import parameters_of_legs
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_the_whitening_makes_the_claimed_covariance_one(session: AxesSession) ->
 def test_exact_axes_give_the_truth(joints: float, coplanar: bool) -> None:
     session = axes_session(coplanar=coplanar)
     start = session.start(joints=joints)
-    assert np.abs(session.errors(joints_of(start.legs))).min() > 0.9 * joints
+    assert np.abs(session.errors(parameters_of_legs(start.legs))).min() > 0.9 * joints
     found = refine(session.legs, session.measurements, no_outlines(), start, axes=session.axes)
     assert np.abs(session.errors(found.parameters)).max() < 1e-9
     assert found.rms_px is None

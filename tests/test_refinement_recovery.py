@@ -21,12 +21,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from thinned import thinned
 
 from legcal.calibration.joint_fit.fit import refine, refine_from_best
-from legcal.calibration.joint_fit.solution import Solution, joints_of
+from legcal.calibration.joint_fit.solution import Solution
 from legcal.calibration.joint_fit.variables import FittedLegs, RefinementSettings
 from legcal.data.measurements import Measurements
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array
-from legcal.machine import KinematicParameters
+from legcal.machine import KinematicParameters, parameters_of_legs
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_exact_outlines_give_the_truth(
     session: Session, joints: float, camera: float, degrees: float
 ) -> None:
     start = disturbed_start(session, joints=joints, camera=camera, angle=np.deg2rad(degrees))
-    assert np.abs(joint_errors(joints_of(start.legs))).min() > 0.9 * joints
+    assert np.abs(joint_errors(parameters_of_legs(start.legs))).min() > 0.9 * joints
     solution = refine(session.legs, session.measurements, session.outlines, start)
     assert np.abs(joint_errors(solution.parameters)).max() < 1e-9
     assert gauge_is_kept(solution.parameters)

@@ -21,7 +21,7 @@ from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.lines import normal_basis
 from legcal.geometry.types import Array
-from legcal.machine import Cylinder, Leg, LegKind
+from legcal.machine import Cylinder, JointType, Leg, LegKind
 from legcal.vision.camera import Camera
 from legcal.vision.cylinder import outlines_of_axis
 
@@ -213,8 +213,9 @@ def repeated_outlines(
 
 
 LEG = Leg(
-    "S", "U", LegKind.ACTUATED, np.zeros(3), np.ones(3), 0.3, name="leg1", prismatic="slide",
-    travel=(0.0, 0.1), cylinders=(Cylinder("rod", RADIUS, "base", 0.0, 0.3),),
+    JointType("S"), JointType("U"), LegKind.ACTUATED, np.zeros(3), np.ones(3), 0.3,
+    name="leg1", prismatic="slide", travel=(0.0, 0.1),
+    cylinders=(Cylinder("rod", RADIUS, "base", 0.0, 0.3),),
 )  # fmt: skip
 U = np.array([0.25, -0.93, 0.27]) / np.linalg.norm([0.25, -0.93, 0.27])
 AT = np.array([0.06, -0.04, 0.85])

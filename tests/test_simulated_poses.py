@@ -27,7 +27,7 @@ from legcal.machine import (
     load_mechanism,
     singularity,
 )
-from legcal.machine.mobility import side
+from legcal.machine.mobility import determinant_sign
 from legcal.simulation.poses import JITTER, Feasibility, are_extreme, draw_poses, given_poses
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
@@ -59,7 +59,7 @@ def test_extreme_poses_of_shipped_machines_are_poses_of_theirs(name: str) -> Non
         np.testing.assert_allclose(readings, inverse_kinematics(machine, T), atol=1e-10)
         assert np.all((readings >= lower - 1e-9) & (readings <= upper + 1e-9))
         assert singularity(machine, T) >= least
-        assert side(machine, T) == side(machine, machine.home)
+        assert determinant_sign(machine, T) == determinant_sign(machine, machine.home)
     part = _parts(machine, poses)
     assert np.ptp(part, axis=0).max() > 0.4
     if name != LONG_TRAVEL:

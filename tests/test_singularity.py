@@ -21,8 +21,8 @@ from legcal.machine import (
     load_mechanism,
     singularity,
 )
-from legcal.machine.equations import demands_at
-from legcal.machine.mobility import dimensionless, side
+from legcal.machine.equations import equations_at
+from legcal.machine.mobility import determinant_sign, dimensionless
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 
@@ -36,7 +36,7 @@ def _turned(machine: Machine, degrees: float, height: float = 0.4) -> RigidTrans
 def test_leg_lines_alone_say_the_same_as_all_equations_of_a_hexapod() -> None:
     machine = load_mechanism("hexapod-strut")
     T = displaced(machine.home, [0.1, 0.2, -0.1, 0.02, 0.03, 0.01])
-    jacobian = demands_at(machine, T).by_pose[0]
+    jacobian = equations_at(machine, T).by_pose[0]
     lengths = np.linalg.norm(leg_vectors(machine, T), axis=1)
     centre = T.rotation.apply(machine.B_platform.mean(axis=0))
     moments = (jacobian[:, :3] - np.cross(centre, jacobian[:, 3:])) / lengths.mean()
@@ -109,7 +109,7 @@ def test_the_measure_is_the_concurrency_determinant_of_a_planar_platform(tmp_pat
         A = machine.A_base
         moments = A[:, 0] * u[:, 1] - A[:, 1] * u[:, 0]
         lines = np.column_stack([moments, u[:, :2]])
-        assert abs(side(machine, T)) == 1.0
+        assert abs(determinant_sign(machine, T)) == 1.0
         found = dimensionless(machine, T)
         scale = np.linalg.norm(vectors, axis=1).mean()
         assert abs(np.linalg.det(found)) == pytest.approx(
@@ -122,7 +122,7 @@ def test_a_3_upu_is_singular_in_its_constraints_where_all_legs_are_parallel() ->
     measures = []
     for height in (0.45, 5.0, 50.0):
         T = RigidTransform.from_components([0.0, 0.0, height], machine.home.rotation)
-        rows = dimensionless(machine, T)[~demands_at(machine, T).measured]
+        rows = dimensionless(machine, T)[~equations_at(machine, T).measured]
         measures.append(float(np.linalg.svd(rows, compute_uv=False)[2]))
     assert measures[0] > 5.0 * measures[1] > 20.0 * measures[2]
 
@@ -159,9 +159,9 @@ def test_the_measure_does_not_depend_on_size_or_frames(tmp_path: Path) -> None:
 
 def test_forward_kinematics_does_not_pass_a_singular_attitude() -> None:
     machine = load_mechanism("hexapod")
-    here = side(machine, machine.home)
+    here = determinant_sign(machine, machine.home)
     beyond = _turned(machine, 100.0)
-    assert side(machine, beyond) == -here
+    assert determinant_sign(machine, beyond) == -here
     follower = Follower(machine)
     for degrees in (20.0, 40.0, 60.0, 75.0):
         wanted = _turned(machine, degrees)
@@ -169,7 +169,7 @@ def test_forward_kinematics_does_not_pass_a_singular_attitude() -> None:
         np.testing.assert_allclose(reached.as_matrix(), wanted.as_matrix(), atol=1e-9)
     # the same lengths have a pose on this side: it is found, and not the one beyond
     back = forward_kinematics(machine, inverse_kinematics(machine, beyond))
-    assert side(machine, back) == here
+    assert determinant_sign(machine, back) == here
     assert (back.rotation * beyond.rotation.inv()).magnitude() > 0.1
     there = forward_kinematics(machine, inverse_kinematics(machine, beyond), start=beyond)
     np.testing.assert_allclose(there.as_matrix(), beyond.as_matrix(), atol=1e-9)

@@ -19,7 +19,7 @@ from legcal.errors import ModelError, UsageError
 from legcal.geometry import roll_pitch_yaw
 from legcal.geometry.types import Array
 from legcal.machine import (
-    Demand,
+    EquationKind,
     Leg,
     LegKind,
     Machine,
@@ -101,8 +101,8 @@ def _check_equations(true: Machine, legs: tuple[Leg, ...]) -> None:
         matrix = T.as_matrix()[None]
         for j, leg in enumerate(legs):
             at = pose_equations([leg], matrix[:, :3, :3], matrix[:, :3, 3])
-            for demand, value in zip(at.demands, at.values[0], strict=True):
-                is_read = demand is Demand.LENGTH and leg.kind is not LegKind.CONSTANT
+            for demand, value in zip(at.kinds, at.values[0], strict=True):
+                is_read = demand is EquationKind.LENGTH and leg.kind is not LegKind.CONSTANT
                 wanted = true.legs[j].sign * readings[j] if is_read else 0.0
                 assert abs(value - wanted) < 1e-10
 

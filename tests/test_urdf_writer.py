@@ -20,14 +20,14 @@ from legcal.machine import (
     inverse_kinematics,
     load_mechanism,
 )
-from legcal.machine.urdf import UrdfPatch
-from legcal.machine.written import (
+from legcal.machine.model_writer import (
     check_closes,
     moved_origins,
     reload_and_check,
     write_calibrated_yaml,
     write_urdf,
 )
+from legcal.machine.urdf import UrdfPatch
 
 ORIGIN = re.compile(rb"""(<origin\b[^>]*?\bxyz\s*=\s*["'])([^"']*)(["'])""")
 

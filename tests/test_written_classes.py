@@ -10,15 +10,15 @@ from legcal.errors import ModelError
 from legcal.machine import (
     Leg,
     Machine,
-    footed,
     geometries,
-    home_with,
+    home_of_legs,
     load_mechanism,
     moved_legs,
     parametrization_of,
     vector_of,
+    with_platform_foot,
 )
-from legcal.machine.written import reload_and_check, write_calibrated_yaml, write_urdf
+from legcal.machine.model_writer import reload_and_check, write_calibrated_yaml, write_urdf
 
 
 def _other_legs(nominal: Machine, size: float) -> tuple[Leg, ...]:
@@ -27,7 +27,7 @@ def _other_legs(nominal: Machine, size: float) -> tuple[Leg, ...]:
     unit = np.where([unit == "m" for unit in parametrization.units], size, 10.0 * size)
     signs = np.random.default_rng(2).choice([-1.0, 1.0], len(unit))
     legs = moved_legs(geometries(nominal), parametrization.place, unit * signs)
-    return footed(legs, np.asarray(nominal.T_platform_Re.inv().translation))
+    return with_platform_foot(legs, np.asarray(nominal.T_platform_Re.inv().translation))
 
 
 @pytest.mark.parametrize("name", ["3-rpr", "3-rps", "3-upu-tilted", "hexapod-rod", "tricept"])
@@ -36,7 +36,7 @@ def test_a_model_with_other_axes_and_rods_gets_the_home_where_it_closes(
 ) -> None:
     nominal = load_mechanism(name)
     legs = _other_legs(nominal, 3e-3)
-    home = home_with(nominal, legs, 0.2)
+    home = home_of_legs(nominal, legs, 0.2)
     assert home is not None
     write_urdf(nominal, legs, tmp_path / "calibrated.urdf")
     write_calibrated_yaml(nominal, tmp_path / "calibrated.yaml", "calibrated.urdf", home)
@@ -57,7 +57,7 @@ def test_only_the_numbers_of_home_change_in_the_yaml(tmp_path: Path) -> None:
     without = (tmp_path / "calibrated.yaml").read_text()
     with pytest.raises(ModelError, match=r"legcal\.home could not be used"):
         load_mechanism(tmp_path / "calibrated.yaml")
-    home = home_with(nominal, legs, 0.2)
+    home = home_of_legs(nominal, legs, 0.2)
     write_calibrated_yaml(nominal, tmp_path / "calibrated.yaml", "calibrated.urdf", home)
     text = (tmp_path / "calibrated.yaml").read_text()
     number = r"-?\d[\d.e-]*"

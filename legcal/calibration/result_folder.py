@@ -51,7 +51,7 @@ from legcal.machine import (
     calibrated_axis,
     describe_direction,
     geometries,
-    home_with,
+    home_of_legs,
     load_mechanism,
     nominal_axes,
     parametrization_of,
@@ -89,7 +89,7 @@ def write_result(calibration: Calibration, destination: Path) -> None:
     with result_folder(destination, stale=stale) as folder:
         urdf, yaml = folder / "calibrated.urdf", folder / MODEL_NAME
         write_urdf(machine, solution.legs, urdf)
-        home = home_with(machine, solution.legs, MAX_HOME_RESIDUAL)
+        home = home_of_legs(machine, solution.legs, MAX_HOME_RESIDUAL)
         if home is None:
             raise DidNotConverge(
                 f"{machine.yaml_path}: the calibrated model could not be written: found no "

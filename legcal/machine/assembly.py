@@ -20,13 +20,13 @@ from legcal.machine.description import (
     wrong_lengths,
     wrong_sizes,
 )
-from legcal.machine.leg import LegKind
+from legcal.machine.leg import JointType, LegKind
 
 TRIALS = 40
 EVALUATIONS = 60  # of the closure in each trial; good starts need about ten
 CLOSED = 1e-10  # of the size of the machine
-SETTLED = 1e-13
-FAR = 0.01  # of the size: a home written with few digits is nearer
+CLOSED_EXACTLY = 1e-13
+MAX_OUTSIDE = 0.01  # of the size: a home written with few digits is nearer
 PARALLEL = 1e-9
 FREE_TRAVEL = (0.5, 1.5)  # of the length at home, for passive sliders without limits
 
@@ -102,14 +102,14 @@ def assemble(described: Description) -> Assembled:
 
 def all_revolute(described: Description) -> bool:
     """Say whether all joints are R, as in planar mechanisms."""
-    return all((leg.type.base, leg.type.platform) == ("R", "R") for leg in described.legs)
+    return all(leg.type.is_planar for leg in described.legs)
 
 
 def _in_a_plane(legs: Sequence[AssembledLeg]) -> bool:
     """Say whether all axes are parallel revolutes across all legs."""
     n = legs[0].base_axis
     return all(
-        (leg.type.base, leg.type.platform) == ("R", "R")
+        leg.type.is_planar
         and np.linalg.norm(np.cross(axis, n)) < PARALLEL
         and abs(leg.u @ n) < PARALLEL
         for leg in legs
@@ -224,7 +224,7 @@ class _Closure:
         self.B = np.array([leg.B_platform for leg in legs])
         self.size = float(max(np.ptp(self.A, axis=0).max(), np.ptp(self.B, axis=0).max(), 1e-3))
         self._legs = legs
-        self._planar = all((leg.type.base, leg.type.platform) == ("R", "R") for leg in legs)
+        self._planar = all(leg.type.is_planar for leg in legs)
         self.wanted = np.full(len(legs), np.nan)
         for j, leg in enumerate(legs):
             if leg.kind is LegKind.CONSTANT:
@@ -242,8 +242,8 @@ class _Closure:
         rows = [(lengths - self.wanted)[held] / self.size]
         for leg, vector in zip(self._legs, vectors, strict=True):
             axes = self._axes(leg.base_axis, leg.platform_axis, T)
-            for letter, axis in zip((leg.type.base, leg.type.platform), axes, strict=True):
-                if letter == "R" and axis is not None:
+            for joint, axis in zip((leg.type.base, leg.type.platform), axes, strict=True):
+                if joint is JointType.REVOLUTE and axis is not None:
                     rows.append(np.array([axis @ vector]) / self.size)
             if self._planar:
                 rows.append(np.cross(axes[0], axes[1]))  # type: ignore[arg-type]
@@ -262,7 +262,7 @@ class _Closure:
                 )
             axes = self._axes(leg.base_axis, leg.platform_axis, T)
             for side, axis in zip(("base", "platform"), axes, strict=True):
-                if getattr(leg.type, side) != "R" or axis is None:
+                if getattr(leg.type, side) is not JointType.REVOLUTE or axis is None:
                     continue
                 angle = np.degrees(np.arccos(min(1.0, abs(float(axis @ vector)) / length)))
                 if 90.0 - angle > 1e-6:
@@ -289,9 +289,9 @@ def _settle(described: Description, home: Home) -> Home:
     closure = _Closure(described, mid_travel=False)
     T = home.motion()
     miss = closure.residual(T)
-    if np.abs(miss).max(initial=0.0) < SETTLED:
+    if np.abs(miss).max(initial=0.0) < CLOSED_EXACTLY:
         return home
-    if np.abs(miss).max() < FAR:
+    if np.abs(miss).max() < MAX_OUTSIDE:
         T = _polished(closure, T)
         miss = closure.residual(T)
     if np.abs(miss).max() < CLOSED:

@@ -7,137 +7,22 @@ each; revolutes along the leg only turn it.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import OutOfClass
-from legcal.geometry import Array, distance_to_line, normal_basis, product
-from legcal.machine.bodies import Connection
-from legcal.machine.leg import JointLetter, Leg, LegKind, PlatformLetter
+from legcal.geometry import Array, normal_basis, product
+from legcal.machine.leg import Axis, JointType, Leg, LegChain, LegKind, Pivot, Step
 
 CONCURRENT = 10e-6  # [m]
 PERPENDICULAR = 1e-3  # [rad]
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
-    """A connection as a leg passes it from base to platform."""
-
-    connection: Connection
-    near: int  # which of its two bodies lies towards the base,
-    far: int  # and which towards the platform
-    axis: Array  # (3,) unit axis in the joint frame
-
-    @property
-    def name(self) -> str:
-        """The joint as a message names it."""
-        return self.connection.joint or "the 3d closure"
-
-    def line(self, side: int) -> tuple[Array, Array]:
-        """Return a point [m] and the direction of the axis in the body of one side."""
-        matrix = self.connection.T_body_joint[side].as_matrix()
-        return matrix[:3, 3], matrix[:3, :3] @ self.axis
-
-
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """The axis of a revolute, or the centre of a sphere, which has no direction."""
-
-    name: str
-    point: Array  # (3,) the joint's origin [m]
-    direction: Array | None  # (3,) unit vector
-
-    @property
-    def along(self) -> Array:
-        """The direction of a revolute."""
-        if self.direction is None:
-            raise ValueError("a sphere has no axis")
-        return self.direction
-
-    def distance(self, point: Array) -> float:
-        """Return how far a point is from the axis, or from the centre of a sphere [m]."""
-        if self.direction is None:
-            return float(np.linalg.norm(point - self.point))
-        return float(distance_to_line(point, self.direction, self.point))
-
-    def foot(self, point: Array) -> Array:
-        """Return the point of the axis that is nearest to a point [m]."""
-        return self.point + ((point - self.point) @ self.along) * self.along
-
-
-@dataclass(frozen=True, eq=False)
-class Pivot:
-    """What the revolutes and spheres at one end of a leg make together."""
-
-    letter: PlatformLetter  # empty where nothing turns but the leg about itself
-    centre: Array | None  # (3,) [m]; None for R, which has an axis of possible ones
-    axes: tuple[Axis, ...]  # that of R; of U the one fixed in base or platform, then the inner one
-    spins: tuple[Axis, ...] = ()  # revolutes along the leg that are not part of it
-    spare: int = 0  # freedoms that it has beyond those of its letter
-
-    @property
-    def outer(self) -> Array | None:
-        """The direction fixed in base or platform of R or U."""
-        return self.axes[0].along if self.axes else None
-
-    @property
-    def inner(self) -> Array | None:
-        """The direction fixed in the leg of R or U."""
-        return self.axes[-1].along if self.axes else None
-
-
-@dataclass(frozen=True, eq=False)
-class LegChain:
-    """The joints of one leg, and its geometry with all of them at zero in the base body's frame."""
-
-    steps: tuple[Step, ...]  # from base to platform
-    poses: tuple[RigidTransform, ...]  # of the base body, the bodies of the leg, the platform's
-    n_lower: int  # joints on the base side of the slider, or of the rod
-    slider: Step | None  # None for a leg of constant length
-    base: Pivot
-    platform: Pivot
-    A: Array  # (3,) [m]
-    B: Array  # (3,) [m]
-    u: Array  # (3,) in which a slider moves the platform end; else from A to B
-    idle_spins: int  # freedoms that turn nothing but the leg about itself
-
-    @property
-    def bodies(self) -> tuple[str, ...]:
-        """The bodies of the leg, without base and platform."""
-        return tuple(step.connection.bodies[step.far] for step in self.steps[:-1])
-
-    @property
-    def n_upper(self) -> int:
-        """The index of the body behind the slider, or of the one of the rod."""
-        return self.n_lower + (self.slider is not None)
-
-    @property
-    def motor(self) -> str | None:
-        """The slider's joint, None for a rod."""
-        return None if self.slider is None else self.slider.connection.joint
-
-    @property
-    def reach(self) -> float:
-        """Position of B past A along u at joint value zero [m]."""
-        return float((self.B - self.A) @ self.u)
-
-    @property
-    def twists(self) -> bool:
-        """Whether an S joint lets the leg twist about itself."""
-        return "S" in (self.base.letter, self.platform.letter)
-
-    def line_in(self, body: int, point: Array) -> tuple[Array, Array]:
-        """Return a point and the direction u in one of the bodies, 0 the base's, -1 the last."""
-        matrix = self.poses[body].inv().as_matrix()
-        return matrix[:3, :3] @ point + matrix[:3, 3], matrix[:3, :3] @ self.u
-
-
-def understand(steps: Sequence[Step], platform_origin: Array, path: Path) -> LegChain:
+def classify_leg(steps: Sequence[Step], platform_origin: Array, path: Path) -> LegChain:
     """Return a leg from its joints; the origin of the platform link is one in the platform's body.
 
     Raises
@@ -205,11 +90,11 @@ def leg_of(
     T_zero_platform = product(chain.poses[-1], T_platform)
     base_axis = _axis(chain, chain.base, T_base)
     platform_axis = _axis(chain, chain.platform, T_zero_platform)
-    if chain.platform.letter == "":
+    if chain.platform.type is JointType.FIXED:
         platform_axis = sign * np.asarray(T_platform.rotation.inv().apply(u_last))
     return Leg(
-        base_joint=cast("JointLetter", chain.base.letter),
-        platform_joint=chain.platform.letter,
+        base_joint=chain.base.type,
+        platform_joint=chain.platform.type,
         kind=kind,
         A=A,
         B=B,
@@ -221,6 +106,7 @@ def leg_of(
         prismatic=chain.motor,
         sign=sign,
         travel=travel,
+        chain=chain,
     )
 
 
@@ -239,7 +125,7 @@ def _sign(reach: float, travel: tuple[float, float], length: float | None) -> in
 
 def _axis(chain: LegChain, pivot: Pivot, T_zero_link: RigidTransform) -> Array | None:
     """Return the axis of a joint in its link, where it is a parameter."""
-    if pivot.outer is None or (pivot.letter == "U" and chain.twists):
+    if pivot.outer is None or (pivot.type is JointType.UNIVERSAL and chain.twists):
         return None
     return undirected(np.asarray(T_zero_link.rotation.inv().apply(pivot.outer)))
 
@@ -285,10 +171,11 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
         *lines, spin = lines
         spins = (spin,)
     if len(lines) < 2:
-        return Pivot("R" if lines else "", None, tuple(lines), spins, spare)
+        turns = JointType.REVOLUTE if lines else JointType.FIXED
+        return Pivot(turns, None, tuple(lines), spins, spare)
     centre = _meeting(lines, leg)
     if len(lines) > 2:
-        return Pivot("S", centre, (), (), spare + len(lines) - 3)
+        return Pivot(JointType.SPHERICAL, centre, (), (), spare + len(lines) - 3)
     tilt = off_square(lines[0].along, lines[1].along)
     if tilt > PERPENDICULAR:
         raise OutOfClass(
@@ -296,7 +183,7 @@ def _pivot(axes: Sequence[Axis], along: Array | None, leg: str) -> Pivot:
             f"{np.degrees(tilt):.4g} deg from perpendicular, needed a universal joint within "
             f"{np.degrees(PERPENDICULAR):.2g} deg; correct their axes."
         )
-    return Pivot("U", centre, tuple(lines), (), spare)
+    return Pivot(JointType.UNIVERSAL, centre, tuple(lines), (), spare)
 
 
 def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str) -> Pivot:
@@ -309,7 +196,7 @@ def _about_sphere(sphere: Axis, others: Sequence[Axis], leg: str) -> Pivot:
                 f"of {sphere.name} by {1e3 * miss:.4g} mm, needed one joint at each end of the leg "
                 "within 0.01 mm; correct their origins."
             )
-    return Pivot("S", sphere.point, (), (), len(others))
+    return Pivot(JointType.SPHERICAL, sphere.point, (), (), len(others))
 
 
 def _distinct(axes: Sequence[Axis]) -> list[Axis]:
@@ -395,36 +282,37 @@ def _with_spins(base: Pivot, platform: Pivot, u: Array, leg: str) -> tuple[Pivot
     spare = [len(base.spins), len(platform.spins)]
     ends = [base, platform]
     for i in (0, 1):
-        if ends[i].letter == "U" and spare[1 - i] and ends[1 - i].letter != "S":
+        other = ends[1 - i].type
+        if ends[i].type is JointType.UNIVERSAL and spare[1 - i] and not other.twists_freely:
             spare[1 - i] -= 1
-            ends[i] = replace(ends[i], letter="S", axes=())
-    left = sum(spare)
-    letters = [end.letter for end in ends]
-    if letters[0] == "":
+            ends[i] = replace(ends[i], type=JointType.SPHERICAL, axes=())
+    left, twisting = sum(spare), [end.type.twists_freely for end in ends]
+    if ends[0].type is JointType.FIXED:
         raise OutOfClass(
             f"the leg of joint '{leg}' is outside the method: found the axis of "
             f"'{base.spins[0].name}' along the leg, needed one perpendicular to it within "
             f"{np.degrees(PERPENDICULAR):.2g} deg; this machine cannot be calibrated this way."
         )
-    if left and "S" not in letters:
+    if left and not any(twisting):
         name = (*base.spins, *platform.spins)[0].name
         raise OutOfClass(
             f"the leg of joint '{leg}' is outside the method: found the axis of '{name}' along the "
             "leg, and no S joint; needed the inner axis of a universal joint perpendicular to the "
             f"leg within {np.degrees(PERPENDICULAR):.2g} deg; correct its axis."
         )
-    idle = left + base.spare + platform.spare + (letters == ["S", "S"])
+    idle = left + base.spare + platform.spare + all(twisting)
     return ends[0], ends[1], idle
 
 
 def _check_axes(base: Pivot, platform: Pivot, u: Array, leg: str) -> None:
     """Refuse revolute axes, and inner axes of legs without S, that are not square to the leg."""
-    without_s = "S" not in (base.letter, platform.letter)
+    twists = base.type.twists_freely or platform.type.twists_freely
     for end in (base, platform):
-        if end.letter == "R" or (end.letter == "U" and without_s):
+        if end.type is JointType.REVOLUTE or (end.type is JointType.UNIVERSAL and not twists):
             tilt = off_square(end.axes[-1].along, u)
             if tilt > PERPENDICULAR:
-                what = "a revolute axis" if end.letter == "R" else "an inner axis of a U joint"
+                is_revolute = end.type is JointType.REVOLUTE
+                what = "a revolute axis" if is_revolute else "an inner axis of a U joint"
                 raise OutOfClass(
                     f"the leg of joint '{leg}' is outside the method: found the axis of "
                     f"'{end.axes[-1].name}' {np.degrees(tilt):.4g} deg from perpendicular to the "
@@ -487,7 +375,7 @@ def _split_rod(axes: Sequence[Axis], n_lower: int, leg: str) -> Ends:
     u = (B - A) / length
     base, platform = _pivot(lower, u, leg), _pivot(upper, u, leg)
     base, platform, idle_spins = _with_spins(base, platform, u, leg)
-    if platform.letter == "":
+    if platform.type is JointType.FIXED:
         raise OutOfClass(
             f"the leg of joint '{leg}' is outside the method: found a rod that only turns "
             "about itself at the platform, needed a joint there; correct its axes."
@@ -535,7 +423,12 @@ def _places(axes: Sequence[Axis]) -> list[list[Axis]]:
     return places
 
 
-_END = {"R": "platform axis", "U": "platform joint", "S": "platform joint", "": "slider"}
+_END = {
+    JointType.REVOLUTE: "platform axis",
+    JointType.UNIVERSAL: "platform joint",
+    JointType.SPHERICAL: "platform joint",
+    JointType.FIXED: "slider",
+}
 
 
 def _telescope(
@@ -558,17 +451,17 @@ def _telescope(
     base, platform, idle_spins = _with_spins(base, platform, u, leg)
     origin = axes[slider].point
     A, B, miss = _on_slider(base, platform, u, origin)
-    what = f"its axis through the {_END[platform.letter]} misses the base joint"
+    what = f"its axis through the {_END[platform.type]} misses the base joint"
     for spin in (*base.spins, *platform.spins):
         if spin.distance(A) > miss:
             miss, what = spin.distance(A), f"the axis of '{spin.name}' misses that of the leg"
     if miss > CONCURRENT:
         raise OutOfClass(
             f"the leg of slider '{axes[slider].name}' is outside the method: {what} "
-            f"{'axis' if base.letter == 'R' else 'centre'} by {1e3 * miss:.4g} mm, needed at most "
+            f"{'axis' if base.centre is None else 'centre'} by {1e3 * miss:.4g} mm, needed at most "
             "0.01 mm; correct the origins along the leg."
         )
-    if platform.letter == "":
+    if platform.type is JointType.FIXED:
         B = A + ((platform_origin - A) @ u) * u
     _check_axes(base, platform, u, leg)
     return base, platform, A, B, u, idle_spins
@@ -577,8 +470,8 @@ def _telescope(
 def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[Array, Array, float]:
     """Return A and B where a line along the slider meets both joints, and by how much it misses."""
     A, B = base.centre, platform.centre
-    v = base.axes[0] if base.letter == "R" else None
-    w = platform.axes[0] if platform.letter == "R" else None
+    v = base.axes[0] if base.type is JointType.REVOLUTE else None
+    w = platform.axes[0] if platform.type is JointType.REVOLUTE else None
     if v is not None and w is not None:
         if parallel(v.along, w.along):
             across = np.cross(v.along, u)
@@ -589,7 +482,7 @@ def _on_slider(base: Pivot, platform: Pivot, u: Array, origin: Array) -> tuple[A
         A = _crossing(v, u, origin if B is None else B)
     if B is None:
         B = origin if w is None or A is None else _crossing(w, u, A)
-        if w is None and base.letter != "R":
+        if w is None and v is None:
             B = A
     if A is None or B is None:
         raise ValueError("a leg without any joint has no centre")

@@ -28,13 +28,13 @@ from legcal.machine.mobility import free_motions, project, singularity
 from legcal.machine.model import Machine
 from legcal.machine.solver import RANK, moved
 
-TRIES = 40  # draws for each configuration
-NEARER = 1.3 * 0.8 ** np.arange(TRIES)  # how far from home draws go, at most all of the way
+MAX_DRAWS = 40  # draws for each configuration
+SHARES = 1.3 * 0.8 ** np.arange(MAX_DRAWS)  # how far from home draws go, at most all of the way
 REGULAR = 0.1  # of the singularity measure at home: nobody works nearer to a singularity
-SHORTEST = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
+MIN_STEP = 1.0 / 16.0  # of the way from home; what is harder to reach is drawn again
 WALK = 6  # steps of a random walk between two configurations
 ON_THE_CHAIN = 7  # draws of eight, where following is quick
-HOPELESS = 20  # configurations in vain, if they are the first
+MAX_FAILED = 20  # configurations in vain, if they are the first
 STRIDE = 0.15  # [rad], and of a leg length
 INSIDE = 1e-12  # [m]
 WORKSPACE_POSES = 100  # that stand for the workspace wherever errors over it are told
@@ -50,7 +50,7 @@ SINGULAR = 0.05  # smallest singular value, of its value at home
 FREE = 0.05  # mean leg lengths: how far poses move where no motor holds them
 ATTEMPTS = 12
 SHRINKING = 0.6  # each attempt with that part of the travel of the one before, but
-LEAST_SHARE = 0.078  # of the travel at least
+MIN_SHARE = 0.078  # of the travel at least
 LOOSE = 0.01  # of a hold by motors and joints, without unit
 
 
@@ -106,8 +106,8 @@ def random_configurations(
     if len(found) < count:
         raise DidNotConverge(
             f"{machine.yaml_path}: random poses could not be drawn: found {len(found)} of "
-            f"{count} inside the travel in {TRIES} tries for each, needed all; check legcal.home "
-            "and the limits of the sliders."
+            f"{count} inside the travel in {MAX_DRAWS} tries for each, needed all; check "
+            "legcal.home and the limits of the sliders."
         )
     return Configurations(
         np.array(found).reshape(count, machine.chain.nq),
@@ -142,9 +142,9 @@ def _drawn(machine: Machine, count: int, chance: np.random.Generator) -> Iterato
     least = REGULAR * singularity(machine, machine.home)
     drawn = 0
     for turn in range(count):
-        if turn == HOPELESS and not drawn:
+        if turn == MAX_FAILED and not drawn:
             return
-        for tries, nearer in enumerate(NEARER):
+        for tries, nearer in enumerate(SHARES):
             q = chance.uniform(lower, upper)
             if nearer < 1.0:
                 q = np.clip(home + nearer * (q - home), lower, upper)
@@ -153,7 +153,7 @@ def _drawn(machine: Machine, count: int, chance: np.random.Generator) -> Iterato
                     machine,
                     machine.home_configuration,
                     q,
-                    shortest=SHORTEST,
+                    min_step=MIN_STEP,
                     on_the_chain=tries % (ON_THE_CHAIN + 1) < ON_THE_CHAIN,
                 )
             except DidNotConverge:  # the legs cannot have these lengths at the same time
@@ -170,14 +170,14 @@ def _wandered(machine: Machine, count: int, chance: np.random.Generator) -> Iter
     """Yield every few steps of a random walk whose sliders stay inside their travel."""
     here = machine.home_configuration
     for _ in range(count):
-        for _ in range(TRIES):
-            here = strolled(machine, here, chance)
+        for _ in range(MAX_DRAWS):
+            here = random_walk(machine, here, chance)
             if not beyond_travel(machine, here).any():
                 yield here
                 break
 
 
-def strolled(machine: Machine, here: Array, chance: np.random.Generator) -> Array:
+def random_walk(machine: Machine, here: Array, chance: np.random.Generator) -> Array:
     """Return a closed configuration a few steps away, no further outside the travel."""
     for _ in range(WALK):
         motions = free_motions(machine, here)
@@ -241,7 +241,7 @@ def random_poses(
         found_R, found_t = np.concatenate([found_R, R[good]]), np.concatenate([found_t, t[good]])
         if len(found_t) >= count:
             return found_R[:count], found_t[:count]
-        share = max(SHRINKING * share, LEAST_SHARE)
+        share = max(SHRINKING * share, MIN_SHARE)
     found = f"found {len(found_t)} of {count} random poses inside the travel"
     if 2 * near_singular > tried and drive.hold() < LOOSE:
         raise DidNotConverge(

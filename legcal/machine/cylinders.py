@@ -13,8 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array, product
 from legcal.machine.bodies import Bodies
-from legcal.machine.classification import LegChain, Step
-from legcal.machine.leg import Cylinder, Leg
+from legcal.machine.leg import Cylinder, JointType, Leg, LegChain, Step
 from legcal.machine.urdf import Urdf, origin_of, parse_robot
 
 PARALLEL = 1e-6
@@ -36,7 +35,6 @@ def with_cylinders(
     legs: Sequence[Leg],
     shown: Sequence[VisualCylinder],
     bodies: Bodies,
-    chains: Sequence[LegChain],
 ) -> tuple[Leg, ...]:
     """Return the legs with the visual cylinders that are coaxial with them, in the file's order.
 
@@ -44,8 +42,8 @@ def with_cylinders(
     leg, or only turns about the leg's axis.
     """
     return tuple(
-        replace(leg, cylinders=_along(leg, chain, shown, bodies))
-        for leg, chain in zip(legs, chains, strict=True)
+        leg if leg.chain is None else replace(leg, cylinders=_along(leg, leg.chain, shown, bodies))
+        for leg in legs
     )
 
 
@@ -111,7 +109,7 @@ def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
             break
     if chain.slider is None:
         return halves
-    if leg.platform_joint == "":
+    if leg.is_fixed_to_platform:
         last, (B, u) = chain.steps[-1], chain.line_in(-1, chain.B)
         halves[last.connection.bodies[last.far]] = "platform", B, leg.sign * u
     for k in range(chain.n_upper, len(chain.steps)):
@@ -122,7 +120,9 @@ def _halves(leg: Leg, chain: LegChain) -> dict[str, Half]:
 
 def _raised(chain: LegChain, shown: Sequence[VisualCylinder], bodies: Bodies) -> LegChain:
     """Return one leg with both centres at the height of its cylinder along the joints' axes."""
-    if chain.platform.letter != "R" or len(chain.steps) != 2 + (chain.slider is not None):
+    if chain.platform.type is not JointType.REVOLUTE or len(chain.steps) != 2 + (
+        chain.slider is not None
+    ):
         return chain
     normal = chain.base.axes[-1].along
     found = []

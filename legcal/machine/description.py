@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -11,13 +10,12 @@ from legcal.files import motion_from_xyz_quat
 from legcal.geometry import Array
 from legcal.machine.classification import PERPENDICULAR
 from legcal.machine.leg import (
-    LONGEST,
-    SHORTEST,
-    THICKEST,
-    THINNEST,
-    JointLetter,
+    MAX_LENGTH,
+    MAX_RADIUS,
+    MIN_LENGTH,
+    MIN_RADIUS,
+    JointType,
     LegKind,
-    PlatformLetter,
 )
 
 _TYPE = re.compile(r"([RUS])(P?)([RUS]?)")
@@ -32,14 +30,19 @@ NEEDED_TYPE = (
 class LegType:
     """The joints of a leg from base to platform, as they are written: ``UPS``, ``SS``, ``UP``."""
 
-    base: JointLetter  # the joint at the base
+    base: JointType  # the joint at the base
     has_slider: bool  # whether there is a P
-    platform: PlatformLetter  # the joint at the platform; empty for a leg that is fixed there
+    platform: JointType  # the joint at the platform
 
     @property
     def has_sphere(self) -> bool:
         """Whether one of the joints is an S."""
-        return "S" in (self.base, self.platform)
+        return self.base.twists_freely or self.platform.twists_freely
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether both joints are R, as in planar machines."""
+        return self.base is self.platform is JointType.REVOLUTE
 
 
 def leg_type(text: str) -> LegType | None:
@@ -47,7 +50,7 @@ def leg_type(text: str) -> LegType | None:
     match = _TYPE.fullmatch(text)
     if match is None or not (match[2] or match[3]):
         return None
-    return LegType(cast(JointLetter, match[1]), bool(match[2]), cast(PlatformLetter, match[3]))
+    return LegType(JointType(match[1]), bool(match[2]), JointType(match[3]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +113,11 @@ def wrong_sizes(described: Description) -> list[str]:
         ("platform", [leg.B_platform for leg in described.legs]),
     ):
         reach = float(np.linalg.norm(np.ptp(joints, axis=0)))
-        if reach > LONGEST:
+        if reach > MAX_LENGTH:
             problems.append(
                 f"{described.source}: the {side} joints could not be used: found them "
                 f"{reach:.4g} m apart with lengths in {described.unit}, needed at most "
-                f"{LONGEST:g} m; {_about_the_unit(described.unit, too_long=True)}."
+                f"{MAX_LENGTH:g} m; {_about_the_unit(described.unit, too_long=True)}."
             )
     return problems
 
@@ -127,11 +130,11 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
         if found:
             return found
         for radius in (leg.tube, leg.rod):
-            if radius is not None and not THINNEST < radius / length < THICKEST:
+            if radius is not None and not MIN_RADIUS < radius / length < MAX_RADIUS:
                 return [
                     f"{described.source}: leg '{leg.name}' could not be used: found a radius of "
                     f"{1e3 * radius:.4g} mm on a length of {1e3 * length:.4g} mm, needed "
-                    f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
+                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
                 ]
         if leg.kind is LegKind.CONSTANT or leg.travel is None:
             continue
@@ -149,12 +152,12 @@ def wrong_lengths(described: Description, lengths: Array) -> list[str]:
 
 def _out_of_proportion(described: Description, leg: str, length: float) -> list[str]:
     """Return that a leg has a length that no leg has."""
-    if SHORTEST <= length <= LONGEST:
+    if MIN_LENGTH <= length <= MAX_LENGTH:
         return []
     where = f"{described.source}: leg '{leg}' could not be used: found a length of {length:.4g} m"
     return [
-        f"{where} with lengths in {described.unit}, needed {SHORTEST:g} to {LONGEST:g} m; "
-        f"{_about_the_unit(described.unit, too_long=length > LONGEST, positive=length > 0.0)}."
+        f"{where} with lengths in {described.unit}, needed {MIN_LENGTH:g} to {MAX_LENGTH:g} m; "
+        f"{_about_the_unit(described.unit, too_long=length > MAX_LENGTH, positive=length > 0.0)}."
     ]
 
 
@@ -174,18 +177,18 @@ def wrong_axes(
 ) -> list[str]:
     """Return which axes do not fit their leg at home."""
     problems = []
-    for side, letter, axis in (
+    for side, joint, axis in (
         ("base", entry.type.base, axes[0]),
         ("platform", entry.type.platform, axes[1]),
     ):
         angle = float(np.degrees(np.arccos(np.clip(abs(axis @ u), 0.0, 1.0))))
-        if letter == "R" and 90.0 - angle > np.degrees(PERPENDICULAR):
+        if joint is JointType.REVOLUTE and 90.0 - angle > np.degrees(PERPENDICULAR):
             problems.append(
                 f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
                 f"found it at {angle:.4g} deg to the leg at home, needed 90 deg for an R joint; "
                 f"correct {side}_axes or home."
             )
-        if letter == "U" and angle < ALONG:
+        if joint is JointType.UNIVERSAL and angle < ALONG:
             problems.append(
                 f"{described.source}: the {side} axis of leg '{entry.name}' could not be used: "
                 f"found it along the leg at home ({angle:.3g} deg), where a U joint is singular; "

@@ -28,13 +28,15 @@ from legcal.files import (
 )
 from legcal.geometry import Array
 from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
-from legcal.machine.leg import MOST_LEGS, LegKind
+from legcal.machine.leg import MAX_LEGS, LegKind
 
-LARGEST = 1e9  # of any number, whatever its unit
+MAX_NUMBER = 1e9  # of any number, whatever its unit
 
 
 def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
+    )
 
 
 def _wanted(value: Any, fits: bool, needed: str) -> Any:
@@ -49,7 +51,7 @@ def _numbers(value: Any) -> Any:
     return _wanted(
         value,
         all(_number(x) or (x is None and isinstance(value, list)) for x in entries),
-        f"a number below {LARGEST:g}, or a list with a number (or null) for each leg",
+        f"a number below {MAX_NUMBER:g}, or a list with a number (or null) for each leg",
     )
 
 
@@ -95,7 +97,7 @@ def _points(value: Any) -> Any:
         if not fits:
             raise ValueError(
                 f"found {describe(row)} in row {i + 1}, needed three numbers below "
-                f"{LARGEST:g}, x y z (two in the plane); correct it."
+                f"{MAX_NUMBER:g}, x y z (two in the plane); correct it."
             )
     return [[*row, 0.0][:3] for row in rows]
 
@@ -191,9 +193,9 @@ COLUMNS = (
     *(
         Column(
             name,
-            least=-LARGEST,
-            most=LARGEST,
-            needed=f"a number below {LARGEST:g}",
+            least=-MAX_NUMBER,
+            most=MAX_NUMBER,
+            needed=f"a number below {MAX_NUMBER:g}",
             remedy="correct the cell",
             required=name in _POINTS and not name.endswith("z"),
             blank=name not in _POINTS or name.endswith("z"),
@@ -351,11 +353,11 @@ def _contradictions(file: TableFile, source: str) -> list[str]:
             f"{source}: type {file.type} could not be used: found {n} base_joints, needed "
             f"{int(told[0])}; correct the type or the rows."
         )
-    if not 2 <= n <= MOST_LEGS:
+    if not 2 <= n <= MAX_LEGS:
         remedy = "add rows" if n < 2 else "leave out passive legs"
         problems.append(
             f"{source}: base_joints could not be used: found {n} {'leg' if n == 1 else 'legs'}, "
-            f"needed 2 to {MOST_LEGS}; {remedy}."
+            f"needed 2 to {MAX_LEGS}; {remedy}."
         )
     names = file.legs or [f"leg{j + 1}" for j in range(n)]
     problems += [
@@ -493,12 +495,12 @@ def _disagreements(described: Description) -> list[str]:
                 f"{where}the kind constant with a P in its type, needed a type without P for a leg "
                 "of constant length; correct kinds or types."
             )
-        for side, letter, axis in (
+        for side, type_, axis in (
             ("base", leg.type.base, leg.base_axis),
             ("platform", leg.type.platform, leg.platform_axis),
         ):
-            if axis is not None and letter not in ("R", "U"):
-                joint = f"an {letter} joint" if letter else "a leg that is fixed"
+            if axis is not None and not type_.has_axis:
+                joint = f"an {type_} joint" if type_ else "a leg that is fixed"
                 problems.append(
                     f"{where}an axis for {joint} at the {side}, needed axes of R and U joints "
                     f"only; write null in {side}_axes."

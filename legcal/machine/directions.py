@@ -44,7 +44,7 @@ def sparse_basis(basis: Array) -> Array:
     return np.asarray(sparse[np.argsort(first, kind="stable")])
 
 
-_MOST_GROUPS = 4  # of joints in one direction
+_MAX_GROUPS = 4  # of joints in one direction
 _NOUN = {
     "base": ("base joint", "base joints"),
     "platform": ("platform joint", "platform joints"),
@@ -97,9 +97,9 @@ def describe_direction(parameters: Sequence[str], leg_names: Sequence[str]) -> s
         noun = _NOUN[kind][len(owners) > 1]
         ordered = _labelled(owners, leg_names)
         phrases.append(f"{axes + ' of ' if axes else ''}{noun} {joined(ordered)}")
-    if len(phrases) > _MOST_GROUPS:
-        more = len(phrases) - _MOST_GROUPS + 1
-        phrases = [*phrases[: _MOST_GROUPS - 1], f"{more} more such changes"]
+    if len(phrases) > _MAX_GROUPS:
+        more = len(phrases) - _MAX_GROUPS + 1
+        phrases = [*phrases[: _MAX_GROUPS - 1], f"{more} more such changes"]
     together = " together" if len(coordinates) > 1 else ""
     return f"{joined(phrases)}{together}"
 

@@ -1,24 +1,27 @@
-"""What legs demand of poses, with derivatives by the pose and by the numbers of the legs.
+"""The equations of legs at poses, with derivatives by the pose and by the numbers of the legs.
 
-A row holds by a reading (the length of an actuated leg) or by the machine alone (the length of a
-rod, a revolute axis, a twist, the plane of a planar machine). Freedoms are a rotation about the
-origin of the platform's frame [rad] and a displacement [m], both in the frame of the base. The
-rows of :func:`linearize` are those of the paper; :func:`pose_equations` counts rows without a unit
-at the far end of their leg, so that all are lengths.
+An equation is measured (the length of an actuated leg) or a constraint of the machine alone (the
+length of a rod, a revolute axis, a twist, the plane of a planar machine). Steps of a pose are a
+rotation about the origin of the platform's frame [rad] and a displacement [m], both in the frame of
+the base. The rows of :func:`leg_equations` are those of the paper; :func:`pose_equations`
+multiplies rows without a unit by the leg length, so that all are lengths. Which equations a leg has
+follows from its joints (:class:`legcal.machine.leg.JointType`); each is one function here, which
+gives the residual and its gradients by the vector from A to B and by the axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, cross, normal_basis
-from legcal.machine.leg import N_LOCAL, Demand, Leg, LegKind
+from legcal.machine.leg import N_LOCAL, EquationKind, JointType, Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameters import Parametrization
 
@@ -27,13 +30,13 @@ from legcal.machine.parameters import Parametrization
 class PoseEquations:
     """Equations at k poses, m rows each."""
 
-    values: Array  # (k, m) how far from met [m]; |AB| - q0 for a length, to equal the leg's s q
+    values: Array  # (k, m) residuals [m]; |AB| - q0 for a length, to equal s q
     by_pose: Array  # (k, m, 6) derivative by rotation [rad] and displacement [m]
-    by_local: Array  # (k, m, 12) by the numbers of the row's leg, exact where the rows are met:
+    by_local: Array  # (k, m, 12) by the numbers of the row's leg, exact where residuals are zero:
     # A, B, q0 [m], turns of both axes about their normal_basis, twist [rad]; or (k, m, 0)
     leg: IntArray  # (m,) the leg of each row, -1 for the plane
-    demands: tuple[Demand, ...]  # (m,) what each row is about
-    measured: BoolArray  # (m,) rows that hold by a reading
+    kinds: tuple[EquationKind, ...]  # (m,) what each row is about
+    measured: BoolArray  # (m,) rows of readings; the others are constraints
 
     def of(self, rows: BoolArray) -> PoseEquations:
         """Return some of the rows."""
@@ -42,7 +45,7 @@ class PoseEquations:
             self.by_pose[:, rows],
             self.by_local[:, rows],
             self.leg[rows],
-            tuple(d for d, is_in in zip(self.demands, rows, strict=True) if is_in),
+            tuple(kind for kind, is_in in zip(self.kinds, rows, strict=True) if is_in),
             self.measured[rows],
         )
 
@@ -57,74 +60,85 @@ class PoseEquations:
 def pose_equations(
     legs: Sequence[Leg], R: Array, t: Array, *, by_local: bool = True
 ) -> PoseEquations:
-    """Return what legs demand of poses R (k, 3, 3), t (k, 3) [m]; all rows are lengths.
+    """Return the equations of legs at poses R (k, 3, 3), t (k, 3) [m]; all rows are lengths.
 
     Without *by_local* these derivatives have no columns, which takes two thirds of the time.
     """
-    if all(map(_is_point_like, legs)):
-        return _point_like(legs, R, t, by_local)
+    if all(leg.kind is not LegKind.PASSIVE and len(leg.equations) == 1 for leg in legs):
+        return _lengths(legs, R, t, by_local)
     parts = []
     for j, leg in enumerate(legs):
-        found = linearize(leg, R, t, by_local=by_local)
-        rows = np.array([leg.kind is not LegKind.PASSIVE] + [True] * (len(leg.demands) - 1))
-        arm = np.where(_are(Demand.LENGTH, leg.demands), 1.0, found.values[:, :1] + leg.q0)
+        found = leg_equations(leg, R, t, by_local=by_local)
+        rows = np.array([leg.kind is not LegKind.PASSIVE] + [True] * (len(leg.equations) - 1))
+        is_length = np.array([kind is EquationKind.LENGTH for kind in found.kinds])
+        arm = np.where(is_length, 1.0, found.values[:, :1] + leg.q0)
         parts.append(
             PoseEquations(
                 arm * found.values,
                 arm[..., None] * found.by_pose,
                 arm[..., None] * found.by_local,
                 np.full(len(rows), j),
-                found.demands,
+                found.kinds,
                 found.measured,
             ).of(rows)
         )
     return _stacked(parts)
 
 
-def linearize(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> PoseEquations:
+def leg_equations(leg: Leg, R: Array, t: Array, *, by_local: bool = True) -> PoseEquations:
     """Return all equations of one leg at poses R (k, 3, 3), t (k, 3) [m], as the paper has them.
 
     Rows but that of the length have no unit; a passive leg has the row of its length too.
     """
-    state = _State(leg, R, t, by_local)
-    rows = [_ROWS[demand](state) for demand in leg.demands]
-    is_length = _are(Demand.LENGTH, leg.demands)
+    arm = R @ leg.B
+    vector = arm + t - leg.A
+    length = np.linalg.norm(vector, axis=1)
+    at = _Placed(leg, R, length, vector / length[:, None])
+    kinds = leg.equations
+    values, by_pose = np.empty((len(t), len(kinds))), np.empty((len(t), len(kinds), 6))
+    local = np.zeros((len(t), len(kinds), N_LOCAL if by_local else 0))
+    for i, kind in enumerate(kinds):
+        row = _RESIDUALS[kind](at)
+        values[:, i] = row.value
+        by_pose[:, i, :3], by_pose[:, i, 3:] = cross(arm, row.by_leg), row.by_leg
+        if row.by_tied is not None:
+            by_pose[:, i, :3] += cross(at.in_base(row.tied), row.by_tied)
+        if by_local:
+            local[:, i, :3], local[:, i, 3:6] = -row.by_leg, _in_platform(R, row.by_leg)
+            local[:, i, 6], local[:, i, 11] = row.by_q0, row.by_twist
+            if row.by_base_axis is not None:
+                e1, e2 = _basis(_given(leg.base_axis))
+                local[:, i, 7], local[:, i, 8] = -row.by_base_axis @ e2, row.by_base_axis @ e1
+            if row.by_tied is not None:
+                turns = cross(_basis(_given(leg.platform_axis)), row.tied)
+                local[:, i, 9:11] = _in_platform(R, row.by_tied) @ turns.T
+    measured = [kind is EquationKind.LENGTH and leg.kind is LegKind.ACTUATED for kind in kinds]
     return PoseEquations(
-        np.stack([row.value for row in rows], axis=1),
-        np.stack([row.by_pose for row in rows], axis=1),
-        np.stack([row.by_local for row in rows], axis=1),
-        np.zeros(len(rows), dtype=np.intp),
-        leg.demands,
-        is_length & (leg.kind is LegKind.ACTUATED),
+        values, by_pose, local, np.zeros(len(kinds), dtype=np.intp), kinds, np.array(measured)
     )
 
 
-def equations_at(machine: Machine, R: Array, t: Array) -> PoseEquations:
+def machine_equations(machine: Machine, R: Array, t: Array) -> PoseEquations:
     """Return all equations of a machine, its plane too, at poses of its links, without by_local."""
     found = pose_equations(machine.legs, R, t, by_local=False)
     return found if machine.spatial else _stacked([found, _plane(machine, R, t)])
 
 
-def demands_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
+def equations_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
     """Return the same at one pose."""
     matrix = T_base_platform.as_matrix()[None]
-    return equations_at(machine, matrix[:, :3, :3], matrix[:, :3, 3])
+    return machine_equations(machine, matrix[:, :3, :3], matrix[:, :3, 3])
 
 
 def constraints_at(machine: Machine, T_base_platform: RigidTransform) -> PoseEquations:
-    """Return the equations that hold at one pose whatever the readings are."""
-    demands = demands_at(machine, T_base_platform)
-    return demands.of(~demands.measured)
+    """Return the constraints at one pose."""
+    equations = equations_at(machine, T_base_platform)
+    return equations.of(~equations.measured)
 
 
 def is_constrained(machine: Machine) -> bool:
     """Say whether the machine itself forbids some poses, whatever the lengths of its sliders."""
-    return not machine.spatial or any(map(n_bonds, machine.legs))
-
-
-def n_bonds(leg: Leg) -> int:
-    """Return how many equations of a leg hold without a reading."""
-    return len(leg.demands) - (leg.kind is not LegKind.CONSTANT)
+    return not machine.spatial or any(leg.n_constraints for leg in machine.legs)
 
 
 def freedoms(frame_legs: Sequence[int]) -> tuple[int, ...]:
@@ -145,7 +159,7 @@ def pose_sensitivity(
     """Return how parameters move R_e in R_b at given readings, (k, 6, p): rotation, displacement.
 
     The equations of all legs hold before and after: F_pose d_pose + F_xi d_xi = 0. Where there are
-    more than freedoms (a 3-UPU that only translates) the platform goes where they are met best.
+    more than freedoms (a 3-UPU that only translates) their squares are least.
 
     Raises
     ------
@@ -171,49 +185,44 @@ def pose_sensitivity(
 
 
 _WORDS = {
-    Demand.LENGTH: "off its constant length",
-    Demand.BASE_AXIS: "off the plane normal to its axis at the base",
-    Demand.PLATFORM_AXIS: "off the plane normal to its axis at the platform",
-    Demand.ALONG_1: "off the direction that it has in the platform",
-    Demand.ALONG_2: "off the direction that it has in the platform",
-    Demand.TWIST: "twisted at its end",
-    Demand.PLANE: "out of its plane",
+    EquationKind.LENGTH: "off its constant length",
+    EquationKind.BASE_AXIS: "off the plane normal to its axis at the base",
+    EquationKind.PLATFORM_AXIS: "off the plane normal to its axis at the platform",
+    EquationKind.DIRECTION_1: "off the direction that it has in the platform",
+    EquationKind.DIRECTION_2: "off the direction that it has in the platform",
+    EquationKind.TWIST: "twisted at its end",
+    EquationKind.PLANE: "out of its plane",
 }
-_EXACT = 1e-9  # [m]
+_TOLERANCE = 1e-9  # [m]
 
 
-def worst_in_words(machine: Machine, equations: PoseEquations, verb: str = "") -> str:
-    """Return the row furthest from met at the first pose: who (verb) how far how."""
+def describe_worst(machine: Machine, equations: PoseEquations, verb: str = "") -> str:
+    """Return the row with the largest residual at the first pose: who (verb) how far how."""
     row = int(np.argmax(np.abs(equations.values[0])))
-    leg, how = equations.leg[row], _WORDS[equations.demands[row]]
+    leg, how = equations.leg[row], _WORDS[equations.kinds[row]]
     who = "the platform" if leg < 0 else f"leg '{machine.leg_names[leg]}'"
     return " ".join(f"{who} {verb} {1e3 * abs(equations.values[0, row]):.3g} mm {how}".split())
 
 
-def unmet(machine: Machine, T_base_platform: RigidTransform) -> str | None:
+def violated_constraint(machine: Machine, T_base_platform: RigidTransform) -> str | None:
     """Return which constraint a pose does not meet, in words; None where it meets all.
 
-    A constraint counts as met within a nanometre, or as well as the machine meets it at home where
+    A residual counts as zero up to a nanometre, or up to that of the machine at home where
     its axes are a little off (they may be, by up to a milliradian).
     """
     if not is_constrained(machine):
         return None
     here = constraints_at(machine, T_base_platform)
     worst = np.abs(here.values).max()
-    if worst <= _EXACT:
+    if worst <= _TOLERANCE:
         return None
     at_home = np.abs(constraints_at(machine, machine.home).values).max()
-    if worst <= _EXACT + 10.0 * at_home:
+    if worst <= _TOLERANCE + 10.0 * at_home:
         return None
-    return worst_in_words(machine, here, "would be")
+    return describe_worst(machine, here, "would be")
 
 
-def _is_point_like(leg: Leg) -> bool:
-    """Say whether a leg demands its length and nothing else."""
-    return leg.kind is not LegKind.PASSIVE and leg.demands == (Demand.LENGTH,)
-
-
-def _point_like(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> PoseEquations:
+def _lengths(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> PoseEquations:
     """Return the lengths of all legs at once."""
     A = np.array([leg.A for leg in legs]).reshape(-1, 3)
     arms = np.array([leg.B for leg in legs]).reshape(-1, 3) @ np.swapaxes(R, 1, 2)
@@ -228,7 +237,7 @@ def _point_like(legs: Sequence[Leg], R: Array, t: Array, by_local: bool) -> Pose
         np.concatenate([cross(arms, u), u], axis=2),
         local,
         np.arange(len(legs)),
-        (Demand.LENGTH,) * len(legs),
+        (EquationKind.LENGTH,) * len(legs),
         np.array([leg.kind is LegKind.ACTUATED for leg in legs], dtype=np.bool_),
     )
 
@@ -249,7 +258,7 @@ def _plane(machine: Machine, R: Array, t: Array) -> PoseEquations:
         by_pose[:, row, :3] = scale[:, None] * np.cross(carried, e)
     none = np.zeros((len(t), 3, 0))
     is_read = np.zeros(3, dtype=np.bool_)
-    return PoseEquations(values, by_pose, none, np.full(3, -1), (Demand.PLANE,) * 3, is_read)
+    return PoseEquations(values, by_pose, none, np.full(3, -1), (EquationKind.PLANE,) * 3, is_read)
 
 
 def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
@@ -259,156 +268,130 @@ def _stacked(parts: Sequence[PoseEquations]) -> PoseEquations:
         np.concatenate([part.by_pose for part in parts], axis=1),
         np.concatenate([part.by_local for part in parts], axis=1),
         np.concatenate([part.leg for part in parts]),
-        tuple(demand for part in parts for demand in part.demands),
+        tuple(kind for part in parts for kind in part.kinds),
         np.concatenate([part.measured for part in parts]),
     )
 
 
-def _are(which: Demand, demands: Sequence[Demand]) -> BoolArray:
-    """Return which rows are about one thing."""
-    return np.array([demand is which for demand in demands], dtype=np.bool_)
+class VectorOps(NamedTuple):
+    """Products of vectors: of rows (k, 3) in numpy, or of symbols, as CasADi has them."""
+
+    dot: Callable[[Any, Any], Any]
+    cross: Callable[[Any, Any], Any]
+    unit: Callable[[Any], Any]
+    cos: Callable[[Any], Any]
+    sin: Callable[[Any], Any]
 
 
-class _State:
-    """A leg at poses: its direction, and its axes turned into the frame of the base."""
+def axis_in_leg(joint: JointType, axis: Any, u: Any, ops: VectorOps) -> Any:
+    """Return the axis of a joint that stays in the leg, from the one in base or platform."""
+    return ops.unit(ops.cross(axis, u)) if joint.inner_is_across else axis
 
-    def __init__(self, leg: Leg, R: Array, t: Array, by_local: bool) -> None:
-        self.leg, self.R, self.by_local = leg, R, by_local
-        self.arm = R @ leg.B
-        vector = self.arm + t - leg.A
-        self.length = np.linalg.norm(vector, axis=1)
-        self.u = vector / self.length[:, None]
 
-    def turned(self, vector: Array) -> Array:
+def twist_residual(p: Any, w: Any, u: Any, twist: Any, ops: VectorOps) -> Any:
+    """Return sin(angle - twist), the angle about u from the axis p in the leg to the other, w."""
+    return ops.cos(twist) * ops.dot(u, ops.cross(p, w)) - ops.sin(twist) * ops.dot(p, w)
+
+
+class _Placed(NamedTuple):
+    """A leg at k poses."""
+
+    leg: Leg
+    R: Array  # (k, 3, 3)
+    length: Array  # (k,) [m]
+    u: Array  # (k, 3)
+
+    def in_base(self, vector: Array) -> Array:
         """Return a direction of the platform in the frame of the base, (k, 3)."""
         return np.asarray(self.R @ vector)
 
-
-class _Row:
-    """One equation at poses, its derivative collected from what it depends on."""
-
-    def __init__(self, state: _State, value: Array) -> None:
-        self.state, self.value = state, value
-        self.by_pose = np.zeros((len(value), 6))
-        self.by_local = np.zeros((len(value), N_LOCAL if state.by_local else 0))
-
-    def depends_on_leg(self, gradient: Array) -> None:
-        """Add the dependence on the vector from A to B."""
-        self.by_pose[:, :3] += cross(self.state.arm, gradient)
-        self.by_pose[:, 3:] += gradient
-        if self.state.by_local:
-            self.by_local[:, :3] -= gradient
-            self.by_local[:, 3:6] += _back(self.state.R, gradient)
-
-    def depends_on_u(self, gradient: Array) -> None:
-        """Add the dependence on the leg's direction."""
-        u = self.state.u
-        across = gradient - u * _dot(u, gradient)[:, None]
-        self.depends_on_leg(across / self.state.length[:, None])
-
-    def depends_on_base_axis(self, gradient: Array) -> None:
-        """Add the dependence on the axis at the base."""
-        if not self.state.by_local:
-            return
-        e1, e2 = _basis(_given(self.state.leg.base_axis))
-        self.by_local[:, 7] -= gradient @ e2
-        self.by_local[:, 8] += gradient @ e1
-
-    def depends_on_platform_vector(self, vector: Array, gradient: Array) -> None:
-        """Add the dependence on a direction that is tied to the platform and to its axis."""
-        axis = _given(self.state.leg.platform_axis)
-        self.by_pose[:, :3] += cross(self.state.turned(vector), gradient)
-        if not self.state.by_local:
-            return
-        inside = _back(self.state.R, gradient)
-        for column, e in zip((9, 10), _basis(axis), strict=True):
-            self.by_local[:, column] += inside @ cross(e, vector)
+    def by_leg(self, by_u: Array) -> Array:
+        """Return the gradient by the vector from A to B of what depends on its direction."""
+        across = by_u - self.u * _dot(self.u, by_u)[:, None]
+        return np.asarray(across / self.length[:, None])
 
 
-def _length(state: _State) -> _Row:
+_NOTHING = np.zeros(3)
+
+
+class _Row(NamedTuple):
+    """One equation at k poses: its residual, and its gradients by what it depends on."""
+
+    value: Array  # (k,)
+    by_leg: Array  # (k, 3) by the vector from A to B
+    by_base_axis: Array | None = None  # (k, 3)
+    tied: Array = _NOTHING  # (3,) a direction that is tied to the platform and to its axis
+    by_tied: Array | None = None  # (k, 3), in the frame of the base
+    by_q0: float = 0.0
+    by_twist: Array | float = 0.0
+
+
+def _length(at: _Placed) -> _Row:
     """Return |AB| - q0."""
-    row = _Row(state, state.length - state.leg.q0)
-    row.depends_on_leg(state.u)
-    row.by_local[:, 6:7] = -1.0
-    return row
+    return _Row(at.length - at.leg.q0, at.u, by_q0=-1.0)
 
 
-def _base_axis(state: _State) -> _Row:
+def _base_axis(at: _Placed) -> _Row:
     """Return v . u of eq (7) at the base."""
-    v = np.broadcast_to(_given(state.leg.base_axis), state.u.shape)
-    row = _Row(state, _dot(v, state.u))
-    row.depends_on_u(v)
-    row.depends_on_base_axis(state.u)
-    return row
+    v = np.broadcast_to(_given(at.leg.base_axis), at.u.shape)
+    return _Row(_dot(v, at.u), at.by_leg(v), by_base_axis=at.u)
 
 
-def _platform_axis(state: _State) -> _Row:
+def _platform_axis(at: _Placed) -> _Row:
     """Return v . u of eq (7) at the platform."""
-    return _component(state, _given(state.leg.platform_axis))
+    return _component(at, _given(at.leg.platform_axis))
 
 
-def _along(which: int, state: _State) -> _Row:
-    """Return a component of u across the direction that the platform gives the leg."""
-    return _component(state, _basis(_given(state.leg.platform_axis))[which])
-
-
-def _component(state: _State, vector: Array) -> _Row:
+def _component(at: _Placed, tied: Array) -> _Row:
     """Return the component of u along a direction of the platform."""
-    v = state.turned(vector)
-    row = _Row(state, _dot(v, state.u))
-    row.depends_on_u(v)
-    row.depends_on_platform_vector(vector, state.u)
-    return row
+    v = at.in_base(tied)
+    return _Row(_dot(v, at.u), at.by_leg(v), tied=tied, by_tied=at.u)
 
 
-def _twist(state: _State) -> _Row:
-    """Return sin(angle - twist) of the inner axes p and w about u."""
-    leg, u = state.leg, state.u
-    a, tau = _given(leg.base_axis), float(leg.twist or 0.0)
-    across = cross(a, u)
-    reach = np.linalg.norm(across, axis=1)[:, None]
-    p = np.broadcast_to(a, u.shape) if leg.base_joint == "R" else across / reach
+def _twist(at: _Placed) -> _Row:
+    """Return sin(angle - twist) of the axes p and w in the leg, and its gradients."""
+    leg, u, tau = at.leg, at.u, float(at.leg.twist or 0.0)
     b = _given(leg.platform_axis)
-    outer = _basis(b)[0] if leg.platform_joint == "" else b
-    far = cross(state.turned(outer), u)
-    far_reach = np.linalg.norm(far, axis=1)[:, None]
-    w = far / far_reach if leg.platform_joint == "U" else state.turned(outer)
+    tied = _basis(b)[0] if leg.is_fixed_to_platform else b
+    outer = np.broadcast_to(_given(leg.base_axis), u.shape), at.in_base(tied)
+    joints = leg.base_joint, leg.platform_joint
+    p, w = (axis_in_leg(*end, u, _ROWS) for end in zip(joints, outer, strict=True))
     c, s = np.cos(tau), np.sin(tau)
-    row = _Row(state, c * _dot(u, cross(p, w)) - s * _dot(p, w))
-    by_p, by_w = c * cross(w, u) - s * w, c * cross(u, p) - s * p
-    row.depends_on_u(c * cross(p, w))
-    if leg.base_joint == "U":
-        row.depends_on_u(cross(by_p, a) / reach)
-        by_p = cross(u, by_p) / reach
-    row.depends_on_base_axis(by_p)
-    if leg.platform_joint == "U":
-        row.depends_on_u(cross(by_w, state.turned(outer)) / far_reach)
-        by_w = cross(u, by_w) / far_reach
-    row.depends_on_platform_vector(outer, by_w)
-    if state.by_local:
-        row.by_local[:, 11] = -(s * _dot(u, cross(p, w)) + c * _dot(p, w))
-    return row
+    by_u, by_axes = c * cross(p, w), [c * cross(w, u) - s * w, c * cross(u, p) - s * p]
+    for i, (joint, axis) in enumerate(zip(joints, outer, strict=True)):
+        if joint.inner_is_across:
+            size = np.linalg.norm(cross(axis, u), axis=1)[:, None]
+            by_u = by_u + cross(by_axes[i], axis) / size
+            by_axes[i] = cross(u, by_axes[i]) / size
+    return _Row(
+        twist_residual(p, w, u, tau, _ROWS),
+        at.by_leg(by_u),
+        by_base_axis=by_axes[0],
+        tied=tied,
+        by_tied=by_axes[1],
+        by_twist=-twist_residual(p, w, u, tau - 0.5 * np.pi, _ROWS),
+    )
 
 
-_ROWS = {
-    Demand.LENGTH: _length,
-    Demand.BASE_AXIS: _base_axis,
-    Demand.PLATFORM_AXIS: _platform_axis,
-    Demand.ALONG_1: lambda state: _along(0, state),
-    Demand.ALONG_2: lambda state: _along(1, state),
-    Demand.TWIST: _twist,
+_RESIDUALS: dict[EquationKind, Callable[[_Placed], _Row]] = {
+    EquationKind.LENGTH: _length,
+    EquationKind.BASE_AXIS: _base_axis,
+    EquationKind.PLATFORM_AXIS: _platform_axis,
+    EquationKind.DIRECTION_1: lambda at: _component(at, _basis(_given(at.leg.platform_axis))[0]),
+    EquationKind.DIRECTION_2: lambda at: _component(at, _basis(_given(at.leg.platform_axis))[1]),
+    EquationKind.TWIST: _twist,
 }
 
 
 def _given(vector: Array | None) -> Array:
-    """Return an axis that a leg with this demand has."""
+    """Return an axis that a leg with this equation has."""
     if vector is None:
         raise ValueError("a leg whose joints need an axis was described without one")
     return vector
 
 
 def _basis(axis: Array) -> Array:
-    """Return the two directions across an axis of a leg, which is asked for at every pose."""
+    """Return the two directions across an axis of a leg, which is needed at every pose."""
     return _basis_of(np.ascontiguousarray(axis, dtype=np.float64).tobytes())
 
 
@@ -425,6 +408,14 @@ def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.einsum("ki,ki->k", a, b))
 
 
-def _back(R: Array, vectors: Array) -> Array:
+def _in_platform(R: Array, vectors: Array) -> Array:
     """Return directions of the base's frame in that of the platform, (k, 3)."""
     return np.asarray((vectors[:, None] @ R)[:, 0])
+
+
+def _unit(vectors: Array) -> Array:
+    """Return unit vectors of rows."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1)[:, None])
+
+
+_ROWS = VectorOps(_dot, cross, _unit, np.cos, np.sin)

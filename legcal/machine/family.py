@@ -15,7 +15,7 @@ from legcal.geometry import Array
 from legcal.machine.assembly import across_leg
 from legcal.machine.description import NEEDED_TYPE, Description, Home, LegEntry, LegType, leg_type
 from legcal.machine.description_table import in_metres, read_description
-from legcal.machine.leg import MOST_LEGS, LegKind
+from legcal.machine.leg import MAX_LEGS, JointType, LegKind
 
 _FAMILY = re.compile(r"([0-9]{1,2})-([A-Z]+)")
 SPREAD = 30.0  # [deg] between the two joints of a pair
@@ -46,12 +46,12 @@ def describe_family(asked: Family) -> Description:
     """Return the machine of a family."""
     match = _FAMILY.fullmatch(asked.family)
     letters = None if match is None else leg_type(match[2])
-    if match is None or letters is None or not 2 <= int(match[1]) <= MOST_LEGS:
+    if match is None or letters is None or not 2 <= int(match[1]) <= MAX_LEGS:
         raise UsageError(
             f"The family could not be understood: found '{asked.family}', needed a number of legs "
-            f"from 2 to {MOST_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
+            f"from 2 to {MAX_LEGS} and their type, such as 6-UPS: {NEEDED_TYPE}; correct --family."
         )
-    in_plane = (letters.base, letters.platform) == ("R", "R")
+    in_plane = letters.is_planar
     problems = _problems(asked, in_plane) + _pointless(asked, int(match[1]), letters, in_plane)
     if problems:
         raise UsageError(problems)
@@ -137,7 +137,7 @@ def _problems(asked: Family, in_plane: bool) -> list[str]:
 
 def _pointless(asked: Family, count: int, letters: LegType, in_plane: bool) -> list[str]:
     """Return which given dimensions a machine of this family does not have."""
-    no_axes = not {letters.base, letters.platform} & {"R", "U"}
+    no_axes = not (letters.base.has_axis or letters.platform.has_axis)
     found = {
         "--height": in_plane and bool(asked.height) and "a planar machine",
         "--tilt": (in_plane or no_axes) and bool(asked.tilt) and "axes that cannot tilt",
@@ -182,10 +182,10 @@ def _tilted_axes(
     u = vector / np.linalg.norm(vector)
     across = across_leg(u, A)
     axes = list[Array | None]()
-    for letter, sense in ((letters.base, 1.0), (letters.platform, -1.0)):
-        up = np.cross(u, across) if letter == "R" else np.array([0.0, 0.0, 1.0])
+    for joint, sense in ((letters.base, 1.0), (letters.platform, -1.0)):
+        up = np.cross(u, across) if joint is JointType.REVOLUTE else np.array([0.0, 0.0, 1.0])
         tilted = np.cos(tilt) * across + sense * np.sin(tilt) * up
-        axes.append(tilted if letter in ("R", "U") else None)
+        axes.append(tilted if joint.has_axis else None)
     return tuple(axes)
 
 

@@ -21,12 +21,13 @@ from legcal.machine.chain import ClosedChain, Closure
 from legcal.machine.files import find_model, find_urdf, read_file, yaml_of_urdf
 from legcal.machine.mjcf import read_mjcf_source
 from legcal.machine.schema import MechanismFile, read_mechanism_file
-from legcal.machine.tree import (
+from legcal.machine.solver import solve
+from legcal.machine.spanning_tree import (
     DRAWING,
     Loop,
     LoopKind,
     Source,
-    TreeText,
+    UrdfBuilder,
     assumed_travel,
     check_one_mechanism,
     close_loop,
@@ -54,7 +55,7 @@ TRIALS = 24
 STEPS = 200
 CLOSED = 1e-10  # [m] and [rad]
 _SPREAD = 0.1  # [rad] and [m], of the start of a trial, times its number
-_LONGEST = 0.3  # step [rad, m]
+_MAX_STEP = 0.3  # step [rad, m]
 
 _NO_BLOCK = (
     ("legcal.home could not be used", "the pose that the file draws could not be used"),
@@ -189,7 +190,7 @@ def axes_of(kind: str) -> str | None:
 
 def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) -> dict[str, str]:
     """Replace the joints of a URDF that stand for others, and return what frames they carried."""
-    text = TreeText(dict.fromkeys(urdf.links, ""), dict.fromkeys(urdf.joints, ""))
+    text = UrdfBuilder(dict.fromkeys(urdf.links, ""), dict.fromkeys(urdf.joints, ""))
     elements = {e.get("name"): e for e in robot if e.tag == "joint"}
     replaced = {}
     for name, kind in zip(file.joint_name, file.joint_type, strict=True):
@@ -200,7 +201,7 @@ def replace_stand_ins(robot: etree._Element, file: MechanismFile, urdf: Urdf) ->
         replaced[name] = joint.child
         letters = str(axes_of(kind))
         parent = joint.parent
-        added = TreeText(dict(text.links), dict(text.joints))
+        added = UrdfBuilder(dict(text.links), dict(text.joints))
         for i, letter in enumerate(letters):
             last = i == len(letters) - 1
             child = joint.child if last else added.unused(f"{name}_{letter}_link")
@@ -241,7 +242,7 @@ def read_loop_source(path: Path, content: bytes) -> Source:
     for element in elements:
         robot.remove(element)
     poses = reference_poses(bare)
-    text = TreeText(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
+    text = UrdfBuilder(dict.fromkeys(bare.links, ""), dict.fromkeys(bare.joints, ""))
     pairs = [close_loop(loop, text, poses) for loop in loops]
     for line in [*text.links.values(), *text.joints.values()]:
         if line:
@@ -448,27 +449,20 @@ def _turned(before: Array, after: Array) -> float:
 
 
 def _close(chain: ClosedChain, configuration: Array) -> Array | None:
-    """Close the loops by damped Gauss-Newton steps, or return None."""
-    damping = 1e-2
-    residual, jacobian = chain.linearize(configuration)
-    for _ in range(STEPS):
-        if float(np.abs(residual).max()) <= CLOSED:
-            return configuration
-        square = jacobian @ jacobian.T + damping * np.eye(len(residual))
-        if not np.linalg.cond(square) < 1e15:  # numbers of hugely different size
-            return None
-        step = -jacobian.T @ np.linalg.solve(square, residual)
-        step *= min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300))
-        tried = chain.integrate(configuration, step)
-        new_residual, new_jacobian = chain.linearize(tried)
-        if new_residual @ new_residual < residual @ residual:
-            configuration, residual, jacobian = tried, new_residual, new_jacobian
-            damping = max(0.2 * damping, 1e-12)
-        elif damping > 1e6:
-            return None
-        else:
-            damping *= 10.0
-    return None
+    """Close the loops near a configuration, or return None."""
+
+    def equations(points: Array) -> tuple[Array, Array]:
+        residual, jacobian = chain.linearize(points[0])
+        return residual[None], jacobian[None]
+
+    def retract(points: Array, step: Array) -> Array:
+        step = step[0] * min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-300))
+        return chain.integrate(points[0], step)[None]
+
+    found = solve(
+        equations, retract, configuration[None], tolerance=CLOSED, damped=True, steps=STEPS
+    )
+    return found.points[0] if found.worst[0] <= CLOSED else None
 
 
 def _off(chain: ClosedChain, configuration: Array) -> float:

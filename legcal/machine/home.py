@@ -1,8 +1,8 @@
 """Home: a closed pose in the wanted assembly mode, given by a file or searched for.
 
 A home may lie outside a travel by a little: drawings are, and limits are often set before the
-machine is. Up to :data:`FAR` of the travel that is a note. Further out the pose is no pose of this
-machine, and everything computed there would be judged where no motor goes.
+machine is. Up to :data:`MAX_OUTSIDE` of the travel that is a note. Further out the pose is no pose
+of this machine, and everything computed there would be judged where no motor goes.
 """
 
 from collections.abc import Sequence
@@ -13,20 +13,20 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DidNotConverge, ModelError
 from legcal.geometry import Array, motion_of
-from legcal.machine.equations import equations_at, is_constrained
-from legcal.machine.kinematics import close_at, platform_pose, readings_at, settle
+from legcal.machine.equations import is_constrained, machine_equations
+from legcal.machine.kinematics import close_at, platform_pose, project_pose, readings_at
 from legcal.machine.leg import Leg, LegKind
 from legcal.machine.model import Machine
 from legcal.machine.parameters import in_links
 from legcal.machine.solver import moved, solve
 
 TRIALS = 200
-ENOUGH = 20  # trials, where one of them found a pose above the base
-TOGETHER = 21  # trials solved at once
-PATIENCE = 5  # steps that change little
+MIN_TRIALS = 20  # trials, where one of them found a pose above the base
+BATCH = 21  # trials solved at once
+MAX_STALLED = 5  # steps that change little
 NEAR = 0.05  # of the travel: as good as inside
-FAR = 1.0  # of the travel: refused beyond, if it is also beyond
-_FAR_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
+MAX_OUTSIDE = 1.0  # of the travel: refused beyond, if it is also beyond
+_MAX_OUTSIDE_OF_LEG = 0.01  # of the leg length at home, for sliders that hardly move
 
 
 def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTransform, Array]:
@@ -35,16 +35,16 @@ def closed_home(machine: Machine, home: RigidTransform | None) -> tuple[RigidTra
     Raises
     ------
     ModelError, DidNotConverge
-        As :func:`settle_home`, :func:`find_home` and :func:`legcal.machine.kinematics.close_at`.
+        As :func:`project_home`, :func:`find_home` and :func:`legcal.machine.kinematics.close_at`.
     """
     start = find_home(machine) if home is None else home
-    settled = settle_home(machine, start)
+    settled = project_home(machine, start)
     configuration = close_at(machine, settled, hold=False)
     constrained = is_constrained(machine)
     return platform_pose(machine, configuration) if constrained else settled, configuration
 
 
-def settle_home(machine: Machine, home: RigidTransform) -> RigidTransform:
+def project_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     """Return the pose nearest to home that meets every demand of legs and plane.
 
     Files give home with few digits; sliders absorb that, but rods, revolute axes and universal
@@ -55,7 +55,7 @@ def settle_home(machine: Machine, home: RigidTransform) -> RigidTransform:
     ModelError
         If home is more than 1 % of a leg length away from any such pose.
     """
-    settled, problem = settle(machine, home)
+    settled, problem = project_pose(machine, home)
     if problem is not None:
         raise ModelError(
             f"{machine.yaml_path}: legcal.home could not be used: found {problem} there, needed "
@@ -83,8 +83,8 @@ def find_home(machine: Machine) -> RigidTransform:
     centre = machine.A_base.mean(axis=0)
     reach = float(np.abs(wanted + machine.q0).mean())
     best: tuple[float, RigidTransform] | None = None
-    for first in range(0, TRIALS, TOGETHER):
-        trials = np.arange(first, min(first + TOGETHER, TRIALS))
+    for first in range(0, TRIALS, BATCH):
+        trials = np.arange(first, min(first + BATCH, TRIALS))
         starts = [
             (centre + rng.normal(0.0, reach, 3), rng.normal(0.0, 0.1 + trial / TRIALS, 3))
             for trial in trials
@@ -96,7 +96,7 @@ def find_home(machine: Machine) -> RigidTransform:
             rank = _unlikely(machine, T) + float(T.rotation.magnitude())
             if best is None or rank < best[0] - 1e-6:
                 best = rank, T
-            if trial >= ENOUGH and best[0] < 5.0:
+            if trial >= MIN_TRIALS and best[0] < 5.0:
                 return best[1]
     if best is None:
         raise DidNotConverge(
@@ -106,11 +106,11 @@ def find_home(machine: Machine) -> RigidTransform:
     return best[1]
 
 
-def home_with(machine: Machine, legs: Sequence[Leg], furthest: float) -> RigidTransform | None:
+def home_of_legs(machine: Machine, legs: Sequence[Leg], max_error: float) -> RigidTransform | None:
     """Return the closed pose nearest to home once the legs have other numbers, None if none is.
 
     *legs* are those of the machine in R_b and R_e as they are to be; both frames stay where they
-    are. Home may miss what they demand by *furthest* leg lengths; it stays where they demand
+    are. Home may miss what they demand by *max_error* leg lengths; it stays where they demand
     nothing else.
     """
     changed = tuple(
@@ -125,7 +125,7 @@ def home_with(machine: Machine, legs: Sequence[Leg], furthest: float) -> RigidTr
         )
         for leg, wanted in zip(machine.legs, in_links(machine, legs), strict=True)
     )
-    home, problem = settle(replace(machine, legs=changed), machine.home, furthest)
+    home, problem = project_pose(replace(machine, legs=changed), machine.home, max_error)
     return None if problem is not None else home
 
 
@@ -137,13 +137,19 @@ def _with_lengths(
     poses = np.concatenate([Rotation.from_rotvec(turns).as_matrix(), t[..., None]], axis=2)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = equations_at(machine, poses[:, :, :3], poses[:, :, 3])
+        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
         found.values[:, found.measured] -= lengths
         return found.values, found.by_pose
 
     unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
     found = solve(
-        equations, moved, poses, met=1e-14 * reach, unit=unit, far=True, patience=PATIENCE
+        equations,
+        moved,
+        poses,
+        tolerance=1e-14 * reach,
+        unit=unit,
+        damped=True,
+        max_stalled=MAX_STALLED,
     )
     return [
         motion_of(pose[:, :3], pose[:, 3]) if worst < 1e-9 else None
@@ -162,7 +168,7 @@ def _unlikely(machine: Machine, T: RigidTransform) -> float:
         lower, upper = leg.travel
         if leg.kind is LegKind.PASSIVE and not lower <= q <= upper:
             penalty += 5.0
-        if leg.platform_joint == "" and leg.platform_axis is not None:
+        if leg.is_fixed_to_platform and leg.platform_axis is not None:
             along = T.rotation.apply(leg.platform_axis) @ (B[j] - machine.A_base[j])
             penalty += 100.0 * float(along < 0.0)
     return penalty
@@ -179,10 +185,10 @@ def check_home_travel(machine: Machine) -> None:
     """
     far = {}
     q = readings_at(machine, machine.home)
-    for j, excess in legs_outside(machine, FAR).items():
+    for j, excess in legs_outside(machine, MAX_OUTSIDE).items():
         leg = machine.legs[j]
         length = leg.sign * float(q[j]) + leg.q0
-        if leg.kind is LegKind.ACTUATED and excess > _FAR_OF_LEG * length:
+        if leg.kind is LegKind.ACTUATED and excess > _MAX_OUTSIDE_OF_LEG * length:
             far[j] = excess
     if not far:
         return

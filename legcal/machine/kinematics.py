@@ -17,27 +17,36 @@ from legcal.errors import DidNotConverge, NotIdentifiable, UsageError
 from legcal.geometry import Array, BoolArray, IntArray, motion_of, product
 from legcal.machine.equations import (
     constraints_at,
-    equations_at,
+    describe_worst,
     freedoms,
     is_constrained,
+    machine_equations,
     pose_equations,
-    unmet,
-    worst_in_words,
+    violated_constraint,
 )
 from legcal.machine.leg import Leg, LegKind
-from legcal.machine.mobility import CLOSED, dimensionless, hardly_changes, leg_scale, side
+from legcal.machine.mobility import (
+    CLOSED,
+    determinant_sign,
+    dimensionless,
+    excludes_singularity,
+    leg_scale,
+)
 from legcal.machine.model import Machine
-from legcal.machine.solver import Equations, Retraction, moved, newton, solve, walk
+from legcal.machine.solver import Equations, Retraction, moved, newton, solve, walk_in_steps
 
-EXACT = 1e-11  # [m, rad]: where a held platform is
+POSE_TOLERANCE = 1e-11  # [m, rad]: where a held platform is
 NEAR = 2e-3  # [m, rad]: no other posture of a leg is as near as what axes may be off
 RESTARTS = 60
 CONTRACTION = 0.5  # of the step before; of 1 rad or a leg length for the first
-MET = 1e-13  # of a leg length
-SHORTEST = 1.0 / 4096.0  # of the way from known readings to the wanted ones
-FRESH, FEW_RESTARTS = 6, 2  # other angles of all legs, and of those that do not close from there
+TOLERANCE = 1e-13  # of a leg length
+MIN_STEP = 1.0 / 4096.0  # of the way from known readings to the wanted ones
+RANDOM_ANGLES, FEW_RESTARTS = (
+    6,
+    2,
+)  # other angles of all legs, and of those that do not close from there
 DEPENDENT = 1e-7  # of the largest singular value: demands that say the same
-FURTHEST = 0.01  # of a leg length: how far a given pose may be from a closed one
+MAX_POSE_ERROR = 0.01  # of a leg length: how far a given pose may be from a closed one
 
 
 def forward_kinematics(
@@ -101,7 +110,7 @@ class Follower:
         self._mechanism = machine
         self.configuration = machine.home_configuration
         if start is not None:
-            settled, problem = settle(machine, start)
+            settled, problem = project_pose(machine, start)
             if problem is not None:
                 raise UsageError(
                     f"The pose could not be followed from its start: found {problem} there, needed "
@@ -199,7 +208,7 @@ def inverse_kinematics(machine: Machine, T_base_platform: RigidTransform) -> Arr
         If the legs or the plane of motion do not allow the pose: a rod that is too short or too
         long, a revolute axis that is not perpendicular to its leg, a leg that would be twisted.
     """
-    problem = unmet(machine, T_base_platform)
+    problem = violated_constraint(machine, T_base_platform)
     if problem is not None:
         raise UsageError(
             f"The platform cannot stand there: {problem}, needed a pose that every leg "
@@ -338,35 +347,35 @@ def solve_poses(
         return values, jacobian
 
     poses = np.concatenate([R, t[..., None]], axis=2)
-    found = solve(equations, moved, poses, met=1e-15, rank=DEPENDENT, steps=steps)
+    found = solve(equations, moved, poses, tolerance=1e-15, rank=DEPENDENT, steps=steps)
     return SolvedPoses(found.points[:, :, :3], found.points[:, :, 3], found.worst, found.size)
 
 
-def settle(
-    machine: Machine, T: RigidTransform, furthest: float = FURTHEST
+def project_pose(
+    machine: Machine, T: RigidTransform, max_error: float = MAX_POSE_ERROR
 ) -> tuple[RigidTransform, str | None]:
     """Return the nearest pose that meets every constraint, and what is in the way if none is near.
 
-    Constraints may be missed by *furthest* leg lengths at the start, T_base_platform.
+    Constraints may be missed by *max_error* leg lengths at the start, T_base_platform.
     """
     if not is_constrained(machine):
         return T, None
     scale = leg_scale(machine, T)
     first = constraints_at(machine, T)
-    if np.abs(first.values).max() > furthest * scale:
-        return T, worst_in_words(machine, first)
+    if np.abs(first.values).max() > max_error * scale:
+        return T, describe_worst(machine, first)
 
     def equations(poses: Array) -> tuple[Array, Array]:
-        found = equations_at(machine, poses[:, :, :3], poses[:, :, 3])
+        found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
         held = ~found.measured
         return found.values[:, held], found.by_pose[:, held]
 
     unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
-    found = solve(equations, moved, T.as_matrix()[None, :3], met=MET * scale, unit=unit)
+    found = solve(equations, moved, T.as_matrix()[None, :3], tolerance=TOLERANCE * scale, unit=unit)
     settled = motion_of(found.points[0, :, :3], found.points[0, :, 3])
     if found.worst[0] <= 1e-9 * scale:
         return settled, None
-    return settled, worst_in_words(machine, constraints_at(machine, settled))
+    return settled, describe_worst(machine, constraints_at(machine, settled))
 
 
 def close_at(
@@ -389,7 +398,7 @@ def close_at(
     DidNotConverge
         If a leg does not close, naming its closure and the distance left.
     """
-    chain, astray = machine.chain, EXACT if hold else NEAR
+    chain, tolerance = machine.chain, POSE_TOLERANCE if hold else NEAR
     angles = np.zeros(chain.nv, dtype=np.bool_)
     for joint in machine.urdf.joints.values():
         if joint.type in ("revolute", "continuous"):
@@ -397,11 +406,11 @@ def close_at(
     # Gaps of legs shorter than a metre count in leg lengths: beside angles in radians they would
     # weigh too little to be closed, and NEAR would be a large part of a leg.
     metre = min(1.0, leg_scale(machine, T_base_platform))
-    configuration = _placed(machine, T_base_platform, start, astray)
+    configuration = _placed(machine, T_base_platform, start, tolerance)
     rng = np.random.default_rng(20020701)
     for _ in range(restarts):
         equations, retract = _held(machine, T_base_platform, metre, angles)
-        found = solve(equations, retract, configuration[None], met=0.01 * CLOSED, far=True)
+        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
         configuration = found.points[0]
         stuck = np.abs(found.values[0]) > NEAR
         if not stuck.any():
@@ -417,12 +426,12 @@ def close_at(
         pose = T_base_platform if hold else None
         every = angles if hold else np.ones(chain.nv, dtype=np.bool_)
         equations, retract = _held(machine, pose, 1.0, every)
-        found = solve(equations, retract, configuration[None], met=0.01 * CLOSED, far=True)
+        found = solve(equations, retract, configuration[None], tolerance=0.01 * CLOSED, damped=True)
         configuration, left = found.points[0], found.values[0]
     off = _off(machine, T_base_platform, configuration)
     if np.abs(left).max(initial=0.0) >= CLOSED:
         problem = f"{worst_closure(machine, left)}, needed less than 1e-12 m"
-    elif max(off) > astray:
+    elif max(off) > tolerance:
         problem = f"the platform went {_away(off)} away, needed a pose that the legs allow"
     else:
         return configuration
@@ -441,7 +450,7 @@ def worst_closure(machine: Machine, residual: Array) -> str:
 
 
 def _placed(
-    machine: Machine, T_base_platform: RigidTransform, start: Array | None, astray: float
+    machine: Machine, T_base_platform: RigidTransform, start: Array | None, tolerance: float
 ) -> Array:
     """Return a configuration with the platform and the sliders set."""
     chain = machine.chain
@@ -455,7 +464,7 @@ def _placed(
             T_base_platform,
         )
         off = _off(machine, T_base_platform, configuration)
-        if max(off) > astray:
+        if max(off) > tolerance:
             raise _not_closed(
                 machine,
                 T_base_platform,
@@ -530,13 +539,13 @@ def follow(
     configuration: Array,
     readings: Array,
     which: str = "",
-    shortest: float = SHORTEST,
+    min_step: float = MIN_STEP,
     on_the_chain: bool = False,
 ) -> Array:
     """Return the closed configuration at readings (n_motors,), followed from a closed one.
 
     It is closed to 1e-12 m, in the same assembly mode, with no leg flipped. Steps are no shorter
-    than a part *shortest* of the way. *on_the_chain* stops where the joints of the chain do: soon,
+    than a part *min_step* of the way. *on_the_chain* stops where the joints of the chain do: soon,
     but in a place that depends on the spanning tree. *which* names the readings in the message.
 
     Raises
@@ -557,22 +566,22 @@ def follow(
         reached, jacobian = _closed_from(machine, trial, free)
         if reached is None or _is_flipped(machine, reached):
             return False
-        if not hardly_changes(known, jacobian):
+        if not excludes_singularity(known, jacobian):
             if here is None:
-                here = side(machine, platform_pose(machine, configuration))
-            there = side(machine, platform_pose(machine, reached))
+                here = determinant_sign(machine, platform_pose(machine, configuration))
+            there = determinant_sign(machine, platform_pose(machine, reached))
             if not here == there != 0.0:  # not square: only ways on which little changes
                 return False
         configuration, known = reached, jacobian
         return True
 
-    done = walk(attempt, shortest)
+    done = walk_in_steps(attempt, min_step)
     if done == 1.0:
         return configuration
     T = platform_pose(machine, configuration)
     part = 0.0
     if not on_the_chain:
-        T, part = follow_pose(machine, T, configuration[q_columns], readings, shortest)
+        T, part = follow_pose(machine, T, configuration[q_columns], readings, min_step)
     if part < 1.0:
         raise DidNotConverge(
             f"{machine.yaml_path}: the pose at the readings{which} could not be reached: at "
@@ -593,7 +602,7 @@ def follow(
 
 
 def follow_pose(
-    machine: Machine, T: RigidTransform, first: Array, last: Array, shortest: float
+    machine: Machine, T: RigidTransform, first: Array, last: Array, min_step: float
 ) -> tuple[RigidTransform, float]:
     """Return the pose followed from T at first to last readings, and which part of it is done."""
     pose, known = T.as_matrix()[None, :3], dimensionless(machine, T)
@@ -605,20 +614,28 @@ def follow_pose(
         lengthening = machine.sign[motors] * readings
 
         def equations(poses: Array) -> tuple[Array, Array]:
-            found = equations_at(machine, poses[:, :, :3], poses[:, :, 3])
+            found = machine_equations(machine, poses[:, :, :3], poses[:, :, 3])
             found.values[:, found.measured] -= lengthening
             return found.values, found.by_pose
 
         scale = leg_scale(machine, motion_of(pose[0, :, :3], pose[0, :, 3]))
         unit = np.array([1.0 / scale] * 3 + [1.0] * 3)
         found = newton(
-            equations, moved, pose, met=MET * scale, contraction=CONTRACTION, first=scale, unit=unit
+            equations,
+            moved,
+            pose,
+            tolerance=TOLERANCE * scale,
+            contraction=CONTRACTION,
+            first=scale,
+            unit=unit,
         )
         there = motion_of(found.points[0, :, :3], found.points[0, :, 3])
-        if not (found.arrived[0] or found.worst[0] < MET * scale) or _is_reversed(machine, there):
+        if not (found.converged[0] or found.worst[0] < TOLERANCE * scale) or _is_reversed(
+            machine, there
+        ):
             return False
         jacobian = dimensionless(machine, there)
-        if not hardly_changes(known, jacobian):
+        if not excludes_singularity(known, jacobian):
             if known.shape[0] != known.shape[1]:
                 return False
             signs = [float(np.sign(np.linalg.det(J))) for J in (known, jacobian)]
@@ -627,7 +644,7 @@ def follow_pose(
         pose, known = found.points, jacobian
         return True
 
-    done = walk(attempt, shortest)
+    done = walk_in_steps(attempt, min_step)
     return motion_of(pose[0, :, :3], pose[0, :, 3]), done
 
 
@@ -637,7 +654,7 @@ def _closed_from(
     """Return the configuration closed with the motors held, None if not near, and its Jacobian."""
     equations, retract = _held(machine, None, 1.0, free)
     found = newton(
-        equations, retract, configuration[None], met=0.01 * CLOSED, contraction=CONTRACTION
+        equations, retract, configuration[None], tolerance=0.01 * CLOSED, contraction=CONTRACTION
     )
     return found.points[0] if found.worst[0] < CLOSED else None, found.jacobian[0]
 
@@ -651,8 +668,8 @@ def _closed_at(
     """
     rng = np.random.default_rng(1965)
     angles = machine.chain.rotation_columns()
-    turns = np.zeros((1 + FRESH, machine.chain.nv))
-    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (FRESH, machine.chain.nv))[:, angles]
+    turns = np.zeros((1 + RANDOM_ANGLES, machine.chain.nv))
+    turns[1:, angles] = rng.uniform(-np.pi, np.pi, (RANDOM_ANGLES, machine.chain.nv))[:, angles]
     tries = [(turn, True) for turn in turns] + [(turns[0], False)] * is_constrained(machine)
     for turn, hold in tries:
         there = machine.chain.integrate(start, turn)
@@ -679,7 +696,7 @@ def _is_flipped(machine: Machine, configuration: Array) -> bool:
 def _is_reversed(machine: Machine, T: RigidTransform) -> bool:
     """Say whether a leg that is fixed to the platform points the wrong way."""
     return any(
-        leg.platform_joint == ""
+        leg.is_fixed_to_platform
         and leg.platform_axis is not None
         and float(T.rotation.apply(leg.platform_axis) @ vector) <= 0.0
         for leg, vector in zip(machine.legs, leg_vectors(machine, T), strict=True)

@@ -1,9 +1,13 @@
-"""A leg: the joint at its base, a slider or a rod, the joint at its platform, and its numbers.
+"""A leg: the chain of joint, slider or rod, and joint from base to platform, and its numbers.
 
-What belongs to the base stands in a frame of the base, what belongs to the platform in a frame of
-the platform: the links for the legs of a :class:`~legcal.machine.model.Machine`, the joint
-frames R_b and R_e for :func:`legcal.machine.parameters.geometries`.
+:class:`JointType` is the one table of joints: what each leaves free, which axis it has, and which
+equations it adds to those of its leg. What belongs to the base stands in a frame of the base, what
+belongs to the platform in a frame of the platform: the links for the legs of a
+:class:`~legcal.machine.model.Machine`, the joint frames R_b and R_e for
+:func:`legcal.machine.parameters.geometries`.
 """
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +15,14 @@ from enum import StrEnum
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from legcal.geometry import Array
+from legcal.geometry import Array, distance_to_line
+from legcal.machine.bodies import Connection
 
-JointLetter = Literal["R", "U", "S"]
-PlatformLetter = Literal["R", "U", "S", ""]
-
-SHORTEST, LONGEST = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
-THINNEST, THICKEST = 2e-4, 0.5  # radius of a leg in its length; beyond, its unit is the mistake
-MOST_LEGS = 32  # the work of all that is done with them grows with the cube of their number
+MIN_LENGTH, MAX_LENGTH = 1e-3, 20.0  # [m]; legs beyond are most likely written in another unit
+MIN_RADIUS, MAX_RADIUS = 2e-4, 0.5  # of the leg length; beyond, its unit is the mistake
+MAX_LEGS = 32  # the work of all that is done with them grows with the cube of their number
 N_LOCAL = 12  # numbers of a leg: A, B, length, base axis 1 and 2, platform axis 1 and 2, twist
 
 
@@ -31,16 +34,67 @@ class LegKind(StrEnum):
     CONSTANT = "constant"
 
 
-class Demand(StrEnum):
+class EquationKind(StrEnum):
     """What an equation of a leg is about."""
 
     LENGTH = "length"
     BASE_AXIS = "base axis"
     PLATFORM_AXIS = "platform axis"
-    ALONG_1 = "direction in the platform, first angle"
-    ALONG_2 = "direction in the platform, second angle"
+    DIRECTION_1 = "direction in the platform, first angle"
+    DIRECTION_2 = "direction in the platform, second angle"
     TWIST = "twist"
     PLANE = "plane of motion"  # of the platform of a planar machine, and of no leg
+
+
+class JointType(StrEnum):
+    """The joint at one end of a leg, by its letter.
+
+    ============  ==  ======================  ====================  ============================
+    joint             axis in base, platform  axis in the leg       constraint on direction u
+    ============  ==  ======================  ====================  ============================
+    revolute      R   v                       v                     v . u = 0, eq (7)
+    universal     U   v                       v x u                 none
+    spherical     S   none                    none: the leg twists  none
+    fixed             u                       the first across u    u across its axis, two rows
+    ============  ==  ======================  ====================  ============================
+    """
+
+    n_freedoms: int  # rotations of the leg that it leaves free
+    at_base: tuple[EquationKind, ...]  # what it adds to the equations of its leg at the base,
+    at_platform: tuple[EquationKind, ...]  # and at the platform
+
+    def __new__(
+        cls,
+        letter: str,
+        n_freedoms: int = 0,
+        at_base: tuple[EquationKind, ...] = (),
+        at_platform: tuple[EquationKind, ...] = (),
+    ) -> JointType:
+        """Return a row of the table."""
+        member = str.__new__(cls, letter)
+        member._value_ = letter
+        member.n_freedoms, member.at_base, member.at_platform = n_freedoms, at_base, at_platform
+        return member
+
+    REVOLUTE = "R", 1, (EquationKind.BASE_AXIS,), (EquationKind.PLATFORM_AXIS,)
+    UNIVERSAL = "U", 2
+    SPHERICAL = "S", 3
+    FIXED = "", 0, (), (EquationKind.DIRECTION_1, EquationKind.DIRECTION_2)  # at the platform only
+
+    @property
+    def has_axis(self) -> bool:
+        """Whether it turns about an axis that is fixed in base or platform."""
+        return self in (JointType.REVOLUTE, JointType.UNIVERSAL)
+
+    @property
+    def twists_freely(self) -> bool:
+        """Whether the leg may turn about itself."""
+        return self is JointType.SPHERICAL
+
+    @property
+    def inner_is_across(self) -> bool:
+        """Whether the axis in the leg is across the leg and the axis in base or platform."""
+        return self is JointType.UNIVERSAL
 
 
 @dataclass(frozen=True)
@@ -68,18 +122,131 @@ def main_cylinders(cylinders: Sequence[Cylinder]) -> dict[str, Cylinder]:
 
 
 @dataclass(frozen=True, eq=False)
+class Step:
+    """A connection as a leg passes it from base to platform."""
+
+    connection: Connection
+    near: int  # which of its two bodies lies towards the base,
+    far: int  # and which towards the platform
+    axis: Array  # (3,) unit axis in the joint frame
+
+    @property
+    def name(self) -> str:
+        """The joint as a message names it."""
+        return self.connection.joint or "the 3d closure"
+
+    def line(self, side: int) -> tuple[Array, Array]:
+        """Return a point [m] and the direction of the axis in the body of one side."""
+        matrix = self.connection.T_body_joint[side].as_matrix()
+        return matrix[:3, 3], matrix[:3, :3] @ self.axis
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """The axis of a revolute, or the centre of a sphere, which has no direction."""
+
+    name: str
+    point: Array  # (3,) the joint's origin [m]
+    direction: Array | None  # (3,) unit vector
+
+    @property
+    def along(self) -> Array:
+        """The direction of a revolute."""
+        if self.direction is None:
+            raise ValueError("a sphere has no axis")
+        return self.direction
+
+    def distance(self, point: Array) -> float:
+        """Return how far a point is from the axis, or from the centre of a sphere [m]."""
+        if self.direction is None:
+            return float(np.linalg.norm(point - self.point))
+        return float(distance_to_line(point, self.direction, self.point))
+
+    def foot(self, point: Array) -> Array:
+        """Return the point of the axis that is nearest to a point [m]."""
+        return self.point + ((point - self.point) @ self.along) * self.along
+
+
+@dataclass(frozen=True, eq=False)
+class Pivot:
+    """What the revolutes and spheres at one end of a leg make together."""
+
+    type: JointType  # FIXED where nothing turns but the leg about itself
+    centre: Array | None  # (3,) [m]; None for R, which has an axis of possible ones
+    axes: tuple[Axis, ...]  # that of R; of U the one fixed in base or platform, then the inner one
+    spins: tuple[Axis, ...] = ()  # revolutes along the leg that are not part of it
+    spare: int = 0  # freedoms that it has beyond those of its type
+
+    @property
+    def outer(self) -> Array | None:
+        """The direction fixed in base or platform of R or U."""
+        return self.axes[0].along if self.axes else None
+
+    @property
+    def inner(self) -> Array | None:
+        """The direction fixed in the leg of R or U."""
+        return self.axes[-1].along if self.axes else None
+
+
+@dataclass(frozen=True, eq=False)
+class LegChain:
+    """The joints of one leg, and its geometry with all of them at zero in the base body's frame."""
+
+    steps: tuple[Step, ...]  # from base to platform
+    poses: tuple[RigidTransform, ...]  # of the base body, the bodies of the leg, the platform's
+    n_lower: int  # joints on the base side of the slider, or of the rod
+    slider: Step | None  # None for a leg of constant length
+    base: Pivot
+    platform: Pivot
+    A: Array  # (3,) [m]
+    B: Array  # (3,) [m]
+    u: Array  # (3,) in which a slider moves the platform end; else from A to B
+    idle_spins: int  # freedoms that turn nothing but the leg about itself
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The bodies of the leg, without base and platform."""
+        return tuple(step.connection.bodies[step.far] for step in self.steps[:-1])
+
+    @property
+    def n_upper(self) -> int:
+        """The index of the body behind the slider, or of the one of the rod."""
+        return self.n_lower + (self.slider is not None)
+
+    @property
+    def motor(self) -> str | None:
+        """The slider's joint, None for a rod."""
+        return None if self.slider is None else self.slider.connection.joint
+
+    @property
+    def reach(self) -> float:
+        """Position of B past A along u at joint value zero [m]."""
+        return float((self.B - self.A) @ self.u)
+
+    @property
+    def twists(self) -> bool:
+        """Whether an S joint lets the leg twist about itself."""
+        return self.base.type.twists_freely or self.platform.type.twists_freely
+
+    def line_in(self, body: int, point: Array) -> tuple[Array, Array]:
+        """Return a point and the direction u in one of the bodies, 0 the base's, -1 the last."""
+        matrix = self.poses[body].inv().as_matrix()
+        return matrix[:3, :3] @ point + matrix[:3, 3], matrix[:3, :3] @ self.u
+
+
+@dataclass(frozen=True, eq=False)
 class Leg:
     """A leg from its base joint centre A to its platform joint centre B.
 
     Axes are lines, given for joints whose axis is a parameter: R, and the outer axis of U in a leg
     without an S joint; none in planar machines. A leg that is fixed to the platform (the centre
-    leg of a Tricept) has the platform joint "", its direction from A to B as platform axis, and B
+    leg of a Tricept) has its direction from A to B as platform axis, and B
     at the foot of the platform link's origin. The twist is the angle about u from the inner axis at
     the base to the inner one at the platform, which a leg without an S joint keeps.
     """
 
-    base_joint: JointLetter
-    platform_joint: PlatformLetter
+    base_joint: JointType
+    platform_joint: JointType
     kind: LegKind
     A: Array  # (3,) base joint centre [m]
     B: Array  # (3,) platform joint centre [m]
@@ -92,6 +259,7 @@ class Leg:
     sign: int = 1  # -1 where the leg shrinks with the joint value
     travel: tuple[float, float] = (0.0, 0.0)  # joint limits of the slider [m]
     cylinders: tuple[Cylinder, ...] = ()  # what a camera can see of it
+    chain: LegChain | None = None  # its joints in the URDF; None where no file describes it
 
     @property
     def type(self) -> str:
@@ -105,18 +273,31 @@ class Leg:
         return {link: c.radius for link, c in main_cylinders(self.cylinders).items()}
 
     @property
-    def demands(self) -> tuple[Demand, ...]:
-        """The equations of this leg, in the order in which they are linearised."""
-        found = [Demand.LENGTH]
-        if self.base_joint == "R" and self.base_axis is not None:
-            found.append(Demand.BASE_AXIS)
-        if self.platform_joint == "R" and self.platform_axis is not None:
-            found.append(Demand.PLATFORM_AXIS)
-        if self.platform_joint == "":
-            found += [Demand.ALONG_1, Demand.ALONG_2]
+    def is_fixed_to_platform(self) -> bool:
+        """Whether the leg does not turn against the platform."""
+        return self.platform_joint is JointType.FIXED
+
+    @property
+    def equations(self) -> tuple[EquationKind, ...]:
+        """The equations of this leg, in the order of their rows."""
+        found = [EquationKind.LENGTH]
+        if self.base_axis is not None:
+            found += self.base_joint.at_base
+        if self.platform_axis is not None:
+            found += self.platform_joint.at_platform
         if self.twist is not None:
-            found.append(Demand.TWIST)
+            found.append(EquationKind.TWIST)
         return tuple(found)
+
+    @property
+    def idle_spins(self) -> int:
+        """Freedoms of its joints in the URDF that turn nothing but the leg about itself."""
+        return 0 if self.chain is None else self.chain.idle_spins
+
+    @property
+    def n_constraints(self) -> int:
+        """How many equations hold without a reading."""
+        return len(self.equations) - (self.kind is not LegKind.CONSTANT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +306,29 @@ class KinematicParameters:
 
     base_joints: Array  # (n_legs, 3) A in R_b [m]
     platform_joints: Array  # (n_legs, 3) B in R_e [m]
-    offsets: Array  # (n_legs,) q0 of actuated legs, length of constant ones, NaN of passive ones
+    offsets: Array  # (n_legs,) q0, or the length of constant legs [m]
+    passive: tuple[int, ...] = ()  # legs whose offset is no parameter, since no reading tells it
+
+
+def parameters_of_legs(legs: Sequence[Leg]) -> KinematicParameters:
+    """Return the joint centres and lengths of legs."""
+    return KinematicParameters(
+        np.array([leg.A for leg in legs]),
+        np.array([leg.B for leg in legs]),
+        np.array([leg.q0 for leg in legs]),
+        tuple(j for j, leg in enumerate(legs) if leg.kind is LegKind.PASSIVE),
+    )
 
 
 def point_like_legs(parameters: KinematicParameters) -> tuple[Leg, ...]:
-    """Return actuated legs with point-like joints; those without an offset are passive."""
-    kinds = [LegKind.PASSIVE if np.isnan(q0) else LegKind.ACTUATED for q0 in parameters.offsets]
-    joints = zip(parameters.base_joints, parameters.platform_joints, strict=True)
+    """Return legs with point-like joints, actuated where they are not passive."""
+    S = JointType.SPHERICAL
+    joints = zip(
+        parameters.base_joints, parameters.platform_joints, parameters.offsets, strict=True
+    )
     return tuple(
-        Leg("S", "S", kind, A, B, float(q0))
-        for (A, B), kind, q0 in zip(joints, kinds, parameters.offsets, strict=True)
+        Leg(S, S, LegKind.PASSIVE if j in parameters.passive else LegKind.ACTUATED, A, B, float(q0))
+        for j, (A, B, q0) in enumerate(joints)
     )
 
 

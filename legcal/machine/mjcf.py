@@ -18,7 +18,7 @@ from legcal.errors import ModelError, OutOfClass
 from legcal.files import closest
 from legcal.geometry import Array, rotation_between
 from legcal.machine.schema import MechanismFile
-from legcal.machine.tree import (
+from legcal.machine.spanning_tree import (
     DRAWING,
     EYE,
     FULL_TURN,
@@ -26,7 +26,7 @@ from legcal.machine.tree import (
     LoopKind,
     Source,
     TextCylinder,
-    TreeText,
+    UrdfBuilder,
     close_loop,
     moving_groups,
 )
@@ -226,7 +226,7 @@ class MjcfTree:
     """What is found while the bodies are walked."""
 
     values: Values
-    text: TreeText = field(default_factory=TreeText)  # the URDF
+    text: UrdfBuilder = field(default_factory=UrdfBuilder)  # the URDF
     poses: dict[str, RigidTransform] = field(default_factory=dict)
     sites: dict[str, tuple[str, RigidTransform]] = field(default_factory=dict)
     joints: dict[str, str] = field(default_factory=dict)  # the type of every hinge, slide
@@ -559,7 +559,7 @@ def _site(tree: MjcfTree, element: etree._Element, place: Place) -> None:
     tree.sites[name] = place.body, place.T_body_frame * T
 
 
-MOST_PARTS = 5000
+MAX_PARTS = 5000
 _COUPLINGS = ("joint", "tendon", "flex", "flexvert", "flexstrain")
 _WORDS = (("closed_loop", "<equality>"), ("the root of the URDF", "<worldbody>"), *DRAWING)
 _OTHER_DRIVES = ("tendon", "site", "refsite", "cranksite", "slidersite")
@@ -569,10 +569,10 @@ def read_mjcf_source(path: Path, content: bytes) -> Source:
     """Return the mechanism of an MJCF file."""
     root = parse_xml(path, content, "MJCF file")
     n_parts = sum(1 for _ in root.iter("body", "joint", "default", "frame"))
-    if n_parts > MOST_PARTS:
+    if n_parts > MAX_PARTS:
         raise ModelError(
             f"{path}: the MJCF file could not be used: found {n_parts} bodies, joints, frames and "
-            f"default classes, needed at most {MOST_PARTS}; give the mechanism alone."
+            f"default classes, needed at most {MAX_PARTS}; give the mechanism alone."
         )
     problems = Problems(path)
     values = Values(root, problems)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from legcal.geometry import Array
-from legcal.machine.equations import demands_at, is_constrained
+from legcal.machine.equations import equations_at, is_constrained
 from legcal.machine.model import Machine
 from legcal.machine.solver import solve
 
@@ -19,7 +19,7 @@ CLOSED = 1e-12  # [m], and [rad] for frames
 RANK_TOLERANCE = 1e-7  # of the largest singular value, lengths and angles made comparable
 STEP = 0.05  # [rad], and of a leg length
 CONFIGURATIONS = 3
-SURE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity between J0 and J1
+MAX_CHANGE = 0.5  # norm of J0^-1 J1 - 1 that leaves no room for a singularity between J0 and J1
 
 
 def leg_scale(machine: Machine, T_base_platform: RigidTransform) -> float:
@@ -79,7 +79,7 @@ def project(machine: Machine, configuration: Array) -> Array | None:
         equations,
         lambda points, step: chain.integrate(points[0], step[0])[None],
         configuration[None],
-        met=0.01 * CLOSED,
+        tolerance=0.01 * CLOSED,
         unit=_column_units(machine),
         steps=15,
     )
@@ -136,7 +136,7 @@ def singularity(machine: Machine, T_base_platform: RigidTransform) -> float:
     return float(np.linalg.svd(jacobian, compute_uv=False)[5])
 
 
-def side(machine: Machine, T_base_platform: RigidTransform) -> float:
+def determinant_sign(machine: Machine, T_base_platform: RigidTransform) -> float:
     """Return the sign of the determinant of the legs' equations where they are square, else 0.
 
     Between two poses of different sign lies a singularity.
@@ -152,7 +152,7 @@ def dimensionless(machine: Machine, T_base_platform: RigidTransform) -> Array:
     vectors = turned + matrix[:3, 3] - machine.A_base
     lengths = np.linalg.norm(vectors, axis=1)
     if is_constrained(machine):
-        jacobian = demands_at(machine, T_base_platform).by_pose[0]
+        jacobian = equations_at(machine, T_base_platform).by_pose[0]
         gradient, moment, centre = jacobian[:, 3:], jacobian[:, :3], turned.mean(axis=0)
         return np.hstack([(moment - np.cross(centre, gradient)) / lengths.mean(), gradient])
     motors = list(machine.motors)  # lines alone; arm x u is written out, np.cross is slow
@@ -162,7 +162,7 @@ def dimensionless(machine: Machine, T_base_platform: RigidTransform) -> Array:
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
 
 
-def hardly_changes(known: Array, jacobian: Array) -> bool:
+def excludes_singularity(known: Array, jacobian: Array) -> bool:
     """Say whether two Jacobians differ too little for one of smaller rank between them."""
     difference = jacobian - known
     if known.shape[0] == known.shape[1]:
@@ -170,9 +170,9 @@ def hardly_changes(known: Array, jacobian: Array) -> bool:
             change = np.linalg.solve(known, difference)
         except np.linalg.LinAlgError:
             change = np.full_like(known, np.inf)
-        if float(np.abs(change).sum(axis=1).max()) < SURE:
+        if float(np.abs(change).sum(axis=1).max()) < MAX_CHANGE:
             return True
     left, values, right = np.linalg.svd(known, full_matrices=False)
     rank = int(np.sum(values > 1e-6 * values[0]))
     change = (left[:, :rank].T @ difference @ right[:rank].T) / values[:rank, None]
-    return float(np.linalg.norm(change, 2)) < SURE
+    return float(np.linalg.norm(change, 2)) < MAX_CHANGE

@@ -12,8 +12,14 @@ from scipy.spatial.transform import RigidTransform
 from legcal.errors import UsageError
 from legcal.geometry import Array, frame_on_points
 from legcal.machine.chain import ClosedChain
-from legcal.machine.classification import LegChain
-from legcal.machine.leg import Cylinder, KinematicParameters, Leg, LegKind
+from legcal.machine.leg import (
+    Cylinder,
+    JointType,
+    KinematicParameters,
+    Leg,
+    LegKind,
+    parameters_of_legs,
+)
 from legcal.machine.urdf import Urdf
 
 
@@ -34,7 +40,6 @@ class Machine:
     home_configuration: Array  # (nq,) the closed chain there
     chain: ClosedChain  # the tree and its closures in Pinocchio
     urdf: Urdf  # the tree as written
-    leg_chains: tuple[LegChain, ...]  # the joints of every leg
     mobility: int = 0  # freedoms of the platform
     diagnostics: tuple[str, ...] = ()  # what the reader should know, one sentence each
     base_normal: Array | None = None  # (3,) of the plane of motion in the links of base and
@@ -99,8 +104,8 @@ class Machine:
         for rank, leg in enumerate(self.frame_legs):  # zero by definition, not by rounding
             base[leg, rank:n_d] = 0.0
             platform[leg, rank:n_d] = 0.0
-        passive = [leg.kind is LegKind.PASSIVE for leg in self.legs]
-        return KinematicParameters(base, platform, np.where(passive, np.nan, self.q0))
+        found = parameters_of_legs(self.legs)
+        return replace(found, base_joints=base, platform_joints=platform)
 
     def with_cylinders(self, cylinders: Sequence[Sequence[Cylinder]]) -> "Machine":
         """Return the mechanism with other visible cylinders of its legs."""
@@ -127,7 +132,6 @@ class Machine:
         return replace(
             self,
             legs=tuple(self.legs[j] for j in order),
-            leg_chains=tuple(self.leg_chains[j] for j in order),
             frame_legs=tuple(order.index(j) for j in self.frame_legs),
         )
 
@@ -153,9 +157,9 @@ def describe(machine: Machine) -> dict[str, Any]:
         "motors": len(machine.motors),
         "n": machine.n_legs,
         "n_d": len(machine.frame_legs),
-        "r": sum(leg.base_joint == "R" for leg in machine.legs),
+        "r": sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
         "n_ac": len(kinds) - kinds.count(LegKind.PASSIVE),
-        "idle_spins": sum(chain.idle_spins for chain in machine.leg_chains),
+        "idle_spins": sum(leg.idle_spins for leg in machine.legs),
         "legs": [_leg(leg) for leg in machine.legs],
         "diagnostics": list(machine.diagnostics),
     }

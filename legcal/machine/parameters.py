@@ -56,7 +56,7 @@ def parametrize(
         free[j, 7:9] = leg.base_axis is not None
         free[j, 9:11] = leg.platform_axis is not None
         free[j, _TWIST] = twists and leg.twist is not None
-        if leg.platform_joint == "" and leg.platform_axis is not None:  # B anywhere on the line
+        if leg.is_fixed_to_platform and leg.platform_axis is not None:  # B anywhere on the line
             free[j, 3 + int(np.argmax(np.abs(leg.platform_axis)))] = False
     found: list[tuple[str, str]] = []
     place = np.full(free.shape, -1, dtype=np.intp)
@@ -132,7 +132,7 @@ def _in_frames(
 
 
 def to_vector(parameters: KinematicParameters, frame_legs: Sequence[int]) -> Array:
-    """Return point-like parameters as one vector [m], in the order of :func:`parametrize`."""
+    """Return parameters as one vector [m], passive or not, as :func:`parametrize` orders them."""
     free = free_coordinates(len(parameters.offsets), frame_legs)
     return np.concatenate(
         [parameters.base_joints[free], parameters.platform_joints[free], parameters.offsets]
@@ -185,7 +185,7 @@ def moved_legs(legs: Sequence[Leg], place: IntArray, step: Array) -> tuple[Leg, 
     return tuple(moved)
 
 
-def footed(legs: Sequence[Leg], origin: Array) -> tuple[Leg, ...]:
+def with_platform_foot(legs: Sequence[Leg], origin: Array) -> tuple[Leg, ...]:
     """Return legs with B where models put it on those that are fixed to the platform.
 
     Nothing depends on where B lies on the line of such a leg; models take the foot of the platform
@@ -193,7 +193,7 @@ def footed(legs: Sequence[Leg], origin: Array) -> tuple[Leg, ...]:
     """
     found = []
     for leg in legs:
-        if leg.platform_joint == "" and leg.platform_axis is not None:
+        if leg.is_fixed_to_platform and leg.platform_axis is not None:
             along = float((origin - leg.B) @ leg.platform_axis)
             leg = replace(leg, B=leg.B + along * leg.platform_axis, q0=leg.q0 + along)
         found.append(leg)
@@ -216,7 +216,7 @@ def twist_after(leg: Leg, turn: Rotation) -> float | None:
     The twist of a leg that is fixed to the platform counts to the first :func:`normal_basis` vector
     of its direction, which is not turned with it.
     """
-    if leg.twist is None or leg.platform_axis is None or leg.platform_joint != "":
+    if leg.twist is None or leg.platform_axis is None or not leg.is_fixed_to_platform:
         return leg.twist
     outer = np.asarray(turn.apply(normal_basis(leg.platform_axis)[0]))
     e1, e2 = normal_basis(np.asarray(turn.apply(leg.platform_axis)))
@@ -272,7 +272,7 @@ def tied_twist_slope(leg: Leg, nominal: Leg) -> Array:
     and the turned one, as corners of a spherical triangle, exceed pi.
     """
     u, n = leg.platform_axis, nominal.platform_axis
-    if u is None or n is None or leg.platform_joint != "":
+    if u is None or n is None or not leg.is_fixed_to_platform:
         return np.zeros(2)
     n = n if n @ u > 0.0 else -n
     e1, e2 = normal_basis(u)

@@ -1,9 +1,9 @@
-"""Steps to where equations are met, for many points of a manifold at once.
+"""Roots and least squares of equations, for many points of a manifold at once.
 
 One solver for platform poses and for configurations of the closed chain: Gauss-Newton steps of
 least norm, damped where they do not lead downhill (Levenberg-Marquardt). Where a solution has to be
-the one that belongs to the start, steps are not damped but must shrink; :func:`walk` then divides
-the way.
+the one that belongs to the start, steps are not damped but must shrink; :func:`walk_in_steps` then
+divides the way.
 """
 
 from collections.abc import Callable
@@ -18,10 +18,9 @@ Equations = Callable[[Array], tuple[Array, Array]]  # points (k, ...) to (k, m) 
 Retraction = Callable[[Array, Array], Array]  # points (k, ...) and steps (k, n) to points
 
 RANK = 1e-9  # of the largest singular value: what is smaller counts as dependent
-FIRST_DAMPING, UNDAMPED, HOPELESS = 1e-3, 1e-12, 1e6  # of the mean eigenvalue
-LEAST_STEP = 1e-14  # of the unit
-PATIENCE = 5  # steps that change little
-LARGEST_TURN = 0.5  # [rad] in one step of a pose
+INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-12, 1e6  # of the mean eigenvalue
+MIN_STEP = 1e-14  # of the unit
+MAX_TURN = 0.5  # [rad] in one step of a pose
 
 
 class Solved(NamedTuple):
@@ -31,7 +30,7 @@ class Solved(NamedTuple):
     values: Array  # (k, m) what is left
     jacobian: Array  # (k, m, n)
     size: Array  # (k,) the largest component of the last step, in its unit
-    arrived: BoolArray  # (k,) equations met, or at rest where they are met best
+    converged: BoolArray  # (k,) residual below the tolerance, or least squares at rest
 
     @property
     def worst(self) -> Array:
@@ -44,29 +43,29 @@ def solve(
     retract: Retraction,
     points: Array,
     *,
-    met: Array | float,
+    tolerance: Array | float,
     unit: Array | float = 1.0,
     rank: float = RANK,
-    far: bool = False,
+    damped: bool = False,
     steps: int = 60,
-    patience: int | None = None,
+    max_stalled: int | None = None,
 ) -> Solved:
     """Return the points (k, ...) to which damped steps lead.
 
-    *met* is what may be left of the equations; *unit* (n,) divides the components of steps before
-    their size counts. Steps are damped from the first where the start is *far*, else where one does
-    not lead downhill. With *patience* points are given up that hardly improve.
+    *tolerance* is that of residuals; *unit* (n,) divides the components of steps before their size
+    counts. Steps are damped from the first if *damped*, else where one does not lead downhill.
+    Points that hardly improve in more than *max_stalled* steps are given up.
     """
     points = points.copy()
     values, jacobian = equations(points)
     cost = np.einsum("km,km->k", values, values)
-    damping = np.minimum(FIRST_DAMPING if far else 0.0, cost)
+    damping = np.minimum(INITIAL_DAMPING if damped else 0.0, cost)
     size = np.zeros(len(points))
-    stuck = np.zeros(len(points), dtype=np.intp)
+    stalled = np.zeros(len(points), dtype=np.intp)
     moving = np.ones(len(points), dtype=np.bool_)
     for _ in range(steps):
         worst = np.abs(values).max(axis=1, initial=0.0)
-        moving &= worst > met
+        moving &= worst > tolerance
         if not moving.any():
             break
         step = np.zeros((len(points), jacobian.shape[2]))
@@ -76,14 +75,14 @@ def solve(
         ahead, slopes = equations(trial)
         ahead_cost = np.einsum("km,km->k", ahead, ahead)
         better = moving & (ahead_cost < cost)
-        if patience is not None:
-            stuck = np.where(better, np.where(ahead_cost > 0.9 * cost, stuck + 1, 0), stuck)
-            moving &= stuck <= patience
+        if max_stalled is not None:
+            stalled = np.where(better, np.where(ahead_cost > 0.9 * cost, stalled + 1, 0), stalled)
+            moving &= stalled <= max_stalled
         points[better], values[better], jacobian[better] = (
             trial[better], ahead[better], slopes[better]
         )  # fmt: skip
         cost[better] = ahead_cost[better]
-        at_rest = (worst < 100.0 * met) | (size < LEAST_STEP) | (damping > HOPELESS)
+        at_rest = (worst < 100.0 * tolerance) | (size < MIN_STEP) | (damping > MAX_DAMPING)
         moving &= better | ~at_rest
         damping = np.where(better, 0.1 * damping, np.maximum(10.0 * damping, 1e-8))
     return Solved(points, values, jacobian, size, ~moving)
@@ -94,7 +93,7 @@ def newton(
     retract: Retraction,
     points: Array,
     *,
-    met: float,
+    tolerance: float,
     contraction: float,
     first: float = 1.0,
     unit: Array | float = 1.0,
@@ -102,15 +101,15 @@ def newton(
 ) -> Solved:
     """Return the points to which steps lead that shrink from one to the next.
 
-    *first* bounds the first step by the same *contraction*. What did not shrink has not arrived,
-    unless it is met already.
+    *first* bounds the first step by the same *contraction*. What did not shrink has not converged,
+    unless its residual is below the tolerance.
     """
     values, jacobian = equations(points)
     previous = np.full(len(points), first)
-    arrived, moving = np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)
+    converged, moving = np.zeros(len(points), np.bool_), np.ones(len(points), np.bool_)
     for _ in range(steps):
-        ok = np.abs(values).max(axis=1, initial=0.0) < met
-        arrived |= moving & ok
+        ok = np.abs(values).max(axis=1, initial=0.0) < tolerance
+        converged |= moving & ok
         moving &= ~ok
         if not moving.any():
             break
@@ -124,17 +123,17 @@ def newton(
         points = retract(points, step * unit)
         previous = np.where(moving, size, previous)
         values, jacobian = equations(points)
-        still = moving & (size < met)
-        arrived |= still
+        still = moving & (size < tolerance)
+        converged |= still
         moving &= ~still
-    return Solved(points, values, jacobian, previous, arrived)
+    return Solved(points, values, jacobian, previous, converged)
 
 
-def walk(attempt: Callable[[float], bool], shortest: float) -> float:
+def walk_in_steps(attempt: Callable[[float], bool], min_step: float) -> float:
     """Return which part of a way is done, walked in steps that are halved where one fails.
 
     ``attempt(part)`` tries to reach a part of the way from where the last successful one ended; no
-    step is shorter than a part *shortest* of the way.
+    step is shorter than a part *min_step* of the way.
     """
     done, step = 0.0, 1.0
     while done < 1.0:
@@ -143,7 +142,7 @@ def walk(attempt: Callable[[float], bool], shortest: float) -> float:
             done, step = wanted, 2.0 * step
         else:
             step *= 0.5
-            if step < shortest:
+            if step < min_step:
                 break
     return done
 
@@ -154,7 +153,7 @@ def moved(poses: Array, step: Array) -> Array:
     Steps that turn far are shortened.
     """
     turn = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
-    step = step * np.minimum(1.0, LARGEST_TURN / np.maximum(turn, 1e-300))
+    step = step * np.minimum(1.0, MAX_TURN / np.maximum(turn, 1e-300))
     R = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :, :3]
     return np.concatenate([R, (poses[:, :, 3] + step[:, 3:])[..., None]], axis=2)
 
@@ -163,7 +162,7 @@ def _damped(jacobian: Array, values: Array, damping: Array, rank: float) -> Arra
     """Return steps (k, n), damped by parts of the mean eigenvalue."""
     n = jacobian.shape[2]
     step = np.zeros((len(values), n))
-    free = damping < UNDAMPED
+    free = damping < MIN_DAMPING
     if free.any():
         step[free] = -_least(jacobian[free], values[free], rank)
     if not free.all():
@@ -177,7 +176,7 @@ def _damped(jacobian: Array, values: Array, damping: Array, rank: float) -> Arra
 
 
 def _least(jacobian: Array, values: Array, rank: float) -> Array:
-    """Return the shortest solutions (k, n) of linear equations, or of those that are met best."""
+    """Return the shortest least-squares solutions (k, n) of linear equations."""
     if len(values) == 1 and jacobian.shape[1] == jacobian.shape[2]:
         try:
             change = np.linalg.solve(jacobian, values[..., None])[..., 0]

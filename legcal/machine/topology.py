@@ -22,18 +22,16 @@ from legcal.machine.bodies import Bodies, Connection, frame_link, rigid_bodies
 from legcal.machine.chain import Closure
 from legcal.machine.classification import (
     CONCURRENT,
-    Axis,
-    LegChain,
-    Step,
+    classify_leg,
     nearest,
     off_square,
     parallel,
-    understand,
     undirected,
 )
+from legcal.machine.leg import Axis, LegChain, Step
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock
-from legcal.machine.tree import reference_poses
+from legcal.machine.spanning_tree import reference_poses
 from legcal.machine.urdf import Urdf, UrdfJoint
 
 Normals = tuple[Array, Array]
@@ -57,7 +55,7 @@ def find_chains(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[Le
             "legcal.platform."
         )
     origin = np.asarray(bodies.T_body_link[platform].translation)
-    return [understand(steps, origin, urdf.path) for steps in _paths(bodies, urdf, *ends)]
+    return [classify_leg(steps, origin, urdf.path) for steps in _paths(bodies, urdf, *ends)]
 
 
 def _paths(bodies: Bodies, urdf: Urdf, base: str, platform: str) -> list[list[Step]]:
@@ -390,7 +388,7 @@ def _name(connection: Connection) -> str:
 
 def _normals(chain: LegChain) -> Normals | None:
     """Return the direction of all axes of a leg in base and platform, None if they differ."""
-    if chain.base.letter != "R" or chain.platform.letter not in ("R", ""):
+    if chain.base.type.n_freedoms != 1 or chain.platform.type.n_freedoms > 1:
         return None
     v, w = chain.base.inner, chain.platform.inner
     if v is None or (w is not None and not parallel(v, w)):

@@ -64,7 +64,9 @@ def parse_xml(path: Path, content: bytes, what: str) -> etree._Element:
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
 
-LARGEST = 1e12  # squares of larger numbers overflow; none of them is a length, an angle or a limit
+MAX_NUMBER = (
+    1e12  # squares of larger numbers overflow; none of them is a length, an angle or a limit
+)
 
 # element -> attribute -> how many numbers it holds, and whether they must be positive
 _NUMERIC: dict[str, dict[str, tuple[int, bool]]] = {
@@ -111,7 +113,7 @@ def number_list(text: str, count: int) -> list[float] | None:
     if len(words) != count or not all(_NUMBER.match(word) for word in words):
         return None
     numbers = [float(word) for word in words]
-    return numbers if all(math.isfinite(x) and abs(x) < LARGEST for x in numbers) else None
+    return numbers if all(math.isfinite(x) and abs(x) < MAX_NUMBER for x in numbers) else None
 
 
 def check_numbers(element: etree._Element, problems: Problems) -> None:

@@ -128,7 +128,7 @@ def _length_errors(
     # Points of the plane are complex numbers x + i y here.
     A, B = (P[:, 0] + 1j * P[:, 1] for P in (parameters.base_joints, parameters.platform_joints))
     for row in np.unique(axes.row):
-        length = q[row] + parameters.offsets
+        length = q[row] + machine.offsets
         here = np.flatnonzero((axes.row == row) & (place[axes.leg] >= 0))
         here = here[np.isfinite(length[axes.leg[here]])]
         if len(here) < 2:

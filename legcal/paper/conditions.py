@@ -14,7 +14,7 @@ from math import comb
 import numpy as np
 
 from legcal.geometry import Array, IntArray
-from legcal.machine import Leg, LegKind, n_frame_legs
+from legcal.machine import EquationKind, Leg, LegKind, n_frame_legs
 
 _SAME_DIRECTION = 1e-9  # of the normalised information of eq (6)
 _AT_ONCE = 3  # legs that give the pose of the platform in the camera frame, eq (18)
@@ -99,7 +99,7 @@ def three_legs_at_once(
     for j, leg in enumerate(legs):
         together = [set(view) for view in views if j in view]
         axes = leg.platform_axis is not None or (
-            leg.base_axis is not None and leg.base_joint == "U"
+            leg.base_axis is not None and EquationKind.BASE_AXIS not in leg.equations
         )
         if spatial and axes and not any(len(view) >= _AT_ONCE for view in together):
             missing.add(j)

@@ -35,7 +35,7 @@ class StagedResult:
 
     @property
     def parameters(self) -> KinematicParameters:
-        """Joint centres [m] and offsets [m], NaN for passive legs."""
+        """Joint centres [m] and offsets [m]."""
         return self.machine.parameters
 
 

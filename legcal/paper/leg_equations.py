@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from legcal.machine import Demand
+from legcal.machine import EquationKind, JointType, VectorOps, axis_in_leg, twist_residual
 from legcal.paper.motions import moved_points, turned_frame, turned_points
 
 N_UNKNOWNS = 15
@@ -41,7 +41,9 @@ def length_of_leg() -> ca.Function:
 
 
 @cache
-def constraint_of_leg(about: Demand, base_joint: str, platform_joint: str) -> ca.Function:
+def constraint_of_leg(
+    about: EquationKind, base_joint: JointType, platform_joint: JointType
+) -> ca.Function:
     """Return (local; B, R, t, A, a, b, twist, sigma) -> residuals of a constraint, in sigmas.
 
     a and b are the frames (3, 3) of the axes at base and platform where turns are zero: an axis and
@@ -53,13 +55,13 @@ def constraint_of_leg(about: Demand, base_joint: str, platform_joint: str) -> ca
     a, b = ca.SX.sym("a", 3, 3), ca.SX.sym("b", 3, 3)
     twist, sigma = ca.SX.sym("twist"), ca.SX.sym("sigma")
     u, frame = leg.vector / ca.norm_2(leg.vector), leg.in_base(turned_frame(leg.local[6:8], b))
-    if about is Demand.PLATFORM_AXIS:
+    if about is EquationKind.PLATFORM_AXIS:
         residual = ca.dot(frame[:, 0], u)
-    elif about is Demand.ALONG_1:
+    elif about is EquationKind.DIRECTION_1:
         residual = frame[:, 1:].T @ u
     else:
         base = turned_frame(leg.local[4:6], a)[:, 0]
-        outer = frame[:, 1 if platform_joint == "" else 0]
+        outer = frame[:, 1 if platform_joint is JointType.FIXED else 0]
         total = twist + leg.local[8]
         residual = _sine_of_twist((base_joint, platform_joint), base, outer, u, total)
     observed = [*leg.known, a, b, twist, sigma]
@@ -67,7 +69,7 @@ def constraint_of_leg(about: Demand, base_joint: str, platform_joint: str) -> ca
 
 
 @cache
-def closure_of_leg(base_joint: str, platform_joint: str) -> ca.Function:
+def closure_of_leg(base_joint: JointType, platform_joint: JointType) -> ca.Function:
     """Return (turns of a, of b, twist; u, R, a, b, twist, unit) -> sine of the twist over unit.
 
     As :func:`constraint_of_leg` has it, where direction u and rotation R of the platform are known.
@@ -76,23 +78,27 @@ def closure_of_leg(base_joint: str, platform_joint: str) -> ca.Function:
     a, b = ca.SX.sym("a", 3, 3), ca.SX.sym("b", 3, 3)
     twist, unit = ca.SX.sym("twist"), ca.SX.sym("unit")
     base = turned_frame(local[:2], a)[:, 0]
-    outer = R @ turned_frame(local[2:4], b)[:, 1 if platform_joint == "" else 0]
+    outer = R @ turned_frame(local[2:4], b)[:, 1 if platform_joint is JointType.FIXED else 0]
     sine = _sine_of_twist((base_joint, platform_joint), base, outer, u, twist + local[4])
     return ca.Function("closure", [local, u, R, a, b, twist, unit], [sine / unit])
 
 
-def _sine_of_twist(joints: tuple[str, str], a: ca.SX, b: ca.SX, u: ca.SX, twist: ca.SX) -> ca.SX:
-    """Return sin(angle - twist) of the inner axes of a leg about its direction u.
+def _sine_of_twist(
+    joints: tuple[JointType, JointType], a: ca.SX, b: ca.SX, u: ca.SX, twist: ca.SX
+) -> ca.SX:
+    """Return the residual of the twist of a leg about its direction u.
 
     a and b are the outer axes at base and platform in one frame, of a leg fixed to the platform the
-    first direction across it. The inner axis of a universal joint is the outer one across u, of
-    others the outer one.
+    first direction across it.
     """
     p, w = (
-        ca.cross(axis, u) / ca.norm_2(ca.cross(axis, u)) if joint == "U" else axis
-        for joint, axis in zip(joints, (a, b), strict=True)
+        axis_in_leg(joint, axis, u, _SYMBOLS) for joint, axis in zip(joints, (a, b), strict=True)
     )
-    return ca.cos(twist) * ca.dot(u, ca.cross(p, w)) - ca.sin(twist) * ca.dot(p, w)
+    sine: ca.SX = twist_residual(p, w, u, twist, _SYMBOLS)
+    return sine
+
+
+_SYMBOLS = VectorOps(ca.dot, ca.cross, lambda v: v / ca.norm_2(v), ca.cos, ca.sin)
 
 
 class _Leg(NamedTuple):

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from legcal.geometry import Array, BoolArray
 from legcal.machine import (
+    EquationKind,
     KinematicParameters,
     Leg,
     LegKind,
     Machine,
     geometries,
+    parameters_of_legs,
     point_like_legs,
 )
 
@@ -48,13 +50,14 @@ class NominalMachine:
 
     @cached_property
     def parameters(self) -> KinematicParameters:
-        """Joint centres and offsets [m]; constant legs have their length, passive NaN."""
+        """Joint centres and offsets [m]; constant legs have their length."""
+        return parameters_of_legs(self.legs)
+
+    @cached_property
+    def offsets(self) -> Array:
+        """Offsets, (n_legs,) [m]; NaN for passive legs, like their readings."""
         passive = np.array([leg.kind is LegKind.PASSIVE for leg in self.legs])
-        return KinematicParameters(
-            np.array([leg.A for leg in self.legs]),
-            np.array([leg.B for leg in self.legs]),
-            np.where(passive, np.nan, [leg.q0 for leg in self.legs]),
-        )
+        return np.where(passive, np.nan, self.parameters.offsets)
 
     @cached_property
     def constant(self) -> BoolArray:
@@ -64,15 +67,13 @@ class NominalMachine:
     @cached_property
     def on_platform(self) -> BoolArray:
         """Which legs are fixed to the platform, (n_legs,)."""
-        return np.array([leg.platform_joint == "" for leg in self.legs], dtype=np.bool_)
+        return np.array([leg.is_fixed_to_platform for leg in self.legs], dtype=np.bool_)
 
     @cached_property
     def revolute(self) -> BoolArray:
         """Which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
-        return np.array(
-            [leg.base_joint == "R" and leg.base_axis is not None for leg in self.legs],
-            dtype=np.bool_,
-        )
+        constrained = [EquationKind.BASE_AXIS in leg.equations for leg in self.legs]
+        return np.array(constrained, dtype=np.bool_)
 
     @cached_property
     def base_axes(self) -> Array:
@@ -99,5 +100,5 @@ def point_like_machine(
     sign: NDArray[Any],
     frame_legs: tuple[int, ...],
 ) -> NominalMachine:
-    """Return a machine with point-like joints; legs without an offset are passive."""
+    """Return a machine with point-like joints."""
     return NominalMachine(tuple(leg_names), point_like_legs(parameters), sign, frame_legs)

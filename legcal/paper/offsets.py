@@ -48,7 +48,7 @@ def identify_offsets(
         _check_identifiable(machine, directions, pairs, solution)
         return replace(machine, legs=unknowns.legs(solution.x, machine.legs))
     for _ in range(_REWEIGHTINGS):
-        q0 = machine.parameters.offsets
+        q0 = machine.offsets
         solution = solve_least_squares(build_constant_distances(nominal, directions, q0, sigma_q))
         _check_identifiable(nominal, directions, pairs, solution, mean_length(directions, q0))
         machine = replace(machine, legs=unknowns.legs(solution.x, machine.legs))
@@ -149,7 +149,7 @@ def pairs_apart(machine: NominalMachine, directions: LegDirections) -> IntArray:
     Two legs that meet in one platform joint are at distance zero whatever their offsets are; a leg
     that is fixed to the platform ends on it whatever its offset is.
     """
-    q0, B = machine.parameters.offsets, machine.parameters.platform_joints
+    q0, B = machine.offsets, machine.parameters.platform_joints
     pairs = pairs_of_legs(directions, q0)
     legs = directions.leg[pairs]
     gap = np.linalg.norm(B[legs[:, 0]] - B[legs[:, 1]], axis=1)
@@ -211,7 +211,7 @@ def _check_identifiable(
     largest_sigma: float = np.inf,
 ) -> None:
     """Refuse when an offset can change without any distance noticing."""
-    with_offset = np.flatnonzero(np.isfinite(machine.parameters.offsets))
+    with_offset = np.flatnonzero(np.isfinite(machine.offsets))
     loose = solution.undetermined(len(with_offset))
     if np.isfinite(largest_sigma):
         sigma = np.sqrt(np.diag(solution.covariance())[: len(with_offset)])

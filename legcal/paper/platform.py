@@ -27,7 +27,7 @@ import numpy as np
 
 from legcal.errors import DidNotConverge, NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray
-from legcal.machine import Demand, linearize
+from legcal.machine import EquationKind, JointType, leg_equations
 from legcal.paper.joints_in_base import JointsInBase
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
@@ -104,6 +104,9 @@ def locate_platform_joints(
     return replace(machine, legs=legs), diagnostics
 
 
+_OF_STEP_4 = {EquationKind.PLATFORM_AXIS, EquationKind.DIRECTION_1, EquationKind.TWIST}
+
+
 @dataclass(frozen=True, eq=False)
 class RigidProblem:
     """What the rigid criterion is built of."""
@@ -132,7 +135,7 @@ class RigidProblem:
         for v, T in enumerate(base.T_Rb_camera):
             if T is not None:
                 centre[directions.view == v] = T.translation
-        q0, of_A = machine.parameters.offsets, _covariance_of_A(directions, base)
+        q0, of_A = machine.offsets, _covariance_of_A(directions, base)
         covariance = leg_end_covariance(directions, q0, sigma_q) + of_A
         poses = locate_platform(
             directions,
@@ -160,7 +163,7 @@ class RigidProblem:
         pose, B = self.poses.pose[rows], self.unknowns.known_B[self.directions.leg[rows]]
         return B, self.poses.R[pose], self.poses.t[pose], self.directions.A[rows]
 
-    def sigma(self, rows: IntArray, about: Demand, least: float) -> Array:
+    def sigma(self, rows: IntArray, about: EquationKind, least: float) -> Array:
         """Return standard deviations of an equation (k,), *least* with an exact A.
 
         Lengths and constraints hold exactly, but between joints A that have errors: an error of A
@@ -173,8 +176,8 @@ class RigidProblem:
             here = np.flatnonzero(which.ravel() == k)
             leg = replace(self.machine.legs[directions.leg[rows[i]]], A=directions.A[rows[i]])
             pose = self.poses.pose[rows[here]]
-            linear = linearize(leg, self.poses.R[pose], self.poses.t[pose])
-            by_A = linear.by_local[:, linear.demands.index(about), :3]
+            linear = leg_equations(leg, self.poses.R[pose], self.poses.t[pose])
+            by_A = linear.by_local[:, linear.kinds.index(about), :3]
             of_A = self.A_covariance[rows[here]]
             variance[here] = np.einsum("ni,nij,nj->n", by_A, of_A, by_A)
         return np.asarray(np.sqrt(least**2 + variance))
@@ -213,7 +216,7 @@ def build_rigid(rigid: RigidProblem) -> LeastSquares:
     NotIdentifiable if no pose shows two legs at once.
     """
     directions, poses, machine = rigid.directions, rigid.poses, rigid.machine
-    q0, B = machine.parameters.offsets, machine.parameters.platform_joints
+    q0, B = machine.offsets, machine.parameters.platform_joints
     mean_offset = np.mean(q0[np.isfinite(q0)])
     posed = np.flatnonzero(poses.pose >= 0)
     # Groups without a pose: distances between ends are all they give.
@@ -241,7 +244,7 @@ def build_rigid(rigid: RigidProblem) -> LeastSquares:
     observed = directions.u[posed], directions.basis[posed], whitener(directions.covariance[posed])
     readings = (
         directions.reading[with_length],
-        rigid.sigma(with_length, Demand.LENGTH, sigma_length),
+        rigid.sigma(with_length, EquationKind.LENGTH, sigma_length),
     )
     terms = (
         Term(_ends_and_joints(), index, (observed_legs(directions, pairs), sigma), robust=True),
@@ -266,12 +269,12 @@ def _ends_and_joints() -> ca.Function:
 def _constraints(rigid: RigidProblem, rows: IntArray) -> list[Term]:
     """Return the residuals of constraints of legs at unknown poses, in standard deviations."""
     legs, unknowns, terms = rigid.machine.legs, rigid.unknowns, []
-    constrained: dict[tuple[Demand, str, str], list[int]] = {}
+    constrained: dict[tuple[EquationKind, JointType, JointType], list[int]] = {}
     for j, leg in enumerate(legs):
-        for about in {Demand.PLATFORM_AXIS, Demand.ALONG_1, Demand.TWIST}.intersection(leg.demands):
+        for about in _OF_STEP_4.intersection(leg.equations):
             constrained.setdefault((about, leg.base_joint, leg.platform_joint), []).append(j)
     for kind, those in sorted(constrained.items()):
-        usable = rows[rigid.in_base[rows]] if kind[0] is Demand.TWIST else rows
+        usable = rows[rigid.in_base[rows]] if kind[0] is EquationKind.TWIST else rows
         here = usable[np.isin(rigid.directions.leg[usable], those)]
         if not len(here):
             continue

@@ -17,7 +17,7 @@ import numpy as np
 
 from legcal.errors import NotIdentifiable
 from legcal.geometry import Array, BoolArray, IntArray, frame_on_points
-from legcal.machine import Leg, LegKind, tied_twist, twist_after
+from legcal.machine import EquationKind, JointType, Leg, LegKind, tied_twist, twist_after
 from legcal.paper.joints_in_base import JointsInBase, distance_of_joints
 from legcal.paper.least_squares import LeastSquares, Term, solve_least_squares
 from legcal.paper.leg_directions import LegDirections
@@ -68,7 +68,7 @@ def platform_as_printed(
     directions, centre, in_base = _in_base_frame(machine, base, directions, transformation)
     poses = locate_platform(
         directions,
-        leg_ends(directions, machine.parameters.offsets),
+        leg_ends(directions, machine.offsets),
         np.array([leg.B for leg in legs]),
         centre=centre,
         transformation=transformation,
@@ -97,7 +97,7 @@ def build_mean_distances(
 
     Two legs that end in one place have none. In a plane the heights of R_e are nominal.
     """
-    q0 = machine.parameters.offsets
+    q0 = machine.offsets
     ends = leg_ends(directions, q0)
     pairs = pairs_of_legs(directions, q0)
     B = machine.parameters.platform_joints[directions.leg[pairs]]
@@ -160,15 +160,15 @@ def _with_axis_and_end(
     here = np.flatnonzero((directions.leg == j) & (poses.pose >= 0))
     u, R, t = directions.u[here], poses.R[poses.pose[here]], poses.t[poses.pose[here]]
     u_Re = np.einsum("nij,ni->nj", R, u)
-    if nominal is not None and leg.platform_joint == "R":
+    if nominal is not None and EquationKind.PLATFORM_AXIS in leg.equations:
         leg = replace(leg, platform_axis=revolute_axis(name, u_Re, nominal))
-    elif nominal is not None and leg.platform_joint == "":
+    elif nominal is not None and leg.is_fixed_to_platform:
         fixed = replace(leg, platform_axis=fixed_direction(name, u_Re))
         twist = None if leg.twist is None else tied_twist(fixed, leg, leg.twist)
         leg = replace(fixed, twist=twist)
     if leg.kind is LegKind.PASSIVE:
         free = np.flatnonzero(unknowns.place[j, OF_B] >= 0)
-        if j in machine.frame_legs and leg.platform_joint != "":
+        if j in machine.frame_legs and not leg.is_fixed_to_platform:
             free = np.arange(3 if machine.spatial else 2)
         B = locate_passive_end(name, u, directions.A[here], (R, t), leg.B, free)
         leg = replace(leg, B=B)
@@ -257,7 +257,7 @@ def _close_legs(
     ``legs`` have all else as it was found. Returns them, and what was left at nominal, in words.
     """
     twisting = np.array([leg.twist is not None for leg in unknowns.start])
-    known_axis = np.array([leg.platform_joint != "U" for leg in unknowns.start])
+    known_axis = np.array([leg.platform_joint is not JointType.UNIVERSAL for leg in unknowns.start])
     turns = unknowns.place[twisting, LENGTH + 1 :]
     wanted = np.setdiff1d(turns[turns >= 0], unknowns.place[known_axis, PLATFORM_TURNS])
     if not len(wanted):

@@ -50,7 +50,7 @@ class Unknowns:
         """Return those of step 4: all that step 2 does not estimate; twists only if freed."""
         columns = np.ones((machine.n_legs, N_LOCAL), dtype=np.bool_)
         columns[:, OF_A] = False
-        columns[:, BASE_TURNS] = np.array([[leg.base_joint != "R"] for leg in machine.legs])
+        columns[:, BASE_TURNS] = ~machine.revolute[:, None]
         return cls._among(machine, columns, free_twists=free_twists)
 
     @classmethod

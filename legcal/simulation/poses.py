@@ -30,9 +30,9 @@ from legcal.machine import (
     joint_values,
     leg_vectors,
     platform_pose,
+    random_walk,
     singularity,
     slider_columns,
-    strolled,
 )
 from legcal.progress import Report, no_progress
 from legcal.simulation.request import Sampling
@@ -302,7 +302,7 @@ def _followed(
             q = readings if part == 1.0 else home + part * (readings - home)
             try:
                 configuration = follow(
-                    machine, configuration, q, shortest=_SHORTEST, on_the_chain=True
+                    machine, configuration, q, min_step=_SHORTEST, on_the_chain=True
                 )
             except DidNotConverge:
                 return "legs that cannot have such lengths at the same time"
@@ -332,7 +332,7 @@ def _walked(
     feasibility, here = Feasibility(machine), machine.home_configuration
     while True:
         for _ in range(_MAX_DRAWS):
-            there = strolled(machine, here, rng)
+            there = random_walk(machine, here, rng)
             problem = feasibility.problem(there)
             if problem is None or beyond_travel(machine, there).any():
                 here = there  # walks never lead further out of the travel

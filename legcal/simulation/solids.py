@@ -345,7 +345,7 @@ def dressed(machine: Machine) -> tuple[Solid, ...]:
         below = 0.0 if machine.spatial else _POST_LENGTH + _PLATE_THICKNESS + _GAP
         added += _end(machine.base, machine.A_base, radii, [True] * len(radii), away, below)
     if machine.platform in bare:
-        balls = [leg.platform_joint != "" for leg in machine.legs]
+        balls = [not leg.is_fixed_to_platform for leg in machine.legs]
         B = machine.B_platform
         away = _away(machine.home.apply(B), machine, 1.0)
         if away is not None:

@@ -21,14 +21,14 @@ from legcal.machine import (
     Machine,
     UrdfPatch,
     check_closes,
-    footed,
     geometries,
-    home_with,
+    home_of_legs,
     load_mechanism,
     mechanism_text,
     model_name,
     moved_legs,
     parametrization_of,
+    with_platform_foot,
     write_urdf,
 )
 from legcal.simulation.settings import (
@@ -68,7 +68,7 @@ def draw_errors(
         step[i] = spread.size * unit[i]
     moved = moved_legs(legs, found.place, step)
     origin = np.asarray(nominal.T_platform_Re.inv().translation)
-    return footed(moved, origin)
+    return with_platform_foot(moved, origin)
 
 
 def _spread(errors: ParameterErrors, name: str) -> Spread:
@@ -144,7 +144,7 @@ def write_true_model(
     for _ in range(MAX_DRAWS):
         legs = draw_errors(nominal, errors, rng)
         radii = draw_radii(nominal, errors.radii, of_radii)
-        home = home_with(nominal, legs, MAX_HOME_SHIFT)
+        home = home_of_legs(nominal, legs, MAX_HOME_SHIFT)
         if home is None:
             problems["legs that do not meet near home"] += 1
             continue

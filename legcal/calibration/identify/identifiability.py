@@ -32,11 +32,12 @@ from legcal.files import closest
 from legcal.machine import (
     DATASET_YAML,
     NEAR,
+    JointType,
     Machine,
     geometries,
     legs_outside,
     load_mechanism,
-    singular_note,
+    singularity_note,
 )
 from legcal.paper import Condition, count_conditions, three_legs_at_once, two_directions
 
@@ -46,7 +47,7 @@ _IMAGES = 15
 
 
 def answer(
-    # A mechanism as :func:`legcal.machine.load.load_mechanism` takes it, or a dataset folder or its
+    # A machine as :func:`legcal.machine.load_mechanism` takes it, or a dataset folder or its
     # ``dataset.yaml``
     source: str,
     views: Sequence[Sequence[str]],  # legs of each view; none for a dataset
@@ -252,7 +253,7 @@ def _judge(
         legs=machine.leg_names,
         n=machine.n_legs,
         n_d=len(machine.frame_legs),
-        r=sum(leg.base_joint == "R" for leg in machine.legs),
+        r=sum(leg.base_joint is JointType.REVOLUTE for leg in machine.legs),
         n_ac=int(session.with_length.sum()),
         conditions=conditions,
         staged=staged,
@@ -288,7 +289,7 @@ def _machine_notes(machine: Machine) -> list[str]:
             "home and travel were judged too, which the machine may not reach; correct "
             "legcal.home or the limits."
         )
-    singular = singular_note(machine)
+    singular = singularity_note(machine)
     return notes if singular is None else [*notes, singular[0].upper() + singular[1:]]
 
 
@@ -303,7 +304,7 @@ def conditions_of(machine: Machine, session: Session) -> tuple[Condition, ...]:
         session.views,
         session.n_legs,
         spatial=session.spatial,
-        revolute=[j for j, x in enumerate(session.legs) if x.base_joint == "R"],
+        revolute=[j for j, x in enumerate(session.legs) if x.base_joint is JointType.REVOLUTE],
         passive=[j for j, has in enumerate(session.with_length) if not has],
         board=bool(session.board.all()),
     )

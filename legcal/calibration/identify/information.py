@@ -32,7 +32,7 @@ from legcal.estimation import (
     marginal_rows,
 )
 from legcal.geometry import Array, IntArray
-from legcal.machine import Demand, freedoms, pose_equations
+from legcal.machine import EquationKind, freedoms, pose_equations
 
 SIGMA_EXACT = 1e-7  # [m]: of what the mechanism itself demands
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -61,7 +61,7 @@ class WhitenedEquations:
     by_pose: Array
     by_parameters: Array  # (k, m, p): by the parameters in metres
     leg: IntArray  # (m,): the leg of each row
-    demand: tuple[Demand, ...]  # (m,): what it is about
+    demand: tuple[EquationKind, ...]  # (m,): what it is about
 
     def at(self, poses: IntArray) -> WhitenedEquations:
         """Return the equations at some of the poses, in that order."""
@@ -77,7 +77,7 @@ def leg_equations(session: Session) -> WhitenedEquations:
         (equations.by_pose / sigma * pose_unit(session))[:, :, columns],
         equations.by_parameters(session.parametrization) / sigma * session.unit,
         equations.leg,
-        equations.demands,
+        equations.kinds,
     )
 
 

@@ -35,7 +35,7 @@ from legcal.calibration.identify.session import (
 from legcal.calibration.identify.steps import base_by_frames, offsets_from_distances, scattered
 from legcal.estimation import compress, eliminate, marginal_rows
 from legcal.geometry import Array, IntArray
-from legcal.machine import Machine, joined
+from legcal.machine import JointType, Machine, joined
 from legcal.paper import Condition, count_conditions, three_legs_at_once
 
 _CAMERA = 6  # unknowns of its pose
@@ -122,7 +122,7 @@ class _Candidates:
             views,
             s.n_legs,
             spatial=s.spatial,
-            revolute=[j for j, leg in enumerate(s.legs) if leg.base_joint == "R"],
+            revolute=[j for j, leg in enumerate(s.legs) if leg.base_joint is JointType.REVOLUTE],
             passive=np.flatnonzero(~s.with_length).tolist(),
             board=bool(s.board.all()),
         )

@@ -15,7 +15,7 @@ from legcal.calibration.identify.information import SIGMA_EXACT, WhitenedEquatio
 from legcal.calibration.identify.session import Across, Session, at_base_joints, at_platform_joints
 from legcal.estimation import compress, eliminate, grouped
 from legcal.geometry import Array, BoolArray, IntArray, normal_basis
-from legcal.machine import freedoms
+from legcal.machine import EquationKind, JointType, freedoms
 
 _BASE = (0, 1, 2)  # places among the twelve numbers of a leg
 _PLATFORM = (3, 4, 5)
@@ -156,7 +156,9 @@ def identify_platform(
 
     *images* and *equations* are those of the joint fit.
     """
-    universal = np.array([leg.base_joint == "U" for leg in session.legs], dtype=np.bool_)
+    universal = np.array(
+        [leg.base_joint is JointType.UNIVERSAL for leg in session.legs], dtype=np.bool_
+    )
     columns = np.unique(
         np.concatenate(
             [
@@ -245,7 +247,7 @@ def scattered(step: Step, n_parameters: int) -> Array:
 def revolute_axes(session: Session) -> BoolArray:
     """Return which legs have a revolute axis at the base that is a parameter, (n_legs,)."""
     return np.array(
-        [leg.base_joint == "R" and leg.base_axis is not None for leg in session.legs],
+        [EquationKind.BASE_AXIS in leg.equations for leg in session.legs],
         dtype=np.bool_,
     )
 

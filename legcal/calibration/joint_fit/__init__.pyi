@@ -32,7 +32,6 @@ from .sensitivity import FOCAL_PART as FOCAL_PART
 from .sensitivity import Sensitivity as Sensitivity
 from .solution import Solution as Solution
 from .solution import in_file_order as in_file_order
-from .solution import joints_of as joints_of
 from .variables import DEFAULT_SETTINGS as DEFAULT_SETTINGS
 from .variables import FittedLegs as FittedLegs
 from .variables import RefinementSettings as RefinementSettings

@@ -51,7 +51,7 @@ from legcal.estimation import (
     fixed_at_start,
 )
 from legcal.geometry import Array, BoolArray
-from legcal.machine import freedoms, n_bonds, radius_name
+from legcal.machine import freedoms, radius_name
 from legcal.vision import (
     Camera,
     intrinsic_names,
@@ -114,7 +114,8 @@ class FitProblem(Problem[State]):
     @property
     def n_unknowns(self) -> int:
         """Number of unknowns; a pose counts with the freedoms that its constraints leave."""
-        bound = 6 - len(freedoms(self.legs.frame_legs)) + sum(map(n_bonds, self.legs.nominal))
+        bound = 6 - len(freedoms(self.legs.frame_legs))
+        bound += sum(leg.n_constraints for leg in self.legs.nominal)
         return self.n_kept + max(6 - bound, 0) * self.n_elements
 
     @property

@@ -41,11 +41,11 @@ from legcal.geometry import Array, BoolArray, IntArray
 from legcal.machine import (
     KinematicParameters,
     Leg,
-    LegKind,
     Parametrization,
-    footed,
+    parameters_of_legs,
     parametrize,
     radius_name,
+    with_platform_foot,
 )
 from legcal.vision import Camera
 
@@ -103,18 +103,8 @@ class Solution:
 
     @property
     def parameters(self) -> KinematicParameters:
-        """Joint centres, and offsets or constant lengths; NaN for passive legs [m]."""
-        return joints_of(self.legs)
-
-
-def joints_of(legs: tuple[Leg, ...]) -> KinematicParameters:
-    """Return joint centres, and offsets or constant lengths; NaN for passive legs [m]."""
-    lengths = [np.nan if leg.kind is LegKind.PASSIVE else leg.q0 for leg in legs]
-    return KinematicParameters(
-        np.array([leg.A for leg in legs]),
-        np.array([leg.B for leg in legs]),
-        np.array(lengths),
-    )
+        """Joint centres, and offsets or constant lengths [m]."""
+        return parameters_of_legs(self.legs)
 
 
 def assemble_solution(
@@ -309,7 +299,7 @@ def in_file_order(solution: Solution, order: Order, dataset: Dataset) -> Solutio
     machine, measurements = dataset.machine, dataset.measurements
     legs, views = inverse(order.legs).tolist(), inverse(order.views).tolist()
     origin = np.asarray(machine.T_platform_Re.inv().translation)
-    geometry = footed([solution.legs[j] for j in legs], origin)
+    geometry = with_platform_foot([solution.legs[j] for j in legs], origin)
     by_leg = {leg: j for j, leg in enumerate(legs)}
     radii = {(by_leg[leg], part): value for (leg, part), value in solution.radii.items()}
     with_board = dataset.board is not None

@@ -26,7 +26,6 @@ from legcal.machine import (
     freedoms,
     geometries,
     moved_legs,
-    n_bonds,
     parametrize,
     pose_equations,
     solve_poses,
@@ -220,7 +219,7 @@ class LegParameters:
                 leg,
                 twist=tied_twist(leg, nominal, self.values.get(f"{name}.twist", nominal.twist)),
             )
-            if nominal.twist is not None and leg.platform_joint == "" and unknown[TWIST] < 0
+            if nominal.twist is not None and leg.is_fixed_to_platform and unknown[TWIST] < 0
             else leg
             for leg, nominal, name, unknown in zip(
                 moved, self.legs.nominal, names, self.unknown, strict=True
@@ -335,7 +334,7 @@ class LegConstraints:
         """
         if np.any(state.radii <= 0.0):
             raise DidNotConverge("The joint fit came to a radius that is not positive.")
-        if not any(map(n_bonds, state.legs)):
+        if not any(leg.n_constraints for leg in state.legs):
             return state
         found = solve_poses(state.legs, self.legs.frame_legs, *state.platform_pose)
         size = float(found.size.max(initial=0.0))
@@ -349,7 +348,7 @@ class LegConstraints:
 
     def tangent(self, problem: Problem[State], state: State) -> Tangent | None:
         """Return the motions of poses that the constraints leave; None where all are free."""
-        if self.legs.spatial and not any(map(n_bonds, state.legs)):
+        if self.legs.spatial and not any(leg.n_constraints for leg in state.legs):
             return None
         free = list(freedoms(self.legs.frame_legs))
         n_poses, n_kept = problem.n_elements, problem.n_kept

@@ -194,11 +194,11 @@ def _descended(pairs: PosePairs, frames: Array, rows: Array | int, max_iteration
         equations,
         retract,
         frames,
-        met=0.0,
+        tolerance=0.0,
         unit=pairs.scale,
-        far=True,
+        damped=True,
         steps=max_iterations,
-        patience=_MAX_STALLED,
+        max_stalled=_MAX_STALLED,
     ).points
 
 

@@ -12,25 +12,28 @@ from legcal.files import MotionEntry, closest, motion_to_xyz_quat
 from legcal.geometry import Array
 from legcal.machine.bodies import Bodies, rigid_bodies
 from legcal.machine.chain import ClosedChain, Closure
-from legcal.machine.classification import CONCURRENT, PERPENDICULAR, LegChain, leg_of
+from legcal.machine.classification import CONCURRENT, PERPENDICULAR, leg_of
 from legcal.machine.cylinders import at_visible_heights, visual_cylinders, with_cylinders
-from legcal.machine.equations import linearize
+from legcal.machine.equations import leg_equations
 from legcal.machine.formats import read_source
 from legcal.machine.home import check_home_travel, closed_home, legs_outside
 from legcal.machine.kinematics import leg_vectors, platform_pose, readings_at, slider_columns
 from legcal.machine.leg import (
-    LONGEST,
-    MOST_LEGS,
-    SHORTEST,
-    THICKEST,
-    THINNEST,
-    Demand,
+    MAX_LEGS,
+    MAX_LENGTH,
+    MAX_RADIUS,
+    MIN_LENGTH,
+    MIN_RADIUS,
+    EquationKind,
+    JointType,
+    LegChain,
     LegKind,
 )
 from legcal.machine.mobility import CONFIGURATIONS, generic_configurations, mobility, singularity
 from legcal.machine.model import Machine
 from legcal.machine.parameters import n_frame_legs
 from legcal.machine.schema import LegcalBlock, MechanismFile
+from legcal.machine.spanning_tree import Source
 from legcal.machine.topology import (
     any_joint,
     check_bodies,
@@ -43,16 +46,15 @@ from legcal.machine.topology import (
     propose_block,
     propose_frame,
 )
-from legcal.machine.tree import Source
 from legcal.machine.urdf import Urdf
 
-FARTHEST = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
-_FOUND = {
-    Demand.BASE_AXIS: "its revolute axis at the base {0:.3g} deg from perpendicular to the leg",
-    Demand.PLATFORM_AXIS: "its revolute axis at the platform {0:.3g} deg from perpendicular to it",
-    Demand.ALONG_1: "it turned {0:.3g} deg in the platform to which it is fixed",
-    Demand.ALONG_2: "it turned {0:.3g} deg in the platform to which it is fixed",
-    Demand.TWIST: "it twisted by {0:.3g} deg although it has no S joint",
+MAX_ORIGIN = 1e4  # [m]; beyond, floats do not resolve the tolerances of joints
+_DEVIATION = {  # by [deg]
+    EquationKind.BASE_AXIS: "its revolute axis at the base {} deg from perpendicular to the leg",
+    EquationKind.PLATFORM_AXIS: "its revolute axis at the platform {} deg from perpendicular to it",
+    EquationKind.DIRECTION_1: "it turned {} deg in the platform to which it is fixed",
+    EquationKind.DIRECTION_2: "it turned {} deg in the platform to which it is fixed",
+    EquationKind.TWIST: "it twisted by {} deg although it has no S joint",
 }
 REGULAR = 1e-4  # singularity measure: less than that is the rounding of a file
 
@@ -77,7 +79,7 @@ def load_mechanism(model: str | Path) -> Machine:
     try:
         return _load(source)
     except LegcalError as error:
-        said = [source.in_its_words(problem) for problem in error.problems]
+        said = [source.in_format_terms(problem) for problem in error.problems]
         raise type(error)(said) from error
 
 
@@ -108,7 +110,7 @@ def _load(source: Source) -> Machine:
     machine = replace(machine, mobility=mobility(machine))
     check_equations(machine)
     proposed = proposal_notes(file.legcal, machine)
-    found = map(source.in_its_words, diagnose(machine, home_is_given=block.home is not None))
+    found = map(source.in_format_terms, diagnose(machine, home_is_given=block.home is not None))
     return replace(machine, diagnostics=(*source.notes, *proposed, *found))
 
 
@@ -163,14 +165,13 @@ def _assemble(source: Source, block: LegcalBlock, closures: Sequence[Closure]) -
         base=block.base,
         platform=block.platform,
         platform_joint=block.platform_joint,
-        legs=with_cylinders(legs, shown, bodies, chains),
+        legs=with_cylinders(legs, shown, bodies),
         frame_legs=tuple(names.index(name) for name in base_frame),
         spatial=normals is None,
         home=RigidTransform.identity() if home is None else home,
         home_configuration=chain.neutral(),
         chain=chain,
         urdf=urdf,
-        leg_chains=tuple(chains),
         base_normal=base_normal,
         platform_normal=platform_normal,
     )
@@ -291,7 +292,7 @@ def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
     Raises
     ------
     OutOfClass
-        If there are fewer, or more than MOST_LEGS, or a leg of a planar mechanism is fixed to
+        If there are fewer, or more than MAX_LEGS, or a leg of a planar mechanism is fixed to
         the platform.
     """
     n_d = n_frame_legs(spatial=spatial)
@@ -302,12 +303,12 @@ def check_count(chains: Sequence[LegChain], *, spatial: bool, path: Path) -> Non
             f"{'leg' if len(chains) == 1 else 'legs'} {where}, needed at least {n_d}, whose joints "
             "define the frames of base and platform; this machine cannot be calibrated this way."
         )
-    if len(chains) > MOST_LEGS:
+    if len(chains) > MAX_LEGS:
         raise OutOfClass(
             f"{path}: this mechanism is outside the method: found {len(chains)} legs, needed at "
-            f"most {MOST_LEGS}, since the work grows with their cube; leave out passive legs."
+            f"most {MAX_LEGS}, since the work grows with their cube; leave out passive legs."
         )
-    fixed = [chain for chain in chains if chain.platform.letter == ""]
+    fixed = [chain for chain in chains if chain.platform.type is JointType.FIXED]
     if fixed and not spatial:
         raise OutOfClass(
             f"{path}: the leg of joint '{any_joint(fixed[0])}' is outside the method: found it "
@@ -384,11 +385,11 @@ def check_origins(urdf: Urdf) -> None:
     """
     for joint in urdf.joints.values():
         away = float(np.linalg.norm(joint.T_parent_origin.translation))
-        if away > FARTHEST:
+        if away > MAX_ORIGIN:
             raise ModelError(
                 f"{urdf.path}: the lengths could not be used: found the origin of joint "
                 f"'{joint.name}' {away:.4g} m away from its parent link, needed at most "
-                f"{FARTHEST:g} m; write all lengths in metres (are they millimetres?)."
+                f"{MAX_ORIGIN:g} m; write all lengths in metres (are they millimetres?)."
             )
 
 
@@ -405,10 +406,10 @@ def check_spread(machine: Machine) -> None:
         "the joints on the platform": float(np.linalg.norm(np.ptp(machine.B_platform, axis=0))),
     }
     for name, size in sizes.items():
-        if size > LONGEST:
+        if size > MAX_LENGTH:
             raise ModelError(
                 f"{machine.urdf_path}: the lengths could not be used: found {name} {size:.4g} m "
-                f"apart, needed at most {LONGEST:g} m; write all lengths in metres (are they "
+                f"apart, needed at most {MAX_LENGTH:g} m; write all lengths in metres (are they "
                 "millimetres?)."
             )
 
@@ -423,8 +424,8 @@ def check_unit(machine: Machine) -> None:
         cylinder along it is thicker than half of it or thinner than 2e-4 of it.
     """
     lengths = np.linalg.norm(leg_vectors(machine, machine.home), axis=1)
-    fixed = np.array([leg.platform_joint == "" for leg in machine.legs])
-    odd = np.flatnonzero(~fixed & ((lengths < SHORTEST) | (lengths > LONGEST)))
+    fixed = np.array([leg.is_fixed_to_platform for leg in machine.legs])
+    odd = np.flatnonzero(~fixed & ((lengths < MIN_LENGTH) | (lengths > MAX_LENGTH)))
     if len(odd):
         raise ModelError(
             f"{machine.urdf_path}: the lengths could not be used: found leg "
@@ -433,7 +434,7 @@ def check_unit(machine: Machine) -> None:
         )
     for leg in machine.legs:
         reach = leg.travel[1] - leg.travel[0]
-        if leg.kind is LegKind.ACTUATED and reach > LONGEST:
+        if leg.kind is LegKind.ACTUATED and reach > MAX_LENGTH:
             raise ModelError(
                 f"{machine.urdf_path}: the travel of leg '{leg.name}' could not be used: found "
                 f"{leg.travel[0]:.4g} to {leg.travel[1]:.4g} m, needed at most 20 m; write the "
@@ -446,12 +447,12 @@ def _check_radii(machine: Machine, lengths: Array) -> None:
     """Check that what a camera sees of each leg is no thicker and no thinner than a leg is."""
     for leg, length in zip(machine.legs, lengths, strict=True):
         for cylinder in leg.cylinders:
-            if not THINNEST < cylinder.radius / length < THICKEST:
+            if not MIN_RADIUS < cylinder.radius / length < MAX_RADIUS:
                 raise ModelError(
                     f"{machine.urdf_path}: the <visual> cylinder of link '{cylinder.link}' "
                     f"could not be used: found a radius of {1e3 * cylinder.radius:.4g} mm along "
                     f"leg '{leg.name}', which is {1e3 * length:.4g} mm long at home, needed "
-                    f"{THINNEST:g} to {THICKEST:g} of the length; correct radius and its unit."
+                    f"{MIN_RADIUS:g} to {MAX_RADIUS:g} of the length; correct radius and its unit."
                 )
 
 
@@ -498,12 +499,12 @@ def check_equations(machine: Machine) -> None:
         T = platform_pose(machine, configuration)
         R, t = T.rotation.as_matrix()[None], np.asarray(T.translation)[None]
         for j, leg in enumerate(machine.legs):
-            equations = linearize(leg, R, t, by_local=False)
+            equations = leg_equations(leg, R, t, by_local=False)
             values = equations.values[0].copy()
             if leg.kind is not LegKind.CONSTANT:
                 values[0] -= leg.sign * configuration[slider_columns(machine, (j,))[0][0]]
-            for demand, value in zip(equations.demands, np.abs(values), strict=True):
-                problem = _problem(demand, float(value))
+            for kind, value in zip(equations.kinds, np.abs(values), strict=True):
+                problem = _problem(kind, float(value))
                 if problem is not None:
                     problems.setdefault(
                         leg.name,
@@ -514,16 +515,16 @@ def check_equations(machine: Machine) -> None:
         raise OutOfClass(list(problems.values()))
 
 
-def _problem(demand: Demand, value: float) -> str | None:
+def _problem(kind: EquationKind, value: float) -> str | None:
     """Return how an equation is broken, None if it is kept."""
-    if demand is Demand.LENGTH:
+    if kind is EquationKind.LENGTH:
         if value <= CONCURRENT:
             return None
         return f"its length {1e3 * value:.3g} mm from reading plus offset, needed at most 0.01 mm,"
     if value <= PERPENDICULAR:
         return None
-    angle = np.degrees(np.arcsin(min(value, 1.0)))
-    return f"{_FOUND[demand].format(angle)}, needed at most {np.degrees(PERPENDICULAR):.2g} deg,"
+    angle = f"{np.degrees(np.arcsin(min(value, 1.0))):.3g}"
+    return f"{_DEVIATION[kind].format(angle)}, needed at most {np.degrees(PERPENDICULAR):.2g} deg,"
 
 
 def diagnose(machine: Machine, *, home_is_given: bool) -> tuple[str, ...]:
@@ -565,7 +566,7 @@ def proposal_notes(written: LegcalBlock | None, machine: Machine) -> tuple[str, 
     return ()
 
 
-def singular_note(machine: Machine) -> str | None:
+def singularity_note(machine: Machine) -> str | None:
     """Return that the motors do not hold the platform at home, None where they do."""
     if not 0 < machine.mobility <= len(machine.motors):
         return None
@@ -606,21 +607,22 @@ def _motor_notes(machine: Machine) -> list[str]:
             f"{found}: mobility {machine.mobility}, motors {n_motors}; forward kinematics is "
             "refused."
         )
-    singular = singular_note(machine)
+    singular = singularity_note(machine)
     return notes if singular is None else [*notes, singular]
 
 
 def _spin_notes(machine: Machine) -> list[str]:
     """Return what spins idly: legs with an S joint at both ends, and revolutes too many."""
     notes = []
-    chains = machine.leg_chains
-    both = sum(leg.base_joint == leg.platform_joint == "S" for leg in machine.legs)
+    both = sum(
+        leg.base_joint.twists_freely and leg.platform_joint.twists_freely for leg in machine.legs
+    )
     if both:
         legs, spin = "1 leg has", "spins about itself"
         if both > 1:
             legs, spin = f"{both} legs have", "spin about themselves"
         notes.append(f"{legs} an S joint at both ends and {spin}; this is not counted as mobility.")
-    others = sum(chain.idle_spins for chain in chains) - both
+    others = sum(leg.idle_spins for leg in machine.legs) - both
     if others:
         joints = "1 revolute repeats" if others == 1 else f"{others} revolutes repeat"
         notes.append(

@@ -11,11 +11,11 @@ from legcal.files import temporary_folder
 from legcal.geometry import Array
 from legcal.machine.assembly import Assembled, AssembledLeg, assemble
 from legcal.machine.description import Description
-from legcal.machine.leg import LegKind
-from legcal.machine.load import load_mechanism
+from legcal.machine.leg import JointType, LegKind
+from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.schema import mechanism_yaml
-from legcal.machine.tree import TreeText, along, limit, place, visual
+from legcal.machine.spanning_tree import UrdfBuilder, along, limit, place, visual
 
 TURN = (-3.15, 3.15)  # [rad]
 VISIBLE = 0.9  # part of the shortest leg that its tube and its rod cover
@@ -24,7 +24,7 @@ _AXES = {letter: along(axis) for letter, axis in zip("xyz", np.eye(3), strict=Tr
 
 def urdf_text(machine: Assembled) -> str:
     """Return the URDF of a machine: all its geometry."""
-    tree = TreeText()
+    tree = UrdfBuilder()
     tree.link("base")
     tree.link("platform")
     if machine.planar:
@@ -59,7 +59,7 @@ def yaml_text(machine: Assembled) -> str:
 
 def _hangs_from_base(leg: AssembledLeg) -> bool:
     """Say whether a leg hangs from the base, and not from the platform with its S at the base."""
-    return leg.type.base != "S" or leg.type.platform == "S"
+    return not leg.type.base.twists_freely or leg.type.platform.twists_freely
 
 
 def _joint_of(leg: AssembledLeg) -> str:
@@ -70,7 +70,7 @@ def _joint_of(leg: AssembledLeg) -> str:
 
 
 def _joint(
-    tree: TreeText,
+    tree: UrdfBuilder,
     name: str,
     kind: str,
     links: tuple[str, str],
@@ -86,7 +86,7 @@ def _joint(
 class _Branch:
     """One leg, from the link that it hangs from to the frames that close its loop."""
 
-    def __init__(self, tree: TreeText, machine: Assembled, leg: AssembledLeg) -> None:
+    def __init__(self, tree: UrdfBuilder, machine: Assembled, leg: AssembledLeg) -> None:
         self._tree, self._leg = tree, leg
         self._from_base = _hangs_from_base(leg)
         self._R_base_platform = machine.T_base_platform.rotation.as_matrix()
@@ -115,27 +115,26 @@ class _Branch:
             R = self._far(R)
         self._close(R)
 
-    def _near(self, side: str, letter: str, u: Array, axis: Array, at: Array) -> Array:
+    def _near(self, side: str, joint: JointType, u: Array, axis: Array, at: Array) -> Array:
         """Add the joint that a leg hangs from, and return the frame of the leg there."""
         y = _unit(np.cross(u, axis))
         along = np.column_stack([np.cross(y, u), y, u])
-        first = np.column_stack([axis, y, np.cross(axis, y)]) if letter == "U" else along
-        self._turn(f"{side}1", at, first, "x")
-        if letter == "U":
-            self._turn(f"{side}2", None, first.T @ along, "y")
-        if letter == "S":
-            self._turn(f"{side}2", None, None, "y")
-            self._turn(f"{side}3", None, None, "z")
+        first = np.column_stack([axis, y, np.cross(axis, y)]) if joint.inner_is_across else along
+        for number, name in enumerate("xyz"[: joint.n_freedoms], start=1):
+            place, frame = (at, first) if number == 1 else (None, None)
+            if number == 2 and joint.inner_is_across:
+                frame = first.T @ along
+            self._turn(f"{side}{number}", place, frame, name)
         return along
 
     def _far(self, R: Array) -> Array:
         """Add the joint at the platform of a leg without S, and return the frame after it."""
         leg = self._leg
-        if leg.type.platform == "":
+        if leg.type.platform is JointType.FIXED:
             return R
         y = _unit(np.cross(leg.u, leg.platform_axis))
         along = np.column_stack([np.cross(y, leg.u), y, leg.u])
-        if leg.type.platform == "R":
+        if leg.type.platform is JointType.REVOLUTE:
             self._turn("b1", self._along, R.T @ along, "x")
             return along
         last = np.column_stack([leg.platform_axis, y, np.cross(leg.platform_axis, y)])

@@ -1,6 +1,6 @@
 """Models of other formats rewritten as a tree with pairs of frames that coincide.
 
-:class:`Source` is what every reader returns, :class:`TreeText` the URDF while it is put together.
+:class:`Source` is what every reader returns, :class:`UrdfBuilder` writes the URDF of the tree.
 A joint that closes a loop (:class:`Loop`) becomes a pair of frames: a point a ``3d`` pair, a weld a
 ``6d`` pair; a revolute or universal joint becomes one or two revolute joints with massless links,
 welded to the other side.
@@ -46,7 +46,7 @@ class Source:
     poses: Mapping[str, RigidTransform] | None = None
     words: Sequence[tuple[str, str]] = ()
 
-    def in_its_words(self, problem: str) -> str:
+    def in_format_terms(self, problem: str) -> str:
         """Return a message that names keys of the YAML in the words of this format."""
         for key, word in self.words:
             problem = problem.replace(key, word)
@@ -67,7 +67,7 @@ class TextCylinder:
 
 
 @dataclass
-class TreeText:
+class UrdfBuilder:
     """The lines of a URDF while it is put together."""
 
     links: dict[str, str] = field(default_factory=dict)  # the line of every link and joint, by name
@@ -280,7 +280,7 @@ class Loop:
 
 
 def close_loop(
-    loop: Loop, text: TreeText, poses: Mapping[str, RigidTransform]
+    loop: Loop, text: UrdfBuilder, poses: Mapping[str, RigidTransform]
 ) -> tuple[list[str], str]:
     """Add the frames of a loop to a tree and return the closure."""
     one, two = loop.T_link_frame

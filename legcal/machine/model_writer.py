@@ -23,12 +23,11 @@ from legcal.errors import DidNotConverge, OutOfClass, OutOfResources, UsageError
 from legcal.files import motion_to_xyz_quat, write_atomically
 from legcal.geometry import Array, roll_pitch_yaw, rotation_between
 from legcal.machine.bodies import Bodies, frame_link, rigid_bodies
-from legcal.machine.classification import LegChain, Step
 from legcal.machine.files import FOLDER_YAML
 from legcal.machine.formats import XML_SUFFIXES
 from legcal.machine.kinematics import forward_kinematics, inverse_kinematics
-from legcal.machine.leg import Leg, LegKind
-from legcal.machine.load import load_mechanism
+from legcal.machine.leg import Leg, LegChain, LegKind, Step
+from legcal.machine.loader import load_mechanism
 from legcal.machine.model import Machine
 from legcal.machine.parameters import (
     Parametrization,
@@ -186,9 +185,8 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
         seen = seen.inv() if handle.is_inverse else seen
         found[joint.name] = seen.of(T_parent_origin), is_turned or seen.turn is not None
 
-    for leg, chain, wanted in zip(
-        machine.legs, machine.leg_chains, in_links(machine, legs), strict=True
-    ):
+    for leg, wanted in zip(machine.legs, in_links(machine, legs), strict=True):
+        chain = _chain(leg)
         at_base, at_platform = _ends(leg, wanted)
         grown = wanted.q0 - leg.q0, _twisted(leg, wanted, at_platform)
         if chain.slider is not None:
@@ -202,9 +200,16 @@ def moved_origins(machine: Machine, legs: Sequence[Leg]) -> dict[str, tuple[Rigi
     return found
 
 
+def _chain(leg: Leg) -> LegChain:
+    """Return the joints of a leg that a file describes."""
+    if leg.chain is None:
+        raise ValueError("a leg that no file describes has no joints to write")
+    return leg.chain
+
+
 def _ends(leg: Leg, wanted: Leg) -> tuple[Motion, Motion]:
     """Return how the ends of a leg move in the links of base and platform."""
-    is_fixed = leg.platform_joint == ""
+    is_fixed = leg.is_fixed_to_platform
     return (
         Motion(wanted.A - leg.A, leg.A, _turn(leg.base_axis, wanted.base_axis)),
         Motion(
@@ -287,7 +292,7 @@ def mechanism_text(machine: Machine, urdf: str) -> str:
             "platform_joint": machine.platform_joint,
             "base_frame": [machine.leg_names[j] for j in machine.frame_legs],
             "home": motion_to_xyz_quat(machine.home),
-            "legs": {leg.name: _joint_of(machine, j) for j, leg in enumerate(machine.legs)},
+            "legs": {leg.name: _joint_of(machine, leg) for leg in machine.legs},
         },
     )
 
@@ -325,11 +330,11 @@ def write_model(machine: Machine, folder: Path) -> tuple[Path, Path]:
     return places
 
 
-def _joint_of(machine: Machine, j: int) -> str:
+def _joint_of(machine: Machine, leg: Leg) -> str:
     """Return a joint that stands for a leg: its slider, or any other on it."""
-    leg, chain = machine.legs[j], machine.leg_chains[j]
     if leg.prismatic is not None:
         return leg.prismatic
+    chain = _chain(leg)
     moving = [step.connection.joint for step in chain.steps if step.connection.joint]
     fixed = [joint.name for joint in machine.urdf.joints.values() if joint.child in chain.bodies]
     return str([*moving, *fixed][0])
