@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from rendered_cylinders import Photographed, interpolated
 
-from legcal.calibration.canny import edge_points
+from legcal.calibration.measurement_noise.canny import edge_points
 from legcal.geometry.types import Array
 from legcal.perception.edges import measure_edges
 from legcal.perception.light import Grey

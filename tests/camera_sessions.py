@@ -7,7 +7,7 @@ import numpy as np
 from boards import before
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from legcal.calibration.camera import SeenCorners
+from legcal.calibration.camera_calibration.adjustment import BoardCorners
 from legcal.geometry.types import Array
 from legcal.simulation.board import PlacedBoard
 from legcal.simulation.rendering.appearance import Appearance
@@ -37,7 +37,7 @@ CAMERAS = {
 
 def seen_corners(
     camera: Camera, n_images: int, seed: int, *, tilt: float = 0.6, noise: float = NOISE_PX
-) -> SeenCorners:
+) -> BoardCorners:
     """Return the corners of a board in random places, all over the image."""
     rng = np.random.default_rng(seed)
     middle = RigidTransform.from_translation(-BOARD.points.mean(axis=0))
@@ -60,7 +60,7 @@ def seen_corners(
         points.append(BOARD.points[inside])
         px.append(at[inside])
     exact = np.concatenate(px)
-    return SeenCorners(
+    return BoardCorners(
         np.concatenate(image).astype(np.intp),
         np.concatenate(points),
         exact + noise * rng.standard_normal(exact.shape),

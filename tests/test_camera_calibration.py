@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from camera_sessions import CAMERAS, NOISE_PX, SIZE, seen_corners
 
-from legcal.calibration.camera import Agreed, SeenCorners, agreed, refuse_undetermined, warnings
+from legcal.calibration.camera_calibration.adjustment import BoardCorners, RobustFit, robust_fit
+from legcal.calibration.camera_calibration.diagnostics import refuse_undetermined, warnings
 from legcal.errors import NotIdentifiable
 from legcal.geometry.types import Array
 from legcal.vision.camera import DistortionModel, intrinsic_values
@@ -15,13 +16,13 @@ from legcal.vision.camera import DistortionModel, intrinsic_values
 MODELS: tuple[DistortionModel, ...] = ("plumb_bob", "rational_polynomial", "equidistant")
 
 
-def fitted(seen: SeenCorners, model: DistortionModel = "plumb_bob") -> Agreed:
-    found = agreed(seen, SIZE, model)
+def fitted(seen: BoardCorners, model: DistortionModel = "plumb_bob") -> RobustFit:
+    found = robust_fit(seen, SIZE, model)
     assert found is not None
     return found
 
 
-def sigmas(found: Agreed) -> Array:
+def sigmas(found: RobustFit) -> Array:
     return np.sqrt(np.diag(found.adjusted.covariance) * found.scale)
 
 
@@ -117,7 +118,7 @@ def test_corners_in_the_middle_are_told_with_their_share() -> None:
     counts = np.bincount(seen.image[middle], minlength=14)
     keep = middle & (counts[seen.image] >= 12)
     _, image = np.unique(seen.image[keep], return_inverse=True)
-    part = SeenCorners(image, seen.points[keep], seen.px[keep], seen.sigma_px[keep])
+    part = BoardCorners(image, seen.points[keep], seen.px[keep], seen.sigma_px[keep])
     told = " ".join(warnings(fitted(part)))
     share = int(told.split("Corners cover ")[1].split(" %")[0])
     assert 15 <= share <= 23

@@ -13,7 +13,7 @@ from camera_sessions import CAMERAS, PINHOLE, drawings, photographs
 from numpy.typing import NDArray
 
 from legcal import calibrate_camera, cli
-from legcal.calibration.camera import CameraCalibration
+from legcal.calibration import CameraCalibration
 from legcal.calibration.joint_fit.choices import Prior, known_parameters, resolve
 from legcal.data.measurements import View
 from legcal.data.overrides import overrides_of_call
@@ -55,7 +55,7 @@ def search_once(monkeypatch: pytest.MonkeyPatch) -> None:
             SEARCHED[key] = find_corners(board, image)
         return SEARCHED[key]
 
-    monkeypatch.setattr("legcal.calibration.camera.find_corners", search)
+    monkeypatch.setattr("legcal.calibration.camera_calibration.calibration.find_corners", search)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:

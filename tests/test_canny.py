@@ -6,7 +6,7 @@ import pytest
 from rendering import Bar, Light, render
 from scipy.spatial.transform import RigidTransform
 
-from legcal.calibration.canny import canny_parts, edge_points
+from legcal.calibration.measurement_noise.canny import canny_parts, edge_points
 from legcal.data.measurements import Measurements, View
 from legcal.data.outlines import Outlines
 from legcal.geometry.types import Array

@@ -14,9 +14,10 @@ import yaml
 from repeated_images import RepeatedImages, repeated_images
 from rich.console import Console
 
-from legcal import cli
-from legcal.calibration.noise import Noise, find_repeats, measure_noise, noise_notes
-from legcal.calibration.repeatability import QUANTITIES
+from legcal import cli, measure_noise
+from legcal.calibration import Noise
+from legcal.calibration.measurement_noise.comparison import find_repeats, noise_notes
+from legcal.calibration.measurement_noise.repeatability import QUANTITIES
 from legcal.data.dataset import load_dataset
 from legcal.errors import DatasetError, LegcalError, NotIdentifiable, NotVisible
 from legcal.machine import load_mechanism

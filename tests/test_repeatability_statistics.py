@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from legcal.calibration.repeatability import (
+from legcal.calibration.measurement_noise.repeatability import (
     QUANTITIES,
     AxisValues,
     Repeats,

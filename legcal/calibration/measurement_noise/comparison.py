@@ -1,35 +1,26 @@
-"""The measurement noise of a dataset with repeated images, as section 4.2 estimates it.
-
-The same images go through both methods: legcal's detection, and Canny's edge points with lines by
-least squares; the spread of repeats is that of :mod:`legcal.calibration.repeatability`.
-"""
+"""The noise of repeated images by two methods, as section 4.2 estimates it: ``legcal noise``."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from legcal.calibration.canny import canny_parts
-from legcal.calibration.repeatability import (
+from legcal.calibration.measurement_noise.canny import canny_parts
+from legcal.calibration.measurement_noise.document import CALLED, LegNoise, MethodNoise, Noise
+from legcal.calibration.measurement_noise.repeatability import (
     OUTLINE,
-    QUANTITIES,
     LegOrientation,
     Repeats,
-    Sample,
-    Spread,
     group_rows,
     leg_orientations,
-    pool,
 )
 from legcal.calibration.session import start_session
 from legcal.data import Dataset, Measurements, Outlines, load_dataset, no_outlines
 from legcal.errors import DatasetError, NotIdentifiable, NotVisible
-from legcal.files import Document
 from legcal.geometry import Array, BoolArray
 from legcal.machine import forward_kinematics_many
 from legcal.perception import (
@@ -47,275 +38,22 @@ from legcal.progress import Report, no_progress
 from legcal.vision import EPSILON
 from legcal.workers import worker_pool
 
-METHODS: dict[str, tuple[Method, str]] = {
+_METHODS: dict[str, tuple[Method, str]] = {
     "detector": (measure, "Measuring outlines"),
     "canny": (canny_parts, "Canny and least squares"),
 }
-CALLED = {"detector": "detector", "canny": "Canny"}  # methods, in words
-EVERY = (*QUANTITIES, OUTLINE)
-BIAS = (
+_BIAS = (
     "Repeats show what differs between images of one pose, not the bias that they share: an edge "
     "that light, blur or rounding to whole pixels displaces in all of them shows no spread. What "
     "the detector claims allows for such bias, so that a ratio below one is expected of it."
 )
-RANGE = (
+_RANGE = (
     "The 95 % ranges hold for normal errors: where a method falls on one edge in some images and "
     "on another in others, they are too narrow."
 )
-JUMP = 3.0  # ratio of spread to claim, from which an edge is said to jump: as it is, and in the
-# median ratio, lest all edges of a method that claims too little do
-_NAMED = 4  # places in a note
-
-
-@dataclass(frozen=True, eq=False)
-class LegNoise:
-    """What one method finds of one leg."""
-
-    name: str
-    orientations: tuple[LegOrientation, ...]  # by view and pose; empty if no image shows the leg
-
-    @property
-    def images(self) -> int:
-        """Images that show the leg by the model."""
-        return sum(o.images for o in self.orientations)
-
-    @property
-    def axes(self) -> int:
-        """Images in which the axis was found."""
-        return sum(o.axes for o in self.orientations)
-
-    @property
-    def without_M_LS(self) -> int:
-        """Orientations in which M_LS does not exist."""
-        return sum(o.inclination is not None for o in self.orientations)
-
-    def samples(self, quantity: str) -> list[Sample]:
-        """Return the samples of one of the ``QUANTITIES`` or of the outlines."""
-        return [sample for o in self.orientations for sample in o.samples(quantity)]
-
-    def spread(self, quantity: str) -> Spread | None:
-        """Return the spread over all orientations, None where nothing was found twice."""
-        return pool(self.samples(quantity))
-
-
-@dataclass(frozen=True, eq=False)
-class MethodNoise:
-    """What one method finds of all legs, in the order of the mechanism."""
-
-    name: str  # one of METHODS
-    legs: tuple[LegNoise, ...]
-
-    def spread(self, quantity: str) -> Spread | None:
-        """Return the spread over all legs and orientations; its largest is that of Table 1."""
-        return pool([sample for leg in self.legs for sample in leg.samples(quantity)])
-
-    def bounding(self, quantity: str) -> LegOrientation | None:
-        """Return the orientation whose standard deviation is the largest, None without any."""
-        every = [o for leg in self.legs for o in leg.orientations if o.samples(quantity)]
-        return max(every, key=lambda o: max(s.sd for s in o.samples(quantity)), default=None)
-
-
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """The measurement noise of a dataset.
-
-    Attributes
-    ----------
-    dataset : Dataset
-        The dataset.
-    view_names, pose_labels : tuple of str
-        What the indices of orientations mean.
-    repeats : tuple of Repeats
-        The images that repeat each other.
-    methods : tuple of MethodNoise
-        Both methods.
-    leg_names : tuple of str
-        What the legs of orientations mean.
-    differences : mapping of str to array
-        How far Canny's outlines lie outside the detector's, averaged over repeats, at both ends
-        (n, 2) [px], by leg.
-    notes : tuple of str
-        What else a reader should know.
-    """
-
-    dataset: Dataset
-    view_names: tuple[str, ...]
-    pose_labels: tuple[str, ...]
-    repeats: tuple[Repeats, ...]
-    methods: tuple[MethodNoise, ...]
-    leg_names: tuple[str, ...]
-    differences: Mapping[str, Array]
-    notes: tuple[str, ...]
-
-    def difference(self, leg: str | None = None) -> tuple[float, float] | None:
-        """Return mean and rms of the differences of a leg, or of all [px]; None without any."""
-        outward = [d for name, d in self.differences.items() if leg in (None, name)]
-        if not outward:
-            return None
-        every = np.concatenate(outward)
-        return float(np.mean(every)), float(np.sqrt(np.mean(np.square(every))))
-
-    def place(self, orientation: LegOrientation) -> Place:
-        """Return leg, view and pose of an orientation, by their names."""
-        return Place(
-            leg=self.leg_names[orientation.leg],
-            view=self.view_names[orientation.view],
-            pose=self.pose_labels[orientation.pose],
-        )
-
-    def document(self) -> dict[str, Any]:
-        """Return the document that ``--json`` prints."""
-        counts = [len(group.rows) for group in self.repeats]
-        return NoiseDocument(
-            legcal_noise=1,
-            mechanism=self.dataset.machine.name,
-            images=sum(counts),
-            orientations=len(counts),
-            repeats=RepeatCounts(least=min(counts), most=max(counts)),
-            methods={method.name: self._method(method) for method in self.methods},
-            difference={
-                name or "all": None if found is None else MeanAndRms(mean=found[0], rms=found[1])
-                for name in (None, *(leg.name for leg in self.methods[0].legs))
-                for found in [self.difference(name)]
-            },
-            notes=list(self.notes),
-        ).document()
-
-    def _method(self, method: MethodNoise) -> MethodBlock:
-        spreads = {name: method.spread(name) for name in EVERY}
-        largest = {name: s.largest for name, s in spreads.items() if s is not None}
-        bounding = {name: method.bounding(name) for name in EVERY}
-        at = {name: self.place(o) for name, o in bounding.items() if o is not None}
-        return MethodBlock(
-            legs=[
-                LegBlock(
-                    leg=leg.name,
-                    images=leg.images,
-                    axes=leg.axes,
-                    outlines=sum(o.outlines for o in leg.orientations),
-                    outlines_found=sum(o.outlines_found for o in leg.orientations),
-                    without_M_LS=leg.without_M_LS,
-                    **{name: leg.spread(name) for name in EVERY},
-                    orientations=[self._orientation(o) for o in leg.orientations],
-                )
-                for leg in method.legs
-            ],
-            all=ByQuantity[Spread](**spreads),
-            upper_bound=ByQuantity[float](**largest),
-            upper_bound_at=ByQuantity[Place](**at),
-        )
-
-    def _orientation(self, o: LegOrientation) -> OrientationBlock:
-        line = pool(o.lines)
-        found = {name: o.quantities[name].sd for name in QUANTITIES if name in o.quantities}
-        return OrientationBlock(
-            view=self.view_names[o.view],
-            pose=self.pose_labels[o.pose],
-            images=o.images,
-            axes=o.axes,
-            **found,
-            outline=None if line is None else line.sd,
-        )
-
-
-T = TypeVar("T")
-
-
-class ByQuantity(Document, Generic[T]):
-    """Something of every quantity, or null."""
-
-    psi: T | None = None
-    theta: T | None = None
-    x: T | None = None
-    z: T | None = None
-    angle: T | None = None
-    across: T | None = None
-    tilt: T | None = None
-    depth: T | None = None
-    outline: T | None = None
-
-
-class Place(Document):
-    """Which orientation."""
-
-    leg: str
-    view: str
-    pose: str
-
-
-class OrientationBlock(Document):
-    """The standard deviations of one orientation."""
-
-    view: str
-    pose: str
-    images: int
-    axes: int
-    psi: float | None = None
-    theta: float | None = None
-    x: float | None = None
-    z: float | None = None
-    angle: float | None = None
-    across: float | None = None
-    tilt: float | None = None
-    depth: float | None = None
-    outline: float | None = None
-
-
-class LegBlock(Document):
-    """What one method finds of one leg."""
-
-    leg: str
-    images: int
-    axes: int
-    outlines: int
-    outlines_found: int
-    without_M_LS: int
-    psi: Spread | None
-    theta: Spread | None
-    x: Spread | None
-    z: Spread | None
-    angle: Spread | None
-    across: Spread | None
-    tilt: Spread | None
-    depth: Spread | None
-    outline: Spread | None
-    orientations: list[OrientationBlock]
-
-
-class MethodBlock(Document):
-    """What one method finds."""
-
-    legs: list[LegBlock]
-    all: ByQuantity[Spread]
-    upper_bound: ByQuantity[float]
-    upper_bound_at: ByQuantity[Place]
-
-
-class MeanAndRms(Document):
-    """Of the differences between both methods [px]."""
-
-    mean: float
-    rms: float
-
-
-class RepeatCounts(Document):
-    """Images of one orientation."""
-
-    least: int
-    most: int
-
-
-class NoiseDocument(Document):
-    """What ``legcal noise --json`` prints."""
-
-    legcal_noise: int
-    mechanism: str
-    images: int
-    orientations: int
-    repeats: RepeatCounts
-    methods: dict[str, MethodBlock]
-    difference: dict[str, MeanAndRms | None]
-    notes: list[str]
+_MIN_JUMP = 3.0  # ratio of spread to claim of an edge that jumps, and the same in the median ratio:
+# not all edges of a method that claims too little jump
+_MAX_NAMED = 4  # places in a note
 
 
 def measure_noise(
@@ -343,8 +81,8 @@ def measure_noise(
         If the images do not show the legs where they should be, or no leg was found twice.
     """
     dataset = source if isinstance(source, Dataset) else load_dataset(source)
-    with worker_pool(workers) as pool_of_workers:
-        session = start_session(dataset, pool_of_workers, progress)
+    with worker_pool(workers) as executor:
+        session = start_session(dataset, executor, progress)
         machine, measurements = session.machine, session.measurements
         paths = [dataset.image_path(row) for row in session.order.rows.tolist()]
         has_image = np.array(
@@ -436,7 +174,7 @@ def _search(
     repeated = replace(every, detect=np.sort(np.concatenate([group.rows for group in repeats])))
     found = {
         name: measure_photographs(repeated, placement, progress, method=method, stage=stage)
-        for name, (method, stage) in METHODS.items()
+        for name, (method, stage) in _METHODS.items()
     }
     return placement, found
 
@@ -469,7 +207,7 @@ def _differences(
 
 def noise_notes(measurements: Measurements, methods: Sequence[MethodNoise]) -> list[str]:
     """Return what repeats cannot tell, and what is not known of which leg."""
-    notes = [BIAS, RANGE]
+    notes = [_BIAS, _RANGE]
     for leg in methods[0].legs:
         if not leg.orientations:
             notes.append(f"{leg.name} is in none of the repeated images.")
@@ -495,7 +233,7 @@ def noise_notes(measurements: Measurements, methods: Sequence[MethodNoise]) -> l
 def _jumps(measurements: Measurements, method: MethodNoise) -> list[str]:
     """Return a note on outlines that spread far more than the others, against what is claimed."""
     ratios = [line.ratio for leg in method.legs for o in leg.orientations for line in o.lines]
-    least = JUMP * max(1.0, float(np.median(ratios))) if ratios else np.inf
+    least = _MIN_JUMP * max(1.0, float(np.median(ratios))) if ratios else np.inf
     found = []
     for leg in method.legs:
         for o in leg.orientations:
@@ -505,8 +243,8 @@ def _jumps(measurements: Measurements, method: MethodNoise) -> list[str]:
     if not found:
         return []
     found.sort(key=lambda jump: -jump[0])
-    places = ", ".join(f"{where} ({sd:.3f} px)" for sd, where in found[:_NAMED])
-    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    places = ", ".join(f"{where} ({sd:.3f} px)" for sd, where in found[:_MAX_NAMED])
+    more = f" and {len(found) - _MAX_NAMED} more" if len(found) > _MAX_NAMED else ""
     return [
         f"{CALLED[method.name]}: single outlines spread over {least:.2g} times as far as is "
         f"claimed of them: {places}{more}. Such an edge jumps between images; pooled "

@@ -1,0 +1,304 @@
+"""From photographs of a board to a camera: ``legcal camera``."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from legcal.calibration.camera_calibration.adjustment import (
+    MIN_CORNERS,
+    BoardCorners,
+    RobustFit,
+    robust_fit,
+)
+from legcal.calibration.camera_calibration.diagnostics import (
+    MIN_IMAGES,
+    coverage,
+    refuse_undetermined,
+    tilts,
+    too_few_images,
+    warnings,
+)
+from legcal.calibration.camera_calibration.document import (
+    CAMERA_FILE,
+    CameraCalibration,
+    ImageResult,
+    write_camera,
+)
+from legcal.errors import DatasetError, DidNotConverge, NotVisible, UsageError
+from legcal.files import describe
+from legcal.geometry import Array, IntArray
+from legcal.perception import describe_image, find_corners
+from legcal.progress import Report, no_progress
+from legcal.vision import (
+    Board,
+    Camera,
+    DistortionModel,
+    ImageSize,
+    board_of,
+    image_size,
+    read_image,
+)
+from legcal.workers import Run, worker_pool
+
+_STAGE = "Searching the board"
+_N_DESCRIBED = 2  # images of which it is said what they show instead
+_Corners = tuple[IntArray, Array, Array]
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+_MAX_NAMED = 5
+
+
+def calibrate_camera(
+    images: str | Path | Sequence[str | Path],
+    board: str | Path | Board,
+    *,
+    model: DistortionModel = "plumb_bob",
+    output: str | Path | None = None,
+    progress: Report = no_progress,
+    workers: int = 1,
+) -> CameraCalibration:
+    """Calibrate a camera from photographs of a flat board.
+
+    Parameters
+    ----------
+    images : str, Path or sequence of these
+        Files, folders or patterns.
+    board : str, Path or Board
+        Such as ``chessboard:9x6:25mm`` (squares), or a YAML file with the block ``board`` of a
+        dataset. Its size does not matter here, its proportions do.
+    model : {"plumb_bob", "rational_polynomial", "equidistant"}
+        How the lens distorts.
+    output : path, optional
+        Write a ROS camera_info file there, with the standard deviations of all numbers.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+    workers : int
+        Search the images in that many processes, as :func:`legcal.calibrate` does.
+
+    Returns
+    -------
+    CameraCalibration
+        Look at its ``warnings`` before you use it.
+
+    Raises
+    ------
+    DatasetError
+        If images cannot be read, or are not of one size.
+    UsageError
+        If the board, the model or the output cannot be meant.
+    NotVisible
+        If no image shows the board.
+    NotIdentifiable
+        If fewer than three images show it, or all from one side.
+    DidNotConverge
+        If no camera explains the corners.
+    """
+    if model not in get_args(DistortionModel):
+        raise UsageError(
+            f"The camera could not be calibrated: found the model {model!r}, needed "
+            f"{', '.join(get_args(DistortionModel))}; correct it."
+        )
+    if output is not None:
+        CAMERA_FILE.check_place(Path(output))
+    flat_board = board_of(board)
+    paths = _listed_images([images] if isinstance(images, str | Path) else images)
+    size = _common_size(paths)
+    with worker_pool(workers) as run:
+        found = _search(flat_board, paths, size, run, progress)
+    shown = [k for k, (numbers, _, _) in enumerate(found) if len(numbers) >= MIN_CORNERS]
+    if not shown:
+        raise _not_visible(flat_board, paths, size)
+    if len(shown) < MIN_IMAGES:
+        raise too_few_images(len(shown), [paths[k].name for k in shown])
+    progress("Adjusting the camera", 0, 1)
+    fitted = robust_fit(_table(flat_board, [found[k] for k in shown]), size, model)
+    progress("Adjusting the camera", 1, 1)
+    if fitted is None:
+        raise DidNotConverge(
+            f"The camera could not be calibrated: found no {model} camera that explains the "
+            "corners, needed one; check the board and the model of the lens."
+        )
+    left_out = [f"{paths[shown[k]].name}: {why}" for k, why in fitted.left_out.items()]
+    refuse_undetermined(fitted, [paths[shown[k]].name for k in fitted.images], left_out)
+    result = _result(flat_board, paths, found, shown, fitted)
+    if output is not None:
+        write_camera(result, Path(output))
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search of an image, for any process."""
+
+    board: Board
+    paths: tuple[Path, ...]
+    size: ImageSize
+
+    def __call__(self, k: int) -> _Corners:
+        return find_corners(self.board, _read(self.paths[k], self.size))
+
+
+def _read(path: Path, size: ImageSize) -> Array:
+    """Return the grey levels of an image whose size is known."""
+    return np.asarray(read_image(path, Camera(np.eye(3), size.width, size.height)))
+
+
+def _search(
+    board: Board, paths: Sequence[Path], size: ImageSize, run: Run, progress: Report
+) -> list[_Corners]:
+    """Return the corners in every image."""
+    progress(_STAGE, 0, len(paths))
+    found = []
+    for corners in run(_Search(board, tuple(paths), size), range(len(paths))):
+        found.append(corners)
+        progress(_STAGE, len(found), len(paths))
+    return found
+
+
+def _table(board: Board, found: Sequence[_Corners]) -> BoardCorners:
+    """Return the corners of some images in one table."""
+    counts = [len(numbers) for numbers, _, _ in found]
+    return BoardCorners(
+        np.repeat(np.arange(len(found)), counts),
+        np.concatenate([board.points[numbers] for numbers, _, _ in found]),
+        np.concatenate([px for _, px, _ in found]),
+        np.concatenate([sigma for _, _, sigma in found]),
+    )
+
+
+def _not_visible(board: Board, paths: Sequence[Path], size: ImageSize) -> NotVisible:
+    """Return the refusal of images without the board, and say what they show instead."""
+    described = (describe_image(board, _read(path, size)) for path in paths[:_N_DESCRIBED])
+    what = next((words for words in described if words), None)
+    thing = "tags" if board.kind == "aprilgrid" else "squares"
+    hint = ""
+    if what is None and board.kind == "chessboard":
+        hint = f" (squares are counted: {board.columns - 1} x {board.rows - 1} inner corners)"
+    return NotVisible(
+        f"The camera could not be calibrated: found {what or 'nothing like the board'} in its "
+        f"{len(paths)} image{'s' * (len(paths) != 1)}, needed a {board.kind} of {board.columns} x "
+        f"{board.rows} {thing}{hint}; correct --board, or take sharper images of the whole board."
+    )
+
+
+def _result(
+    board: Board,
+    paths: Sequence[Path],
+    found: Sequence[_Corners],
+    shown: Sequence[int],
+    fitted: RobustFit,
+) -> CameraCalibration:
+    """Return the camera with what it rests on."""
+    adjusted, seen = fitted.adjusted, fitted.seen
+    used = {shown[k]: i for i, k in enumerate(fitted.images)}
+    left_out = {shown[k]: why for k, why in fitted.left_out.items()}
+    square = np.sum(adjusted.residual**2, axis=1)
+    tilt = tilts(fitted)
+    images = []
+    for k, path in enumerate(paths):
+        i = used.get(k)
+        n = len(found[k][0])
+        why = left_out.get(k, "" if k in shown else "the board was not found")
+        if i is None:
+            images.append(ImageResult(path.name, n, 0, None, None, why))
+            continue
+        here = seen.image == i
+        rms = float(np.sqrt(np.mean(square[here])))
+        n_used = int(np.count_nonzero(here))
+        images.append(ImageResult(path.name, n, n_used, rms, float(tilt[i]), ""))
+    n_dof = max(2 * len(square) - len(adjusted.covariance) - 6 * len(fitted.images), 1)
+    return CameraCalibration(
+        camera=adjusted.camera,
+        covariance=adjusted.covariance * fitted.scale,
+        board=board,
+        images=tuple(images),
+        rms_px=float(np.sqrt(np.mean(square))),
+        noise_px=float(np.sqrt(square.sum() / n_dof)),
+        coverage=coverage(fitted),
+        warnings=(*_left_out(images), *warnings(fitted)),
+    )
+
+
+def _left_out(images: Sequence[ImageResult]) -> list[str]:
+    """Return a sentence for each reason for which images were left out."""
+    by_reason: dict[str, list[str]] = {}
+    for image in images:
+        if image.reason:
+            by_reason.setdefault(image.reason, []).append(image.name)
+    return [f"{', '.join(names)} left out: {why}." for why, names in by_reason.items()]
+
+
+def _listed_images(named: Sequence[str | Path]) -> list[Path]:
+    """Return the image files that are named, each once, those of a folder or pattern by name."""
+    found: dict[Path, None] = {}
+    problems = []
+    for name in named:
+        paths = _matching(str(name))
+        if not paths:
+            problems.append(
+                f"The images {describe(str(name))} could not be read: found no such file, folder "
+                f"with images or pattern that matches one, needed {', '.join(_SUFFIXES)}; check "
+                "the path."
+            )
+        found |= dict.fromkeys(paths)
+    if problems or not found:
+        raise DatasetError(problems or "The images could not be read: found none, needed some.")
+    return list(found)
+
+
+def _matching(name: str) -> list[Path]:
+    """Return the images that one name stands for."""
+    if not name:
+        return []
+    path = Path(name)
+    if path.is_dir():
+        return [p for p in sorted(path.iterdir()) if p.suffix.lower() in _SUFFIXES and p.is_file()]
+    if os.path.lexists(path):
+        return [path]
+    hits = [Path(hit) for hit in sorted(glob.glob(name, recursive=True))]
+    return [hit for hit in hits if hit.suffix.lower() in _SUFFIXES and hit.is_file()]
+
+
+def _common_size(paths: Sequence[Path]) -> ImageSize:
+    """Return the size that all images have."""
+    sizes: dict[ImageSize, list[Path]] = {}
+    problems = []
+    for path in paths:
+        found = ""
+        try:
+            sizes.setdefault(image_size(path.read_bytes()), []).append(path)
+        except OSError as error:
+            found = f"'{error.strerror}'"
+        except ValueError as error:
+            found = str(error)
+        if found:
+            problems.append(
+                f"{path}: the image could not be read: found {found}, needed a complete PNG, JPEG "
+                "or TIFF file; copy it again or leave it out."
+            )
+    if problems:
+        raise DatasetError(problems)
+    if len(sizes) > 1:
+        by_count = sorted(sizes.items(), key=lambda item: -len(item[1]))
+        sizes_in_words = "; ".join(
+            f"{size.width} x {size.height} px in {_named(some)}" for size, some in by_count
+        )
+        raise DatasetError(
+            f"The camera could not be calibrated: found images of different sizes, "
+            f"{sizes_in_words}, needed one size; leave out those that another camera took, or that "
+            "were scaled, cropped or turned."
+        )
+    return next(iter(sizes))
+
+
+def _named(paths: Sequence[Path]) -> str:
+    """Return some of the names of files."""
+    if len(paths) <= _MAX_NAMED:
+        return ", ".join(path.name for path in paths)
+    return f"{len(paths)} images ({paths[0].name}, ...)"

@@ -1,0 +1,163 @@
+"""What images of a board determine of a camera: refused where it is too little, else warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from legcal.calibration.camera_calibration.adjustment import RobustFit, adjust
+from legcal.errors import NotIdentifiable
+from legcal.geometry import Array
+from legcal.vision import Camera, intrinsic_names
+
+MIN_IMAGES, _FEW_IMAGES = 3, 10
+_MAX_FOCAL_SIGMA, _WEAK_FOCAL_SIGMA = 0.05, 0.003  # as parts of the focal length
+_MIN_TILT, _MIN_SPREAD = np.radians(15.0), np.radians(20.0)
+_MIN_COVERAGE = 0.5
+_LARGE_RESIDUAL_PX = 1.0
+_MANY_LEFT_OUT = 0.05  # of all corners
+_OVERFIT = 0.01  # probability from which on the gain of more coefficients may be chance
+_FOLDED_PX = 0.1
+
+
+def tilts(found: RobustFit) -> Array:
+    """Return the angle of each board out of the image plane, (n_images,) [rad]."""
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
+    return np.asarray(np.arccos(np.clip(np.abs(normal[:, 2]), 0.0, 1.0)))
+
+
+def spread(found: RobustFit) -> float:
+    """Return the largest angle between two boards' planes [rad]."""
+    normal = np.array([T.rotation.as_matrix()[:, 2] for T in found.adjusted.T_camera_board])
+    return float(np.arccos(np.clip(np.abs(normal @ normal.T), 0.0, 1.0).min()))
+
+
+def coverage(found: RobustFit) -> float:
+    """Return the share of the image inside the convex hull of all corners."""
+    hull = cv2.convexHull(found.seen.px.astype(np.float32))
+    camera = found.adjusted.camera
+    return float(cv2.contourArea(hull)) / (camera.width * camera.height)
+
+
+def refuse_undetermined(
+    found: RobustFit, names: Sequence[str], left_out: Sequence[str] = ()
+) -> None:
+    """Raise NotIdentifiable if the images do not determine the camera."""
+    n = len(found.images)
+    if n < MIN_IMAGES:
+        raise too_few_images(n, names, left_out)
+    camera = found.adjusted.camera
+    f = float(camera.K[0, 0])
+    sigma = float(np.sqrt(found.adjusted.covariance[0, 0] * found.scale))
+    if not sigma <= _MAX_FOCAL_SIGMA * f:
+        raise NotIdentifiable(
+            f"The camera could not be calibrated: found boards tilted by at most "
+            f"{np.degrees(tilts(found).max()):.0f} deg out of the image plane and at most "
+            f"{np.degrees(spread(found)):.0f} deg to each other, which leave the focal length open "
+            f"(fx {f:.0f} px, known to {sigma:.2g} px), needed views from several sides; tilt the "
+            "board by 30 deg and more to the left, the right, up and down."
+        )
+    centre = camera.K[:2, 2]
+    if not np.all((centre > 0.0) & (centre < [camera.width - 1.0, camera.height - 1.0])):
+        raise NotIdentifiable(
+            f"The camera could not be calibrated: found the principal point at ({centre[0]:.0f}, "
+            f"{centre[1]:.0f}) px, outside the image, needed one inside; see that the images are "
+            "not cropped, that the model fits the lens, and tilt the board more."
+        )
+
+
+def too_few_images(n: int, names: Sequence[str], left_out: Sequence[str] = ()) -> NotIdentifiable:
+    """Return the refusal of so few images with the board, saying why others were left out."""
+    found = f"{n} images" if n != 1 else "1 image"
+    which = f" ({', '.join(names)})" if names else ""
+    others, mend = "", ""
+    if left_out:
+        reasons = "; ".join(left_out)
+        others = f" that agree{which}, and {len(left_out)} more that had to be left out ({reasons})"
+        mend = "see that the board is flat and does not move while it is photographed, and "
+    return NotIdentifiable(
+        f"The camera could not be calibrated: found {found} with the board{others or which}, "
+        f"needed {MIN_IMAGES} at least and better {_FEW_IMAGES}; {mend}take more, with the "
+        "board tilted to all sides."
+    )
+
+
+def warnings(found: RobustFit) -> list[str]:
+    """Return what is wrong with a camera that can be used, one sentence each."""
+    n, camera = len(found.images), found.adjusted.camera
+    sigma = np.sqrt(np.diag(found.adjusted.covariance) * found.scale)
+    sentences = []
+    if n < _FEW_IMAGES:
+        sentences.append(
+            f"{n} images are few: the standard deviations themselves are uncertain; take "
+            f"{_FEW_IMAGES} or more."
+        )
+    tilt, apart = float(tilts(found).max()), spread(found)
+    focal = float(sigma[0] / camera.K[0, 0])
+    if tilt < _MIN_TILT or apart < _MIN_SPREAD or focal > _WEAK_FOCAL_SIGMA:
+        sentences.append(
+            f"The focal length is weakly determined, to {100.0 * focal:.2g} % ({sigma[0]:.2g} px): "
+            f"the boards are tilted by at most {np.degrees(tilt):.0f} deg out of the image plane "
+            f"and {np.degrees(apart):.0f} deg to each other; tilt them by 30 deg and more."
+        )
+    covered = coverage(found)
+    if covered < _MIN_COVERAGE:
+        sentences.append(
+            f"Corners cover {100.0 * covered:.0f} % of the image: what the lens does outside is "
+            "extrapolated; bring the board near every edge and corner of the image."
+        )
+    sentences += _folding(camera)
+    sentences += _overfit(found)
+    rms = float(np.sqrt(np.mean(np.sum(found.adjusted.residual**2, axis=1))))
+    if rms > _LARGE_RESIDUAL_PX:
+        sentences.append(
+            f"The residuals are large, {rms:.2f} px (rms): the board is bent, its dimensions are "
+            "wrong, or the model of the lens does not fit."
+        )
+    n_all = found.n_left_out + len(found.seen.px)
+    if found.n_left_out > _MANY_LEFT_OUT * n_all:
+        sentences.append(
+            f"{found.n_left_out} of {n_all} corners disagree with the others and were left out; "
+            "see that the board is flat, sharp and evenly lit."
+        )
+    return sentences
+
+
+def _folding(camera: Camera) -> list[str]:
+    """Return a warning if the lens model maps two directions to one pixel inside the image."""
+    w, h = camera.width - 1.0, camera.height - 1.0
+    corners = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
+    back = camera.distort(camera.undistort(corners))
+    off = float(np.nan_to_num(np.abs(back - corners), nan=np.inf).max())
+    if off < _FOLDED_PX:
+        return []
+    return [
+        "The lens model folds back before the corners of the image, where no board was seen: "
+        "pixels there cannot be used; bring the board into the corners, or take a simpler --model."
+    ]
+
+
+def _overfit(found: RobustFit) -> list[str]:
+    """Return a warning if the three more coefficients of the rational model gain nothing."""
+    full = found.adjusted
+    if full.camera.model != "rational_polynomial":
+        return []
+    simple = [name for name in intrinsic_names(full.camera) if name not in ("k4", "k5", "k6")]
+    zeroed = full.camera.distortion.copy()
+    zeroed[5:] = 0.0
+    start = Camera(full.camera.K, full.camera.width, full.camera.height, zeroed, full.camera.model)
+    plain = adjust(start, full.T_camera_board, found.seen, simple)
+    if plain is None:
+        return []
+    dof = 2 * len(found.seen.px) - len(full.covariance) - 6 * len(found.images)
+    gain = (plain.cost - full.cost) / 3.0 / max(full.cost / max(dof, 1), 1e-30)
+    if gain > 0.0 and f_distribution.sf(gain, 3, max(dof, 1)) < _OVERFIT:
+        return []
+    rms = [float(np.sqrt(np.mean(np.sum(a.residual**2, axis=1)))) for a in (full, plain)]
+    return [
+        f"The model overfits: with rational_polynomial corners are {rms[0]:.4f} px off (rms), "
+        f"with plumb_bob {rms[1]:.4f} px, which is no better than chance; take --model plumb_bob."
+    ]

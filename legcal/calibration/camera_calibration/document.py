@@ -1,0 +1,188 @@
+"""The calibration of a camera, its document, and the camera file: written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legcal.files import Document, OwnYaml
+from legcal.geometry import Array
+from legcal.vision import CALIBRATED, Board, Camera, camera_info, intrinsic_names, intrinsic_values
+
+CAMERA_FILE = OwnYaml(
+    "the camera", "camera file", CALIBRATED, "a new file or one that this command wrote"
+)
+_DIGITS = 6  # of figures that describe the calibration
+
+
+@dataclass(frozen=True)
+class ImageResult:
+    """What an image gave.
+
+    Attributes
+    ----------
+    name : str
+        Its file.
+    corners : int
+        Of the board, found in it.
+    used : int
+        Those that were used.
+    rms_px : float or None
+        Of their residuals, both coordinates together [px]; None if the image was left out.
+    tilt : float or None
+        Of the board out of the image plane [rad].
+    reason : str
+        Why it was left out, "" if it was not.
+    """
+
+    name: str
+    corners: int
+    used: int
+    rms_px: float | None
+    tilt: float | None
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """The result of :func:`legcal.calibrate_camera`.
+
+    Attributes
+    ----------
+    camera : Camera
+        The camera.
+    covariance : (k, k) array
+        Of its numbers, in the order of ``names`` [px, and without unit].
+    board : Board
+        The board that it was calibrated with.
+    images : tuple of ImageResult
+        All images, in their order.
+    rms_px : float
+        Of the residuals, both coordinates together [px].
+    noise_px : float
+        Scatter of either coordinate of a corner, one standard deviation [px].
+    coverage : float
+        Share of the image inside the convex hull of all corners.
+    warnings : tuple of str
+        What is wrong with it, one sentence each.
+    """
+
+    camera: Camera
+    covariance: Array
+    board: Board
+    images: tuple[ImageResult, ...]
+    rms_px: float
+    noise_px: float
+    coverage: float
+    warnings: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the numbers: ``fx fy cx cy``, then the distortion in OpenCV's order."""
+        return intrinsic_names(self.camera)
+
+    @property
+    def values(self) -> Array:
+        """The numbers, (k,) [px, and without unit]."""
+        return intrinsic_values(self.camera)
+
+    @property
+    def sigma(self) -> Array:
+        """Their standard deviations, (k,) [px, and without unit]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def document(self) -> dict[str, Any]:
+        """Return what ``--json`` prints."""
+        numbers = zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True)
+        return CameraDocument(
+            legcal_camera=1,
+            model=self.camera.model,
+            width=self.camera.width,
+            height=self.camera.height,
+            intrinsics=[Intrinsic(name=name, value=v, sigma=sigma) for name, v, sigma in numbers],
+            covariance=self.covariance.tolist(),
+            rms_px=self.rms_px,
+            noise_px=self.noise_px,
+            coverage=self.coverage,
+            images=[
+                BoardImage(
+                    image=image.name,
+                    corners=image.corners,
+                    used=image.used,
+                    rms_px=image.rms_px,
+                    tilt_rad=image.tilt,
+                    reason=image.reason or None,
+                )
+                for image in self.images
+            ],
+            warnings=list(self.warnings),
+        ).document()
+
+
+class Intrinsic(Document):
+    """A number of the camera [px, or without unit]."""
+
+    name: str
+    value: float
+    sigma: float
+
+
+class BoardImage(Document):
+    """What an image gave."""
+
+    image: str
+    corners: int
+    used: int
+    rms_px: float | None
+    tilt_rad: float | None
+    reason: str | None
+
+
+class CameraDocument(Document):
+    """What ``legcal camera --json`` prints."""
+
+    legcal_camera: int
+    model: str
+    width: int
+    height: int
+    intrinsics: list[Intrinsic]
+    covariance: list[list[float]]
+    rms_px: float
+    noise_px: float
+    coverage: float
+    images: list[BoardImage]
+    warnings: list[str]
+
+
+def write_camera(calibration: CameraCalibration, path: Path) -> None:
+    """Write a camera; an earlier one of this command is replaced, any other file is not.
+
+    Raises
+    ------
+    UsageError
+        If another file stands there, or none can be written.
+    OutOfResources
+        If the file cannot be written.
+    """
+    names, sigma = calibration.names, calibration.sigma.tolist()
+    block = {
+        "version": 1,
+        "rms_px": _short(calibration.rms_px),
+        "coverage": _short(calibration.coverage),
+        "sigma": {name: _short(s) for name, s in zip(names, sigma, strict=True)},
+        "images": [
+            {"image": i.name, "corners": i.used, "rms_px": _short(i.rms_px)}
+            for i in calibration.images
+            if i.rms_px is not None
+        ],
+        "warnings": list(calibration.warnings),
+    }
+    text = camera_info(calibration.camera, path.stem, {CALIBRATED: block})
+    CAMERA_FILE.write(path, text)
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
