@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from legcal.geometry.types import Array
 from legcal.simulation.request import Level
 from legcal.simulation.settings import SimulationSettings
 from legcal.vision.camera import Camera
@@ -34,9 +33,3 @@ def files_of(folder: Path) -> dict[str, bytes]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-
-
-def distances_to_lines(h: Array, xy: Array) -> Array:
-    """Return how far points (n, 2, 2) of the sensor plane are from lines (n, 3) there."""
-    value = np.sum(h[:, None, :2] * xy, axis=-1) + h[:, None, 2]
-    return np.asarray(value / np.linalg.norm(h[:, None, :2], axis=-1))

@@ -4,14 +4,20 @@ import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from simulated import settings
+from thinned import thinned
 
+from legcal.data import Dataset, Outlines, load_dataset
+from legcal.data.outlines import read_observations
 from legcal.errors import UsageError
-from legcal.geometry.types import Array
+from legcal.geometry import Array
 from legcal.machine import Machine, load_mechanism
-from legcal.simulation.rendering.appearance import Appearance, Light
+from legcal.simulation import Appearance, Level, simulate
+from legcal.simulation.rendering.appearance import Light
 from legcal.simulation.rendering.rays import PixelRays
 from legcal.simulation.rendering.scene import prepare_view, render
 from legcal.simulation.solids import (
@@ -23,15 +29,14 @@ from legcal.simulation.solids import (
     Shape,
     Solid,
     Sphere,
-    dressed,
     link_poses,
     placed,
     solids_of,
 )
-from legcal.vision.camera import Camera
-from legcal.vision.cylinder import outlines_of_axis
+from legcal.vision import Camera, camera_info, outlines_of_axis
 
 ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 IDENTITY = RigidTransform.identity()
 WIDTH, HEIGHT, F = 320, 240, 400.0
 LENSES = {
@@ -52,7 +57,7 @@ LENSES = {
 }
 
 
-@pytest.fixture(scope="module", params=sorted(p.stem for p in (ROOT / "models").glob("*.yaml")))
+@pytest.fixture(scope="module", params=SHIPPED)
 def shipped(request: pytest.FixtureRequest) -> Machine:
     return load_mechanism(ROOT / "models" / f"{request.param}.yaml")
 
@@ -215,16 +220,6 @@ def test_every_solid_of_every_mechanism_is_shown_where_it_is(shipped: Machine) -
         assert image[v, u] > 0.3
 
 
-def test_every_mechanism_makes_a_photograph(shipped: Machine) -> None:
-    solids = placed(dressed(shipped), link_poses(shipped, shipped.home_configuration))
-    T, rng = looking_at(shipped, solids), np.random.default_rng(1)
-    image = render(solids, LENSES["barrel"], T, Appearance(clutter=4, samples=13), rng)
-    assert image.shape == (HEIGHT, WIDTH)
-    assert image.dtype == np.uint8
-    assert 15.0 < image.mean() < 180.0
-    assert image.std() > 15.0
-
-
 def test_the_same_seed_gives_the_same_bits_and_another_one_does_not() -> None:
     ball = solid(Sphere(0.2), RigidTransform.from_translation([0.0, 0.0, 1.0]))
     camera = LENSES["barrel"]
@@ -253,6 +248,7 @@ def test_grey_levels_are_radiance_to_the_power_of_one_over_gamma() -> None:
     linear, curved = clean([placed_bar]), clean([placed_bar], gamma=2.2)
     assert np.allclose(curved**2.2, linear, atol=1e-4)
     assert np.allclose(clean([placed_bar], bits=8), linear, atol=0.6 / 255.0)
+    assert clean([placed_bar], exposure=3.0).max() == 1.0  # saturated
 
 
 def test_blur_spreads_an_edge_by_its_sigma() -> None:
@@ -262,11 +258,6 @@ def test_blur_spreads_an_edge_by_its_sigma() -> None:
     x = np.arange(len(steps))
     spread = math.sqrt(steps @ (x - steps @ x) ** 2)
     assert spread == pytest.approx(math.hypot(1.5, math.sqrt(1.0 / 12.0)), rel=0.05)
-
-
-def test_light_saturates_at_full_scale() -> None:
-    placed_bar, _, _ = bar(0.4, 0.05)
-    assert clean([placed_bar], exposure=3.0).max() == 1.0
 
 
 def test_colours_are_the_materials_and_grey_is_their_mean() -> None:
@@ -320,3 +311,113 @@ def test_every_pixel_looks_where_the_camera_says(lens: str) -> None:
     middles = np.array([[0, 0], [100, 77], [WIDTH - 1, HEIGHT - 1]])[:, None]
     assert np.abs(inside - middles).max() < 0.501
     assert np.abs((inside - middles).mean(axis=1)).max() < 0.02
+
+
+# --- photographs of datasets against the truth beside them, by edge measurements of their own
+
+
+REACH, STEP = 4.0, 0.25  # of profiles across an outline [px]
+FREE = 0.12  # of an outline, left out at both ends
+
+
+def lens(folder: Path, width: int, height: int) -> Path:
+    """Write the file of a camera that distorts like a cheap lens."""
+    K = np.array([[1.25 * width, 0.0, 0.51 * width], [0.0, 1.26 * width, 0.48 * height], [0, 0, 1]])
+    path = folder / "lens.yaml"
+    path.write_text(camera_info(Camera(K, width, height, np.array([-0.2, 0.05, 0, 0, 0])), "lens"))
+    return path
+
+
+def photographs(name: str, folder: Path, size: tuple[int, int], looks: Appearance) -> Dataset:
+    few = settings(
+        level=Level.PHOTOGRAPHS, poses=1, views=1, camera=lens(folder, *size), appearance=looks
+    )
+    return load_dataset(simulate(name, folder / "set", few).folder)
+
+
+def picture(dataset: Dataset) -> Array:
+    path = dataset.image_path(0)
+    assert path is not None
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image.astype(np.float64)
+
+
+def true_outlines(dataset: Dataset) -> Outlines:
+    path = dataset.folder / "truth" / "outlines.csv"
+    return read_observations(path, dataset.machine.legs, dataset.measurements)
+
+
+def profiles(image: Array, camera: Camera, ends: Array, other: Array) -> Array:
+    """Return grey levels across an outline (n, m), from inside to outside.
+
+    Inside is where the other outline of the same part is. Bends of the lens are followed.
+    """
+    t = np.arange(FREE, 1.0 - FREE, 1.0 / np.linalg.norm(ends[1] - ends[0]))
+    start, end = camera.undistort(ends)
+    curve = camera.distort(start + t[:, None] * (end - start))
+    along = np.gradient(curve, axis=0)
+    out = np.stack([along[:, 1], -along[:, 0]], axis=-1)
+    out /= np.linalg.norm(out, axis=-1, keepdims=True)
+    out *= np.sign(out[len(out) // 2] @ (ends.mean(axis=0) - other.mean(axis=0)))
+    across = np.arange(-REACH, REACH + 0.5 * STEP, STEP)
+    points = (curve[:, None] + across[:, None] * out[:, None]).astype(np.float32)
+    found = cv2.remap(image.astype(np.float32), points[..., 0], points[..., 1], cv2.INTER_LINEAR)
+    return np.asarray(found, dtype=np.float64)
+
+
+def outward_errors(levels: Array) -> Array:
+    """Return how far outside of an outline the edge is [px]: areas of profiles between two levels.
+
+    Profiles that another edge crosses have no constant level at one end, and are left out.
+    """
+    flat = round(2.0 / STEP)
+    inside, outside = levels[:, :flat], levels[:, -flat:]
+    step = outside.mean(axis=1) - inside.mean(axis=1)
+    clean = np.maximum(np.ptp(inside, axis=1), np.ptp(outside, axis=1)) < 0.01 * np.abs(step)
+    levels, step, first = levels[clean], step[clean], inside[clean].mean(axis=1)
+    covered = 1.0 - (levels - first[:, None]) / step[:, None]
+    return np.asarray((covered.sum(axis=1) - 0.5) * STEP - REACH)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "tricept"])
+def test_clean_photographs_show_the_true_outlines_on_both_sides(name: str, tmp_path: Path) -> None:
+    dataset = photographs(name, tmp_path, (640, 480), Appearance.clean())
+    truth, (view,) = true_outlines(dataset), dataset.measurements.views
+    image = picture(dataset)
+    medians: dict[int, list[float]] = {1: [], 2: []}
+    for i in range(len(truth.row)):
+        same = (truth.leg == truth.leg[i]) & (np.array(truth.part) == truth.part[i])
+        (pair,) = np.flatnonzero(same & (truth.edge != truth.edge[i]))
+        levels = profiles(image, view.camera, truth.ends[i], truth.ends[pair])
+        errors = outward_errors(levels)
+        if len(errors) > 40:
+            medians[int(truth.edge[i])].append(float(np.median(errors)))
+    for side in medians.values():
+        assert len(side) >= 3
+        assert np.abs(side).max() < 0.02
+        assert abs(np.mean(side)) < 0.01
+
+
+@pytest.mark.parametrize("name", thinned(SHIPPED, ["3-rpr", "3-upu", "tricept"]))
+def test_photographs_of_every_class_show_the_legs_that_they_are_said_to(
+    name: str, tmp_path: Path
+) -> None:
+    looks = Appearance(clutter=4, samples=13)
+    dataset = photographs(name, tmp_path, (320, 240), looks)
+    truth, (view,) = true_outlines(dataset), dataset.measurements.views
+    image = picture(dataset)
+    assert image.shape == (240, 320)
+    names = dataset.machine.leg_names
+    said = {names.index(leg) for leg in view.legs or names}
+    assert said <= set(truth.leg.tolist())
+    for leg in said:
+        surest = 0.0
+        for i in np.flatnonzero(truth.leg == leg):
+            same = (truth.leg == leg) & (np.array(truth.part) == truth.part[i])
+            (pair,) = np.flatnonzero(same & (truth.edge != truth.edge[i]))
+            levels = profiles(image, view.camera, truth.ends[i], truth.ends[pair])
+            middle = levels.shape[1] // 2
+            step = levels[:, middle + round(1.5 / STEP)] - levels[:, middle - round(1.5 / STEP)]
+            surest = max(surest, abs(float(np.median(step))))
+        assert surest > 4.0  # grey levels: those of one pixel have a noise of two

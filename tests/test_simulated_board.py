@@ -10,17 +10,14 @@ import numpy as np
 import pytest
 from boards import CHARUCO
 
-from legcal.data.dataset import load_dataset
-from legcal.errors import DatasetError, NotVisible, UsageError
+from legcal.data import load_dataset
+from legcal.errors import DatasetError, NotVisible
 from legcal.files import motion_from_xyz_quat
 from legcal.machine import Machine, load_mechanism
 from legcal.perception import camera_poses, find_corners
+from legcal.simulation import Level, SimulationSettings, simulate
 from legcal.simulation.board import chosen_board
-from legcal.simulation.dataset import simulate
-from legcal.simulation.request import Level, Request
-from legcal.simulation.settings import SimulationSettings, requested
-from legcal.vision import Board
-from legcal.vision import parse_board as described_board
+from legcal.vision import parse_board
 
 
 @cache
@@ -69,7 +66,7 @@ def test_corners_are_off_by_as_much_as_they_claim(standing: Path) -> None:
 
 def test_the_truth_says_where_the_board_is(standing: Path, held: Path) -> None:
     for folder in (standing, held):
-        _, T = described_board(_truth(folder)["board"], folder)
+        _, T = parse_board(_truth(folder)["board"], folder)
         assert T is not None
         given = load_dataset(folder).T_base_board
         assert (given is None) == (folder == held)
@@ -84,7 +81,7 @@ def test_every_hand_held_image_has_its_own_place_and_the_board_gives_it(held: Pa
     assert [view.name for view in m.views] == [f"c1-{k + 1}" for k in range(m.n_rows)]
     poses, _ = camera_poses(dataset.corners, dataset.board, m, [view.name for view in m.views])
     truth = _truth(held)
-    _, T_base_board = described_board(truth["board"], held)
+    _, T_base_board = parse_board(truth["board"], held)
     assert T_base_board is not None
     places = []
     for view, T_board_camera in zip(m.views, poses, strict=True):
@@ -105,7 +102,7 @@ def test_photographs_show_the_board_where_it_is(tmp_path: Path) -> None:
     assert dataset.board is not None
     number, px, sigma = find_corners(dataset.board, dataset.read_image(0))
     truth = _truth(tmp_path / "seen")
-    _, T_base_board = described_board(truth["board"], tmp_path)
+    _, T_base_board = parse_board(truth["board"], tmp_path)
     assert T_base_board is not None
     T = motion_from_xyz_quat(**truth["views"]["c1"]["T_base_camera"]).inv() * T_base_board
     exact = dataset.measurements.views[0].camera.project(T.apply(dataset.board.points))
@@ -134,46 +131,3 @@ def test_a_board_comes_from_a_file_or_fits_the_machine(tmp_path: Path) -> None:
     path.write_text("kind: chessboard\n")
     with pytest.raises(DatasetError, match="found no block board, needed one as in"):
         chosen_board(path, [])
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"hand_held": True}, "found a camera in the hand without a board"),
-        ({"board_pose": True}, "found the pose of a board without a board"),
-        ({"board": CHARUCO, "hand_held": True, "images": 2}, "2 images of each pose from a camera"),
-        ({"board": CHARUCO, "hand_held": True, "views": "c.yaml"}, "and a file of cameras"),
-        ({"board": 3}, "found 3 as board, needed a Board"),
-    ],
-)
-def test_settings_of_boards_that_contradict_others_are_refused(
-    settings: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(UsageError, match=message):
-        SimulationSettings(**settings)
-
-
-@pytest.mark.parametrize(
-    ("request_", "message"),
-    [
-        (Request(hand_held=True), "--hand-held could not be used: found no --board"),
-        (Request(board_pose=True), "--board-pose could not be used: found no --board"),
-        (
-            Request(board="charuco", hand_held=True, cameras=Path("c.yaml")),
-            "found both --hand-held and --cameras",
-        ),
-        (Request(board="charucoo"), "--board could not be used: .* did you mean 'charuco'"),
-        (Request(level=Level.AXES, pixel_noise="0.2px"), "--pixel-noise could not be used"),
-    ],
-)
-def test_options_of_boards_that_contradict_others_are_refused(
-    request_: Request, message: str
-) -> None:
-    with pytest.raises(UsageError, match=message):
-        requested(request_, machine())
-
-
-def test_pixel_noise_of_axes_is_that_of_the_board() -> None:
-    settings = requested(Request(level=Level.AXES, board="charuco", pixel_noise="0.2px"), machine())
-    assert settings.sigma_px == pytest.approx(0.2)
-    assert not isinstance(settings.board, Board)

@@ -1,4 +1,4 @@
-"""Poses of simulated machines, drawn and given: reached, inside limits, no leg through another."""
+"""Poses of simulated machines, drawn, given or commanded: reached and inside all limits."""
 
 import re
 from collections.abc import Callable
@@ -14,8 +14,7 @@ from mechanisms import ROOT
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from legcal.errors import DatasetError, DidNotConverge, ModelError, UsageError
-from legcal.geometry import segment_distance
-from legcal.geometry.types import Array
+from legcal.geometry import Array, segment_distance
 from legcal.machine import (
     REGULAR,
     Configurations,
@@ -28,7 +27,18 @@ from legcal.machine import (
     singularity,
 )
 from legcal.machine.mobility import determinant_sign
-from legcal.simulation.poses import JITTER, Feasibility, are_extreme, draw_poses, given_poses
+from legcal.simulation import poses as module
+from legcal.simulation.poses import (
+    JITTER,
+    Feasibility,
+    are_extreme,
+    commanded_poses,
+    draw_poses,
+    given_poses,
+)
+from legcal.simulation.request import Sampling
+from legcal.simulation.settings import DEFAULT_ERRORS
+from legcal.simulation.truth import write_true_model
 
 SHIPPED = sorted(path.stem for path in (ROOT / "models").glob("*.yaml"))
 LONG_TRAVEL = "nategh-agheli"  # whose legs cannot all be near the ends of their travel
@@ -278,44 +288,6 @@ def test_given_readings_are_reached_in_their_order(name: str, tmp_path: Path) ->
         np.testing.assert_allclose(T.as_matrix(), alone, atol=1e-9)
 
 
-def test_columns_of_given_readings_may_stand_in_any_order(tmp_path: Path) -> None:
-    machine = load_mechanism("3-rps")
-    rows = np.array([[0.02, 0.05, 0.09], [0.1, 0.06, 0.01]])
-    names = [f"leg{j}_prismatic" for j in (3, 1, 2)]
-    found = given_poses(machine, _csv(tmp_path, machine, rows[:, [2, 0, 1]], names))
-    np.testing.assert_allclose(found.readings, rows, atol=1e-12)
-
-
-HEAD = "leg1_prismatic,leg2_prismatic,leg3_prismatic\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "found no header and no row"),
-        (HEAD, "found a header and no row"),
-        (HEAD.replace(",", ";") + "0;0;0\n", "between columns, needed ','"),
-        (HEAD.replace("leg2", "leg9") + "0,0,0\n", "unknown column 'leg9_prismatic'"),
-        (HEAD.replace("leg2", "leg9") + "0,0,0\n", "no column 'leg2_prismatic'"),
-        (HEAD.replace("leg2", "leg1") + "0,0,0\n", "'leg1_prismatic' 2 times"),
-        (HEAD + "0,0,0\n0,0\n", r"row 2 \(line 3\): the row could not be used: found 2 cells"),
-        (HEAD + "0,0,\n", r"row 1 \(line 2\), column leg3_prismatic: .* found an empty cell"),
-        (
-            HEAD + "0,nan,0\n",
-            r"column leg2_prismatic: .* found 'nan', needed a finite number in metres",
-        ),
-        (HEAD + "0,0,1.0\n", "column leg3_prismatic: readings are outside the travel: found 1 m"),
-        (HEAD + "10,20,60\n", "these look like millimetres"),
-    ],
-)
-def test_malformed_files_of_poses_are_refused(text: str, said: str, tmp_path: Path) -> None:
-    path = tmp_path / "poses.csv"
-    path.write_text(text)
-    with pytest.raises(DatasetError, match=said) as caught:
-        given_poses(load_mechanism("3-rps"), path)
-    assert all(problem.startswith(f"{path}") for problem in caught.value.problems)
-
-
 def test_given_readings_that_are_not_reached_are_named_by_row(tmp_path: Path) -> None:
     machine = load_mechanism(LONG_TRAVEL)
     (home, lower, upper) = (
@@ -354,9 +326,65 @@ def test_given_poses_with_legs_through_each_other_are_refused(tmp_path: Path) ->
     assert rows == {i for i, overlap in enumerate(overlaps) if overlap > 0.0}
 
 
-def test_readings_that_do_not_tell_the_pose_are_refused(tmp_path: Path) -> None:
-    machine = load_mechanism("hexapod")
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("0,0,0\n0,0\n", r"row 2 \(line 3\)"),
+        ("0,nan,0\n", r"row 1 \(line 2\), column leg2_prismatic: .*'nan'"),
+        ("0,0,1.0\n", "column leg3_prismatic: readings are outside the travel: found 1 m"),
+        ("", "no row"),
+    ],
+)
+def test_malformed_files_of_poses_are_refused(text: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(f"leg1_prismatic,leg2_prismatic,leg3_prismatic\n{text}")
+    machine = load_mechanism("3-rps")
+    with pytest.raises(DatasetError, match=f"^{path}.*{named}"):
+        given_poses(machine, path)
     passive = replace(machine.legs[1], kind=LegKind.PASSIVE)
-    free = replace(machine, legs=(machine.legs[0], passive, *machine.legs[2:]))
-    with pytest.raises(UsageError, match="found a machine of 6 freedoms and 5 motors"):
-        given_poses(free, tmp_path / "poses.csv")
+    free = replace(machine, legs=(machine.legs[0], passive, machine.legs[2]))
+    with pytest.raises(UsageError, match="found a machine of 3 freedoms and 2 motors"):
+        given_poses(free, path)
+
+
+# --- poses that a controller with the nominal model could have commanded
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Machine, Machine]:
+    nominal = load_mechanism(LONG_TRAVEL)
+    folder: Path = tmp_path_factory.mktemp("truth")
+    return nominal, write_true_model(nominal, DEFAULT_ERRORS, np.random.default_rng(3), folder)
+
+
+def test_the_nominal_model_reaches_every_pose_at_its_readings(
+    pair: tuple[Machine, Machine],
+) -> None:
+    nominal, truth = pair
+    home = singularity(nominal, nominal.home)
+    poses = commanded_poses(truth, nominal, 12, np.random.default_rng(0), Sampling.EXTREME)
+    assert len(poses.configurations) == len(poses.poses) == len(poses.readings) == 12
+    for T, q in zip(poses.poses, poses.readings, strict=True):
+        near = forward_kinematics(nominal, q)
+        assert singularity(nominal, near) >= 0.05 * home
+        assert np.linalg.norm(near.translation - T.translation) < 0.1
+
+
+def test_poses_that_the_nominal_model_does_not_reach_are_drawn_again(
+    pair: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nominal, truth = pair
+    readings = draw_poses(truth, 3, np.random.default_rng(0)).readings
+    monkeypatch.setattr(module, "_reaches", lambda _, q: not np.array_equal(q, readings[1]))
+    poses = commanded_poses(truth, nominal, 3, np.random.default_rng(0), Sampling.EXTREME)
+    assert np.array_equal(poses.readings[:2], readings[[0, 2]])
+    assert len(poses.poses) == 3
+
+
+def test_a_machine_far_from_its_model_is_refused(
+    pair: tuple[Machine, Machine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nominal, truth = pair
+    monkeypatch.setattr(module, "_reaches", lambda *_: False)
+    with pytest.raises(DidNotConverge, match="found 0 that the true machine and the nominal"):
+        commanded_poses(truth, nominal, 1, np.random.default_rng(0), Sampling.EXTREME)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 from yourdfpy import URDF
 
 from legcal.errors import ModelError
@@ -200,11 +200,3 @@ def test_a_link_with_visuals_of_its_own_is_not_dressed(tmp_path: Path) -> None:
     solids = dressed(hexapod_showing(tmp_path, visual))
     assert sum(s.link == "platform" for s in solids) == 1
     assert sum(s.link == "base" for s in solids) == 13
-
-
-def test_a_solid_without_a_link_stays_in_the_base_frame() -> None:
-    machine = load_mechanism("hexapod")
-    one = solids_of(machine)[0]
-    free = type(one)("free", None, one.shape, RigidTransform.from_translation([1.0, 2.0, 3.0]))
-    (found,) = placed([free], {})
-    assert found.T_base_solid.translation == pytest.approx([1.0, 2.0, 3.0])

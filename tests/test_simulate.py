@@ -1,0 +1,586 @@
+"""Simulated datasets: of the spread that they claim, reproducible, whole or not there at all.
+
+What options of the command give and how wrong ones are refused is in tests/characterisation.
+"""
+
+import io
+import json
+import re
+import textwrap
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from outline_tables import LEG_NAMES, outlines_of, recorded
+from rich.console import Console
+from simulated import files_of, settings, small_camera
+
+import legcal
+from legcal.data import View, load_dataset
+from legcal.data.outlines import format_observations, read_observations
+from legcal.errors import DatasetError, LegcalError, NotVisible, OutOfResources, UsageError
+from legcal.machine import LegKind, load_mechanism
+from legcal.report import simulation_table
+from legcal.simulation import (
+    Level,
+    ParameterErrors,
+    Request,
+    SimulatedDataset,
+    SimulationSettings,
+    Spread,
+    TableNoise,
+    requested,
+    simulate,
+    summary_document,
+)
+from legcal.simulation.folder import TRUTH_NAME, check_dataset_destination, dataset_folder
+from legcal.simulation.request import Sampling
+from legcal.simulation.settings import Distribution, read_appearance
+
+FEW = settings(poses=1, views=1)
+
+
+def truth_of(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / TRUTH_NAME).read_text()))
+
+
+# --- what is measured
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDataset:
+    folder = tmp_path_factory.mktemp("simulated") / "outlines"
+    wide = Spread(1e-4, Distribution.UNIFORM)
+    return simulate("hexapod", folder, settings(poses=8, views=3, readings=wide))
+
+
+def test_the_dataset_has_the_nominal_model_and_the_truth_beside_it(made: SimulatedDataset) -> None:
+    dataset = load_dataset(made.folder)
+    assert (dataset.measurements.n_rows, dataset.measurements.n_poses) == (24, 24)
+    assert np.array_equal(dataset.machine.A_base, load_mechanism("hexapod").A_base)
+    assert dataset.machine.yaml_path.is_relative_to(made.folder)
+    for name in ("base_joints", "platform_joints"):
+        errors = getattr(made.truth.parameters, name) - getattr(made.nominal.parameters, name)
+        assert 1e-3 < np.abs(errors).max() <= 2e-3 + 1e-12
+
+
+def test_outlines_scatter_about_the_true_ones_as_their_covariance_says(
+    made: SimulatedDataset,
+) -> None:
+    dataset = load_dataset(made.folder)
+    m, found = dataset.measurements, dataset.observations
+    exact = read_observations(made.folder / "truth" / "outlines.csv", dataset.machine.legs, m)
+    assert found is not None
+    assert (found.row.tolist(), found.leg.tolist()) == (exact.row.tolist(), exact.leg.tolist())
+    camera = m.views[0].camera
+    offset = camera.line_offset(found.h[:, None], camera.undistort(exact.ends))
+    whitened = np.linalg.solve(np.linalg.cholesky(found.covariance), offset[..., None])[..., 0]
+    assert len(offset) > 200
+    assert np.cov(whitened.T) == pytest.approx(np.eye(2), abs=0.25)
+    assert np.abs(whitened.mean(axis=0)).max() < 0.2
+    assert whitened[exact.edge == 1].mean() == pytest.approx(0.0, abs=0.25)  # per side
+
+
+def test_readings_scatter_and_camera_poses_are_rough_as_they_claim(made: SimulatedDataset) -> None:
+    m, truth = load_dataset(made.folder).measurements, truth_of(made.folder)
+    true = np.array([list(truth["poses"][label]["joints"].values()) for label in m.pose_labels])
+    error = m.q - true[m.pose]
+    assert 0.7e-4 < np.abs(error).max() <= 1e-4
+    assert error.std() == pytest.approx(m.sigma_q, rel=0.15)
+    assert m.sigma_q == pytest.approx(1e-4 / np.sqrt(3.0))
+    for view in m.views:
+        assert view.T_base_camera is not None
+        there = np.array(truth["views"][view.name]["T_base_camera"]["xyz"])
+        assert 1e-5 < np.linalg.norm(view.T_base_camera.translation - there) < 0.0151
+
+
+def test_without_errors_and_noise_the_dataset_is_that_of_the_model(tmp_path: Path) -> None:
+    exact = settings(
+        errors=ParameterErrors(), sigma_px=0.0, readings=Spread(), poses=2, views=2, images=2,
+        shared_poses=True, hints=False,
+    )  # fmt: skip
+    made = simulate("hexapod", tmp_path / "set", exact)
+    m, truth = load_dataset(made.folder).measurements, truth_of(made.folder)
+    assert (m.n_rows, m.pose_labels) == (8, ("p01", "p02"))
+    assert m.pose.tolist() == [0, 0, 1, 1] * 2  # two images of each pose, seen by all views
+    for label, q in zip(m.pose_labels, m.q[m.first_rows], strict=True):
+        assert list(truth["poses"][label]["joints"].values()) == pytest.approx(q, abs=1e-12)
+    assert all(view.T_base_camera is None and view.legs is None for view in m.views)
+    given = files_of(made.folder)
+    assert given["observations.csv"] == given["truth/outlines.csv"]
+    assert np.array_equal(made.truth.A_base, made.nominal.A_base)
+
+
+def test_calibration_comes_much_nearer_to_the_truth(tmp_path: Path) -> None:
+    made = simulate("3-rpr", tmp_path / "set", settings(poses=6))
+    legcal.calibrate(made.folder, output=tmp_path / "result")
+    before = legcal.evaluate(made.nominal.yaml_path, made.truth_path).displacement.mean()
+    calibrated = tmp_path / "result" / "calibrated.yaml"
+    after = legcal.evaluate(calibrated, made.truth_path).displacement.mean()
+    assert before > 1e-3
+    assert after < 0.03 * before
+
+
+def test_the_seed_and_nothing_else_decides_what_is_drawn(tmp_path: Path) -> None:
+    def files(name: str, **changes: object) -> dict[str, bytes]:
+        few = replace(FEW, **changes)  # type: ignore[arg-type]
+        return files_of(simulate("hexapod", tmp_path / name, few).folder)
+
+    one, again, other = files("a", seed=7), files("b", seed=7), files("c", seed=8)
+    assert one == again
+    assert one["measurements.csv"] != other["measurements.csv"]
+    axes = files("d", seed=7, level=Level.AXES)
+    for name in ("measurements.csv", "truth/urdf/hexapod.urdf", "truth/outlines.csv"):
+        assert one[name] == axes[name]
+    assert "observations.csv" not in axes
+
+
+def test_photographs_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
+    look = legcal.Appearance(gamma=1.8, clutter=0, samples=13)
+    few = settings(
+        level=Level.PHOTOGRAPHS, poses=2, views=1, images=2, camera=small_camera(tmp_path),
+        appearance=look,
+    )  # fmt: skip
+    one, two = (simulate("3-rps", tmp_path / str(n), few, workers=n) for n in (1, 2))
+    assert files_of(one.folder) == files_of(two.folder)
+    images = [x for name, x in files_of(one.folder).items() if name.endswith(".png")]
+    assert len(set(images)) == 4  # repeated images differ by the noise of the sensor
+    (view,) = load_dataset(one.folder).measurements.views
+    assert (view.camera.gamma, view.camera.gamma_is_given) == (1.8, True)
+    console = Console(width=400, record=True, file=io.StringIO())
+    console.print(simulation_table(summary_document(one), repeated=True))
+    printed = console.export_text()
+    assert f"calibrate with: legcal calibrate {one.folder} -o OUT\n" in printed
+    assert f"measure noise with: legcal noise {one.folder}\n" in printed
+    assert f"judge with: legcal evaluate OUT/calibrated.yaml {one.truth_path}\n" in printed
+
+
+def test_given_cameras_lenses_and_poses_are_used(tmp_path: Path) -> None:
+    place = "T_base_camera: {{xyz: [{}, 0.26, 0.19], quat_xyzw: [0.411, 0.574, -0.552, -0.443]}}"
+    (tmp_path / "cameras.yaml").write_text(
+        f"views:\n  left: {{camera: small.yaml, {place.format(0.93)}}}\n"
+        f"  right: {{{place.format(0.94)}}}\n"
+    )
+    small_camera(tmp_path)
+    rows = ["0.06,0.06,0.06,0.06,0.06,0.06", "0.07,0.06,0.05,0.06,0.08,0.06"]
+    header = ",".join(f"leg{j}_prismatic" for j in range(1, 7))
+    (tmp_path / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
+    given = settings(
+        views=tmp_path / "cameras.yaml", poses=str(tmp_path / "poses.csv"), readings=Spread(),
+        level=Level.AXES,
+    )  # fmt: skip
+    m = load_dataset(simulate("hexapod", tmp_path / "set", given).folder).measurements
+
+    def lens(view: View) -> tuple[str, int]:
+        return view.name, view.camera.width
+
+    assert [lens(view) for view in m.views] == [("left", 200), ("right", 1024)]
+    assert m.pose.tolist() == [0, 1, 0, 1]
+    readings = np.array([[float(x) for x in row.split(",")] for row in rows])
+    assert m.q == pytest.approx(readings[m.pose], abs=1e-12)
+
+
+def test_the_python_of_the_description_of_simulated_datasets_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "simulate.md").read_text()
+    code = text[
+        text.index("    settings = legcal.Sim") : text.index("Metres and radians; `errors`")
+    ]
+    assert "poses=20" in code
+    code = code.replace("poses=20", "poses=2")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"legcal": legcal}
+    exec(textwrap.dedent(code), names)
+    assert names["made"].seen.shape == (6, 6)
+    assert 1e-4 < names["apart"].displacement.mean() < 2e-3
+
+
+# --- settings
+
+
+def test_options_that_are_not_given_are_the_defaults_of_the_settings() -> None:
+    assert requested(Request(), load_mechanism("hexapod")) == SimulationSettings()
+
+
+def test_options_become_settings(tmp_path: Path) -> None:
+    request = Request(
+        level=Level.OUTLINES, seed=4, error=["none", "radii=0.1mm", "joints=1mm:normal"],
+        poses="7", sampling=Sampling.WORKSPACE, shared_poses=True, images=2,
+        cameras=tmp_path / "c.yaml", hints=False, pixel_noise="0px",
+    )  # fmt: skip
+    joints = Spread(1e-3, Distribution.NORMAL)
+    errors = ParameterErrors(base_joints=joints, platform_joints=joints, radii=Spread(1e-4))
+    assert requested(request, load_mechanism("hexapod")) == SimulationSettings(
+        level=Level.OUTLINES, seed=4, errors=errors, poses=7, sampling=Sampling.WORKSPACE,
+        shared_poses=True, images=2, views=tmp_path / "c.yaml", hints=False, sigma_px=0.0,
+    )  # fmt: skip
+
+
+GIVEN: dict[str, Any] = {
+    "tell_gamma": True, "pixel_noise": "0.2px", "table_noise": "degrees", "blur": 0.0, "clutter": 0,
+    "appearance": Path("look.yaml"), "bits": 8, "colour": False,
+}  # fmt: skip
+
+
+def test_options_of_another_level_are_refused() -> None:
+    nominal = load_mechanism("hexapod")
+    levels = {f.name: f.metadata["only"] for f in fields(Request) if f.metadata["only"]}
+    assert levels.keys() == GIVEN.keys()
+    for name, level in levels.items():
+        for other in set(Level) - {level}:
+            with pytest.raises(UsageError) as caught:
+                requested(Request(level=other, **{name: GIVEN[name]}), nominal)
+            (problem,) = caught.value.problems
+            assert f"found --level {other}, needed --level {level}" in problem
+    board = Request(level=Level.AXES, board="charuco", pixel_noise="0.2px")  # of its corners
+    assert requested(board, nominal).sigma_px == pytest.approx(0.2)
+
+
+PASSIVE = "hexapod with a passive leg"
+
+
+@pytest.mark.parametrize(
+    ("machine", "request_", "named"),
+    [
+        ("hexapod", Request(error=["lengths=1mm"]), "--error lengths .* found none in the"),
+        ("hexapod", Request(error=["axes=1deg"]), "--error axes .* found none in the mechanism"),
+        ("3-rps", Request(error=["twists=1deg"]), "--error twists .* found none in the mechanism"),
+        ("hexapod", Request(error=["none"], coplanar=True), "--coplanar .* no errors of joints"),
+        ("hexapod", Request(poses="p.csv", sampling=Sampling.EXTREME), "--sampling with a file"),
+        (PASSIVE, Request(sampling=Sampling.WORKSPACE), "--sampling for a machine whose motors"),
+        (
+            "hexapod",
+            Request(board="charuco", hand_held=True, cameras=Path("c.yaml")),
+            "both --hand-held and --cameras",
+        ),
+    ],
+)
+def test_options_without_effect_on_a_machine_are_refused(
+    machine: str, request_: Request, named: str
+) -> None:
+    nominal = load_mechanism(machine.partition(" ")[0])
+    if machine == PASSIVE:
+        passive = replace(nominal.legs[1], kind=LegKind.PASSIVE)
+        nominal = replace(nominal, legs=(nominal.legs[0], passive, *nominal.legs[2:]))
+    with pytest.raises(UsageError, match=named):
+        requested(request_, nominal)
+
+
+def test_no_errors_of_what_a_machine_has_not_may_be_given() -> None:
+    requested(Request(error=["lengths=0mm", "axes=0deg"]), load_mechanism("hexapod"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"sigma_px": -0.1}, "-0.1 as the noise of edge points, needed 0 to 100 px"),
+        ({"sigma_px": float("nan")}, "nan as the noise of edge points"),
+        ({"sigma_px": "0.1px"}, "sigma_px, needed a number"),
+        ({"sigma_px": 1e9}, "1e\\+09"),
+        ({"readings": 2e-6}, "readings, needed a Spread"),
+        ({"readings": Spread(-1e-6)}, "noise of readings, needed 0 to 1 m"),
+        ({"errors": None}, "errors, needed a ParameterErrors"),
+        ({"errors": ParameterErrors(axes=0.1)}, "errors.axes"),  # type: ignore[arg-type]
+        ({"errors": ParameterErrors(axes=Spread(float("inf")))}, "errors of axes, .* 1 rad"),
+        ({"table": TableNoise(psi="0.05")}, "table.psi"),  # type: ignore[arg-type]
+        ({"table": TableNoise(psi=-1.0)}, "-1 as the noise of psi, .* rad"),
+        ({"table": TableNoise(x=0.0)}, "noise of x, .* m"),
+        ({"appearance": "clean"}, "appearance"),
+        ({"images": True}, "images"),
+        ({"level": "pictures"}, "level 'pictures', needed axes or outlines or photographs"),
+        ({"sampling": "best"}, "sampling 'best'"),
+        ({"poses": 10**9}, "poses, needed a whole number from 1 to 100000"),
+        ({"seed": 1.5}, "seed"),
+        ({"seed": -1}, "seed, needed a whole number of 0 or more"),
+        ({"poses": 1000, "views": 100, "images": 2}, "200000 images"),
+        ({"hand_held": True}, "a camera in the hand without a board"),
+        ({"board_pose": True}, "the pose of a board without a board"),
+        ({"board": "charuco", "hand_held": True, "images": 2}, "2 images of each pose"),
+        ({"board": "charuco", "hand_held": True, "views": "c.yaml"}, "and a file of cameras"),
+        ({"board": 3}, "3 as board, needed a Board"),
+    ],
+)
+def test_settings_without_sense_are_refused(changes: dict[str, object], named: str) -> None:
+    with pytest.raises(UsageError, match=f"The dataset could not be simulated: found .*{named}"):
+        settings(**changes)
+
+
+@pytest.mark.parametrize(("size", "distribution"), [("2mm", "uniform"), (1e-3, "flat")])
+def test_spreads_without_sense_are_refused(size: Any, distribution: Any) -> None:
+    with pytest.raises(UsageError, match=r"found the size .* and the distribution"):
+        Spread(size, distribution)
+
+
+def test_numbers_choices_and_paths_of_any_type_count(tmp_path: Path) -> None:
+    found = settings(
+        poses=np.int64(2), seed=np.uint8(3), readings=Spread(np.float64(0.0)), level="axes",
+        sampling="workspace", camera="lens.yaml",
+    )  # fmt: skip
+    assert (found.poses, found.seed) == (2, 3)
+    assert type(found.poses) is type(found.seed) is int
+    assert (found.level, found.sampling) == (Level.AXES, Sampling.WORKSPACE)
+    assert found.camera == Path("lens.yaml")
+    with pytest.raises(UsageError, match="found 0 workers, needed a whole number of 1 or more"):
+        simulate("hexapod", tmp_path / "set", found, workers=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("blurr: 1\n", "blurr .* did you mean 'blur'"),
+        ("blur: many\n", "blur .*'many'"),
+        ("blur: -1\n", "blur = -1"),
+        ("electrons: 1e-300\n", "electrons = 1e-300"),
+        ("electrons: .nan\n", "electrons = nan"),
+        ("lights: [{strength: 1}]\n", r"lights\.0\.direction"),
+        ("[1]\n", "needed 'key: value' lines"),
+    ],
+)
+def test_a_wrong_appearance_file_is_refused(text: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "look.yaml"
+    path.write_text("electrons: .inf\nlights:\n  - {direction: [0, 0, 1], strength: 0.5}\n")
+    look = read_appearance(path)
+    assert (look.electrons, look.lights[0].strength) == (float("inf"), 0.5)
+    path.write_text(text)
+    with pytest.raises(LegcalError, match=named):
+        read_appearance(path)
+
+
+# --- cameras
+
+
+LOOKING_AWAY = "{xyz: [1.5, 0.0, 0.2], quat_xyzw: [0.5, 0.5, 0.5, 0.5]}"
+
+
+@pytest.mark.parametrize(
+    ("pose", "error", "named"),
+    [
+        (LOOKING_AWAY, NotVisible, "view c1: .* no image shows a leg"),
+        (
+            "{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 1]}",
+            UsageError,
+            "view c1: its camera could not be placed: found it inside the machine",
+        ),
+        (
+            "{xyz: [90.0, 0.0, 0.2], quat_xyzw: [-0.5, -0.5, 0.5, 0.5]}",
+            NotVisible,
+            r"view c1: .* legs are at most \d.* px long",
+        ),
+        ("{xyz: [0.0, 0.0, .inf], quat_xyzw: [0, 0, 0, 1]}", DatasetError, "views.c1"),
+        ("{xyz: [0.0, 0.0, 0.2], quat_xyzw: [0, 0, 0, 2]}", DatasetError, "norm 2"),
+        ("{xyz: [0, 0, 0.2], quat_xyzw: [0, 0, 1]}", DatasetError, r"quat_xyzw .* 3 numbers"),
+    ],
+)
+def test_cameras_that_see_nothing_or_stand_in_the_machine_are_refused(
+    pose: str, error: type[Exception], named: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "cameras.yaml"
+    path.write_text(f"views: {{c1: {{T_base_camera: {pose}}}}}\n")
+    with pytest.raises(error, match=named):
+        simulate("hexapod", tmp_path / "set", settings(poses=1, views=path))
+    assert not (tmp_path / "set").exists()
+
+
+def test_cameras_of_too_many_pixels_or_images_are_refused(tmp_path: Path) -> None:
+    for size in ((4_000_000_000, 3000), (20_000, 20_000)):
+        large = settings(poses=1, views=1, camera=small_camera(tmp_path, *size))
+        with pytest.raises(DatasetError, match=f"found {size[0]} x {size[1]} px, needed at most"):
+            simulate("hexapod", tmp_path / "set", large)
+    place = "{T_base_camera: {xyz: [1, 0, 0.2], quat_xyzw: [0, 0, 0, 1]}}"
+    path = tmp_path / "cameras.yaml"
+    path.write_text(f"views: {{a: {place}, b: {place}}}\n")
+    with pytest.raises(UsageError, match=r"found 120000 images \(2 views of 1 poses, 60000 of"):
+        simulate("hexapod", tmp_path / "set", settings(poses=1, views=path, images=60_000))
+
+
+def test_a_machine_without_visible_legs_cannot_be_seen(tmp_path: Path) -> None:
+    made = simulate("hexapod", tmp_path / "a", FEW)
+    urdf = made.folder / "urdf" / "hexapod.urdf"
+    urdf.write_text(re.sub(r"<visual>.*?</visual>", "", urdf.read_text()))
+    with pytest.raises(NotVisible, match="no leg with a visible cylinder"):
+        simulate(made.folder / "models" / "hexapod.yaml", tmp_path / "b", FEW)
+
+
+# --- the folder: what --force replaces, and what it never touches
+
+
+OWN = ("dataset.yaml", "images/c1_p01.png", "models/a.yaml", "truth/models/a.yaml")
+DETECTED = format_observations(outlines_of(1), recorded(), LEG_NAMES)
+EDITED = DETECTED.replace("detected", "edited", 1)
+
+
+def write(folder: Path, files: dict[str, str]) -> None:
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content)
+
+
+def fill(folder: Path, content: str = "new", *more: str) -> None:
+    write(folder, dict.fromkeys((*OWN, *more), content))
+    truth = {"legcal_truth": 1, "files": [*OWN, *more, TRUTH_NAME]}
+    (folder / TRUTH_NAME).write_text(json.dumps(truth))
+
+
+def replace_dataset(out: Path) -> None:
+    with dataset_folder(out, force=True) as folder:
+        fill(folder)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """Return the folder of an earlier simulated dataset."""
+    fill(tmp_path / "out", "old")
+    return tmp_path / "out"
+
+
+def test_force_replaces_a_simulated_dataset_and_keeps_what_is_not_its_own(tmp_path: Path) -> None:
+    simulate("hexapod", tmp_path, FEW)
+    with pytest.raises(UsageError, match=r"found a simulated dataset.*--force"):
+        simulate("hexapod", tmp_path, FEW)
+    write(tmp_path, {"notes.txt": "mine", ".legcal-cache.json": "{}"})
+    simulate("3-rps", tmp_path, replace(FEW, level=Level.AXES), force=True)
+    files = files_of(tmp_path)
+    assert files["notes.txt"] == b"mine"
+    assert "axes.csv" in files
+    gone = {"observations.csv", ".legcal-cache.json", "models/hexapod.yaml", "urdf/hexapod.urdf"}
+    assert not gone & set(files)
+    assert set(json.loads(files[TRUTH_NAME])["files"]) == set(files) - {"notes.txt"}
+    write(tmp_path, {"images/c1_p01.png": "mine"})  # into a set without photographs
+    with pytest.raises(UsageError, match=r"images/c1_p01\.png, which an earlier simulation did"):
+        simulate("hexapod", tmp_path, FEW, force=True)
+
+
+def test_a_failure_leaves_an_earlier_dataset_as_it_was(out: Path, tmp_path: Path) -> None:
+    (tmp_path / "cameras.yaml").write_text(f"views: {{c1: {{T_base_camera: {LOOKING_AWAY}}}}}\n")
+    before = files_of(tmp_path)
+    with pytest.raises(NotVisible):
+        simulate("hexapod", out, settings(poses=1, views=tmp_path / "cameras.yaml"), force=True)
+    assert files_of(tmp_path) == before
+
+    def full() -> None:
+        with dataset_folder(tmp_path / "new", force=False) as folder:
+            raise OutOfResources(f"{folder}: found 'No space left on device'.")
+
+    with pytest.raises(OutOfResources, match=f"^{tmp_path}/new: found 'No space") as refusal:
+        full()
+    assert "legcal-part" not in str(refusal.value)
+    assert files_of(tmp_path) == before
+
+
+def test_files_of_others_beside_a_dataset_are_kept_whatever_its_truth_names(out: Path) -> None:
+    mine = ("notes.txt", "result/a.csv", "images/.hidden")
+    write(out, dict.fromkeys(mine, "mine"))
+    write(out.parent, {"precious.txt": "mine"})
+    others = ["notes.txt", "result/a.csv", "..", "", "images/../notes.txt", "../precious.txt",
+              str(out.parent / "precious.txt"), 7]  # fmt: skip
+    truth = {"legcal_truth": 1, "files": [*OWN, TRUTH_NAME, *others]}
+    (out / TRUTH_NAME).write_text(json.dumps(truth))
+    replace_dataset(out)
+    found = files_of(out)
+    assert {found[name] for name in OWN} == {b"new"}
+    assert {found[name] for name in mine} == {b"mine"}
+    assert (out.parent / "precious.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["images/c2_p01.png", "images/mine/a.png", "axes.csv", "observations.csv",
+     "camera_info_c2.yaml", "measurements.csv", "models/b.yaml", "truth/notes.txt", "urdf"],
+)  # fmt: skip
+def test_a_file_of_the_user_in_the_place_of_a_dataset_is_refused_first(
+    name: str, out: Path
+) -> None:
+    write(out, {name: "mine"})
+    before = files_of(out)
+    with pytest.raises(UsageError, match="nothing was changed") as refusal:
+        check_dataset_destination(out, force=True)
+    assert name.removesuffix("/a.png") in str(refusal.value)
+    assert files_of(out) == before
+
+
+@pytest.mark.parametrize("name", ["images", "truth/models", "dataset.yaml", "images/c1_p01.png"])
+def test_nothing_is_written_through_links(name: str, out: Path, tmp_path: Path) -> None:
+    (out / name).rename(tmp_path / "elsewhere")
+    (out / name).symlink_to(tmp_path / "elsewhere")
+    before = files_of(tmp_path)
+    with pytest.raises(UsageError, match=f"found {name}, which is a link"):
+        replace_dataset(out)
+    assert files_of(tmp_path) == before
+
+
+def test_what_appears_while_a_dataset_is_made_is_not_replaced(out: Path) -> None:
+    def late() -> None:
+        with dataset_folder(out, force=True) as folder:
+            fill(folder, "new", "images/c2_p01.png")
+            write(out, {"images/c2_p01.png": "mine"})
+
+    with pytest.raises(UsageError, match=r"images/c2_p01\.png, which legcal did not write"):
+        late()
+    found = files_of(out)
+    assert found.pop("images/c2_p01.png") == b"mine"
+    assert {found[name] for name in OWN} == {b"old"}
+
+
+@pytest.mark.parametrize(
+    ("table", "cache"),
+    [
+        (DETECTED, '{"given": []}'),  # as a calibration left them
+        (EDITED, '{"given": []}'),
+        (DETECTED, '{"given": [["c1", "images/c1_p01.png"]]}'),
+        (DETECTED, "{"),
+        (DETECTED, "[]"),
+        ("view\n\0\xe9", '{"given": [1]}'),
+    ],
+)
+def test_outlines_go_where_a_calibration_left_them_and_else_stay(
+    table: str, cache: str, out: Path
+) -> None:
+    write(out, {"observations.csv": table, ".legcal-cache.json": cache})
+    before = files_of(out)
+    if table == DETECTED and cache == '{"given": []}':
+        replace_dataset(out)
+        assert not {"observations.csv", ".legcal-cache.json"} & set(files_of(out))
+        return
+    with pytest.raises(UsageError, match=r"observations\.csv, which an earlier simulation did not"):
+        replace_dataset(out)
+    assert files_of(out) == before
+
+
+def _folder_for_a_file(folder: Path) -> None:
+    fill(folder)
+    (folder / "dataset.yaml").unlink()
+    (folder / "dataset.yaml").mkdir()
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "named"),
+    [
+        ("", lambda folder: write(folder, {"notes.txt": "mine"}), r"folder with (other )?files"),
+        ("", lambda folder: write(folder, {"dataset.yaml": "legcal_dataset: 1\n"}), "files"),
+        ("", _folder_for_a_file, r"found (a simulated dataset|dataset\.yaml, which is a folder)"),
+        ("file", lambda folder: write(folder, {"file": "mine"}), "found a file of that name"),
+        ("file/sub", lambda folder: write(folder, {"file": "mine"}), "file is a file"),
+        ("n" * 300, lambda folder: None, "'File name too long'"),
+    ],
+)
+def test_what_is_no_simulated_dataset_is_not_touched_even_with_force(
+    name: str, before: Callable[[Path], None], named: str, tmp_path: Path
+) -> None:
+    before(tmp_path)
+    files = files_of(tmp_path)
+    for force in (False, True):
+        with pytest.raises(UsageError, match=named):
+            simulate("hexapod", tmp_path / name, FEW, force=force)
+    assert files_of(tmp_path) == files
+
+
+def test_a_name_of_the_greatest_length_is_a_name_and_an_empty_one_is_none(tmp_path: Path) -> None:
+    with dataset_folder(tmp_path / ("ä" * 127), force=False) as folder:
+        fill(folder)
+    assert (tmp_path / ("ä" * 127) / "dataset.yaml").exists()
+    with pytest.raises(UsageError, match="dataset could not be written: found an empty text"):
+        simulate("hexapod", "", FEW)

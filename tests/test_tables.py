@@ -1,0 +1,250 @@
+"""observations.csv and axes.csv: written, read back exactly, corrected by hand, and refused.
+
+Refusals of single cells are in the table of tests/characterisation; here are those that need more
+than one cell of a table that a simulation wrote.
+"""
+
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from outline_tables import LEG_NAMES, LEGS, assert_same, outlines_of, recorded
+
+from legcal.data import LegAxes, Outlines, View, axes_of_table, no_outlines, write_observations
+from legcal.data.axes import read_axes, write_axes
+from legcal.data.measurements import row_names
+from legcal.data.outlines import ENCODING, QUALITY, read_observations, reject_unused_legs
+from legcal.errors import DatasetError
+
+FAST = settings(
+    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+MEASUREMENTS = recorded(labels=["", "", "a", "b"])
+OPTIONAL = (*QUALITY, *ENCODING)
+
+
+def axes_of(seed: int = 0) -> LegAxes:
+    rng = np.random.default_rng(seed)
+    row, leg = np.divmod(np.arange(12, dtype=np.intp), 3)
+    values = rng.uniform([-1.2, -1.2, -0.3, 0.6], [1.2, 1.2, 0.3, 1.2], (12, 4))
+    return axes_of_table(row, leg, values, rng.uniform(1e-4, 1e-3, (12, 4)))
+
+
+def written(folder: Path, table: Outlines | LegAxes) -> Path:
+    if isinstance(table, LegAxes):
+        write_axes(folder / "axes.csv", table, MEASUREMENTS, LEG_NAMES)
+        return folder / "axes.csv"
+    write_observations(folder / "observations.csv", table, MEASUREMENTS, LEG_NAMES)
+    return folder / "observations.csv"
+
+
+def read(path: Path, *, skip_stale: bool = False) -> Outlines:
+    return read_observations(path, LEGS, MEASUREMENTS, skip_stale=skip_stale)
+
+
+def read_again(path: Path) -> Outlines | LegAxes:
+    is_axes = path.name == "axes.csv"
+    return read_axes(path, LEG_NAMES, MEASUREMENTS) if is_axes else read(path)
+
+
+def rewritten(path: Path, change: Callable[[list[list[str]]], list[list[str]]]) -> Path:
+    """Change the cells of a table, the header among them."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        lines = change(list(csv.reader(file)))
+    with path.open("w", newline="", encoding="utf-8-sig") as file:
+        csv.writer(file, lineterminator="\r\n").writerows(lines)
+    return path
+
+
+def edited(path: Path, row: int, **cells: str) -> Path:
+    """Change cells of a row, counted from 1."""
+
+    def change(lines: list[list[str]]) -> list[list[str]]:
+        for name, cell in cells.items():
+            lines[row][lines[0].index(name)] = cell
+        return lines
+
+    return rewritten(path, change)
+
+
+def problems(path: Path) -> tuple[str, ...]:
+    with pytest.raises(DatasetError) as refusal:
+        read_again(path)
+    assert all(problem.startswith(str(path)) for problem in refusal.value.problems)
+    return tuple(refusal.value.problems)
+
+
+# --- written and read
+
+
+@FAST
+@given(st.integers(0, 2**32 - 1))
+def test_outlines_are_read_exactly_as_they_were_written(tmp_path: Path, seed: int) -> None:
+    outlines = outlines_of(seed)
+    path = written(tmp_path, outlines)
+    content = path.read_bytes()
+    found = read(path)
+    assert_same(found, outlines)
+    assert b"nan" not in content  # numbers not found are empty cells
+    assert written(tmp_path, found).read_bytes() == content
+    turned = replace(  # the end nearer to the base joint comes first again
+        outlines, ends=outlines.ends[:, ::-1], covariance=outlines.covariance[:, ::-1, ::-1]
+    )
+    assert_same(read(written(tmp_path, turned)), outlines)
+
+
+def test_axes_are_read_as_they_were_written(tmp_path: Path) -> None:
+    found, expected = read_again(written(tmp_path, axes_of())), axes_of()
+    assert isinstance(found, LegAxes)
+    assert np.array_equal(found.row, expected.row)
+    assert np.array_equal(found.leg, expected.leg)
+    assert np.allclose(found.u, expected.u, atol=1e-15)
+    assert np.allclose(found.M, expected.M, atol=1e-15)
+    turn = found.basis @ np.swapaxes(expected.basis, -1, -2)
+    assert np.allclose(turn, np.eye(2), atol=1e-14)
+    scale = np.abs(expected.covariance).max(axis=(1, 2), keepdims=True)
+    assert np.allclose(found.covariance / scale, expected.covariance / scale, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("table", "header"),
+    [
+        (
+            no_outlines(),
+            "view,image,leg,part,edge,a,b,c,u0,v0,u1,v1,s00,s01,s11,verdict,reason,source,"
+            "contrast,length,residual,gamma,by_gamma",
+        ),
+        (axes_of(), "view,image,leg,psi,theta,x,z,sigma_psi,sigma_theta,sigma_x,sigma_z"),
+    ],
+)
+def test_headers_are_those_of_the_contract(
+    tmp_path: Path, table: Outlines | LegAxes, header: str
+) -> None:
+    path = written(tmp_path, table)
+    assert path.read_text().splitlines()[0] == header
+    assert len(read_again(path)) == len(table)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("table", [outlines_of(4), axes_of(4)])
+def test_column_order_line_ends_and_byte_order_mark_do_not_matter(
+    tmp_path: Path, table: Outlines | LegAxes
+) -> None:
+    path = written(tmp_path, table)
+    expected = read_again(path)
+    found = read_again(rewritten(path, lambda lines: [cells[::-1] for cells in lines]))
+    for name, values in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), values)
+
+
+def test_tables_without_optional_columns_and_rows_without_the_other_edge_are_read(
+    tmp_path: Path,
+) -> None:
+    outlines = outlines_of(3)
+    path = written(tmp_path, outlines)
+    rewritten(path, lambda lines: [cells[: -len(OPTIONAL)] for cells in lines])
+    unknown = np.full(len(outlines), np.nan)
+    assert_same(read(path), replace(outlines, **dict.fromkeys(OPTIONAL, unknown)))  # type: ignore[arg-type]
+    rewritten(path, lambda lines: lines[:2] + lines[3:])
+    assert len(read(path)) == len(outlines) - 1
+
+
+def test_rows_without_image_are_named_by_label_or_else_by_number(tmp_path: Path) -> None:
+    assert row_names(MEASUREMENTS) == ("i/2.png", "i/1.png", "a", "b")
+    assert row_names(recorded()) == ("i/2.png", "i/1.png", "3", "4")
+    twice = recorded(["", "", "", ""], ["x", "y", "x", "z"])
+    assert row_names(twice) == ("1", "y", "3", "z")
+    shared = replace(recorded(["", "", "", ""], ["x", "y"]), pose=np.array([0, 0, 1, 1]))
+    assert row_names(shared) == ("x", "x", "y", "y")
+    clash = recorded(["x", "", "", ""], ["", "y", "x", "z"])
+    assert row_names(clash) == ("x", "y", "3", "z")
+    with written(tmp_path, axes_of()).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["image"] for row in rows[::3]] == ["i/2.png", "i/1.png", "a", "b"]
+    assert rows[2]["leg"] == "leg, C"
+
+
+# --- corrected by hand
+
+
+def test_an_edited_row_is_read_without_what_detection_said_of_it(tmp_path: Path) -> None:
+    outlines = outlines_of(6, rejected=0.0)
+    cells = {"source": "edited", "verdict": "rejected", "reason": "mine"}
+    found = read(edited(written(tmp_path, outlines), 3, **cells))
+    assert (found.source[2], bool(found.used[2]), found.reason[2]) == ("edited", False, "mine")
+    np.testing.assert_array_equal(found.h, outlines.h)
+    for name in OPTIONAL:
+        assert np.isnan(getattr(found, name)[2])
+        assert np.isfinite(getattr(found, name)[[0, 1, 3]]).all()
+
+
+def test_a_rounded_direction_is_made_unit(tmp_path: Path) -> None:
+    outlines = outlines_of(7, rejected=0.0)
+    cells = {name: f"{x:.4f}" for name, x in zip("abc", outlines.h[0], strict=True)}
+    found = read(edited(written(tmp_path, outlines), 1, **cells))
+    assert np.linalg.norm(found.h[0]) == pytest.approx(1.0, abs=1e-15)
+    np.testing.assert_allclose(found.h[0], outlines.h[0], atol=1e-4)
+
+
+def test_stale_rows_are_left_out_only_where_legcal_detected_them(tmp_path: Path) -> None:
+    outlines = outlines_of(12, rejected=0.0)
+    path = edited(written(tmp_path, outlines), 2, image="gone.png")
+    assert len(read(path, skip_stale=True)) == len(outlines) - 1
+    edited(path, 2, source="edited")
+    with pytest.raises(DatasetError, match=r"found 'gone\.png', needed an image"):
+        read(path, skip_stale=True)
+
+
+def test_legs_that_a_view_leaves_out_are_rejected() -> None:
+    outlines = outlines_of(13, rejected=0.0)
+    views = (MEASUREMENTS.views[0], View("left", MEASUREMENTS.views[1].camera, legs=("legA",)))
+    found = reject_unused_legs(outlines, replace(MEASUREMENTS, views=views), LEG_NAMES)
+    left_out = (MEASUREMENTS.view[outlines.row] == 1) & (outlines.leg != 1)
+    np.testing.assert_array_equal(found.used, ~left_out)
+    assert {found.reason[i] for i in np.flatnonzero(left_out)} == {
+        "view left does not use this leg"
+    }
+
+
+# --- refused
+
+
+@pytest.mark.parametrize(
+    ("table", "row", "cells", "named"),
+    [
+        (outlines_of(3, rejected=0.0), 2, {"residual": "-1"}, ("column residual", "'-1'")),
+        (outlines_of(3, rejected=0.0), 2, {"contrast": "inf"}, ("column contrast", "'inf'")),
+        (outlines_of(3, rejected=0.0), 2, {"by_gamma": "nan"}, ("column by_gamma", "'nan'")),
+        (outlines_of(3), 1, {"verdict": "rejected", "a": "left"}, ("column a", "'left'")),
+        (axes_of(), 5, {"z": "-1e300"}, ("column z", "-1000 to 1000 m")),
+        (axes_of(), 5, {"psi": "1.5707963"}, ("columns psi, theta", "(x, 0, z)")),
+        (axes_of(), 5, {"sigma_theta": "3"}, ("column sigma_theta", "1e-09 to 1 rad")),
+        (axes_of(), 5, {"theta": "-inf"}, ("column theta", "'-inf'", "finite")),
+    ],
+)
+def test_a_wrong_cell_is_one_problem_of_its_row(
+    tmp_path: Path, table: Outlines | LegAxes, row: int, cells: dict[str, str], named: tuple[str]
+) -> None:
+    (problem,) = problems(edited(written(tmp_path, table), row, **cells))
+    assert f"row {row} (line {row + 1})" in problem
+    assert [word for word in named if word not in problem] == []
+
+
+def test_many_problems_are_listed_at_once_and_said_shortly(tmp_path: Path) -> None:
+    path = written(tmp_path, outlines_of(10, rejected=0.0))
+    edited(path, 1, view="up", leg="none", edge="0")
+    edited(path, 4, a="x", b="y")
+    edited(path, 6, a="9", s00="-1")
+    assert len(problems(path)) == 7
+    path = written(tmp_path, axes_of())
+    for row in range(1, 13):
+        edited(path, row, theta=str(-90 - row))
+    with pytest.raises(DatasetError) as refusal:
+        read_again(path)
+    assert len(refusal.value.problems) == 12
+    assert str(refusal.value).splitlines()[5:] == ["... and 7 more like these."]
