@@ -9,8 +9,9 @@ A defect replaces a snippet of the package by another one that is as plausible: 
 weight, a frame, a refusal. The snippet is looked up in the whole package, whatever file it is in,
 and however its lines are broken and indented; it must be there once (``--check``). One defect at a
 time is put into a copy of the tree, and pytest runs there until the first failure. ``--suite old``
-runs the files that are named at each defect (``tests``); any other suite is a path of tests, of
-which those go first that the data file names (``cases``, or -k), and with --subset no others run.
+runs the files that are named at each defect (``tests``), ``--suite new`` these and then the cases
+of tests/characterisation that it names (``cases``); any other suite is a path of tests, of which
+the named ones go first (or those of -k), and with --subset no others run.
 
 One line for each defect is appended to defects_SUITE.jsonl beside this file, so that a run
 continues where it stopped; ``--again`` repeats what is there. ``--confirm`` runs the tests that
@@ -43,7 +44,7 @@ import yaml
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 DEFECTS = HERE / "defects.yaml"
-OLD = "old"
+OLD, NEW = "old", "new"
 CAUGHT, SURVIVED, TIMEOUT = "caught", "survived", "timeout"
 LIBRARIES = (
     "casadi",
@@ -270,7 +271,7 @@ def load_libraries() -> None:
 
 def checkpoint_of(suite: str) -> Path:
     """Return the file of the outcomes of a suite."""
-    name = OLD if suite == OLD else Path(suite).name
+    name = suite if suite in (OLD, NEW) else Path(suite).name
     return HERE / f"defects_{name}.jsonl"
 
 
@@ -284,10 +285,12 @@ def read_outcomes(path: Path) -> dict[str, dict[str, object]]:
 
 def commands(defect: Defect, arguments: argparse.Namespace) -> list[list[str]]:
     """Return what pytest runs for a defect, one after the other until it is caught."""
-    if arguments.suite == OLD:
+    cases = ["-k", arguments.k or defect.cases, "-m", ""]  # slow ones too
+    if arguments.suite in (OLD, NEW):
         there = [name for name in defect.tests if (ROOT / "tests" / name).is_file()]
-        return [[f"tests/{name}" for name in there]] if there else []
-    first = [arguments.suite, "-k", arguments.k or defect.cases, "-m", ""]  # slow ones too
+        named = [[f"tests/{name}" for name in there]] if there else []
+        return named if arguments.suite == OLD else [*named, ["tests/characterisation", *cases]]
+    first = [arguments.suite, *cases]
     return [first] if arguments.subset else [first, [arguments.suite]]
 
 
@@ -374,7 +377,7 @@ def compare(defects: Sequence[Defect], one: str, other: str) -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="are all snippets there once?")
-    parser.add_argument("--suite", help="old, or a path of tests")
+    parser.add_argument("--suite", help="old, new, or a path of tests")
     parser.add_argument("--compare", nargs=2, metavar="SUITE")
     parser.add_argument("--only", nargs="+", default=[], metavar="ID")
     parser.add_argument("--concern", nargs="+", default=[])
