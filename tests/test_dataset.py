@@ -273,7 +273,8 @@ def write(path: Path, image: Image, *options: int) -> Path:
 def test_8_bit_images_are_read_as_their_grey(tmp_path: Path, name: str, channels: int) -> None:
     colours = picture(channels=min(channels, 3) if name == "a.jpg" else channels)
     levels = read_image(write(tmp_path / name, colours), CAMERA)
-    assert (levels.shape, levels.dtype) == ((H, W), np.float32)
+    assert levels.shape == (H, W)
+    assert levels.dtype == np.float32
     grey = colours if channels == 1 else colours[..., :3] @ [0.114, 0.587, 0.299]
     rounding = 0.0 if channels == 1 else 0.6
     np.testing.assert_allclose(levels, grey, atol=4.0 if name == "a.jpg" else rounding)
