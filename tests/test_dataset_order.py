@@ -1,27 +1,35 @@
-"""The canonical order: the same whatever the order of rows, views and legs in the files."""
+"""Canonical order and held-out images: neither depends on the order of rows, views and legs."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
+import pytest
+from hexapod_example import HEXAPOD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from outline_tables import LEG_NAMES, assert_same, outlines_of, recorded
 
-from legcal.data.measurements import Measurements
-from legcal.data.rows import (
+from legcal.data import (
+    Dataset,
+    Measurements,
     Order,
     canonical_order,
+    dataset_at,
     inverse,
+    load_dataset,
+    measurements_at,
     reorder_measurements,
-    sort_rows,
+    split_images,
 )
+from legcal.errors import NotIdentifiable, UsageError
 
 FAST = settings(deadline=None, max_examples=25)
 SEEDS = st.integers(0, 2**32 - 1)
 IMAGES = ("b", "a", "", "", "d", "c", "", "")
 
 
-def session() -> Measurements:
+def _session() -> Measurements:
     """Eight rows of five poses in two views; some without an image, some without a label."""
     recording = recorded(IMAGES)
     pose = np.array([0, 1, 2, 0, 3, 1, 4, 2], dtype=np.intp)
@@ -30,74 +38,132 @@ def session() -> Measurements:
     return replace(recording, pose=pose, q=q, pose_labels=("z", "y", "", "x", "w"))
 
 
-def shuffled(seed: int) -> Order:
+def _shuffled(seed: int) -> Order:
     rng = np.random.default_rng(seed)
     return Order(rng.permutation(8), rng.permutation(2), rng.permutation(3))
 
 
-def names(measurements: Measurements) -> list[tuple[str, str, str]]:
+def _names(m: Measurements) -> list[tuple[str, str, str]]:
     return [
-        (measurements.views[v].name, image, measurements.pose_labels[p])
-        for v, image, p in zip(
-            measurements.view, measurements.image, measurements.pose, strict=True
-        )
+        (m.views[v].name, image, m.pose_labels[p])
+        for v, image, p in zip(m.view, m.image, m.pose, strict=True)
     ]
 
 
 @FAST
 @given(SEEDS)
 def test_canonical_order_forgets_the_order_of_the_files(seed: int) -> None:
-    expected = reorder_measurements(session(), canonical_order(session(), LEG_NAMES))
-    order = shuffled(seed)
-    mixed = reorder_measurements(session(), order)
-    mixed_names = [LEG_NAMES[leg] for leg in order.legs]
-    found = reorder_measurements(mixed, canonical_order(mixed, mixed_names))
-    assert names(found) == names(expected)
+    expected = reorder_measurements(_session(), canonical_order(_session(), LEG_NAMES))
+    order = _shuffled(seed)
+    mixed = reorder_measurements(_session(), order)
+    legs = [LEG_NAMES[leg] for leg in order.legs]
+    found = reorder_measurements(mixed, canonical_order(mixed, legs))
+    assert _names(found) == _names(expected)
     np.testing.assert_array_equal(found.q, expected.q)
     np.testing.assert_array_equal(found.pose, expected.pose)
     assert [view.name for view in found.views] == ["left", "right"]
+    assert [found.views[v].name for v in found.view] == ["left"] * 4 + ["right"] * 4
+    assert found.image == ("", "", "a", "c", "", "", "b", "d")
 
 
 @FAST
 @given(SEEDS)
 def test_reordered_rows_keep_their_views_labels_poses_and_readings(seed: int) -> None:
-    order = shuffled(seed)
-    mixed = reorder_measurements(session(), order)
+    order = _shuffled(seed)
+    mixed = reorder_measurements(_session(), order)
     for new, old in enumerate(order.rows):
-        assert names(mixed)[new] == names(session())[old]
-        np.testing.assert_array_equal(mixed.q[new], session().q[old, order.legs])
-    together = mixed.pose[:, None] == mixed.pose
-    was_together = session().pose[:, None] == session().pose
-    np.testing.assert_array_equal(together, was_together[np.ix_(order.rows, order.rows)])
-    _, first = np.unique(mixed.pose, return_index=True)
-    assert np.all(np.diff(first) > 0)
+        assert _names(mixed)[new] == _names(_session())[old]
+        np.testing.assert_array_equal(mixed.q[new], _session().q[old, order.legs])
+    assert np.all(np.diff(mixed.first_rows) > 0)
+    np.testing.assert_array_equal(inverse(order.rows)[order.rows], np.arange(8))
 
 
 @FAST
 @given(SEEDS)
-def test_restored_outlines_are_those_before_reordering(seed: int) -> None:
-    outlines, order = outlines_of(seed), shuffled(seed)
+def test_tables_follow_their_images_and_legs_and_are_restored(seed: int) -> None:
+    outlines, order = outlines_of(seed), _shuffled(seed)
     order = replace(order, rows=np.random.default_rng(seed).permutation(4))
-    assert_same(order.restore(order.reorder(outlines)), outlines.sort())
+    moved = order.reorder(outlines)
+    keys = zip(order.rows[moved.row], order.legs[moved.leg], moved.edge, moved.h, strict=True)
+    before = zip(outlines.row, outlines.leg, outlines.edge, outlines.h, strict=True)
+    of_key = {(row, leg, edge): h for row, leg, edge, h in before}
+    for row, leg, edge, h in keys:
+        np.testing.assert_array_equal(h, of_key[row, leg, edge])
+    assert_same(order.restore(moved), outlines.sort())
 
 
-def test_reordered_outlines_stay_with_their_image_and_leg() -> None:
-    outlines = outlines_of(1, rows=(0, 1))
-    order = Order(np.array([1, 0]), np.array([1, 0]), np.array([2, 0, 1]))
-    found = order.reorder(outlines)
-    assert found.part[0] == "leg, C_rod"
-    assert (found.row[0], found.leg[0]) == (0, 0)
-    np.testing.assert_array_equal(found.h[0], outlines.h[10])
+# Held-out images.
 
 
-def test_rows_are_sorted_by_view_then_image() -> None:
-    plain = replace(session(), pose_labels=())
-    rows = sort_rows(plain)
-    view_names = [plain.views[v].name for v in plain.view[rows]]
-    assert view_names == ["left"] * 4 + ["right"] * 4
-    assert [plain.image[i] for i in rows][2:4] == ["a", "c"]
+@cache
+def _example() -> Dataset:
+    return replace(load_dataset(HEXAPOD, check_images=False), observations=None)
 
 
-def test_inverse_undoes_a_permutation() -> None:
-    p = np.array([2, 0, 3, 1])
-    np.testing.assert_array_equal(inverse(p)[p], np.arange(4))
+@pytest.mark.parametrize(("fraction", "count"), [(0.2, 9), (0.5, 22), (0.01, 1), (0.9, 40)])
+def test_the_fraction_is_held_out_of_every_view(fraction: float, count: int) -> None:
+    dataset = _example()
+    fitted, held_out = split_images(dataset, fraction)
+    assert len(held_out) == count
+    assert sorted([*fitted, *held_out]) == list(range(45))
+    of_view = np.bincount(dataset.measurements.view[held_out], minlength=3)
+    assert of_view.max() <= np.ceil(15 * fraction)
+
+
+def test_images_of_one_pose_are_held_out_together() -> None:
+    m = _example().measurements
+    shared = replace(m, pose=np.tile(np.arange(15), 3), q=np.tile(m.q[:15], (3, 1)))
+    _, held_out = split_images(replace(_example(), measurements=shared), 0.2)
+    assert len(held_out) == 9
+    assert len(set(shared.pose[held_out].tolist())) == 3
+
+
+def test_the_choice_does_not_depend_on_the_order_of_the_rows() -> None:
+    rows = np.random.default_rng(3).permutation(45)
+    order = Order(rows, np.array([2, 0, 1]), np.arange(6))
+    mixed = reorder_measurements(_example().measurements, order)
+    names = [
+        {dataset.measurements.image[row] for row in split_images(dataset, 0.2)[1].tolist()}
+        for dataset in (_example(), replace(_example(), measurements=mixed))
+    ]
+    assert names[0] == names[1]
+
+
+def test_a_leg_that_few_images_show_stays_in_them() -> None:
+    table = outlines_of(1, range(45), legs=(0, 1), rejected=0.0)
+    rare = (table.leg == 0) & ~np.isin(table.row, [4, 20, 21])
+    dataset = replace(_example(), observations=replace(table, used=~rare))
+    for fraction in (0.2, 0.6):
+        fitted, _ = split_images(dataset, fraction)
+        assert 4 in fitted  # alone in its view
+        assert set(fitted.tolist()) & {20, 21}
+
+
+def test_a_part_is_a_dataset_of_its_own() -> None:
+    m = _example().measurements
+    labels = tuple(f"p{k}" for k in range(15))
+    shared = replace(m, pose=np.tile(np.arange(15), 3), pose_labels=labels)
+    table, rows = outlines_of(2, range(45), legs=(0, 1)), np.array([17, 2, 5, 35])
+    part = dataset_at(replace(_example(), measurements=shared, observations=table), rows)
+    assert part.measurements.pose.tolist() == [0, 0, 1, 1]
+    assert part.measurements.pose_labels == ("p2", "p5")
+    assert [part.image_path(k) for k in range(4)] == [_example().image_path(k) for k in rows]
+    assert part.observations is not None
+    kept = np.isin(table.row, rows)
+    np.testing.assert_array_equal(rows[part.observations.row], table.row[kept])
+    np.testing.assert_array_equal(part.observations.h, table.h[kept])
+    assert len(outlines_of(3, range(4)).at(np.zeros(0, dtype=np.intp))) == 0
+    np.testing.assert_array_equal(measurements_at(shared, rows).q, part.measurements.q)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -0.2, 20.0, float("nan"), float("inf")])
+def test_a_fraction_outside_zero_and_one_is_refused(fraction: float) -> None:
+    with pytest.raises(UsageError, match="needed a number between 0 and 1"):
+        split_images(_example(), fraction)
+
+
+@pytest.mark.parametrize("rows", [[0], [0, 15], [0, 15, 30]])
+def test_too_few_images_to_hold_any_out_are_refused(rows: list[int]) -> None:
+    dataset = dataset_at(_example(), np.array(rows))
+    with pytest.raises(NotIdentifiable, match=rf"found {len(rows)} images? of {len(rows)} poses?,"):
+        split_images(dataset, 0.2)
