@@ -1,0 +1,208 @@
+"""Failures from outside: signals, lost processes, full disks, values and names beyond reason."""
+
+import errno
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from dataset_folder import HEXAPOD, Folder, folder
+
+from legcal import cli, load_dataset, load_mechanism
+from legcal.errors import DatasetError, ModelError, OutOfResources, UsageError
+from legcal.files import check_destination, closest, parse_yaml, result_folder
+from legcal.signals import stopped_by_signals
+from legcal.workers import worker_pool
+
+__all__ = ["folder"]
+
+LONG = "a" * 400
+
+POOL = """
+import multiprocessing, os, time
+from legcal.workers import worker_pool
+
+if __name__ == "__main__":
+    with worker_pool(2) as run:
+        list(run(abs, range(8)))
+        print(*[child.pid for child in multiprocessing.active_children()], flush=True)
+        time.sleep(60.0)
+"""
+
+
+@contextmanager
+def handled(number: signal.Signals, by: signal.Handlers) -> Iterator[None]:
+    """Handle a signal in one way for a while, whatever the tests were started under."""
+    before = signal.signal(number, by)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_any_signal_stops_once_and_lets_the_clean_up_end(name: str) -> None:
+    number, ended = signal.Signals[name], []
+
+    @stopped_by_signals()
+    def work() -> None:
+        try:
+            signal.raise_signal(number)
+        finally:
+            signal.raise_signal(number)
+            ended.append(True)
+
+    with handled(number, signal.SIG_DFL):
+        with pytest.raises(KeyboardInterrupt):
+            work()
+        assert ended
+        assert signal.getsignal(number) is signal.SIG_DFL
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
+def test_a_signal_that_was_ignored_stays_so(name: str) -> None:
+    number = signal.Signals[name]
+    with handled(number, signal.SIG_IGN):
+        with stopped_by_signals():
+            signal.raise_signal(number)
+        assert signal.getsignal(number) is signal.SIG_IGN
+
+
+def test_processes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "pool.py"
+    script.write_text(POOL)
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        workers = [int(pid) for pid in parent.stdout.readline().split()]
+        parent.kill()
+    assert len(workers) == 2
+    deadline = time.monotonic() + 10.0
+    while any(_runs(pid) for pid in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(_runs(pid) for pid in workers)
+
+
+def _runs(pid: int) -> bool:
+    """Say whether a process is there and is no corpse that waits to be collected."""
+    listed = subprocess.run(
+        ["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False
+    ).stdout.strip()
+    return listed != "" and not listed.startswith("Z")
+
+
+def test_a_process_that_is_ended_from_outside_is_said_in_one_sentence() -> None:
+    with pytest.raises(OutOfResources, match="ended from outside"), worker_pool(2) as run:
+        list(run(os._exit, [1, 1]))
+
+
+def test_processes_do_not_finish_work_that_is_not_wanted_any_more() -> None:
+    def stop_after_the_first() -> None:
+        with worker_pool(2) as run:
+            for _ in run(time.sleep, [0, 300, 300, 300]):
+                raise KeyboardInterrupt
+
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        stop_after_the_first()
+    assert time.monotonic() - start < 30.0
+
+
+def test_a_result_on_a_full_disk_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    def write() -> None:
+        with result_folder(tmp_path / "out") as new:
+            (new / "result.json").write_text("{}")
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OutOfResources, match=r"No space.*nothing was written"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("words", "stdout"), [("", "> /dev/full"), ("--json", ">&-")])
+def test_output_that_cannot_be_printed_is_said_on_stderr(words: str, stdout: str) -> None:
+    if "/dev" in stdout and not Path("/dev/full").exists():
+        pytest.skip("there is no device that is always full")
+    command = f'"{sys.executable}" -m legcal inspect hexapod {words} {stdout}'
+    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("legcal: The output could not be printed: found ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_failure_is_json_where_stdout_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "argv", ["legcal", "inspect", LONG, "--json"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    assert json.loads(out.getvalue())["error"]["kind"] == "ModelError"
+
+
+# Values that no other test is about; more refusals are in characterisation/refusals.py.
+
+
+@pytest.mark.parametrize("name", ["", "c\n1", "\x1b[31m"])
+def test_a_view_whose_name_a_table_cannot_hold_is_refused(folder: Folder, name: str) -> None:
+    folder.entry["views"][name] = folder.entry["views"]["c2"]
+    with pytest.raises(DatasetError, match="needed printable characters"):
+        load_dataset(folder.write())
+
+
+def test_names_that_are_too_long_are_those_of_no_file(
+    folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("legcal.data.dataset.load_mechanism", load_mechanism)
+    for key in ("measurements", "mechanism"):
+        folder.entry[key] = LONG
+        with pytest.raises((DatasetError, ModelError), match="found no such file"):
+            load_dataset(folder.write())
+    with pytest.raises(DatasetError, match="found no"):
+        load_dataset(LONG)
+    with pytest.raises(UsageError, match="File name too long"):
+        check_destination(Path(LONG))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("- 0.38274", "- 1.0e+308", "needed a number less than"),
+        *(
+            ("leg2: leg2", f'"{name}": leg2', r"legs.*, the first a letter or digit.*; rename it")
+            for name in ("leg1,", "../xleg1", "leg 1", "a" * 101, "-leg")
+        ),
+    ],
+)
+def test_a_model_beyond_reason_is_refused(tmp_path: Path, old: str, new: str, named: str) -> None:
+    text = HEXAPOD.read_text()
+    assert old in text
+    path = tmp_path / "hexapod.yaml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ModelError, match=named):
+        load_mechanism(path)
+
+
+@pytest.mark.parametrize("value", ["!!bool abc", "!!timestamp abc", '!!int ""', "2001-99-99"])
+def test_a_value_that_is_not_of_its_tag_is_found_by_its_line(value: str) -> None:
+    with pytest.raises(DatasetError, match=r"line 2, column 4: .* which is no \w+, needed YAML"):
+        parse_yaml(f"a: 1\nb: {value}\n".encode(), Path("x.yaml"), "file")
+
+
+def test_numbers_to_the_base_sixty_are_texts() -> None:
+    found = parse_yaml(b"a: 6:25\nb: [1:30.5, 7]\nc: '1:2'\n", Path("x.yaml"), "file")
+    assert found == {"a": "6:25", "b": ["1:30.5", 7], "c": "1:2"}
+
+
+def test_a_hint_at_known_names_is_short() -> None:
+    names = [f"name{k}" for k in range(30)]
+    assert closest("name7", names) == "did you mean 'name7'?"
+    assert closest("zzz", names) == f"known are: {', '.join(names[:10])} and 20 more"
+    assert closest("zzz", names[:10]) == f"known are: {', '.join(names[:10])}"
+    assert closest("zzz", []) == "known are: none"
