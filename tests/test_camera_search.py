@@ -35,15 +35,17 @@ def _is_right(placed: Candidates, T: RigidTransform) -> bool:
     return angle < np.deg2rad(5.0) and away < 0.1
 
 
-@pytest.mark.parametrize("n_legs", [3, 4, 6])
-def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int) -> None:
-    for seed in range(2):
-        pictures, T = _pictures(seed, n_legs, 4, **HARD)
-        placed = place_camera(pictures, n_legs)
-        assert placed.is_convincing
-        assert _is_right(placed, T)
-        assert placed.support.shape == placed.expected.shape == (len(placed.poses), 4)
-        assert np.all(np.diff(placed.score) <= 0.0)
+@pytest.mark.parametrize(("n_legs", "error"), [(3, 2e-3), (4, 2e-3), (6, 10e-3)])
+def test_cameras_are_placed_among_clutter_and_missing_legs(n_legs: int, error: float) -> None:
+    """Errors of the nominal model [m] hardly matter."""
+    pictures, T = _pictures(8, n_legs, 5, joint_error=error, **HARD)
+    placed = place_camera(pictures, n_legs)
+    assert placed.is_convincing
+    away, angle = lp.apart(T, placed.pose())
+    assert angle < np.deg2rad(6.0)
+    assert away < 0.15
+    assert placed.support.shape == placed.expected.shape == (len(placed.poses), 5)
+    assert np.all(np.diff(placed.score) <= 0.0)
 
 
 @pytest.mark.slow
@@ -58,15 +60,6 @@ def test_no_wrong_pose_is_convincing() -> None:
         if placed.is_convincing:
             assert _is_right(placed, T), seed
     assert np.mean(right) > 0.75
-
-
-def test_a_model_that_is_wrong_by_ten_millimetres_suffices() -> None:
-    pictures, T = _pictures(8, 6, 5, joint_error=10e-3, **HARD)
-    placed = place_camera(pictures, 6)
-    assert placed.is_convincing
-    away, angle = lp.apart(T, placed.pose())
-    assert angle < np.deg2rad(6.0)
-    assert away < 0.15
 
 
 def test_views_that_know_how_they_stand_to_each_other_are_placed_together() -> None:
@@ -85,12 +78,6 @@ def test_views_that_know_how_they_stand_to_each_other_are_placed_together() -> N
     placed = place_camera(joined, 6)
     assert placed.is_convincing
     assert _is_right(placed, T_base_board)
-
-
-def test_mirrored_pictures_are_refused() -> None:
-    pictures, _ = _pictures(20, 6, 4, n_clutter=6, noise=0.3)
-    assert place_camera(pictures, 6).is_convincing
-    assert not place_camera(mirrored(pictures), 6).is_convincing
 
 
 def test_a_symmetric_machine_at_a_symmetric_reading_is_ambiguous_and_others_resolve_it() -> None:
@@ -114,6 +101,7 @@ def test_a_rough_pose_is_improved() -> None:
         [0.02, -0.02, 0.03], Rotation.from_rotvec([0.03, -0.02, 0])
     )
     placed = place_near(pictures, T * off, 6)
+    assert np.all(placed.leg_error[np.isfinite(placed.leg_error)] < 6e-3)  # from its edge pairs
     assert placed.hinted
     assert placed.is_convincing
     assert _is_right(placed, T)
@@ -127,39 +115,28 @@ def test_a_rough_pose_of_another_place_is_not_believed() -> None:
     assert not placed.is_clear
 
 
-def test_the_error_of_a_leg_tells_how_far_it_is_from_its_bars() -> None:
-    pictures, _ = _pictures(5, 6, 5)
-    placed = place_camera(pictures, 6)
-    assert np.all(placed.leg_error[np.isfinite(placed.leg_error)] < 6e-3)
-    assert np.isfinite(placed.leg_error).sum() >= 4
-
-
 def test_pictures_of_nothing_give_no_pose() -> None:
     rng = np.random.default_rng(0)
     made, where = lp.machine(6, rng), lp.platform(rng)
     joints = made.A, made.posed(where)
     empty = lp.picture(joints, joints, lp.camera(rng), rng, missing=1.1)
-    for pictures in ([empty], [empty, empty]):
-        placed = place_camera(pictures, 6)
-        assert len(placed.poses) == 0
-        assert not placed.is_enough
-        assert not placed.is_clear
-        assert not placed.is_convincing
+    placed = place_camera([empty, empty], 6)
+    assert len(placed.poses) == 0
+    assert not any((placed.is_enough, placed.is_clear, placed.is_convincing))
     wild = lp.picture(joints, joints, lp.camera(rng), rng, missing=1.1, n_clutter=12)
     assert not place_camera([wild] * 2, 6).is_convincing
 
 
-@pytest.mark.parametrize("missing", [0.2, 0.45])
+@pytest.mark.parametrize("missing", [pytest.param(0.2, marks=pytest.mark.slow), 0.45])
 def test_mirrored_pictures_of_a_machine_without_symmetry_are_told_from_its_own(
     missing: float,
 ) -> None:
-    for seed in range(20, 23):
-        pictures, _ = _pictures(seed, 6, 4, **{**HARD, "missing": missing})
-        own, other = place_camera(pictures, 6), place_camera(mirrored(pictures), 6)
-        assert own.is_convincing
-        assert may_be_mirrored(other)
-        assert is_mirrored(other, own) or not other.is_convincing
-        assert not is_mirrored(own, other)
+    pictures, _ = _pictures(20, 6, 4, **{**HARD, "missing": missing})
+    own, other = place_camera(pictures, 6), place_camera(mirrored(pictures), 6)
+    assert own.is_convincing
+    assert may_be_mirrored(other)
+    assert is_mirrored(other, own) or not other.is_convincing
+    assert not is_mirrored(own, other)
 
 
 def test_mirrored_pictures_of_a_planar_machine_are_believed() -> None:

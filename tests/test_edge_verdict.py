@@ -51,26 +51,21 @@ def test_two_edges_at_the_distance_of_the_radius_are_used() -> None:
     assert found.bias == 0.0
 
 
-@pytest.mark.parametrize("wrong", [0, 1])
-def test_after_a_fit_the_edge_away_from_its_prediction_is_not_the_outline(wrong: int) -> None:
+@pytest.mark.parametrize(
+    ("off", "used"),
+    [((1.0, 0.0), (False, True)), ((0.0, -1.0), (True, False)), ((0.6, -0.6), (False, False))],
+)
+def test_after_a_fit_an_edge_away_from_its_prediction_is_not_the_outline(
+    off: tuple[float, float], used: tuple[bool, bool]
+) -> None:
     """A pixel of width passes while the radius is hardly known, and not near a fit."""
     predicted = np.stack([np.zeros(2), WIDTH])
-    v = predicted.copy()
-    v[wrong] += 1.0 if wrong == 0 else -1.0
-    edges = _edge(v[0]), _edge(v[1])
+    edges = _edge(predicted[0] + off[0]), _edge(predicted[1] + off[1])
     pair = EdgePair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
     assert verdict(pair, predicted, LENGTH, edges).reasons == ("", "")
     found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
-    assert found.reasons[1 - wrong] == ""
-    assert found.reasons[wrong].startswith(WRONG_WIDTH)
-
-
-def test_after_a_fit_two_edges_that_both_err_are_not_used() -> None:
-    predicted = np.stack([np.zeros(2), WIDTH])
-    edges = _edge(np.full(2, 0.6)), _edge(WIDTH - 0.6)
-    pair = EdgePair(predicted, np.ones(2, dtype=np.bool_), np.zeros(2, dtype=np.bool_))
-    found = verdict(pair, predicted, LENGTH, edges, near_fit=True)
-    assert all(reason.startswith(WRONG_WIDTH) for reason in found.reasons)
+    for reason, is_used in zip(found.reasons, used, strict=True):
+        assert reason == "" if is_used else reason.startswith(WRONG_WIDTH)
 
 
 @pytest.mark.parametrize("surer", [0, 1])
