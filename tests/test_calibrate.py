@@ -103,157 +103,6 @@ def axes(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedDataset, Pa
     return made, output, calibrate(made.folder, output=output)
 
 
-# The photographs of the example.
-
-
-def test_photographs_bring_the_platform_within_0_15_mm_and_0_03_deg(example_run: Run) -> None:
-    """As much as the README says, which processors change a little."""
-    readme = (ROOT / "README.md").read_text()
-    number = r"\*{0,2}([\d.]+) (?:mm|deg)\*{0,2}"
-    for label, model, limits, within in (
-        ("nominal model", HEXAPOD / "models/hexapod.yaml", (5.0, 1.0), 0.01),
-        ("joint fit of all outlines", example_run.output / "calibrated.yaml", (0.15, 0.03), 0.3),
-    ):
-        found = evaluate(model, TRUTH, dataset=HEXAPOD)
-        mean = 1e3 * found.displacement.mean(), np.degrees(found.rotation.mean())
-        assert mean < limits
-        quoted = re.search(rf"\| {label}[^|]*\| {number} \| {number} \|", readme)
-        assert quoted is not None, label
-        assert mean == pytest.approx((float(quoted[1]), float(quoted[2])), rel=within)
-
-
-def test_errors_from_photographs_are_as_large_as_their_sigmas(example_run: Run) -> None:
-    pulls = _pulls(example_run.calibration, TRUTH)
-    assert len(pulls) == 30
-    assert 0.2 < np.mean(np.square(pulls)) < 2.0
-    radii = [row for row in result_of(example_run.calibration).parameters if ".radius." in row.name]
-    assert len(radii) == 6
-    for radius in radii:  # light at the limb allows no smaller sigma
-        assert radius.sigma is not None
-        assert abs(radius.value - 0.01) < 3.0 * radius.sigma < 0.15e-3
-
-
-def test_the_written_model_is_the_one_that_was_computed(example_run: Run) -> None:
-    written = load_mechanism(example_run.output / "calibrated.yaml").parameters
-    expected = example_run.calibration.solution.parameters
-    for name in ("base_joints", "platform_joints", "offsets"):
-        np.testing.assert_allclose(getattr(written, name), getattr(expected, name), atol=1e-12)
-
-
-def test_a_second_run_searches_no_image_and_gives_the_same(example_run: Run) -> None:
-    stages: list[str] = []
-    dataset = load_dataset(example_run.folder)
-    again = calibrate(dataset, progress=lambda stage, done, total: stages.append(stage))
-    assert "Recognising legs" in example_run.stages
-    assert set(stages) == {"Four steps", "Joint fit"}
-    one, other = (c.solution.parameters for c in (again, example_run.calibration))
-    assert np.abs(one.base_joints - other.base_joints).max() < 1e-12
-
-
-def test_an_edited_row_wins_and_is_kept(example_run: Run, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(example_run.folder, tmp_path / "edited"))
-    path = folder / "observations.csv"
-    lines = path.read_text().splitlines()
-    k = next(i for i, line in enumerate(lines) if ",used,,detected," in line)
-    lines[k] = lines[k].replace(",used,,detected", ",rejected,a reflection,edited")
-    path.write_text("\n".join(lines) + "\n")
-    result = calibrate(folder, output=tmp_path / "out")
-    key = ",".join(lines[k].split(",")[:5])
-    for table in (path, tmp_path / "out/observations.csv"):
-        [kept] = [line for line in table.read_text().splitlines() if line.startswith(key + ",")]
-        assert ",rejected,a reflection,edited," in kept
-    before, after = example_run.calibration.solution.outlines, result.solution.outlines
-    assert after.used.sum() < before.used.sum()
-
-
-@pytest.mark.slow
-def test_the_order_of_photographs_does_not_matter(tmp_path: Path) -> None:
-    given, turned = (copy_of_the_example(tmp_path / name) for name in ("given", "turned"))
-    for folder in (given, turned):
-        _change(folder / "measurements.csv", lambda rows: [*rows[:3], *rows[15:18], *rows[30:33]])
-    _change(turned / "measurements.csv", lambda rows: rows[::-1])
-    one, other = (calibrate(folder).solution for folder in (given, turned))
-    assert one.names == other.names
-    np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-6)
-    A, turned_A = one.parameters.base_joints, other.parameters.base_joints
-    np.testing.assert_allclose(A, turned_A, atol=1e-12)
-
-
-# Recovery from outlines and axes.
-
-
-@pytest.mark.parametrize(
-    "model",
-    [
-        PLANAR,
-        "tricept",
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in (
-                *("3-upu", "3-spr", "3-rps", "3-upu-tilted", "6-sps", "hexapod-rod"),
-                "hexapod-strut",
-            )
-        ),
-    ],
-)
-def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
-    made = _simulated(tmp_path, model, poses=8, views=3)
-    found = calibrate(made.folder, transformation="cross_product")
-    assert found.verdict.trustworthy
-    assert found.steps.failure == ""
-    assert found.steps.legs is not None
-    T, q = found.solution.T_Rb_Re, found.dataset.measurements.q
-    true, nominal, staged, fitted = (
-        poses_at_readings(made.nominal, legs, q, T)
-        for legs in (
-            geometries(load_mechanism(made.truth_path)),
-            geometries(made.nominal),
-            found.steps.legs,
-            found.solution.legs,
-        )
-    )
-    before, by_steps, by_fit = (
-        pose_differences(poses, true)[0].mean() for poses in (nominal, staged, fitted)
-    )
-    assert before > 1e-3
-    assert by_fit < 0.1 * before
-    assert by_steps < 0.2 * before or model in {"3-upu", "tricept"}
-    twists = {n: s for n, s in found.solution.status.items() if n.endswith(".twist")}
-    assert bool(twists) == any(leg.twist is not None for leg in geometries(made.nominal))
-    assert "fixed" not in twists.values()
-
-
-def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Calibration]) -> None:
-    made, output, calibration = axes
-    solution = calibration.solution
-    assert calibration.steps.legs is not None
-    assert 0.4 < np.mean(_pulls(calibration, made.truth_path) ** 2) < 1.9
-    assert solution.chi2 / solution.dof == pytest.approx(1.0, abs=0.35)
-    assert solution.rms_axes == pytest.approx(1.0, abs=0.3)
-    assert solution.rms_px is None
-    assert sorted(files_of(output)) == ["calibrated.urdf", "calibrated.yaml", "result.json"]
-    assert not (made.folder / "observations.csv").exists()
-    assert not [name for name in solution.values if "radius" in name]
-
-
-def test_axes_with_too_small_sigmas_and_of_other_legs_are_found(
-    axes: tuple[SimulatedDataset, Path, Calibration], tmp_path: Path
-) -> None:
-    def shrunk(row: Row) -> Row:
-        return {k: repr(float(v) / 4.0) if k.startswith("sigma") else v for k, v in row.items()}
-
-    folder = Path(shutil.copytree(axes[0].folder, tmp_path / "small"))
-    _change(folder / "axes.csv", lambda rows: [shrunk(row) for row in rows])
-    note = next(note for note in calibrate(folder).notes if "worse than their standard" in note)
-    assert re.search(r"is about [345]\.", note)
-    other = Path(shutil.copytree(axes[0].folder, tmp_path / "other"))
-    names = {f"leg{j}": f"leg{j % 6 + 1}" for j in range(1, 7)}
-    _change(other / "axes.csv", lambda rows: [row | {"leg": names[row["leg"]]} for row in rows])
-    with pytest.raises(DidNotConverge, match=r"axes are those of the right legs|axes disagree"):
-        calibrate(other, output=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 # Invariance.
 
 
@@ -345,6 +194,81 @@ def test_a_contradicted_focal_length_counts_in_the_verdict(
 ) -> None:
     assert _judged(planar[1]).verdict.trustworthy
     assert not _judged(planar[1], focal_doubt=10.0).verdict.trustworthy
+
+
+# Recovery from outlines and axes.
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        PLANAR,
+        "tricept",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in (
+                *("3-upu", "3-spr", "3-rps", "3-upu-tilted", "6-sps", "hexapod-rod"),
+                "hexapod-strut",
+            )
+        ),
+    ],
+)
+def test_fit_and_steps_come_nearer_to_the_truth(model: str, tmp_path: Path) -> None:
+    made = _simulated(tmp_path, model, poses=8, views=3)
+    found = calibrate(made.folder, transformation="cross_product")
+    assert found.verdict.trustworthy
+    assert found.steps.failure == ""
+    assert found.steps.legs is not None
+    T, q = found.solution.T_Rb_Re, found.dataset.measurements.q
+    true, nominal, staged, fitted = (
+        poses_at_readings(made.nominal, legs, q, T)
+        for legs in (
+            geometries(load_mechanism(made.truth_path)),
+            geometries(made.nominal),
+            found.steps.legs,
+            found.solution.legs,
+        )
+    )
+    before, by_steps, by_fit = (
+        pose_differences(poses, true)[0].mean() for poses in (nominal, staged, fitted)
+    )
+    assert before > 1e-3
+    assert by_fit < 0.1 * before
+    assert by_steps < 0.2 * before or model in {"3-upu", "tricept"}
+    twists = {n: s for n, s in found.solution.status.items() if n.endswith(".twist")}
+    assert bool(twists) == any(leg.twist is not None for leg in geometries(made.nominal))
+    assert "fixed" not in twists.values()
+
+
+def test_axes_are_fitted_without_images(axes: tuple[SimulatedDataset, Path, Calibration]) -> None:
+    made, output, calibration = axes
+    solution = calibration.solution
+    assert calibration.steps.legs is not None
+    assert 0.4 < np.mean(_pulls(calibration, made.truth_path) ** 2) < 1.9
+    assert solution.chi2 / solution.dof == pytest.approx(1.0, abs=0.35)
+    assert solution.rms_axes == pytest.approx(1.0, abs=0.3)
+    assert solution.rms_px is None
+    assert sorted(files_of(output)) == ["calibrated.urdf", "calibrated.yaml", "result.json"]
+    assert not (made.folder / "observations.csv").exists()
+    assert not [name for name in solution.values if "radius" in name]
+
+
+def test_axes_with_too_small_sigmas_and_of_other_legs_are_found(
+    axes: tuple[SimulatedDataset, Path, Calibration], tmp_path: Path
+) -> None:
+    def shrunk(row: Row) -> Row:
+        return {k: repr(float(v) / 4.0) if k.startswith("sigma") else v for k, v in row.items()}
+
+    folder = Path(shutil.copytree(axes[0].folder, tmp_path / "small"))
+    _change(folder / "axes.csv", lambda rows: [shrunk(row) for row in rows])
+    note = next(note for note in calibrate(folder).notes if "worse than their standard" in note)
+    assert re.search(r"is about [345]\.", note)
+    other = Path(shutil.copytree(axes[0].folder, tmp_path / "other"))
+    names = {f"leg{j}": f"leg{j % 6 + 1}" for j in range(1, 7)}
+    _change(other / "axes.csv", lambda rows: [row | {"leg": names[row["leg"]]} for row in rows])
+    with pytest.raises(DidNotConverge, match=r"axes are those of the right legs|axes disagree"):
+        calibrate(other, output=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 # Files, refusals and notes.
@@ -565,3 +489,84 @@ def test_views_without_corners_are_named() -> None:
     assert notes(corners) == notes(None) == []
     (note,) = notes(replace(corners, used=np.array([True, False])))
     assert note.startswith("No image of c2 shows the calibration board")
+
+
+# The photographs of the example.
+
+
+def test_photographs_bring_the_platform_within_0_15_mm_and_0_03_deg(example_run: Run) -> None:
+    """As much as the README says, which processors change a little."""
+    readme = (ROOT / "README.md").read_text()
+    number = r"\*{0,2}([\d.]+) (?:mm|deg)\*{0,2}"
+    for label, model, limits, within in (
+        ("nominal model", HEXAPOD / "models/hexapod.yaml", (5.0, 1.0), 0.01),
+        ("joint fit of all outlines", example_run.output / "calibrated.yaml", (0.15, 0.03), 0.3),
+    ):
+        found = evaluate(model, TRUTH, dataset=HEXAPOD)
+        mean = 1e3 * found.displacement.mean(), np.degrees(found.rotation.mean())
+        assert mean < limits
+        quoted = re.search(rf"\| {label}[^|]*\| {number} \| {number} \|", readme)
+        assert quoted is not None, label
+        assert mean == pytest.approx((float(quoted[1]), float(quoted[2])), rel=within)
+
+
+def test_errors_from_photographs_are_as_large_as_their_sigmas(example_run: Run) -> None:
+    pulls = _pulls(example_run.calibration, TRUTH)
+    assert len(pulls) == 30
+    assert 0.2 < np.mean(np.square(pulls)) < 2.0
+    radii = [row for row in result_of(example_run.calibration).parameters if ".radius." in row.name]
+    assert len(radii) == 6
+    for radius in radii:  # light at the limb allows no smaller sigma
+        assert radius.sigma is not None
+        assert abs(radius.value - 0.01) < 3.0 * radius.sigma < 0.15e-3
+
+
+def test_the_written_model_is_the_one_that_was_computed(example_run: Run) -> None:
+    written = load_mechanism(example_run.output / "calibrated.yaml").parameters
+    expected = example_run.calibration.solution.parameters
+    for name in ("base_joints", "platform_joints", "offsets"):
+        np.testing.assert_allclose(getattr(written, name), getattr(expected, name), atol=1e-12)
+
+
+def test_a_second_run_searches_no_image_and_gives_the_same(example_run: Run) -> None:
+    stages: list[str] = []
+    dataset = load_dataset(example_run.folder)
+    again = calibrate(dataset, progress=lambda stage, done, total: stages.append(stage))
+    assert "Recognising legs" in example_run.stages
+    assert set(stages) == {"Four steps", "Joint fit"}
+    one, other = (c.solution.parameters for c in (again, example_run.calibration))
+    assert np.abs(one.base_joints - other.base_joints).max() < 1e-12
+
+
+def test_good_photographs_give_no_notes(example_run: Run) -> None:
+    usual = ("The start ", "The gamma of ")
+    assert [note for note in example_run.calibration.notes if not note.startswith(usual)] == []
+
+
+def test_an_edited_row_wins_and_is_kept(example_run: Run, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(example_run.folder, tmp_path / "edited"))
+    path = folder / "observations.csv"
+    lines = path.read_text().splitlines()
+    k = next(i for i, line in enumerate(lines) if ",used,,detected," in line)
+    lines[k] = lines[k].replace(",used,,detected", ",rejected,a reflection,edited")
+    path.write_text("\n".join(lines) + "\n")
+    result = calibrate(folder, output=tmp_path / "out")
+    key = ",".join(lines[k].split(",")[:5])
+    for table in (path, tmp_path / "out/observations.csv"):
+        [kept] = [line for line in table.read_text().splitlines() if line.startswith(key + ",")]
+        assert ",rejected,a reflection,edited," in kept
+    before, after = example_run.calibration.solution.outlines, result.solution.outlines
+    assert after.used.sum() < before.used.sum()
+
+
+@pytest.mark.slow
+def test_the_order_of_photographs_does_not_matter(tmp_path: Path) -> None:
+    given, turned = (copy_of_the_example(tmp_path / name) for name in ("given", "turned"))
+    for folder in (given, turned):
+        _change(folder / "measurements.csv", lambda rows: [*rows[:3], *rows[15:18], *rows[30:33]])
+    _change(turned / "measurements.csv", lambda rows: rows[::-1])
+    one, other = (calibrate(folder).solution for folder in (given, turned))
+    assert one.names == other.names
+    np.testing.assert_allclose(one.sigma, other.sigma, rtol=1e-6)
+    A, turned_A = one.parameters.base_joints, other.parameters.base_joints
+    np.testing.assert_allclose(A, turned_A, atol=1e-12)
